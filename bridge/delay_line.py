@@ -1,0 +1,58 @@
+"""Real-time delays: an event heap with a thread that acts when a message is due."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from bridge.event_heap import EventHeap
+
+Action = Callable[[], None]
+
+
+class DelayLine:
+    """Runs actions at their time on the monotonic clock, on a thread of its own.
+
+    ``close`` must be called: the thread is no daemon of an ending process.
+    """
+
+    def __init__(self) -> None:
+        self._heap: EventHeap[Action] = EventHeap()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="delay-line", daemon=True)
+        self._thread.start()
+
+    def push(self, release_s: float, action: Action) -> None:
+        """Run ``action`` at ``release_s`` (monotonic seconds); at once if that has passed."""
+        with self._changed:
+            self._heap.push(release_s, action)
+            self._changed.notify()
+
+    def clear(self) -> None:
+        """Forget what is still under way."""
+        with self._changed:
+            self._heap.clear()
+
+    def close(self) -> None:
+        """Stop the thread and wait for it."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (action := self._next_action()) is not None:
+            action()
+
+    def _next_action(self) -> Action | None:
+        """Sleep until an action is due and return it; None once the line is closed."""
+        with self._changed:
+            while not self._closed:
+                due = self._heap.pop_due(time.monotonic())
+                if due is not None:
+                    return due[1]
+                next_s = self._heap.next_arrival_s()
+                self._changed.wait(None if next_s is None else next_s - time.monotonic())
+        return None

@@ -1,0 +1,129 @@
+"""One episode over the wire: state out, decision back, one step of the environment, again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from bridge.clock import Clock
+from bridge.command_hold import Decision
+from bridge.environments import brake_action
+from bridge.safe_stops import SafeStopLog
+from edge_runtime.cli import UserError
+from edge_runtime.episode_report import EpisodeResult
+from edge_runtime.wire import CONTROL_PERIOD_S, State
+
+PublishScene = Callable[[Any, int, int, float], None]
+"""Called with environment, episode, step, simulated time (s) after every state."""
+OnTick = Callable[[int, int, Decision], None]
+"""Called with episode, step, decision after every tick."""
+
+
+class EpisodeRunner:
+    """Drives one environment through a clock and keeps what the report needs."""
+
+    def __init__(
+        self,
+        environment: gymnasium.Env[Any, Any],
+        clock: Clock,
+        session: str,
+        publish_scene: PublishScene,
+        on_tick: OnTick,
+    ) -> None:
+        self.safe_stops = SafeStopLog(CONTROL_PERIOD_S)
+        self.deadline_misses = 0
+        self._environment = environment
+        self._clock = clock
+        self._session = session
+        self._publish_scene = publish_scene
+        self._on_tick = on_tick
+
+    def run(self, episode: int, seed: int) -> EpisodeResult:
+        """Drive one episode to its end; the seed decides the environment and the link."""
+        observation, info = self._environment.reset(seed=seed)
+        self._clock.begin(episode, seed)
+        steps: list[_Step] = []
+        ended = False
+        while not ended:
+            state = self._state(episode, len(steps), observation, info)
+            self._show(state)
+            decision = self._clock.exchange(state)
+            action = self._action(decision)
+            observation, reward, terminated, truncated, info = self._environment.step(action)
+            steps.append(_Step(action, float(reward), info))
+            self._note(state, decision, _speed_mps(info))
+            ended = bool(terminated or truncated)
+        final = self._state(episode, len(steps), observation, info, final=True)
+        self._show(final)
+        self._clock.finish(final)
+        return _result(seed, steps, info)
+
+    def _state(
+        self,
+        episode: int,
+        step: int,
+        observation: np.ndarray,
+        info: dict[str, Any],
+        final: bool = False,
+    ) -> State:
+        return State(
+            session=self._session,
+            episode=episode,
+            step=step,
+            sim_time_s=round(step * CONTROL_PERIOD_S, 6),
+            sent_ns=0,  # The clock stamps it when it sends it.
+            frames=np.ascontiguousarray(observation, dtype=np.uint8).tobytes(),
+            speed_mps=_speed_mps(info),
+            final=final,
+        )
+
+    def _show(self, state: State) -> None:
+        self._publish_scene(self._environment, state.episode, state.step, state.sim_time_s)
+
+    def _action(self, decision: Decision) -> np.ndarray:
+        """The command's action, full brake, or (before the first command) hands off: zeros."""
+        if decision.brake_reason:
+            return brake_action(self._environment)
+        if decision.command is None:
+            return np.zeros(self._environment.action_space.shape or (1,), dtype=np.float32)
+        return np.asarray(decision.command.action, dtype=np.float32)
+
+    def _note(self, state: State, decision: Decision, speed_mps: float) -> None:
+        self.deadline_misses += not decision.fresh
+        self.safe_stops.observe(state.episode, state.step, decision, speed_mps)
+        self._on_tick(state.episode, state.step, decision)
+
+
+class _Step:
+    def __init__(self, action: np.ndarray, reward: float, info: dict[str, Any]) -> None:
+        self.action = [float(value) for value in action]
+        self.reward = reward
+        # An environment need not report accelerations; then they count as zero.
+        self.lateral_mps2 = abs(float(info.get("lateral_acceleration_mps2", 0.0)))
+        self.longitudinal_mps2 = abs(float(info.get("longitudinal_acceleration_mps2", 0.0)))
+
+
+def _speed_mps(info: dict[str, Any]) -> float:
+    try:
+        return float(info["speed_mps"])
+    except KeyError:
+        raise UserError(
+            "the environment's info holds no speed_mps, which every state needs"
+        ) from None
+
+
+def _result(seed: int, steps: list[_Step], info: dict[str, Any]) -> EpisodeResult:
+    return EpisodeResult(
+        seed=seed,
+        outcome=str(info.get("outcome") or "ended"),
+        distance_m=float(info.get("distance_m", 0.0)),
+        reward=float(sum(step.reward for step in steps)),
+        time_s=round(len(steps) * CONTROL_PERIOD_S, 6),
+        lateral_acceleration_mps2=float(np.mean([step.lateral_mps2 for step in steps])),
+        longitudinal_acceleration_mps2=float(np.mean([step.longitudinal_mps2 for step in steps])),
+        steps=len(steps),
+        actions=[step.action for step in steps],
+    )

@@ -1,0 +1,95 @@
+"""The simulator's end of the wire: a thin shell around one Zenoh session."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import zenoh
+
+from bridge.environments import scene_of
+from bridge.scene import encode_scene, scene_key
+from edge_runtime.cli import UserError
+from edge_runtime.transport import open_session
+from edge_runtime.wire import key
+
+CommandHandler = Callable[[bytes], None]
+EDGE_POLL_S = 0.1
+
+
+def simulator_key(vehicle_id: str) -> str:
+    """Return the liveliness key by which viewers see that the simulator is there (extension)."""
+    return f"phil/{vehicle_id}/simulator"
+
+
+class SimulatorPort:
+    """Publishes states and scenes, hands on commands, and sees whether an edge runtime lives."""
+
+    def __init__(self, zenoh_session: zenoh.Session, vehicle_id: str) -> None:
+        self.session = secrets.token_hex(8)
+        self._zenoh = zenoh_session
+        self._vehicle_id = vehicle_id
+        # DROP: a slow listener must never hold up the simulation.
+        drop = zenoh.CongestionControl.DROP
+        self._states = zenoh_session.declare_publisher(
+            key(vehicle_id, "state"), congestion_control=drop
+        )
+        self._scenes = zenoh_session.declare_publisher(
+            scene_key(vehicle_id), congestion_control=drop
+        )
+        self._token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
+        self._commands: Any = None
+
+    def on_command(self, handler: CommandHandler) -> None:
+        """Call ``handler(payload)`` for every command, on Zenoh's thread: it must be quick."""
+        self._commands = self._zenoh.declare_subscriber(
+            key(self._vehicle_id, "command"), lambda sample: handler(sample.payload.to_bytes())
+        )
+
+    def publish_state(self, payload: bytes) -> None:
+        """Send an encoded state to the edge runtime (and to viewers)."""
+        self._states.put(payload)
+
+    def publish_scene(self, environment: Any, episode: int, step: int, sim_time_s: float) -> None:
+        """Send the scene, if the environment has one and anybody is listening."""
+        somebody: Any = self._scenes.matching_status
+        if not somebody.matching:
+            return
+        scene = scene_of(environment)
+        if scene is not None:
+            self._scenes.put(encode_scene(scene, episode, step, sim_time_s))
+
+    def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
+        """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
+        give_up_s = time.monotonic() + limit_s
+        alive = key(self._vehicle_id, "alive")
+        while not any(reply.ok for reply in self._zenoh.liveliness().get(alive, timeout=1.0)):
+            if time.monotonic() >= give_up_s:
+                raise UserError(
+                    f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
+                    f"--policy POLICY.onnx --connect {endpoint} --vehicle-id {self._vehicle_id}"
+                )
+            time.sleep(EDGE_POLL_S)
+
+    def close(self) -> None:
+        """Undeclare everything: a callback left open hangs the process at its end."""
+        for declared in (self._commands, self._token, self._scenes, self._states):
+            if declared is not None:
+                declared.undeclare()
+
+
+@contextlib.contextmanager
+def open_port(listen: str, vehicle_id: str) -> Iterator[SimulatorPort]:
+    """Listen at ``listen`` for the edge runtime; UserError if the port is busy."""
+    zenoh_session = open_session(listen=listen, mode="router")
+    try:
+        port = SimulatorPort(zenoh_session, vehicle_id)
+        try:
+            yield port
+        finally:
+            port.close()
+    finally:
+        zenoh_session.close()

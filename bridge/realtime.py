@@ -1,0 +1,118 @@
+"""Real time: absolute ticks on the monotonic clock, latency by timers, nobody waits for anybody.
+
+Tick n begins at n T after the episode's start. Its state goes out through the delay line, and
+the vehicle acts at the latest 25 ms after the tick on the newest command that has arrived.
+
+Threads: the caller's runs the ticks, Zenoh's hands in commands, the delay line's delivers both
+directions. The condition guards everything that the delay line and the ticks share.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from functools import partial
+
+import msgspec
+
+from bridge.clock import Publish
+from bridge.command_check import CommandCheck
+from bridge.command_hold import COMMAND_WINDOW_S, CommandHold, Decision
+from bridge.delay_line import DelayLine
+from bridge.latency import LatencyModel, LatencySpec, make_link
+from edge_runtime.wire import CONTROL_PERIOD_S, Reason, State, encode
+
+
+class RealTimeClock:
+    """The clock of ``--clock realtime``."""
+
+    def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
+        self.latencies_ms: list[float] = []
+        self.tick_overruns = 0
+        self._publish = publish
+        self._check = check
+        self._spec = spec
+        self._line = DelayLine()
+        self._arrived = threading.Condition()
+        self.begin(episode=0, seed=0)
+
+    def begin(self, episode: int, seed: int) -> None:
+        """Start an episode now."""
+        with self._arrived:
+            self._check.begin(episode)
+            self._link = make_link(self._spec, seed)
+            self._start_s = time.monotonic()
+            self._hold = CommandHold(now_s=self._start_s)
+            self._sent_s: dict[int, float] = {}
+
+    def receive(self, payload: bytes) -> None:
+        """Send one command down the line to the vehicle."""
+        self._send(self._link.down, partial(self._arrive_at_vehicle, payload))
+
+    def exchange(self, state: State) -> Decision:
+        """Wait for the tick, send its state, and decide when its command window closes."""
+        tick_s = self._wait_for_tick(state.step)
+        payload = encode(_stamp(state))
+        with self._arrived:
+            self._sent_s[state.step] = time.monotonic()
+            self._check.sent(state.step)
+        self._send(self._link.up, partial(self._publish, payload))
+        return self._decide(state.step, tick_s + COMMAND_WINDOW_S)
+
+    def finish(self, state: State) -> None:
+        """Forget what is under way and publish the final state at once."""
+        self._line.clear()
+        with self._arrived:
+            self._check.end(state.step, self._hold.newest_step)
+        self._publish(encode(_stamp(state)))
+
+    def close(self) -> None:
+        """Stop the delay line."""
+        self._line.close()
+
+    def _send(self, direction: LatencyModel, action: partial[None]) -> None:
+        release_s = direction.sample(time.monotonic())
+        if release_s is not None:
+            self._line.push(release_s, action)
+
+    def _wait_for_tick(self, step: int) -> float:
+        """Sleep until the tick and return its time; a tick missed altogether moves all later ones.
+
+        Catching up instead would run several ticks at once, at a pace no edge runtime can follow.
+        """
+        tick_s = self._start_s + step * CONTROL_PERIOD_S
+        late_s = time.monotonic() - tick_s
+        if late_s > COMMAND_WINDOW_S:
+            self.tick_overruns += 1
+            self._start_s += late_s
+            return tick_s + late_s
+        time.sleep(max(0.0, -late_s))
+        return tick_s
+
+    def _decide(self, step: int, window_end_s: float) -> Decision:
+        """Return early if this state is already answered: nothing newer can arrive."""
+        with self._arrived:
+            self._arrived.wait_for(
+                lambda: self._hold.newest_step >= step,
+                timeout=max(0.0, window_end_s - time.monotonic()),
+            )
+            return self._hold.decide(time.monotonic())
+
+    def _arrive_at_vehicle(self, payload: bytes) -> None:
+        now_s = time.monotonic()
+        with self._arrived:
+            command = self._check.read(payload)
+            if command is None:
+                return
+            answered_step = self._hold.newest_step
+            if not self._hold.admit(command, now_s):
+                self._check.reject(Reason.STALE.value)
+                return
+            if command.step > answered_step:
+                self.latencies_ms.append((now_s - self._sent_s[command.step]) * 1e3)
+            self._arrived.notify()
+
+
+def _stamp(state: State) -> State:
+    """Return the state with the wall clock at which it is sent."""
+    return msgspec.structs.replace(state, sent_ns=time.time_ns())

@@ -1,0 +1,64 @@
+"""The report of ``bridge simulate``: the contract's keys, and what explains them. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from bridge.safe_stops import SafeStopEvent
+from edge_runtime.episode_report import EpisodeResult, summarise
+
+
+def latency_summary(latencies_ms: Sequence[float]) -> dict[str, float | None]:
+    """Return p50, p99 and max of state sent to command received, ms; None if none came."""
+    if not latencies_ms:
+        return {"p50": None, "p99": None, "max": None}
+    p50, p99 = np.percentile(latencies_ms, [50, 99])
+    return {"p50": float(p50), "p99": float(p99), "max": float(max(latencies_ms))}
+
+
+def make_report(
+    results: Sequence[EpisodeResult],
+    safe_stop_events: Sequence[SafeStopEvent],
+    latencies_ms: Sequence[float],
+    counts: Mapping[str, Any],
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Join the summary of the episodes with what happened on the wire.
+
+    ``settings`` holds scenario, policy_id, seed, clock and latency_spec; ``counts`` holds
+    deadline_misses, tick_overruns and rejected.
+    """
+    return {
+        **summarise(
+            results,
+            scenario=settings["scenario"],
+            condition="nominal",  # The bridge serves an environment as it is registered.
+            policy_id=settings["policy_id"],
+            seed=settings["seed"],
+        ),
+        "latency_ms": latency_summary(latencies_ms),
+        **counts,
+        "safe_stops": len(safe_stop_events),
+        "clock": settings["clock"],
+        "latency_spec": settings["latency_spec"],
+        "safe_stop_events": [asdict(event) for event in safe_stop_events],
+        "per_episode": [result.as_dict() for result in results],
+    }
+
+
+def summary_line(report: Mapping[str, Any]) -> str:
+    """Return the report in one line for a terminal."""
+    latency = report["latency_ms"]
+    times = "no command came"
+    if latency["p50"] is not None:
+        times = f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    rejected = sum(report["rejected"].values())
+    return (
+        f"{report['episodes']} episodes: {report['success_rate']:.0%} goal, "
+        f"{report['collision_rate']:.0%} collision; {times}; {report['safe_stops']} safe stops, "
+        f"{report['deadline_misses']} deadline misses, {rejected} rejected commands"
+    )

@@ -1,0 +1,68 @@
+"""The scene seen from above, for viewers: an extension topic ``phil/<vehicle_id>/scene``.
+
+The policy never hears this topic: it holds what the environment knows and the vehicle does not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from edge_runtime.wire import MAX_PAYLOAD_BYTES, check_vehicle_id
+
+Point = list[float]
+
+
+class SceneVehicle(msgspec.Struct, frozen=True, kw_only=True):
+    """One car, seen from above; ``x``, ``y`` (m) are its centre and y grows downwards."""
+
+    id: int
+    x: float
+    y: float
+    heading_rad: float
+    length_m: float
+    width_m: float
+    speed_mps: float
+    ego: bool = False
+
+
+class Scene(msgspec.Struct, frozen=True, kw_only=True):
+    """Roads and the path as polylines, vehicles as oriented boxes; metres, y grows downwards."""
+
+    episode: int
+    step: int
+    sim_time_s: float
+    roads: list[list[Point]] = []
+    road_width_m: float = 4.0
+    path: list[Point] = []
+    goal: Point | None = None
+    vehicles: list[SceneVehicle] = []
+
+
+_ENCODER = msgspec.msgpack.Encoder(
+    enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+)
+_DECODER = msgspec.msgpack.Decoder(Scene)
+
+
+def scene_key(vehicle_id: str) -> str:
+    """Return the Zenoh key of the scene topic."""
+    return f"phil/{check_vehicle_id(vehicle_id)}/scene"
+
+
+def encode_scene(scene: dict[str, Any], episode: int, step: int, sim_time_s: float) -> bytes:
+    """Encode an environment's ``scene()`` with its place in time as a MessagePack map."""
+    stamped = {**scene, "episode": episode, "step": step, "sim_time_s": sim_time_s}
+    return _ENCODER.encode(stamped)
+
+
+def decode_scene(payload: bytes) -> Scene | None:
+    """Return the scene; None if the payload is not one (a viewer has nothing better to do)."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        return None
+    try:
+        return _DECODER.decode(payload)
+    except (msgspec.MsgspecError, RecursionError):
+        return None

@@ -1,0 +1,178 @@
+"""``python -m bridge simulate``: serve an environment to an edge runtime, and report."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+
+from bridge.arguments import non_negative_int, non_negative_seconds, positive_int
+from bridge.clock import Clock, Publish
+from bridge.command_check import CommandCheck
+from bridge.environments import SCENARIOS, make_environment
+from bridge.episode import EpisodeRunner
+from bridge.latency import GRAMMAR, LatencySpec, parse_spec
+from bridge.lockstep import LockStepClock
+from bridge.port import SimulatorPort, open_port
+from bridge.progress import EpisodeBar, episode_bar
+from bridge.realtime import RealTimeClock
+from bridge.report import make_report, summary_line
+from bridge.signals import sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, write_json_out
+from edge_runtime.files import check_writable
+from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+from edge_runtime.wire import check_vehicle_id
+
+DEFAULT_VEHICLE_ID = "hunter01"
+CLOCKS: dict[str, Callable[[Publish, CommandCheck, LatencySpec], Clock]] = {
+    "lockstep": LockStepClock,
+    "realtime": RealTimeClock,
+}
+
+
+@dataclass(frozen=True)
+class SimulateSettings:
+    """What the command line asks for, checked."""
+
+    env: str
+    episodes: int
+    clock: str
+    listen: str
+    vehicle_id: str
+    latency: LatencySpec
+    seed: int
+    wait_edge_s: float
+    out: str | None
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    words = ", ".join(SCENARIOS)
+    parser.add_argument(
+        "--env", metavar="ENV", required=True, help=f"scenario ({words}), gymnasium id or module:id"
+    )
+    parser.add_argument(
+        "--episodes", metavar="N", type=positive_int, default=1, help="episodes to drive"
+    )
+    parser.add_argument(
+        "--clock",
+        choices=sorted(CLOCKS),
+        default="lockstep",
+        help="lockstep waits for each command; realtime waits for nobody",
+    )
+    parser.add_argument(
+        "--listen",
+        metavar="PROTOCOL/HOST:PORT",
+        default=DEFAULT_ENDPOINT,
+        help="where the edge runtime and viewers connect to",
+    )
+    parser.add_argument(
+        "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to simulate"
+    )
+    network = "injected network: " + GRAMMAR.replace("%", "%%")
+    parser.add_argument("--latency", metavar="SPEC", default="none", help=network)
+    parser.add_argument(
+        "--seed",
+        metavar="N",
+        type=non_negative_int,
+        default=0,
+        help="episode i is reset with seed + i (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--wait-edge-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        default=30.0,
+        help="how long to wait for an edge runtime, in seconds",
+    )
+    parser.add_argument("--out", metavar="R.json", help="write the report to this file")
+
+
+def simulate(arguments: Any) -> int:
+    """Run the command; UserError for anything the caller can put right."""
+    settings = _check(arguments)
+    environment = make_environment(settings.env)
+    try:
+        with sigterm_as_interrupt():
+            report = _serve(settings, environment)
+    finally:
+        environment.close()
+    write_json_out(settings.out, report)
+    print(summary_line(report))
+    return 0
+
+
+def _check(arguments: Any) -> SimulateSettings:
+    settings = SimulateSettings(
+        env=arguments.env,
+        episodes=arguments.episodes,
+        clock=arguments.clock,
+        listen=check_endpoint(arguments.listen),
+        vehicle_id=check_vehicle_id(arguments.vehicle_id),
+        latency=parse_spec(arguments.latency),
+        seed=arguments.seed,
+        wait_edge_s=arguments.wait_edge_s,
+        out=arguments.out,
+    )
+    if settings.out is not None:
+        check_writable(settings.out)
+    return settings
+
+
+def _serve(settings: SimulateSettings, environment: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    action_size = (environment.action_space.shape or (1,))[0]
+    with open_port(settings.listen, settings.vehicle_id) as port:
+        check = CommandCheck(port.session, action_size)
+        with (
+            _running_clock(settings, port.publish_state, check) as clock,
+            episode_bar(settings.episodes) as bar,
+        ):
+            port.on_command(clock.receive)
+            port.wait_for_edge(settings.wait_edge_s, settings.listen)
+            return _drive(settings, environment, port, clock, check, bar)
+
+
+@contextlib.contextmanager
+def _running_clock(
+    settings: SimulateSettings, publish: Publish, check: CommandCheck
+) -> Iterator[Clock]:
+    clock = CLOCKS[settings.clock](publish, check, settings.latency)
+    try:
+        yield clock
+    finally:
+        clock.close()
+
+
+def _drive(
+    settings: SimulateSettings,
+    environment: gymnasium.Env[Any, Any],
+    port: SimulatorPort,
+    clock: Clock,
+    check: CommandCheck,
+    bar: EpisodeBar,
+) -> dict[str, Any]:
+    runner = EpisodeRunner(environment, clock, port.session, port.publish_scene, bar.tick)
+    results = []
+    for episode in range(settings.episodes):
+        results.append(runner.run(episode, settings.seed + episode))
+        bar.done(episode + 1)
+    return make_report(
+        results,
+        runner.safe_stops.events,
+        clock.latencies_ms,
+        counts={
+            "deadline_misses": runner.deadline_misses,
+            "tick_overruns": clock.tick_overruns,
+            "rejected": dict(check.rejected),
+        },
+        settings={
+            "scenario": settings.env,
+            "policy_id": check.policy_id,
+            "seed": settings.seed,
+            "clock": settings.clock,
+            "latency_spec": str(settings.latency),
+        },
+    )

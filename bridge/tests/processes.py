@@ -1,0 +1,92 @@
+"""The bridge's commands as processes, for the tests."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bridge.__main__ import main
+from edge_runtime.cli import run_cli
+from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, wait_until
+from edge_runtime.tests.policies import write_policy
+
+TOY = "bridge.tests.toy:BridgeToy-v0"
+SHORT_TOY = "bridge.tests.toy:BridgeToyShort-v0"
+SLOW_TOY = "bridge.tests.toy:BridgeToySlow-v0"
+
+
+class BridgeProcess:
+    """``python -m bridge`` with a subcommand; killed at the end of the block if need be."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "bridge", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.output, self.errors = "", ""
+
+    def wait(self, timeout_s: float = 60.0) -> int:
+        """Return the exit status; ``output`` and ``errors`` hold what was printed."""
+        self.output, self.errors = self.process.communicate(timeout=timeout_s)
+        return self.process.returncode
+
+    def __enter__(self) -> BridgeProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate()
+
+
+def start_edge(endpoint: str, policy: Path) -> EdgeProcess:
+    """Start ``python -m edge_runtime run`` with an unsigned test policy and wait until ready."""
+    return EdgeProcess("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
+
+
+def refuse(arguments: list[str]) -> int:
+    """Run ``python -m bridge`` in this process, for input that is refused; return the status."""
+    try:
+        return run_cli(main, arguments)
+    except SystemExit as end:
+        return int(str(end.code))
+
+
+def wait_until_driving(edge: EdgeProcess) -> None:
+    """Wait for the log line with which the edge runtime says that it drives."""
+    log = edge.process.stderr
+    assert log is not None
+    wait_until(lambda: "now=drive" in log.readline(), "the first drive")
+
+
+def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
+    """Write a test policy file."""
+    path = folder / f"{kind}.onnx"
+    write_policy(path, kind, value)
+    return path
+
+
+def start_simulate(endpoint: str, out: Path, env: str, *options: str) -> BridgeProcess:
+    """Start ``python -m bridge simulate``."""
+    fixed = ["simulate", "--env", env, "--listen", endpoint, "--out", str(out)]
+    return BridgeProcess(*fixed, *options)
+
+
+def simulate(folder: Path, endpoint: str, env: str, options: Sequence[str]) -> dict[str, Any]:
+    """Run ``simulate`` to its end and return the report."""
+    out = folder / f"report-{time.monotonic_ns()}.json"
+    with start_simulate(endpoint, out, env, *options) as run:
+        assert run.wait(PATIENCE_S * 3) == 0, run.errors
+    return read(out)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Return a JSON report."""
+    return json.loads(path.read_text())

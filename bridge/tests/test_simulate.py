@@ -1,0 +1,175 @@
+"""``python -m bridge simulate`` against real edge runtimes, each in a process of its own."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import gymnasium
+import numpy as np
+import pytest
+
+from bridge.tests.processes import (
+    SHORT_TOY,
+    SLOW_TOY,
+    TOY,
+    make_policy,
+    read,
+    refuse,
+    simulate,
+    start_edge,
+    start_simulate,
+    wait_until_driving,
+)
+from edge_runtime.policy import load_policy
+from edge_runtime.tests.harness import free_endpoint
+from edge_runtime.transport import open_session
+
+CONTRACT_KEYS = {
+    *("scenario", "condition", "episodes", "policy_id", "seed", "success_rate", "collision_rate"),
+    *("surviving_distance_m", "episode_reward", "episode_time_s"),
+    *("lateral_acceleration_mps2", "longitudinal_acceleration_mps2"),
+    *("latency_ms", "deadline_misses", "safe_stops", "rejected"),
+}
+
+
+def drive_in_process(policy_path, seed):
+    """Drive one episode without any wire; return its outcome and actions."""
+    policy = load_policy(str(policy_path), allow_unsigned=True)
+    environment = gymnasium.make(TOY)
+    frames, info = environment.reset(seed=seed)
+    actions, ended = [], False
+    while not ended:
+        actions.append(policy.act(frames))
+        frames, _, terminated, truncated, info = environment.step(actions[-1])
+        ended = terminated or truncated
+    return info["outcome"], np.array(actions)
+
+
+def test_lock_step_over_the_wire_is_the_same_drive_as_in_process(tmp_path):
+    policy, endpoint = make_policy(tmp_path), free_endpoint()
+    with start_edge(endpoint, policy):
+        options = ["--episodes", "3", "--seed", "40"]
+        report = simulate(tmp_path, endpoint, TOY, options)
+        again = simulate(tmp_path, endpoint, TOY, options)
+    assert set(report) >= CONTRACT_KEYS
+    assert report["rejected"] == {}
+    assert report["safe_stops"] == report["deadline_misses"] == 0
+    for row in report["per_episode"]:
+        outcome, actions = drive_in_process(policy, row["seed"])
+        assert row["outcome"] == outcome
+        np.testing.assert_allclose(row["actions"], actions, atol=1e-5)
+    assert [row["seed"] for row in report["per_episode"]] == [40, 41, 42]
+    assert again["per_episode"] == report["per_episode"]
+
+
+def test_virtual_latency_repeats_itself_over_the_wire(tmp_path):
+    policy, endpoint = make_policy(tmp_path), free_endpoint()
+    options = ["--episodes", "2", "--latency", "60ms+-30ms,loss=10%"]
+    with start_edge(endpoint, policy):
+        first, again = (simulate(tmp_path, endpoint, TOY, options) for _ in range(2))
+    assert first["per_episode"] == again["per_episode"]
+    assert first["latency_ms"]["p50"] > 100
+    assert first["latency_spec"] == "delay=60ms,jitter=30ms,loss=10%"
+
+
+def test_real_time_with_latency(tmp_path):
+    policy, endpoint = make_policy(tmp_path, "constant"), free_endpoint()
+    options = ["--clock", "realtime", "--latency", "40ms+-2ms"]
+    with start_edge(endpoint, policy):
+        started_s = time.monotonic()
+        report = simulate(tmp_path, endpoint, TOY, options)
+        took_s = time.monotonic() - started_s
+    assert report["per_episode"][0]["outcome"] == "goal"
+    assert took_s > report["episode_time_s"]["mean"] - 0.2
+    assert 70 < report["latency_ms"]["p50"] < 200
+
+
+@pytest.mark.parametrize("clock", ["lockstep", "realtime"])
+def test_no_state_reaches_the_edge_so_the_simulator_brakes(tmp_path, clock):
+    policy, endpoint = make_policy(tmp_path, "constant"), free_endpoint()
+    options = ["--clock", clock, "--latency", "up.loss=100%"]
+    with start_edge(endpoint, policy):
+        report = simulate(tmp_path, endpoint, SHORT_TOY, options)
+    (event,) = report["safe_stop_events"]
+    assert (event["reason"], event["resumed_after_s"]) == ("no_command", None)
+    assert event["step"] <= 3
+    assert event["stopped_after_s"] < 2.0
+    assert report["latency_ms"] == {"p50": None, "p99": None, "max": None}
+    assert report["per_episode"][0]["outcome"] == "timeout"
+
+
+@pytest.mark.parametrize("clock", ["lockstep", "realtime"])
+def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path, clock):
+    policy, endpoint = make_policy(tmp_path, "constant", 0.1), free_endpoint()
+    out = tmp_path / "killed.json"
+    with start_simulate(endpoint, out, SLOW_TOY, "--clock", clock) as run:
+        with start_edge(endpoint, policy) as edge:
+            wait_until_driving(edge)
+            time.sleep(0.4)
+            edge.process.send_signal(signal.SIGKILL)
+            edge.process.wait()
+        with start_edge(endpoint, policy):
+            assert run.wait() == 0, run.errors
+    report = read(out)
+    # On a busy machine the edge runtime may have stopped for a reason of its own, too.
+    event = next(row for row in report["safe_stop_events"] if row["reason"] == "no_command")
+    # 2 T and one tick; the rest is for a busy machine.
+    assert 0.15 <= event["brake_after_s"] <= 0.5
+    assert event["resumed_after_s"] > 0
+    braked, resumed = event["step"], event["step"] + round(event["resumed_after_s"] * 10)
+    (row,) = report["per_episode"]
+    assert row["actions"][braked:resumed] == [[-1.0]] * (resumed - braked)
+    assert row["actions"][resumed] == pytest.approx([0.1])
+
+
+def test_two_simulators_cannot_share_a_port(tmp_path, capsys):
+    endpoint, out = free_endpoint(), tmp_path / "never.json"
+    first = open_session(listen=endpoint, mode="router")
+    try:
+        assert refuse(["simulate", "--env", TOY, "--listen", endpoint, "--out", str(out)]) == 2
+    finally:
+        first.close()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "in use" in line
+    assert not out.exists()
+
+
+def test_nobody_comes_and_one_line_says_what_to_start(tmp_path):
+    out = tmp_path / "never.json"
+    with start_simulate(free_endpoint(), out, TOY, "--wait-edge-s", "0.3") as run:
+        assert run.wait() == 2
+    assert "python -m edge_runtime run" in run.errors
+    assert len(run.errors.splitlines()) == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (["--env", "phil/Nowhere-v0"], "Nowhere"),
+        (["--env", "no_such_module:X-v0"], "no_such_module"),
+        (["--env", "CartPole-v1"], "uint8"),
+        (["--env", "::"], "module:id"),
+        (["--env", TOY, "--latency", "fast"], "latency"),
+        (["--env", TOY, "--episodes", "0"], "at least 1"),
+        (["--env", TOY, "--vehicle-id", "a/b"], "vehicle id"),
+        (["--env", TOY, "--listen", "here"], "endpoint"),
+        (["--env", TOY, "--out", "/no/such/folder/r.json"], "does not exist"),
+        (["--env", TOY, "--clock", "sundial"], "sundial"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(options, part, capsys):
+    assert refuse(["simulate", *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert part in line
+
+
+def test_an_interrupted_run_writes_no_report(tmp_path):
+    endpoint, out = free_endpoint(), tmp_path / "half.json"
+    policy = make_policy(tmp_path, "constant")
+    with start_edge(endpoint, policy) as edge, start_simulate(endpoint, out, SLOW_TOY) as run:
+        wait_until_driving(edge)
+        run.process.send_signal(signal.SIGTERM)
+        assert run.wait(10) == 130
+    assert list(tmp_path.glob("*half*")) == []

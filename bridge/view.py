@@ -1,0 +1,127 @@
+"""``python -m bridge view``: a listener of its own that shows the wire in rerun."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import rerun as rr
+
+from bridge.arguments import non_negative_seconds
+from bridge.scene import decode_scene
+from bridge.signals import sigterm_as_interrupt
+from bridge.simulate import DEFAULT_VEHICLE_ID
+from bridge.viewer import sinks
+from bridge.viewer.feed import Feed, Heard, open_feed
+from bridge.viewer.wire_log import WireLog
+from edge_runtime import wire
+from edge_runtime.cli import ArgumentParser
+from edge_runtime.files import check_writable
+from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+
+POLL_S = 0.1
+
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    "state": wire.decode_state,
+    "command": wire.decode_command,
+    "feedback": wire.decode_feedback,
+    "health": wire.decode_health,
+    "scene": decode_scene,
+}
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--spawn", action="store_true", help="open a rerun window (the default)")
+    where.add_argument(
+        "--serve", action="store_true", help="serve a web page on this machine's loopback only"
+    )
+    where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
+    parser.add_argument(
+        "--connect",
+        metavar="PROTOCOL/HOST:PORT",
+        default=DEFAULT_ENDPOINT,
+        help="where the simulator listens",
+    )
+    parser.add_argument(
+        "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to watch"
+    )
+    parser.add_argument(
+        "--wait-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        default=10.0,
+        help="how long to wait for the simulator, in seconds",
+    )
+    parser.add_argument(
+        "--duration-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        help="stop after this many seconds (otherwise when the simulator has gone)",
+    )
+
+
+def view(arguments: Any) -> int:
+    """Run the command until the simulator goes, the time is over, or somebody interrupts."""
+    wire.check_vehicle_id(arguments.vehicle_id)
+    check_endpoint(arguments.connect)
+    _check_sink(arguments)
+    dropped = _watch(arguments)
+    if dropped:
+        print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
+    if arguments.save is not None:
+        print(f"wrote {arguments.save}")
+    return 0
+
+
+def _watch(arguments: Any) -> int:
+    """Draw until there is a reason to stop; return how many messages had to be dropped."""
+    with (
+        sigterm_as_interrupt(),
+        open_feed(arguments.connect, arguments.vehicle_id, arguments.wait_s) as feed,
+        _sink(arguments) as recording,
+        # Being interrupted is the ordinary way to end a view: what was drawn is kept.
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        _show(feed, WireLog(recording), arguments.duration_s)
+    return feed.dropped
+
+
+def _check_sink(arguments: Any) -> None:
+    """Say at once, not after waiting for the simulator, that nothing could be shown."""
+    if arguments.save is not None:
+        check_writable(arguments.save)
+    elif arguments.serve:
+        sinks.check_ports()
+    else:
+        sinks.check_display()
+
+
+def _sink(arguments: Any) -> AbstractContextManager[rr.RecordingStream]:
+    if arguments.save is not None:
+        return sinks.save_to(arguments.save)
+    return sinks.serve_page() if arguments.serve else sinks.spawn_window()
+
+
+def _show(feed: Feed, log: WireLog, duration_s: float | None) -> None:
+    """Draw messages until the simulator has gone and the queue is empty, or the time is over."""
+    end_s = None if duration_s is None else time.monotonic() + duration_s
+    while end_s is None or time.monotonic() < end_s:
+        heard = feed.next(POLL_S)
+        if heard is not None:
+            _write(log, heard)
+        elif feed.simulator_gone.is_set():
+            return
+
+
+def _write(log: WireLog, heard: Heard) -> None:
+    message = DECODERS[heard.topic](heard.payload)
+    if message is None or isinstance(message, wire.Rejection):
+        log.write_unreadable(heard.topic, message.detail if message else "not a scene")
+    else:
+        getattr(log, f"write_{heard.topic}")(message, heard.arrived_ns)

@@ -1,0 +1,48 @@
+"""Ed25519 key pairs: the private one signs policies, the public one lets a board verify them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+)
+
+from edge_runtime.errors import UserError
+from edge_runtime.files import write_atomic
+from edge_runtime.signature import DEFAULT_PUBLIC_KEY
+
+DEFAULT_DIRECTORY = str(DEFAULT_PUBLIC_KEY.parent)
+
+
+def write_key_pair(directory: Path) -> tuple[Path, Path]:
+    """Write ``policy.key`` (PKCS8 PEM, readable by the owner alone) and ``policy.pub``.
+
+    Raises:
+        UserError: a key is there already (it may have signed policies that drive), or the
+            directory cannot be written.
+    """
+    private_path, public_path = directory / "policy.key", directory / DEFAULT_PUBLIC_KEY.name
+    for path in (private_path, public_path):
+        if path.exists():
+            raise UserError(f"{path} exists and is not overwritten; choose another --out")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot create the directory {directory}: {error.strerror}") from error
+    key = Ed25519PrivateKey.generate()
+    # The umask, not a later chmod: the private key is never readable by others, even briefly.
+    before = os.umask(0o077)
+    try:
+        private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+        write_atomic(private_path, private)
+    finally:
+        os.umask(before)
+    public = key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+    write_atomic(public_path, public)
+    return private_path, public_path

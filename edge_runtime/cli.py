@@ -1,0 +1,79 @@
+"""What every command of the repository shares: one-line errors, `--help` with defaults, JSON out.
+
+UserError is re-exported here, so that a command needs this module only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from typing import Any, Callable, List, NoReturn, Optional
+
+from edge_runtime import files
+from edge_runtime.errors import UserError
+
+__all__ = [
+    "BAD_INPUT",
+    "INTERRUPTED",
+    "ArgumentParser",
+    "HelpFormatter",
+    "UserError",
+    "run_cli",
+    "write_json_out",
+]
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+_WITHOUT_DEFAULT = (None, False, argparse.SUPPRESS)
+
+
+class HelpFormatter(argparse.HelpFormatter):
+    """Shows the default of every option that has one."""
+
+    def _get_help_string(self, action: argparse.Action) -> Optional[str]:
+        text = action.help or ""
+        if action.default in _WITHOUT_DEFAULT or "%(default)" in text:
+            return text
+        return f"{text} (default: %(default)s)".strip()
+
+
+class ArgumentParser(argparse.ArgumentParser):
+    """argparse with an error of one line and exit status 2. Use it for subparsers, too."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        kwargs.setdefault("formatter_class", HelpFormatter)
+        # A guessed abbreviation would change its meaning when an option is added.
+        kwargs.setdefault("allow_abbrev", False)
+        super().__init__(*args, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        """Print "prog: what is wrong (see prog --help)" and exit with status 2."""
+        line = " ".join(message.split())
+        self.exit(BAD_INPUT, f"{self.prog}: {line} (see {self.prog} --help)\n")
+
+
+def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:
+    """Run `main(argv)` and return its exit status; `argv` defaults to the command line.
+
+    UserError becomes one line on stderr and status 2, ^C status 130, and a reader that closed
+    the pipe (`| head`) status 141 as the shell would show it. Use: `sys.exit(run_cli(main))`.
+    """
+    try:
+        return main(sys.argv[1:] if argv is None else argv)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Python flushes stdout once more at exit; give it somewhere to go.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+
+
+def write_json_out(path: Optional[files.PathLike], value: Any) -> None:
+    """Write the result of a command to `--out`; nothing where no file was asked for."""
+    if path is not None:
+        files.write_json(path, value)

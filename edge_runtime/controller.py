@@ -1,0 +1,151 @@
+"""The decisions of the edge runtime: state, answer and time in, orders out. No clock, no socket.
+
+Times are monotonic seconds. The caller serialises the calls (loop.py holds one lock).
+"""
+
+from __future__ import annotations
+
+from typing import List, NamedTuple, Optional, Sequence
+
+import numpy as np
+
+from edge_runtime import safety as rules
+from edge_runtime.limiter import LimitRow, limit_action, neutral_action, stop_action
+from edge_runtime.safety import Event, Mode, Safety
+from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP, State
+
+
+class Received(NamedTuple):
+    """An accepted state with the time of its arrival, monotonic and wall clock."""
+
+    state: State
+    arrived_s: float
+    arrived_ns: int
+
+
+class Order(NamedTuple):
+    """A command to send: all of it but the stamps of the sender."""
+
+    answers: Received
+    mode: str
+    action: List[float]
+    reason: str
+    inference_ns: int
+
+
+class Controller:
+    """One state at a time: `begin` when the policy starts on it, `finish` with its answer.
+
+    `tick` is called at `next_deadline_s` and gives the orders that time alone causes.
+    """
+
+    def __init__(self, rows: Sequence[LimitRow], needs_rearm: bool) -> None:
+        self.safety = Safety()
+        self.deadline_misses = 0
+        self._rows = rows
+        self._needs_rearm = needs_rearm
+        self._last_action = neutral_action(rows)
+        self._newest: Optional[Received] = None
+        self._begun_s: Optional[float] = None
+        self._next_stop_s = 0.0
+
+    @property
+    def waits_for_rearm(self) -> bool:
+        """Whether only an operator can let it drive again."""
+        stopped = self.safety.mode is Mode.SAFE_STOP
+        return self._needs_rearm and stopped and not self.safety.rearmed
+
+    def begin(self, received: Received, now_s: float) -> None:
+        """The policy starts on the newest state."""
+        if rules.is_silent(self.safety, received.arrived_s):
+            # The gap counts even where the watchdog did not get to run within it.
+            self._apply(Event.SILENT)
+        self.safety = rules.note_arrival(self.safety, received.arrived_s)
+        self._newest = received
+        self._begun_s = now_s
+
+    def finish(self, output: np.ndarray, inference_ns: int, now_s: float) -> Optional[Order]:
+        """The policy's answer (float [n]) to the state of `begin`; None where it came too late."""
+        if self._begun_s is None or self._newest is None:
+            return None
+        if now_s - self._begun_s > rules.MAX_INFERENCE_S:
+            return self._give_up(now_s)
+        self._begun_s = None
+        if now_s - self._newest.arrived_s > CONTROL_PERIOD_S:
+            self.deadline_misses += 1
+        self._apply(self._event_of(output))
+        if self.safety.mode is Mode.SAFE_STOP:
+            self._next_stop_s = now_s + CONTROL_PERIOD_S
+            return self._stop_order(inference_ns)
+        self._last_action = limit_action(output.tolist(), self._last_action, self._rows)
+        return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
+
+    def tick(self, now_s: float) -> Optional[Order]:
+        """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
+        if self._begun_s is not None and now_s - self._begun_s > rules.MAX_INFERENCE_S:
+            return self._give_up(now_s)
+        was = self.safety.mode
+        if was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
+            self._apply(Event.SILENT)
+        if self.safety.mode is not Mode.SAFE_STOP:
+            return None
+        if was is Mode.SAFE_STOP and now_s < self._next_stop_s:
+            return None
+        self._schedule_stop(now_s, on_grid=was is Mode.SAFE_STOP)
+        return self._stop_order(0)
+
+    def next_deadline_s(self) -> Optional[float]:
+        """When `tick` must be called next; None while nothing is due by time alone."""
+        due = []
+        if self._begun_s is not None:
+            due.append(self._begun_s + rules.MAX_INFERENCE_S)
+        if self.safety.mode is Mode.SAFE_STOP:
+            due.append(self._next_stop_s)
+        elif self.safety.mode is Mode.DRIVE and self.safety.last_fresh_s is not None:
+            due.append(self.safety.last_fresh_s + rules.SILENCE_S)
+        return min(due) if due else None
+
+    def rearm(self, now_s: float) -> str:
+        """An operator's permission to drive again. Empty when taken, else why it is refused."""
+        if self.safety.mode is not Mode.SAFE_STOP:
+            return f"nothing to re-arm: the mode is {self.safety.mode.value}"
+        if not self._needs_rearm:
+            return "no vehicle is attached: it drives again by itself after fresh states"
+        if rules.is_silent(self.safety, now_s):
+            # Kept for later, the permission would move the vehicle when the link returns.
+            return "no fresh states arrive; re-arm when the link is back"
+        self._apply(Event.REARM)
+        return ""
+
+    def farewell(self) -> Optional[Order]:
+        """The safe stop that goes out when the runtime is ended while it answers a simulator."""
+        if self.safety.mode is Mode.STANDBY or self._newest is None:
+            return None
+        return self._stop_order(0)._replace(reason="runtime_ended")
+
+    def _event_of(self, output: np.ndarray) -> Event:
+        if not np.all(np.isfinite(output)):
+            return Event.NOT_FINITE
+        assert self._newest is not None
+        return rules.classify_fresh(self.safety, self._newest.state.final, self._needs_rearm)
+
+    def _give_up(self, now_s: float) -> Order:
+        """Stop because the policy takes too long; its answer, should it come, is not used."""
+        self._begun_s = None
+        self.deadline_misses += 1
+        self._apply(Event.TOO_LONG)
+        self._schedule_stop(now_s, on_grid=False)
+        return self._stop_order(0)
+
+    def _schedule_stop(self, now_s: float, on_grid: bool) -> None:
+        """Repetitions stand on a grid, so that late wake-ups do not lower the rate of 1/T."""
+        grid_s = self._next_stop_s + CONTROL_PERIOD_S
+        self._next_stop_s = grid_s if on_grid and grid_s > now_s else now_s + CONTROL_PERIOD_S
+
+    def _stop_order(self, inference_ns: int) -> Order:
+        assert self._newest is not None  # every way into safe_stop begins with a state
+        self._last_action = stop_action(self._last_action, self._rows)
+        return Order(self._newest, SAFE_STOP, self._last_action, self.safety.reason, inference_ns)
+
+    def _apply(self, event: Event) -> None:
+        self.safety = rules.advance(self.safety, event)

@@ -1,0 +1,75 @@
+"""Files that are either whole or absent, never half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any, Union
+
+from edge_runtime.errors import UserError
+
+PathLike = Union[str, "os.PathLike[str]"]
+
+
+def read_bytes(path: PathLike, what: str) -> bytes:
+    """The bytes of an existing file. `what` names it in the error, as in "policy file"."""
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        raise UserError(f"{what} {path} does not exist") from None
+    except IsADirectoryError:
+        raise UserError(f"{what} {path} is a directory, not a file") from None
+    except OSError as error:
+        raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
+    except ValueError as error:  # a NUL inside the name
+        raise UserError(f"{what} {path!r} is not a file name: {error}") from None
+
+
+def write_atomic(path: PathLike, data: bytes) -> None:
+    """Write `data` so that a reader or a crash sees the old file or the new one, nothing between.
+
+    Raises UserError when the directory does not exist or cannot be written.
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise UserError(f"{target} is a directory, not a file")
+    try:
+        descriptor, temporary = tempfile.mkstemp(dir=str(target.parent), prefix=f".{target.name}.")
+    except OSError as error:
+        raise UserError(f"cannot write {target}: {error.strerror}") from None
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp gives 0600, open() would not
+        os.replace(temporary, target)
+    except BaseException as error:
+        os.unlink(temporary)
+        if isinstance(error, OSError):
+            raise UserError(f"cannot write {target}: {error.strerror}") from None
+        raise
+
+
+def check_writable(path: PathLike) -> None:
+    """Raise UserError now if `write_atomic(path)` would fail later, after the long work."""
+    target = Path(path)
+    if target.is_dir():
+        raise UserError(f"{target} is a directory, not a file")
+    if not target.parent.is_dir():
+        raise UserError(f"cannot write {target}: the directory {target.parent} does not exist")
+    if not os.access(str(target.parent), os.W_OK | os.X_OK):
+        raise UserError(f"cannot write {target}: the directory {target.parent} is read-only")
+
+
+def write_json(path: PathLike, value: Any) -> None:
+    """`write_atomic` of indented JSON. NaN and infinity are refused (they are not JSON)."""
+    write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,86 @@
+"""The edge runtime's end of the wire: its publishers, subscriber, queryables and token."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Callable, Dict, List
+
+import msgspec
+import zenoh
+
+from edge_runtime import __version__, log
+from edge_runtime.manifest import Manifest
+from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
+
+_PUBLISHED = ("command", "feedback", "health")
+
+
+class Link:
+    """Thin: it declares, sends and replies, and decides nothing."""
+
+    def __init__(self, session: zenoh.Session, vehicle_id: str, manifest: Manifest) -> None:
+        self.vehicle_id = vehicle_id
+        self._session = session
+        self._manifest = manifest
+        self._declared: List[Any] = []
+        self._publishers: Dict[str, Any] = {}
+        for topic in _PUBLISHED:
+            # DROP: a full queue must never hold the control loop, and the next message is better.
+            self._publishers[topic] = session.declare_publisher(
+                key(vehicle_id, topic),
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+            )
+
+    def declare(
+        self,
+        on_state: Callable[[bytes], None],
+        health: Callable[[], Health],
+        rearm: Callable[[], str],
+    ) -> None:
+        """Listen to states, answer queries, and show that it is alive: in this order."""
+
+        def state_came(sample: zenoh.Sample) -> None:
+            # One byte too many is enough to be rejected; a huge message is not copied.
+            payload = sample.payload
+            size = len(payload)
+            on_state(bytes(MAX_PAYLOAD_BYTES + 1) if size > MAX_PAYLOAD_BYTES else bytes(payload))
+
+        def status_asked(query: zenoh.Query) -> None:
+            _reply(query, self._status(health()))
+
+        def rearm_asked(query: zenoh.Query) -> None:
+            refusal = rearm()
+            _reply(query, {"accepted": not refusal, "detail": refusal, "mode": health().mode})
+
+        session = self._session
+        self._declared = [
+            session.declare_subscriber(key(self.vehicle_id, "state"), state_came),
+            session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
+            session.declare_queryable(key(self.vehicle_id, "rearm"), rearm_asked),
+            session.liveliness().declare_token(key(self.vehicle_id, "alive")),
+        ]
+
+    def send(self, topic: str, message: Message) -> None:
+        """Publish a message. A failure is logged: the receiver's own watchdog handles it."""
+        try:
+            self._publishers[topic].put(encode(message))
+        except zenoh.ZError as error:
+            log.event("error", "not_sent", topic=topic, detail=error)
+
+    def close(self) -> None:
+        """Undeclare all, the token first, then close the session (it hangs at exit otherwise)."""
+        for declared in [*reversed(self._declared), *self._publishers.values()]:
+            declared.undeclare()
+        self._session.close()
+
+    def _status(self, health: Health) -> Dict[str, Any]:
+        status: Dict[str, Any] = msgspec.to_builtins(health)
+        status["version"] = __version__
+        status["manifest"] = msgspec.to_builtins(self._manifest)
+        return status
+
+
+def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
+    query.reply(query.key_expr, json.dumps(value).encode(), encoding="application/json")

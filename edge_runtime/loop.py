@@ -1,0 +1,197 @@
+"""The control loop: the thin shell of clocks, threads and Zenoh around controller.py.
+
+Three kinds of threads meet here, under one lock:
+- Zenoh's call `_on_state`, which judges a message and leaves the newest state in a slot;
+- the policy's thread takes the slot, infers outside the lock, and sends the answer;
+- the main thread is the watchdog: it wakes at absolute deadlines, sends safe stops and health.
+A command is sent under the lock, so that no late answer can follow a safe stop.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Optional
+
+from edge_runtime import log
+from edge_runtime.controller import Controller, Order, Received
+from edge_runtime.inference import infer
+from edge_runtime.latency_window import LatencyWindow
+from edge_runtime.latest import LatestState
+from edge_runtime.link import Link
+from edge_runtime.policy import Policy
+from edge_runtime.safety import Mode, Safety
+from edge_runtime.vehicles.runner import VehicleRunner
+from edge_runtime.wire import TOPICS, Command, Health, Rejection, decode_state
+
+_HEALTH_PERIOD_S = 1.0 / TOPICS["health"].rate_hz
+_JOIN_S = 0.5
+
+
+class ControlLoop:
+    """Answers states with commands until it is stopped."""
+
+    def __init__(
+        self, policy: Policy, controller: Controller, link: Link, vehicle: Optional[VehicleRunner]
+    ) -> None:
+        self._policy = policy
+        self._controller = controller
+        self._link = link
+        self._vehicle = vehicle
+        self._latest = LatestState()
+        self._latency = LatencyWindow()
+        self._slot: Optional[Received] = None
+        self._superseded = 0
+        self._stopping = False
+        self._logged = Safety()
+        self._started_s = time.monotonic()
+        # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
+        self._lock = threading.RLock()
+        self._state_came = threading.Condition(self._lock)
+        self._timer = threading.Condition(self._lock)
+        self._wakes_s = 0.0
+        self._worker = threading.Thread(target=self._work, name="policy", daemon=True)
+
+    def start(self) -> None:
+        """Begin to listen. Call `run` next."""
+        self._worker.start()
+        self._link.declare(self._on_state, self.health, self._rearm)
+
+    def run(self) -> None:
+        """Be the watchdog until `stop` is called."""
+        next_health_s = time.monotonic()
+        with self._lock:
+            while not self._stopping:
+                now_s = time.monotonic()
+                self._send(self._controller.tick(now_s))
+                if now_s >= next_health_s:
+                    self._link.send("health", self.health())
+                    next_health_s = max(next_health_s + _HEALTH_PERIOD_S, now_s)
+                self._sleep(next_health_s)
+
+    def stop(self) -> None:
+        """Ask `run` to return. May be called from a signal handler."""
+        with self._lock:
+            self._stopping = True
+            self._timer.notify_all()
+            self._state_came.notify_all()
+
+    def close(self) -> bool:
+        """Send a last safe stop and end the policy's thread; False where that thread hangs."""
+        self.stop()
+        if self._worker.is_alive():
+            self._worker.join(_JOIN_S)
+        with self._lock:
+            self._send(self._controller.farewell())
+        return not self._worker.is_alive()
+
+    def health(self) -> Health:
+        """The message of the health topic and of the status query."""
+        with self._lock:
+            safety = self._controller.safety
+            return Health(
+                vehicle_id=self._link.vehicle_id,
+                vehicle=self._vehicle.name if self._vehicle else "none",
+                mode=safety.mode.value,
+                reason=safety.reason,
+                needs_rearm=self._controller.waits_for_rearm,
+                accepted=self._latest.accepted,
+                superseded=self._superseded,
+                rejected=dict(self._latest.rejected),
+                deadline_misses=self._controller.deadline_misses,
+                safe_stops=safety.safe_stops,
+                policy_id=self._policy.policy_id,
+                inference_ms=self._latency.summary_ms(),
+                uptime_s=time.monotonic() - self._started_s,
+                sent_ns=time.time_ns(),
+            )
+
+    def _on_state(self, payload: bytes) -> None:
+        arrived_s, arrived_ns = time.monotonic(), time.time_ns()
+        state = decode_state(payload)
+        with self._lock:
+            if isinstance(state, Rejection):
+                self._log_rejection(self._latest.reject(state))
+                return
+            rejection = self._latest.offer(state, arrived_s)
+            if rejection is not None:
+                self._log_rejection(rejection)
+                return
+            self._superseded += int(self._slot is not None)
+            self._slot = Received(state, arrived_s, arrived_ns)
+            self._state_came.notify()
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                self._state_came.wait_for(lambda: self._slot is not None or self._stopping)
+                if self._stopping or self._slot is None:
+                    return
+                received, self._slot = self._slot, None
+                self._controller.begin(received, time.monotonic())
+                self._wake_watchdog()
+            inference = infer(self._policy, received.state.frames_array())
+            with self._lock:
+                self._latency.add(inference.duration_ns)
+                order = self._controller.finish(
+                    inference.output, inference.duration_ns, time.monotonic()
+                )
+                self._send(order)
+
+    def _rearm(self) -> str:
+        with self._lock:
+            refusal = self._controller.rearm(time.monotonic())
+            log.event("info", "rearm", accepted=not refusal, detail=refusal)
+            return refusal
+
+    def _sleep(self, until_s: float) -> None:
+        """Wait for the next deadline; holds the lock before and after."""
+        due_s = self._controller.next_deadline_s()
+        self._wakes_s = until_s if due_s is None else min(until_s, due_s)
+        pause_s = self._wakes_s - time.monotonic()
+        if pause_s > 0:
+            self._timer.wait(pause_s)
+
+    def _wake_watchdog(self) -> None:
+        due_s = self._controller.next_deadline_s()
+        if due_s is not None and due_s < self._wakes_s:
+            self._timer.notify()
+
+    def _send(self, order: Optional[Order]) -> None:
+        self._log_transition()
+        if order is None:
+            return
+        state = order.answers.state
+        command = Command(
+            session=state.session,
+            episode=state.episode,
+            step=state.step,
+            mode=order.mode,
+            action=order.action,
+            policy_id=self._policy.policy_id,
+            received_ns=order.answers.arrived_ns,
+            inference_ns=order.inference_ns,
+            sent_ns=time.time_ns(),
+            reason=order.reason,
+        )
+        self._link.send("command", command)
+        if self._vehicle is not None:
+            self._vehicle.command(command)
+
+    def _log_transition(self) -> None:
+        safety = self._controller.safety
+        if (safety.mode, safety.reason) != (self._logged.mode, self._logged.reason):
+            level = "warning" if safety.mode is Mode.SAFE_STOP else "info"
+            log.event(
+                level,
+                "mode",
+                was=self._logged.mode.value,
+                now=safety.mode.value,
+                reason=safety.reason,
+            )
+            self._logged = safety
+
+    def _log_rejection(self, rejection: Rejection) -> None:
+        """Only the first of each reason: the rest are counted in the health message."""
+        if self._latest.rejected[rejection.reason.value] == 1:
+            log.event("warning", "rejected", reason=rejection.reason.value, detail=rejection.detail)

@@ -1,0 +1,151 @@
+"""A policy file, verified and loaded: frames in, action out. Contract, section 4."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Iterator, List, Optional, Tuple
+
+import numpy as np
+import onnxruntime
+
+from edge_runtime import signature
+from edge_runtime.errors import UserError
+from edge_runtime.files import PathLike, read_bytes
+from edge_runtime.manifest import MANIFEST_KEY, Manifest, decode_manifest
+from edge_runtime.onnx_file import FLOAT32, UINT8, OnnxFile, read_onnx
+from edge_runtime.wire import FRAMES_SHAPE
+
+OPSET = 17
+MAX_IR_VERSION = 8
+INPUT, OUTPUT = "frames", "action"
+_RANGE_TOLERANCE = 1e-5
+_WARM_UP_RUNS = 10
+
+
+class Policy:
+    """A network that may drive. Make it with `load_policy`."""
+
+    def __init__(
+        self, session: onnxruntime.InferenceSession, manifest: Manifest, trust: str
+    ) -> None:
+        self.manifest = manifest
+        self.trust = trust
+        self._session = session
+
+    @property
+    def policy_id(self) -> str:
+        """SHA-256 of the weights, in hex."""
+        return self.manifest.policy_id
+
+    def act(self, frames: np.ndarray) -> np.ndarray:
+        """The action, float32 [n], for frames uint8 [2, 45, 80]. It may hold NaN: check it."""
+        outputs: List[np.ndarray] = self._session.run([OUTPUT], {INPUT: frames[np.newaxis]})
+        return outputs[0][0]
+
+
+def load_policy(
+    path: PathLike, public_key: Optional[PathLike] = None, allow_unsigned: bool = False
+) -> Policy:
+    """Load a policy that may drive: trusted, whole, its manifest and graph of one mind, probed.
+
+    `public_key` is a PEM file; without it `keys/policy.pub` is taken where it exists.
+    Raises UserError with the first reason why the policy may not drive.
+    """
+    # Read once: what is verified is what is loaded, even if the file is replaced meanwhile.
+    data = read_bytes(path, "policy file")
+    trust = signature.check_trust(path, data, public_key, allow_unsigned)
+    try:
+        model = read_onnx(data)
+        manifest = _read_manifest(model)
+        _compare(manifest, model)
+        policy = Policy(_open(data), manifest, trust)
+        _probe(policy)
+    except UserError as error:
+        raise UserError(f"policy {Path(path)} may not drive: {error}") from None
+    return policy
+
+
+def _read_manifest(model: OnnxFile) -> Manifest:
+    if MANIFEST_KEY not in model.metadata:
+        raise UserError(f"it holds no manifest (metadata {MANIFEST_KEY}); export it again")
+    return decode_manifest(model.metadata[MANIFEST_KEY])
+
+
+def _compare(manifest: Manifest, model: OnnxFile) -> None:
+    """Raise UserError where the graph is not what the manifest says."""
+    if model.opset != OPSET or model.ir_version > MAX_IR_VERSION:
+        raise UserError(
+            f"it has opset {model.opset} and IR version {model.ir_version};"
+            f" opset {OPSET} and IR version {MAX_IR_VERSION} or lower are needed"
+        )
+    if manifest.policy_id != model.weights_sha256:
+        raise UserError(
+            f"its manifest names weights {manifest.policy_id[:12]}...,"
+            f" its graph holds {model.weights_sha256[:12]}..."
+        )
+    _compare_tensor("input", model.inputs, (INPUT, UINT8, FRAMES_SHAPE))
+    _compare_tensor("output", model.outputs, (OUTPUT, FLOAT32, (len(manifest.action),)))
+
+
+def _compare_tensor(what: str, found: List, wanted: Tuple[str, int, Tuple[int, ...]]) -> None:
+    """One tensor of this name, type and shape behind a batch dimension that is 1 or open."""
+    name, element_type, shape = wanted
+    fits = (
+        len(found) == 1
+        and found[0].name == name
+        and found[0].element_type == element_type
+        and found[0].dims[1:] == shape
+        and (found[0].dims[0] == 1 or not isinstance(found[0].dims[0], int))
+    )
+    if not fits:
+        shown = ", ".join(f"{t.name} type {t.element_type} {list(t.dims)}" for t in found)
+        dims = ", ".join(str(size) for size in shape)
+        raise UserError(
+            f"its {what} must be {name} type {element_type} [batch, {dims}],"
+            f" it is {shown or 'none'}"
+        )
+
+
+def _open(data: bytes) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    # One thread: so small a network gains nothing from more, and the board has other work.
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions share no narrower base
+        raise UserError(f"onnxruntime does not load it: {error}") from None
+
+
+def probe_frames() -> Iterator[np.ndarray]:
+    """The pictures every policy must answer before it drives: black, grey, and seeded noise."""
+    for level in (0, 128):
+        yield np.full(FRAMES_SHAPE, level, dtype=np.uint8)
+    yield np.random.RandomState(0).randint(0, 256, FRAMES_SHAPE).astype(np.uint8)
+
+
+def _probe(policy: Policy) -> None:
+    """Run it on the probe pictures and warm it up. Raises UserError for an unfit answer."""
+    for frames in probe_frames():
+        action = _try(policy, frames)
+        if not np.all(np.isfinite(action)):
+            raise UserError(f"it answers a probe picture with {action.tolist()}, not finite")
+        for row, value in zip(policy.manifest.action, action.tolist()):
+            if not row.low - _RANGE_TOLERANCE <= value <= row.high + _RANGE_TOLERANCE:
+                raise UserError(
+                    f"it answers a probe picture with {row.name} {value:.3f},"
+                    f" outside its manifest's {row.low} to {row.high}"
+                )
+    for _ in range(_WARM_UP_RUNS):
+        policy.act(frames)
+
+
+def _try(policy: Policy, frames: np.ndarray) -> np.ndarray:
+    try:
+        action = policy.act(frames)
+    except Exception as error:  # as in _open
+        raise UserError(f"onnxruntime does not run it: {error}") from None
+    if action.shape != (len(policy.manifest.action),):
+        raise UserError(f"it answers a probe picture with shape {action.shape}")
+    return action

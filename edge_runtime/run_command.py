@@ -1,0 +1,114 @@
+"""`python -m edge_runtime run`: the control loop as a process."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import signal
+import sys
+from typing import Any, Callable, Optional
+
+from edge_runtime import log
+from edge_runtime.config import Config, load_config
+from edge_runtime.controller import Controller
+from edge_runtime.limiter import limit_rows
+from edge_runtime.link import Link
+from edge_runtime.loop import ControlLoop
+from edge_runtime.policy import Policy, load_policy
+from edge_runtime.transport import open_session
+from edge_runtime.vehicles.interface import Vehicle
+from edge_runtime.vehicles.registry import make_vehicle
+from edge_runtime.vehicles.runner import VehicleRunner
+
+
+class StopSignal:
+    """SIGTERM and SIGINT: remembered from the start, handed on once there is a loop to stop."""
+
+    def __init__(self) -> None:
+        self.came = False
+        self.on_stop: Callable[[], None] = lambda: None
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        self.came = True
+        self.on_stop()
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Verify, connect, drive until a signal comes. Raises UserError before the network opens."""
+    flags = {name: getattr(arguments, name) for name in Config.__struct_fields__}
+    config = load_config(arguments.config, flags)
+    log.configure(config.log_level)
+    stop = StopSignal()
+    vehicle = make_vehicle(config.vehicle)
+    policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
+    rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
+    controller = Controller(rows, needs_rearm=vehicle is not None)
+    if stop.came:
+        return 0
+    return _serve(config, policy, controller, vehicle, stop)
+
+
+def _serve(
+    config: Config,
+    policy: Policy,
+    controller: Controller,
+    vehicle: Optional[Vehicle],
+    stop: StopSignal,
+) -> int:
+    session = open_session(connect=config.connect, mode="peer")
+    link = Link(session, config.vehicle_id, policy.manifest)
+    runner = _attach(vehicle, policy, link)
+    loop = ControlLoop(policy, controller, link, runner)
+    stop.on_stop = loop.stop
+    # What is loaded stays: the collector need not look at it again in the middle of a drive.
+    gc.collect()
+    gc.freeze()
+    try:
+        if runner is not None:
+            runner.start()
+        loop.start()
+        _say_ready(config, policy)
+        if not stop.came:
+            loop.run()
+    finally:
+        ended = loop.close()
+        if runner is not None:
+            runner.close()
+        link.close()
+        log.event("info", "ended", **_totals(loop))
+    if not ended:
+        # The policy's thread hangs in native code, and would hold the interpreter's exit.
+        os._exit(0)
+    return 0
+
+
+def _attach(vehicle: Optional[Vehicle], policy: Policy, link: Link) -> Optional[VehicleRunner]:
+    if vehicle is None:
+        return None
+    names = [action.name for action in policy.manifest.action]
+    return VehicleRunner(vehicle, names, lambda feedback: link.send("feedback", feedback))
+
+
+def _say_ready(config: Config, policy: Policy) -> None:
+    if policy.trust != "verified":
+        log.event("warning", "policy_not_verified", trust=policy.trust)
+    print(
+        f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
+        f" connect={config.connect} policy_id={policy.policy_id}",
+        flush=True,
+    )
+    sys.stdout.flush()
+
+
+def _totals(loop: ControlLoop) -> dict:
+    health = loop.health()
+    return {
+        "accepted": health.accepted,
+        "rejected": sum(health.rejected.values()),
+        "deadline_misses": health.deadline_misses,
+        "safe_stops": health.safe_stops,
+        "uptime_s": round(health.uptime_s, 1),
+    }

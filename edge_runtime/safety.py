@@ -1,0 +1,136 @@
+"""When the policy may drive: a pure state machine over (mode, event, time). Contract, section 5.
+
+TRANSITIONS is all of it; the functions below it only decide which event a moment is.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Dict, NamedTuple, Optional, Tuple
+
+from edge_runtime.wire import CONTROL_PERIOD_S
+
+SILENCE_S = 2 * CONTROL_PERIOD_S
+MAX_INFERENCE_S = CONTROL_PERIOD_S
+FRESH_STATES_TO_RECOVER = 5
+
+
+class Mode(str, Enum):
+    """STANDBY: nothing to answer. DRIVE: the policy's action goes out. SAFE_STOP: the brake."""
+
+    STANDBY = "standby"
+    DRIVE = "drive"
+    SAFE_STOP = "safe_stop"
+
+
+class Event(str, Enum):
+    """What can happen. The first three are fresh states with a finite answer in time."""
+
+    FRESH = "fresh_state"
+    RECOVERED = "recovered"  # the fresh state that meets the condition to drive again
+    FINAL = "final_state"  # the episode ends with it
+    SILENT = "no_fresh_state"  # for more than 2 T
+    NOT_FINITE = "output_not_finite"
+    TOO_LONG = "inference_too_long"  # longer than T
+    REARM = "rearm"  # an operator allows driving again
+
+
+_S, _D, _X = Mode.STANDBY, Mode.DRIVE, Mode.SAFE_STOP
+
+TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
+    (_S, Event.FRESH): _D,
+    (_S, Event.RECOVERED): _D,
+    (_S, Event.FINAL): _S,
+    (_S, Event.SILENT): _S,  # between two episodes nothing is due
+    (_S, Event.NOT_FINITE): _X,
+    (_S, Event.TOO_LONG): _X,
+    (_S, Event.REARM): _S,
+    (_D, Event.FRESH): _D,
+    (_D, Event.RECOVERED): _D,
+    (_D, Event.FINAL): _S,
+    (_D, Event.SILENT): _X,
+    (_D, Event.NOT_FINITE): _X,
+    (_D, Event.TOO_LONG): _X,
+    (_D, Event.REARM): _D,
+    (_X, Event.FRESH): _X,
+    (_X, Event.RECOVERED): _D,
+    (_X, Event.FINAL): _X,  # the end of an episode is no way around the condition
+    (_X, Event.SILENT): _X,
+    (_X, Event.NOT_FINITE): _X,
+    (_X, Event.TOO_LONG): _X,
+    (_X, Event.REARM): _X,  # a fresh state must follow
+}
+FAULTS = (Event.SILENT, Event.NOT_FINITE, Event.TOO_LONG)
+FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
+
+
+class Safety(NamedTuple):
+    """Where the machine stands. `reason` is the fault that stopped it, empty elsewhere.
+
+    `last_fresh_s` is the monotonic arrival of the newest state, None before the first one.
+    """
+
+    mode: Mode = Mode.STANDBY
+    reason: str = ""
+    fresh_in_a_row: int = 0
+    rearmed: bool = False
+    last_fresh_s: Optional[float] = None
+    safe_stops: int = 0
+
+
+def is_silent(safety: Safety, now_s: float) -> bool:
+    """Whether the newest state is older than 2 T (or there was none)."""
+    return safety.last_fresh_s is None or now_s - safety.last_fresh_s > SILENCE_S
+
+
+def classify_fresh(safety: Safety, final: bool, needs_rearm: bool) -> Event:
+    """Which event a fresh state with a finite answer in time is."""
+    if final:
+        return Event.FINAL
+    enough = safety.fresh_in_a_row + 1 >= FRESH_STATES_TO_RECOVER
+    if safety.mode is Mode.SAFE_STOP and enough and (safety.rearmed or not needs_rearm):
+        return Event.RECOVERED
+    return Event.FRESH
+
+
+def advance(safety: Safety, event: Event) -> Safety:
+    """The state after the event. Arrival times are noted by `note_arrival`."""
+    mode = TRANSITIONS[safety.mode, event]
+    stopped = mode is Mode.SAFE_STOP and safety.mode is not Mode.SAFE_STOP
+    is_fault = event in FAULTS
+    reason = safety.reason if mode is Mode.SAFE_STOP else ""
+    if is_fault and mode is Mode.SAFE_STOP:
+        reason = event.value
+    return safety._replace(
+        mode=mode,
+        reason=reason,
+        fresh_in_a_row=_count_fresh(safety, event),
+        # A fault takes an unused permission back: it was given for another situation.
+        rearmed=mode is Mode.SAFE_STOP
+        and not is_fault
+        and (safety.rearmed or event is Event.REARM),
+        safe_stops=safety.safe_stops + int(stopped),
+    )
+
+
+def note_arrival(safety: Safety, arrived_s: float) -> Safety:
+    """Remember when the newest state arrived, before anyone knows what the policy makes of it."""
+    return safety._replace(last_fresh_s=arrived_s)
+
+
+def _count_fresh(safety: Safety, event: Event) -> int:
+    if event in FAULTS:
+        return 0
+    return safety.fresh_in_a_row + int(event in FRESH_EVENTS)
+
+
+def render_table() -> str:
+    """TRANSITIONS as a Markdown table: a row for each event, a column for each mode."""
+    lines = [
+        "| event | " + " | ".join(f"in {mode.value}" for mode in Mode) + " |",
+        "|---" * (len(Mode) + 1) + "|",
+    ]
+    for event in Event:
+        cells = (TRANSITIONS[mode, event].value for mode in Mode)
+        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)

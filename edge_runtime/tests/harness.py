@@ -1,0 +1,188 @@
+"""Real processes and real Zenoh sessions for the tests: an edge runtime and a simulator's end."""
+
+from __future__ import annotations
+
+import queue
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, Callable, Dict, List, Optional
+
+from edge_runtime import wire
+from edge_runtime.operator_commands import ask
+from edge_runtime.transport import open_session
+from edge_runtime.wire import Command, Feedback, Health, State
+
+# This machine may be busy: waits are long, and only what must never happen has a short limit.
+PATIENCE_S = 20.0
+BLACK, WHITE = 0, 255
+
+
+def free_endpoint() -> str:
+    """An endpoint on localhost that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def make_state(step: int, **changes: Any) -> State:
+    """A valid black state; `changes` replace its fields."""
+    fields: Dict[str, Any] = {
+        "session": "simulator-a",
+        "episode": 0,
+        "step": step,
+        "sim_time_s": step * wire.CONTROL_PERIOD_S,
+        "sent_ns": time.time_ns(),
+        "frames": bytes([BLACK]) * wire.FRAMES_BYTES,
+        "speed_mps": 1.0,
+        "final": False,
+    }
+    fields.update(changes)
+    return State(**fields)
+
+
+def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
+    """Poll until the condition is true and return its value; fail with `what` otherwise."""
+    end_s = time.monotonic() + timeout_s
+    while time.monotonic() < end_s:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.01)
+    raise AssertionError(f"not within {timeout_s} s: {what}")
+
+
+class EdgeProcess:
+    """`python -m edge_runtime run` as a process of its own."""
+
+    def __init__(
+        self, *arguments: str, python: str = sys.executable, cwd: Optional[Path] = None
+    ) -> None:
+        self.process = subprocess.Popen(
+            [python, "-m", "edge_runtime", "run", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=cwd,
+        )
+        assert self.process.stdout is not None
+        self.ready_line = self.process.stdout.readline().strip()
+
+    def loaded_files(self) -> str:
+        """What the process has mapped into its memory."""
+        return Path(f"/proc/{self.process.pid}/maps").read_text()
+
+    def end(self, timeout_s: float = PATIENCE_S) -> int:
+        """SIGTERM, then the exit status. Afterwards `log` holds its stderr."""
+        self.process.terminate()
+        _, self.log = self.process.communicate(timeout=timeout_s)
+        return self.process.returncode
+
+    def __enter__(self) -> EdgeProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.communicate()
+
+
+class Simulator:
+    """The simulator's end of the wire: a router that sends states and keeps what comes back."""
+
+    def __init__(self, endpoint: str, vehicle_id: str = "hunter01") -> None:
+        self.endpoint = endpoint
+        self.vehicle_id = vehicle_id
+        self.commands: queue.Queue[Command] = queue.Queue()
+        self.health: List[Health] = []
+        self.feedback: List[Feedback] = []
+        self._session = open_session(listen=endpoint, mode="router")
+        handlers = {
+            "command": lambda sample: self._keep(sample, wire.decode_command, self.commands.put),
+            "health": lambda sample: self._keep(sample, wire.decode_health, self.health.append),
+            "feedback": lambda sample: self._keep(
+                sample, wire.decode_feedback, self.feedback.append
+            ),
+        }
+        self._subscribers = [
+            self._session.declare_subscriber(wire.key(vehicle_id, topic), handler)
+            for topic, handler in handlers.items()
+        ]
+        self.alive = threading.Event()
+        self._subscribers.append(
+            self._session.liveliness().declare_subscriber(
+                wire.key(vehicle_id, "alive"), self._note_alive, history=True
+            )
+        )
+
+    def wait_for_edge(self) -> None:
+        """Until the edge runtime's token is there and its health arrives."""
+        assert self.alive.wait(PATIENCE_S), "no edge runtime came"
+        wait_until(lambda: self.health, "a health message")
+
+    def send(self, state: Any) -> None:
+        """Publish a State, or bytes as they are."""
+        payload = state if isinstance(state, bytes) else wire.encode(state)
+        self._session.put(wire.key(self.vehicle_id, "state"), payload)
+
+    def ask(self, state: State, timeout_s: float = PATIENCE_S) -> Command:
+        """Send a state and wait for the command that answers it, dropping all before."""
+        self.send(state)
+        end_s = time.monotonic() + timeout_s
+        while True:
+            command = self.commands.get(timeout=max(0.001, end_s - time.monotonic()))
+            place = (command.session, command.episode, command.step)
+            if place == (state.session, state.episode, state.step):
+                return command
+
+    def next_command(self, timeout_s: float = PATIENCE_S) -> Command:
+        """The next command, whatever it answers."""
+        return self.commands.get(timeout=timeout_s)
+
+    def drain(self) -> List[Command]:
+        """All commands that came so far."""
+        found = []
+        while not self.commands.empty():
+            found.append(self.commands.get_nowait())
+        return found
+
+    def query(self, topic: str) -> Dict[str, Any]:
+        """The status or rearm query, as an operator's command asks it."""
+        return ask(self.endpoint, self.vehicle_id, topic)
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._session.close()
+
+    def __enter__(self) -> Simulator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _keep(self, sample: Any, decode: Callable, keep: Callable) -> None:
+        message = decode(bytes(sample.payload))
+        assert not isinstance(message, wire.Rejection), message
+        keep(message)
+
+    def _note_alive(self, sample: Any) -> None:
+        if str(sample.kind).endswith("PUT"):
+            self.alive.set()
+        else:
+            self.alive.clear()
+
+
+def run_command(*arguments: str, cwd: Optional[Path] = None) -> subprocess.CompletedProcess:
+    """`python -m edge_runtime ARGUMENTS` to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "edge_runtime", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=cwd,
+        check=False,
+    )

@@ -1,0 +1,124 @@
+"""The command line as a user meets it, wrong inputs first."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import edge_runtime
+from edge_runtime.config import Config, load_config
+from edge_runtime.errors import UserError
+from edge_runtime.tests.harness import Simulator, free_endpoint, run_command
+from edge_runtime.tests.policies import write_policy
+from edge_runtime.transport import open_session
+
+
+def fails_with_one_line(result, *words):
+    assert result.returncode == 2, result.stderr
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1, result.stderr
+    for word in words:
+        assert word in result.stderr
+
+
+def test_check_prints_manifest_and_latency(make_policy, tmp_path):
+    signed, out = make_policy(), tmp_path / "report.json"
+    result = run_command(
+        "check", str(signed.path), "--public-key", str(signed.public_key), "--out", str(out)
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+    report = json.loads(result.stdout)
+    assert report == json.loads(out.read_text())
+    assert report["manifest"]["policy_id"] == report["policy_id"] == signed.policy_id
+    assert 0 < report["inference_ms"]["p50"] <= report["inference_ms"]["max"]
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_policies_that_may_not_drive(tmp_path, command):
+    good, cut, foreign = (tmp_path / name for name in ("good.onnx", "cut.onnx", "foreign.onnx"))
+    write_policy(good)
+    cut.write_bytes(good.read_bytes()[:-40])
+    foreign.write_bytes(b"\x7fELF" + bytes(100))
+    first = [command] if command == "check" else [command, "--policy"]
+    fails_with_one_line(run_command(*first, str(good)), "not signed", "--allow-unsigned")
+    for bad in (cut, foreign):
+        result = run_command(*first, str(bad), "--allow-unsigned")
+        fails_with_one_line(result, "may not drive", "ONNX")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["COMMAND"]),
+        (["fly"], ["fly", "--help"]),
+        (["check"], ["POLICY.onnx"]),
+        (["run"], ["--policy"]),
+        (["run", "--policy", "absent.onnx"], ["absent.onnx", "does not exist"]),
+        (["run", "--policy", "p.onnx", "--vehicle", "tank"], ["tank", "none, mock, hunter"]),
+        (["run", "--policy", "p.onnx", "--vehicle", "hunter"], ["not built yet"]),
+        (["run", "--policy", "p.onnx", "--connect", "localhost"], ["tcp/127.0.0.1:7447"]),
+        (["run", "--policy", "p.onnx", "--vehicle-id", "a/b"], ["a/b"]),
+        (["run", "--policy", "p.onnx", "--config", "absent.toml"], ["absent.toml"]),
+        (["run", "--policy", "p.onnx", "--log-level", "loud"], ["loud"]),
+        (["check", "p.onnx", "--out", "no/such/place.json"], ["no/such"]),
+        (["status", "--connect", "tcp/127.0.0.1:1"], ["nobody answers"]),
+        (["rearm", "--connect", "tcp/127.0.0.1:1"], ["nobody answers"]),
+    ],
+)
+def test_wrong_arguments(arguments, words, tmp_path):
+    fails_with_one_line(run_command(*arguments, cwd=tmp_path), *words)
+
+
+def test_status_with_a_simulator_but_no_edge():
+    with Simulator(free_endpoint()) as simulator:
+        result = run_command("status", "--connect", simulator.endpoint)
+    fails_with_one_line(result, "no edge runtime")
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("policy = 'p.onnx'\nspeed = 3", "speed"),
+        ("policy = 3", "policy"),
+        ("policy = ", "config file"),
+        ("policy = 'p.onnx'\nvehicle = 'tank'", "tank"),
+        ("", "no policy"),
+    ],
+)
+def test_wrong_config_files(tmp_path, text, match):
+    path = tmp_path / "edge.toml"
+    path.write_text(text)
+    with pytest.raises(UserError, match=match):
+        load_config(path, {})
+
+
+def test_flags_win_over_the_file(tmp_path):
+    path = tmp_path / "edge.toml"
+    path.write_text("policy = 'file.onnx'\nvehicle_id = 'from_file'\nallow_unsigned = true")
+    config = load_config(path, {"policy": "flag.onnx", "connect": None, "allow_unsigned": None})
+    assert (config.policy, config.vehicle_id) == ("flag.onnx", "from_file")
+    assert config.allow_unsigned
+
+
+def test_the_example_config_holds_every_key_at_its_default():
+    example = Path(edge_runtime.__file__).with_name("config.example.toml")
+    config = load_config(example, {})
+    assert config == Config(policy="results/policies/left_turn.onnx")
+    text = example.read_text()
+    assert all(f"{name} =" in text for name in Config.__struct_fields__)
+
+
+def test_a_busy_port_is_named():
+    endpoint = free_endpoint()
+    with Simulator(endpoint), pytest.raises(UserError, match="choose another with --listen"):
+        open_session(listen=endpoint, mode="router")
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["", "tcp", "tcp/host", "tcp/host:0", "tcp/host:70000", "x/h:1"]
+)
+def test_malformed_endpoints(endpoint):
+    with pytest.raises(UserError, match="write it as"):
+        open_session(connect=endpoint)

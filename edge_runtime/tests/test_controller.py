@@ -1,0 +1,157 @@
+"""The controller against made-up times: no clock, no socket, no policy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_runtime.controller import Controller, Received
+from edge_runtime.limiter import limit_rows
+from edge_runtime.safety import Mode
+from edge_runtime.tests.harness import make_state
+from edge_runtime.tests.policies import PEDAL, STEERING
+
+GOOD = np.array([0.5], np.float32)
+NAN = np.array([np.nan], np.float32)
+QUICK_NS = 1_000_000
+
+
+def make(needs_rearm=False, actions=(PEDAL,)):
+    return Controller(limit_rows(actions, {}), needs_rearm)
+
+
+def answer(controller, step, now_s, output=GOOD, **changes):
+    controller.begin(Received(make_state(step, **changes), now_s, 0), now_s)
+    return controller.finish(output, QUICK_NS, now_s + 0.001)
+
+
+def test_the_first_state_is_answered_with_drive():
+    order = answer(make(), 0, 5.0)
+    assert (order.mode, order.action, order.reason) == ("drive", [0.5], "")
+    assert order.answers.state.step == 0
+
+
+def test_silence_stops_at_two_periods_and_repeats_on_a_grid():
+    controller = make()
+    answer(controller, 0, 0.0)
+    assert controller.next_deadline_s() == pytest.approx(0.2)
+    assert controller.tick(0.2) is None
+    orders = [controller.tick(0.201)]
+    for late_s in (0.0, 0.03, 0.0, 0.05):  # a late wake-up does not shift those after it
+        orders.append(controller.tick(controller.next_deadline_s() + late_s))
+    assert controller.next_deadline_s() == pytest.approx(0.201 + 0.5)
+    assert {(o.mode, o.reason, tuple(o.action)) for o in orders} == {
+        ("safe_stop", "no_fresh_state", (-1.0,))
+    }
+    assert controller.safety.safe_stops == 1
+
+
+def test_no_burst_after_a_long_pause_of_the_process():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.tick(0.21)
+    assert controller.tick(60.0) is not None
+    assert controller.tick(60.05) is None
+
+
+def test_five_fresh_states_drive_again():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.tick(0.3)
+    modes = [answer(controller, step, 1 + step * 0.1).mode for step in range(1, 7)]
+    assert modes == ["safe_stop"] * 4 + ["drive"] * 2
+
+
+def test_a_gap_between_fresh_states_starts_the_count_again_without_any_tick():
+    controller = make()
+    answer(controller, 0, 0.0)
+    times = [1.0, 1.1, 1.2, 1.3, 1.51, 1.6, 1.7, 1.8, 1.9]
+    modes = [answer(controller, step, now_s).mode for step, now_s in enumerate(times, 1)]
+    assert modes == ["safe_stop"] * 8 + ["drive"]
+
+
+def test_a_nan_stops_with_the_very_state_and_every_further_one():
+    controller = make()
+    answer(controller, 0, 0.0)
+    orders = [answer(controller, step, step * 0.1, NAN) for step in range(1, 9)]
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", "output_not_finite")}
+    assert [o.answers.state.step for o in orders] == list(range(1, 9))
+
+
+def test_an_inference_longer_than_a_period_stops_while_it_runs():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.begin(Received(make_state(1), 0.1, 0), 0.1)
+    assert controller.next_deadline_s() == pytest.approx(0.2)
+    assert controller.tick(0.2) is None
+    assert controller.tick(0.201).reason == "inference_too_long"
+    assert controller.finish(GOOD, 10**9, 1.1) is None
+    assert controller.deadline_misses == 1
+    assert controller.safety.mode is Mode.SAFE_STOP
+
+
+def test_a_late_answer_is_not_used_even_where_no_tick_came_between():
+    controller = make()
+    controller.begin(Received(make_state(0), 0.0, 0), 0.0)
+    order = controller.finish(GOOD, 10**9, 0.15)
+    assert (order.mode, order.reason) == ("safe_stop", "inference_too_long")
+
+
+def test_between_episodes_there_is_no_watchdog():
+    controller = make()
+    assert answer(controller, 0, 0.0, final=True).mode == "drive"
+    assert controller.next_deadline_s() is None
+    assert controller.tick(9.0) is None
+    assert answer(controller, 0, 10.0, episode=1).mode == "drive"
+    assert controller.safety.safe_stops == 0
+
+
+def test_nothing_is_due_before_the_first_state():
+    controller = make()
+    assert controller.next_deadline_s() is None
+    assert controller.tick(100.0) is None
+    assert controller.farewell() is None
+
+
+def test_a_rearm_needs_a_vehicle_a_safe_stop_and_fresh_states():
+    assert "no vehicle" in stop(make()).rearm(0.3)
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0)
+    assert "nothing to re-arm" in controller.rearm(0.0)
+    controller = stop(make(needs_rearm=True))
+    assert "no fresh states" in controller.rearm(0.3)
+    assert controller.waits_for_rearm
+
+
+def test_a_rearm_with_fresh_states_drives_at_the_next():
+    controller = stop(make(needs_rearm=True))
+    modes = [answer(controller, step, 1 + step * 0.1).mode for step in range(1, 10)]
+    assert set(modes) == {"safe_stop"}
+    assert controller.rearm(1.95) == ""
+    assert answer(controller, 10, 2.0).mode == "drive"
+
+
+def test_a_safe_stop_holds_the_last_steering():
+    controller = make(actions=(PEDAL, STEERING))
+    answer(controller, 0, 0.0, np.array([0.4, -0.25], np.float32))
+    assert controller.tick(0.3).action == [-1.0, -0.25]
+
+
+def test_the_farewell_brakes():
+    controller = make()
+    answer(controller, 0, 0.0)
+    order = controller.farewell()
+    assert (order.mode, order.action, order.reason) == ("safe_stop", [-1.0], "runtime_ended")
+
+
+def test_an_answer_later_than_a_period_is_a_deadline_miss():
+    controller = make()
+    controller.begin(Received(make_state(0), 0.0, 0), 0.15)
+    controller.finish(GOOD, QUICK_NS, 0.16)
+    assert controller.deadline_misses == 1
+
+
+def stop(controller):
+    answer(controller, 0, 0.0)
+    controller.tick(0.3)
+    return controller

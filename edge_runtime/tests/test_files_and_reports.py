@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+
+from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
+from edge_runtime.episode_report import EpisodeResult, summarise
+from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.latency_window import WINDOW, LatencyWindow
+
+
+def test_write_atomic_replaces_and_leaves_nothing_else(tmp_path):
+    path = tmp_path / "out.json"
+    write_json_out(path, {"a": 1})
+    write_json_out(path, {"a": 2})
+    assert json.loads(path.read_text()) == {"a": 2}
+    assert os.listdir(tmp_path) == ["out.json"]
+    write_json_out(None, {"a": 3})
+
+
+def test_a_result_that_is_no_json_leaves_the_old_file(tmp_path):
+    path = tmp_path / "out.json"
+    path.write_text("old")
+    with pytest.raises(ValueError, match="JSON"):
+        write_json_out(path, {"a": float("nan")})
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["out.json"]
+
+
+def test_where_nothing_can_be_written(tmp_path):
+    for bad in (tmp_path / "no" / "out.json", tmp_path):
+        with pytest.raises(UserError):
+            check_writable(bad)
+        with pytest.raises(UserError):
+            write_atomic(bad, b"x")
+    check_writable(tmp_path / "new.json")
+
+
+def test_run_cli_turns_errors_into_one_line(capsys):
+    def bad(argv):
+        raise UserError("two\nlines")
+
+    def interrupted(argv):
+        raise KeyboardInterrupt
+
+    assert run_cli(bad, []) == 2
+    assert capsys.readouterr().err == "error: two lines\n"
+    assert run_cli(interrupted, []) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+    assert run_cli(lambda argv: len(argv), ["a"]) == 1
+
+
+def test_a_parser_error_is_one_line_and_help_shows_defaults(capsys):
+    parser = ArgumentParser(prog="tool")
+    parser.add_argument("--runs", type=int, default=50, help="how many")
+    with pytest.raises(SystemExit) as caught:
+        parser.parse_args(["--runs", "many"])
+    assert caught.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert "how many (default: 50)" in parser.format_help()
+
+
+def episode(outcome, distance_m):
+    return EpisodeResult(
+        seed=1, outcome=outcome, distance_m=distance_m, reward=2.0, time_s=3.0,
+        lateral_acceleration_mps2=0.0, longitudinal_acceleration_mps2=1.0, steps=30,
+    )  # fmt: skip
+
+
+def test_summarise_by_hand():
+    report = summarise(
+        [episode("goal", 10.0), episode("collision", 20.0)], "left_turn", "nominal", "id", 7
+    )
+    assert report["success_rate"] == report["collision_rate"] == 0.5
+    assert report["surviving_distance_m"] == {"mean": 15.0, "std": 5.0}
+    assert set(report) == {
+        "scenario", "condition", "episodes", "success_rate", "collision_rate",
+        "surviving_distance_m", "episode_reward", "episode_time_s", "lateral_acceleration_mps2",
+        "longitudinal_acceleration_mps2", "policy_id", "seed",
+    }  # fmt: skip
+    json.dumps(report, allow_nan=False)
+    with pytest.raises(ValueError, match="no episode"):
+        summarise([], "left_turn", "nominal", "id", 7)
+
+
+def test_the_latency_window_forgets():
+    window = LatencyWindow()
+    assert window.summary_ms() == {"p50": 0.0, "p99": 0.0, "max": 0.0}
+    window.add(10**9)
+    assert window.summary_ms()["max"] == 1000.0
+    for _ in range(WINDOW):
+        window.add(2_000_000)
+    assert window.summary_ms() == {"p50": 2.0, "p99": 2.0, "max": 2.0}

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge_runtime.errors import UserError
+from edge_runtime.vehicles.mock import MockParameters, MockState, MockVehicle, advance
+from edge_runtime.vehicles.registry import make_vehicle
+
+
+def enabled(**parameters):
+    vehicle = MockVehicle(MockParameters(**parameters))
+    vehicle.enable(0.0)
+    return vehicle
+
+
+def test_first_order_lag_by_hand():
+    parameters = MockParameters(time_constant_s=0.1, slew_per_s=1e9)
+    after = advance(MockState(pedal=0.0), 1.0, 0.0, 0.1, parameters)
+    assert after.pedal == pytest.approx(1 - math.exp(-1))
+    assert after.speed_mps == pytest.approx((1 - math.exp(-1)) * 5.0 * 0.1)
+
+
+def test_the_rate_limit_by_hand():
+    parameters = MockParameters(time_constant_s=1e-9, slew_per_s=2.0)
+    assert advance(MockState(pedal=0.0), 1.0, 0.0, 0.1, parameters).pedal == pytest.approx(0.2)
+
+
+def test_the_dead_time_passes_before_anything_moves():
+    vehicle = enabled(dead_time_s=0.1)
+    vehicle.command({"pedal": 1.0}, 0.0)
+    assert vehicle.feedback(0.09).action["pedal"] == -1.0
+    assert vehicle.feedback(0.19).action["pedal"] > -1.0
+
+
+def test_it_follows_commands_and_brakes_by_itself_without_them():
+    vehicle = enabled()
+    for step in range(20):
+        vehicle.command({"pedal": 1.0, "steering": 0.5}, step * 0.1)
+    driving = vehicle.feedback(1.95)
+    assert not driving.self_braking
+    assert driving.speed_mps > 5.0
+    assert driving.action["steering"] == pytest.approx(0.5, abs=1e-3)
+    assert not vehicle.feedback(1.9 + 0.2).self_braking
+    left_alone = vehicle.feedback(1.9 + 0.21)
+    assert left_alone.self_braking
+    stopped = vehicle.feedback(10.0)
+    assert stopped.speed_mps == 0.0
+    assert stopped.action["pedal"] == pytest.approx(-1.0)
+    assert stopped.action["steering"] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_brake_overtakes_commands_on_their_way():
+    vehicle = enabled(dead_time_s=0.1)
+    vehicle.command({"pedal": 1.0}, 0.0)
+    vehicle.brake(0.05)
+    assert vehicle.feedback(0.15).action["pedal"] == -1.0
+
+
+def test_a_long_gap_is_no_long_computation():
+    vehicle = enabled()
+    vehicle.command({"pedal": 1.0}, 0.0)
+    assert vehicle.feedback(1e6).speed_mps == 0.0
+
+
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(0.001, 0.5)), max_size=20))
+def test_it_stays_within_its_limits(commands):
+    vehicle, now_s = enabled(), 0.0
+    for pedal, pause_s in commands:
+        vehicle.command({"pedal": pedal}, now_s)
+        now_s += pause_s
+        report = vehicle.feedback(now_s)
+        assert -1.0 - 1e-9 <= report.action["pedal"] <= 1.0 + 1e-9
+        assert 0.0 <= report.speed_mps <= MockParameters().max_speed_mps
+
+
+def test_the_registry():
+    assert make_vehicle("none") is None
+    assert isinstance(make_vehicle("mock"), MockVehicle)
+    for name, match in (("hunter", "not built yet"), ("tank", "choose from none, mock, hunter")):
+        with pytest.raises(UserError, match=match):
+            make_vehicle(name)

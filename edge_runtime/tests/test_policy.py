@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from edge_runtime import signature
+from edge_runtime.errors import UserError
+from edge_runtime.policy import load_policy
+from edge_runtime.tests.policies import PEDAL, STEERING, public_pem, write_policy
+
+KEY = Ed25519PrivateKey.generate()
+
+
+def refused(path, match, **options):
+    with pytest.raises(UserError, match=match) as caught:
+        load_policy(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_signed_policy_drives(make_policy):
+    signed = make_policy("mean")
+    policy = load_policy(signed.path, signed.public_key)
+    assert policy.trust == signature.VERIFIED
+    assert policy.policy_id == signed.policy_id
+    for level in (0, 51, 255):
+        action = policy.act(np.full((2, 45, 80), level, np.uint8))
+        assert action.dtype == np.float32
+        np.testing.assert_allclose(action, [level / 127.5 - 1], atol=1e-6)
+
+
+def test_two_actions(tmp_path):
+    write_policy(tmp_path / "p.onnx", value=-0.25, actions=(PEDAL, STEERING))
+    policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
+    np.testing.assert_allclose(policy.act(np.zeros((2, 45, 80), np.uint8)), [-0.25, -0.25])
+
+
+@settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=30
+)
+@given(position=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
+def test_one_changed_byte_is_refused_whatever_the_flags(make_policy, position, flip):
+    signed = make_policy()
+    data = bytearray(signed.path.read_bytes())
+    data[int(position * len(data))] ^= flip
+    signed.path.write_bytes(bytes(data))
+    for allow_unsigned in (False, True):
+        refused(
+            signed.path, "signature", public_key=signed.public_key, allow_unsigned=allow_unsigned
+        )
+
+
+def test_a_changed_or_short_signature_is_refused(make_policy):
+    signed = make_policy()
+    signature_path = signed.path.with_name(signed.path.name + ".sig")
+    good = signature_path.read_bytes()
+    for bad in (bytes([good[0] ^ 1]) + good[1:], good[:-1], good + b"\n", b""):
+        signature_path.write_bytes(bad)
+        refused(signed.path, "signature", public_key=signed.public_key, allow_unsigned=True)
+
+
+def test_another_key_is_refused(make_policy, tmp_path):
+    signed = make_policy()
+    other = tmp_path / "other.pub"
+    other.write_bytes(public_pem(Ed25519PrivateKey.generate()))
+    refused(signed.path, "another key signed it", public_key=other, allow_unsigned=True)
+
+
+def test_a_key_that_is_none_is_refused(make_policy, tmp_path):
+    signed = make_policy()
+    key = tmp_path / "bad.pub"
+    key.write_bytes(b"not a key")
+    refused(signed.path, "not a PEM public key", public_key=key)
+    key.write_bytes(
+        X25519PrivateKey.generate()
+        .public_key()
+        .public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
+    )
+    refused(signed.path, "not an Ed25519 key", public_key=key)
+    refused(signed.path, "does not exist", public_key=tmp_path / "absent.pub")
+
+
+def test_trust_without_a_key_or_signature(make_policy, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    signed = make_policy()
+    refused(signed.path, "no public key")
+    assert load_policy(signed.path, allow_unsigned=True).trust == signature.UNVERIFIED
+    write_policy(tmp_path / "plain.onnx")
+    refused(tmp_path / "plain.onnx", "not signed")
+    assert load_policy(tmp_path / "plain.onnx", allow_unsigned=True).trust == signature.UNSIGNED
+
+
+def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    signed = make_policy()
+    (tmp_path / "keys").mkdir()
+    signed.public_key.rename(tmp_path / "keys" / "policy.pub")
+    assert load_policy(signed.path).trust == signature.VERIFIED
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"manifest_changes": {"policy_id": "0" * 64}}, "its manifest names weights 000"),
+        ({"manifest_changes": {"action": [PEDAL, STEERING]}}, "its output must be action"),
+        ({"manifest_changes": {"action": []}}, "no action"),
+        ({"manifest_changes": {"control_period_s": 0.05}}, "control period"),
+        ({"manifest_changes": {"schema": 2}}, "schema 2"),
+        ({"opset": 16}, "opset 16"),
+        ({"ir_version": 9}, "IR version 9"),
+        ({"value": 1.5}, "outside its manifest's"),
+        ({"value": float("nan")}, "not finite"),
+    ],
+)
+def test_manifest_and_graph_must_agree(tmp_path, options, match):
+    write_policy(tmp_path / "p.onnx", **options)
+    refused(tmp_path / "p.onnx", match, allow_unsigned=True)
+
+
+def test_an_action_that_nobody_can_stop_is_refused(tmp_path):
+    horn = type(PEDAL)(name="horn", meaning="loud", unit="dB", low=-1.0, high=1.0)
+    write_policy(tmp_path / "p.onnx", actions=(horn,))
+    refused(tmp_path / "p.onnx", "does not know how to stop", allow_unsigned=True)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + bytes(99)])
+def test_foreign_files_are_refused(tmp_path, content):
+    (tmp_path / "p.onnx").write_bytes(content)
+    refused(tmp_path / "p.onnx", "not a whole ONNX file", allow_unsigned=True)
+
+
+def test_absent_files_and_directories_are_refused(tmp_path):
+    refused(tmp_path / "absent.onnx", "does not exist")
+    refused(tmp_path, "is a directory")

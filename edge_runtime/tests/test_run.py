@@ -1,0 +1,219 @@
+"""The real process against a real simulator session. Limits are loose: machines are busy."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from edge_runtime.tests.harness import (
+    BLACK,
+    WHITE,
+    EdgeProcess,
+    Simulator,
+    free_endpoint,
+    make_state,
+    wait_until,
+)
+from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
+
+UNWANTED = ("torch", "gymnasium", "highway_env", "rerun", "/onnx/", "onnx_cpp2py")
+WHITE_FRAMES = bytes([WHITE]) * FRAMES_BYTES
+
+
+@pytest.fixture
+def edge_and_simulator(make_policy):
+    """Starts a runtime with a policy of a kind and a simulator that has seen it."""
+    opened: list = []
+
+    def start(kind="constant", *flags, **options):
+        endpoint = free_endpoint()
+        simulator = Simulator(endpoint)
+        opened.append(simulator)
+        edge = EdgeProcess(*make_policy(kind, **options).flags, "--connect", endpoint, *flags)
+        opened.append(edge)
+        simulator.wait_for_edge()
+        return edge, simulator
+
+    yield start
+    for resource in reversed(opened):
+        resource.__exit__()
+
+
+def drive(simulator, steps, **changes):
+    """Send states at 1/T and give the commands that answer them."""
+    commands = []
+    for step in steps:
+        begun_s = time.monotonic()
+        commands.append(simulator.ask(make_state(step, **changes)))
+        time.sleep(max(0.0, CONTROL_PERIOD_S - (time.monotonic() - begun_s)))
+    return commands
+
+
+def last_health(simulator, condition):
+    return wait_until(
+        lambda: next((h for h in reversed(simulator.health) if condition(h)), None),
+        "a health message as expected",
+    )
+
+
+def test_lock_step_drives_from_the_first_state_and_ends_cleanly(edge_and_simulator):
+    edge, simulator = edge_and_simulator("mean")
+    assert edge.ready_line.startswith("ready ")
+    for step in range(50):
+        level = step * 5
+        command = simulator.ask(make_state(step, frames=bytes([level]) * FRAMES_BYTES))
+        assert command.received_ns <= command.sent_ns
+        if command.mode == "drive":
+            assert command.action == pytest.approx([level / 127.5 - 1], abs=1e-6)
+        else:  # this machine paused for 2 T between two states
+            assert step > 0
+            assert command.reason == "no_fresh_state"
+    assert simulator.alive.is_set()
+    begun_s = time.monotonic()
+    assert edge.end() == 0
+    assert time.monotonic() - begun_s < 5.0
+    assert "Traceback" not in edge.log
+    wait_until(lambda: not simulator.alive.is_set(), "the token is gone")
+
+
+def test_the_process_holds_nothing_of_the_workstation(edge_and_simulator):
+    edge, simulator = edge_and_simulator()
+    simulator.ask(make_state(0))
+    loaded = edge.loaded_files()
+    assert "onnxruntime" in loaded
+    assert not [name for name in UNWANTED if name in loaded]
+
+
+def test_silence_stops_at_the_control_rate_and_fresh_states_drive_again(edge_and_simulator):
+    _, simulator = edge_and_simulator()
+    assert simulator.ask(make_state(0)).mode == "drive"
+    begun_s = time.monotonic()
+    first = simulator.next_command()
+    assert time.monotonic() - begun_s < 1.0
+    assert (first.mode, first.reason, first.action) == ("safe_stop", "no_fresh_state", [-1.0])
+    begun_s = time.monotonic()
+    for _ in range(20):
+        assert simulator.next_command().mode == "safe_stop"
+    assert 1.0 < time.monotonic() - begun_s < 4.0
+    modes = [command.mode for command in drive(simulator, range(1, 30))]
+    assert modes[:4] == ["safe_stop"] * 4
+    assert "drive" in modes
+    health = last_health(simulator, lambda h: h.accepted == 30)
+    assert health.safe_stops >= 1
+    assert health.inference_ms["p50"] > 0
+
+
+def test_between_episodes_silence_is_no_fault(edge_and_simulator):
+    _, simulator = edge_and_simulator()
+    simulator.ask(make_state(0))
+    simulator.ask(make_state(1, final=True))
+    time.sleep(0.6)
+    assert simulator.drain() == []
+    assert simulator.ask(make_state(0, episode=1)).mode == "drive"
+
+
+def test_an_output_that_is_not_finite_stops(edge_and_simulator):
+    _, simulator = edge_and_simulator("nan")
+    assert simulator.ask(make_state(0)).mode == "drive"
+    command = simulator.ask(make_state(1, frames=WHITE_FRAMES))
+    assert (command.mode, command.reason) == ("safe_stop", "output_not_finite")
+    assert command.action == [-1.0]
+    for step in range(2, 10):
+        assert simulator.ask(make_state(step, frames=WHITE_FRAMES)).mode == "safe_stop"
+
+
+def test_an_inference_that_takes_too_long_stops_while_it_runs(edge_and_simulator):
+    _, simulator = edge_and_simulator("slow")
+    assert simulator.ask(make_state(0)).mode == "drive"
+    simulator.send(make_state(1, frames=WHITE_FRAMES))
+    command = wait_until(
+        lambda: next((c for c in simulator.drain() if c.reason == "inference_too_long"), None),
+        "a safe stop while the policy still computes",
+    )
+    assert (command.mode, command.step) == ("safe_stop", 1)
+    assert simulator.next_command().mode == "safe_stop"
+    assert last_health(simulator, lambda h: h.deadline_misses >= 1)
+
+
+def test_bad_states_are_counted_by_reason_and_not_answered(edge_and_simulator):
+    _, simulator = edge_and_simulator()
+    simulator.ask(make_state(5, final=True))  # standby: no safe stop comes in between
+    bad = {
+        "stale": make_state(4),
+        "duplicate": make_state(5),
+        "schema": make_state(6, schema=2),
+        "frames_size": make_state(6, frames=bytes(10)),
+        "oversized": make_state(6, frames=bytes(100_000)),
+        "not_finite": make_state(6, speed_mps=float("inf")),
+        "malformed": b"not a map",
+    }
+    for message in bad.values():
+        simulator.send(message)
+    health = last_health(simulator, lambda h: sum(h.rejected.values()) == len(bad))
+    assert health.rejected == dict.fromkeys(bad, 1)
+    assert simulator.drain() == []
+
+
+def test_a_second_simulator_is_rejected_until_the_first_is_silent(edge_and_simulator):
+    _, simulator = edge_and_simulator()
+    for step in range(10):
+        simulator.ask(make_state(step))
+        simulator.send(make_state(step, session="simulator-b"))
+    health = last_health(simulator, lambda h: h.rejected.get("foreign_session", 0) >= 1)
+    assert health.accepted + sum(health.rejected.values()) == 20
+    time.sleep(3 * CONTROL_PERIOD_S)
+    command = simulator.ask(make_state(100, session="simulator-b"))
+    assert command.session == "simulator-b"
+
+
+def test_status_and_rearm_without_a_vehicle(edge_and_simulator):
+    _, simulator = edge_and_simulator()
+    simulator.ask(make_state(0))
+    status = simulator.query("status")
+    assert status["accepted"] == 1
+    assert status["manifest"]["scenario"] == "left_turn"
+    assert {"mode", "reason", "rejected", "deadline_misses", "policy_id"} <= set(status)
+    assert not simulator.query("rearm")["accepted"]
+
+
+def test_a_vehicle_moves_stops_and_waits_for_the_operator(edge_and_simulator):
+    _, simulator = edge_and_simulator("constant", "--vehicle", "mock", value=0.8)
+    commands = drive(simulator, range(20))
+    assert commands[0].mode == "drive"
+    for command in commands:
+        if command.mode == "drive":
+            assert command.action == pytest.approx([0.8], abs=1e-6)
+    wait_until(lambda: any(f.speed_mps > 0.1 for f in simulator.feedback), "the mock moves")
+    assert simulator.next_command().mode == "safe_stop"
+    wait_until(lambda: simulator.feedback[-1].speed_mps == 0.0, "the mock stands")
+    assert not simulator.query("rearm")["accepted"]  # the link is not back
+    assert {c.mode for c in drive(simulator, range(20, 40))} == {"safe_stop"}
+    assert last_health(simulator, lambda h: h.needs_rearm)
+    step = rearm_while_driving(simulator, 40)
+    assert "drive" in [c.mode for c in drive(simulator, range(step, step + 10))]
+
+
+def rearm_while_driving(simulator, step):
+    """Send states until the operator's query, made between two of them, is taken."""
+    for attempt in range(step, step + 50):
+        simulator.ask(make_state(attempt, frames=bytes([BLACK]) * FRAMES_BYTES))
+        if simulator.query("rearm")["accepted"]:
+            return attempt + 1
+    raise AssertionError("no re-arm was taken")
+
+
+def test_it_waits_for_a_simulator_and_ends_without_one(make_policy):
+    with EdgeProcess(*make_policy().flags, "--connect", free_endpoint()) as edge:
+        assert edge.ready_line.startswith("ready ")
+        assert edge.end() == 0
+
+
+def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
+    endpoint = free_endpoint()
+    with EdgeProcess(*make_policy().flags, "--connect", endpoint):
+        for session in ("first", "second"):
+            with Simulator(endpoint) as simulator:
+                simulator.wait_for_edge()
+                assert simulator.ask(make_state(0, session=session)).session == session
+            time.sleep(3 * CONTROL_PERIOD_S)

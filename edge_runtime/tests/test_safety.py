@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import edge_runtime
+from edge_runtime.safety import (
+    FAULTS,
+    FRESH_STATES_TO_RECOVER,
+    TRANSITIONS,
+    Event,
+    Mode,
+    Safety,
+    advance,
+    classify_fresh,
+    is_silent,
+    note_arrival,
+    render_table,
+)
+
+STANDBY, DRIVE, STOP = Mode.STANDBY, Mode.DRIVE, Mode.SAFE_STOP
+
+# Written out a second time, by event, from the contract: the table must say the same.
+EXPECTED = {
+    Event.FRESH: (DRIVE, DRIVE, STOP),
+    Event.RECOVERED: (DRIVE, DRIVE, DRIVE),
+    Event.FINAL: (STANDBY, STANDBY, STOP),
+    Event.SILENT: (STANDBY, STOP, STOP),
+    Event.NOT_FINITE: (STOP, STOP, STOP),
+    Event.TOO_LONG: (STOP, STOP, STOP),
+    Event.REARM: (STANDBY, DRIVE, STOP),
+}
+
+
+@pytest.mark.parametrize("mode", Mode)
+@pytest.mark.parametrize("event", Event)
+def test_every_pair(mode, event):
+    expected = EXPECTED[event][list(Mode).index(mode)]
+    after = advance(Safety(mode=mode, reason="before" if mode is STOP else ""), event)
+    assert after.mode is expected
+    assert after.safe_stops == int(mode is not STOP and expected is STOP)
+    if expected is not STOP:
+        assert after.reason == ""
+    else:
+        assert after.reason == (event.value if event in FAULTS else "before")
+
+
+def test_the_table_holds_every_pair_and_no_other():
+    assert set(TRANSITIONS) == {(mode, event) for mode in Mode for event in Event}
+
+
+def run_fresh(safety, count, needs_rearm):
+    modes = []
+    for _ in range(count):
+        safety = advance(safety, classify_fresh(safety, False, needs_rearm))
+        modes.append(safety.mode)
+    return safety, modes
+
+
+def test_without_a_vehicle_the_fifth_fresh_state_drives():
+    stopped = advance(Safety(mode=DRIVE, fresh_in_a_row=100), Event.SILENT)
+    _, modes = run_fresh(stopped, 6, needs_rearm=False)
+    assert modes == [STOP] * (FRESH_STATES_TO_RECOVER - 1) + [DRIVE, DRIVE]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_starts_the_count_again(fault):
+    stopped = advance(Safety(mode=DRIVE), fault)
+    four, _ = run_fresh(stopped, 4, needs_rearm=False)
+    _, modes = run_fresh(advance(four, fault), 5, needs_rearm=False)
+    assert modes == [STOP] * 4 + [DRIVE]
+
+
+def test_a_vehicle_waits_for_the_operator():
+    stopped = advance(Safety(mode=DRIVE), Event.SILENT)
+    waiting, modes = run_fresh(stopped, 50, needs_rearm=True)
+    assert set(modes) == {STOP}
+    _, modes = run_fresh(advance(waiting, Event.REARM), 1, needs_rearm=True)
+    assert modes == [DRIVE]
+
+
+def test_a_rearm_alone_does_not_drive_and_needs_five_fresh_states():
+    rearmed = advance(advance(Safety(mode=DRIVE), Event.SILENT), Event.REARM)
+    assert rearmed.mode is STOP
+    _, modes = run_fresh(rearmed, 5, needs_rearm=True)
+    assert modes == [STOP] * 4 + [DRIVE]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_takes_the_permission_back(fault):
+    rearmed = advance(advance(Safety(mode=DRIVE), Event.SILENT), Event.REARM)
+    _, modes = run_fresh(advance(rearmed, fault), 20, needs_rearm=True)
+    assert set(modes) == {STOP}
+
+
+def test_a_rearm_outside_a_safe_stop_is_not_kept():
+    driving = advance(Safety(mode=DRIVE), Event.REARM)
+    assert not driving.rearmed
+    assert not advance(driving, Event.SILENT).rearmed
+
+
+def test_an_episode_end_does_not_end_a_safe_stop():
+    stopped = advance(Safety(mode=DRIVE), Event.NOT_FINITE)
+    assert advance(stopped, classify_fresh(stopped, True, False)).mode is STOP
+
+
+def test_silence_begins_after_two_periods():
+    safety = note_arrival(Safety(), 10.0)
+    assert is_silent(Safety(), 0.0)
+    assert not is_silent(safety, 10.2)
+    assert is_silent(safety, 10.201)
+
+
+@given(st.lists(st.sampled_from(Event)), st.booleans())
+def test_no_way_out_of_a_safe_stop_but_recovery(events, needs_rearm):
+    """From any history: a vehicle leaves a safe stop only re-armed, anything only after five."""
+    safety = Safety()
+    for event in events:
+        if event in (Event.FRESH, Event.RECOVERED):  # only the machine itself says "recovered"
+            event = classify_fresh(safety, False, needs_rearm)
+        before, safety = safety, advance(safety, event)
+        if before.mode is STOP and safety.mode is not STOP:
+            assert before.fresh_in_a_row >= FRESH_STATES_TO_RECOVER - 1
+            assert before.rearmed or not needs_rearm
+        if event in FAULTS:
+            assert safety.mode is not DRIVE
+
+
+def test_the_readme_shows_the_table():
+    readme = Path(edge_runtime.__file__).with_name("README.md").read_text()
+    assert render_table() in readme

@@ -1,0 +1,100 @@
+"""What goes onto the board: the wheel, and where Python 3.8 is found, the board's versions."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import edge_runtime
+from edge_runtime.tests.harness import EdgeProcess, Simulator, free_endpoint, make_state
+
+SOURCE = Path(edge_runtime.__file__).parent
+LOCK = SOURCE.parent / "requirements" / "edge-py38.txt"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel of a copy: building writes into its source folder."""
+    folder = tmp_path_factory.mktemp("wheel")
+    ignored = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
+    shutil.copytree(SOURCE, folder / "edge_runtime", ignore=ignored)
+    built = pip(
+        sys.executable, "wheel", "--no-deps", "--wheel-dir", ".", "./edge_runtime", cwd=folder
+    )
+    skip_without_index(built)
+    assert built.returncode == 0, built.stderr
+    return next(folder.glob("*.whl"))
+
+
+def pip(python, *arguments, cwd=None):
+    command = [python, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments]
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=cwd, timeout=200, check=False
+    )
+
+
+def skip_without_index(result):
+    if result.returncode != 0 and "No matching distribution" in result.stderr:
+        pytest.skip("no package index can be reached")
+
+
+def find_python38():
+    candidates = [shutil.which("python3.8")]
+    candidates += [str(p) for p in sorted(Path.home().glob(".pyenv/versions/3.8*/bin/python"))]
+    for candidate in filter(None, candidates):
+        probe = subprocess.run(
+            [candidate, "-c", "import sys; print(sys.version_info[:2])"],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if probe.stdout.strip() == "(3, 8)":
+            return candidate
+    return None
+
+
+def test_the_wheel_holds_only_the_runtime(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    assert wheel.name.endswith("-py3-none-any.whl")
+    assert {name.split("/")[0].split("-")[0] for name in names} == {
+        "edge_runtime",
+        "phil_edge_runtime",
+    }
+    assert not [name for name in names if "/tests/" in name or "conftest" in name]
+    assert {"edge_runtime/__main__.py", "edge_runtime/vehicles/mock.py"} <= set(names)
+    assert "edge_runtime/config.example.toml" in names
+    assert "edge_runtime/py.typed" in names
+
+
+@pytest.mark.timeout(600)
+def test_the_boards_python_and_versions(wheel, make_policy, tmp_path):
+    python38 = find_python38()
+    if python38 is None:
+        pytest.skip("no Python 3.8 on PATH or under ~/.pyenv")
+    subprocess.run([python38, "-m", "venv", str(tmp_path / "board")], check=True)
+    python = str(tmp_path / "board" / "bin" / "python")
+    installed = pip(python, "install", "--only-binary=:all:", str(wheel), "-r", str(LOCK))
+    skip_without_index(installed)
+    assert installed.returncode == 0, installed.stderr
+    signed = make_policy("mean")
+    checked = subprocess.run(
+        [python, "-m", "edge_runtime", "check", str(signed.path),
+         "--public-key", str(signed.public_key)],
+        capture_output=True, text=True, cwd=tmp_path, check=False,
+    )  # fmt: skip
+    assert (checked.returncode, checked.stderr) == (0, "")
+    report = json.loads(checked.stdout)
+    assert report["policy_id"] == signed.policy_id
+    assert report["onnxruntime"] == "1.19.2"
+    # The board's Zenoh against the workstation's, over the wire.
+    endpoint = free_endpoint()
+    flags = (*signed.flags, "--connect", endpoint)
+    with Simulator(endpoint) as simulator, EdgeProcess(*flags, python=python, cwd=tmp_path) as edge:
+        simulator.wait_for_edge()
+        command = simulator.ask(make_state(0))
+        assert (command.mode, command.action) == ("drive", [-1.0])
+        assert edge.end() == 0

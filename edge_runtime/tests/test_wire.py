@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge_runtime import wire
+from edge_runtime.errors import UserError
+from edge_runtime.tests.harness import make_state
+from edge_runtime.wire import Command, Feedback, Health, Reason, Rejection, State
+
+DECODERS = {
+    State: wire.decode_state,
+    Command: wire.decode_command,
+    Feedback: wire.decode_feedback,
+    Health: wire.decode_health,
+}
+counts = st.integers(0, 2**63 - 1)
+finite = st.floats(allow_nan=False, allow_infinity=False)
+units = st.floats(-1, 1)
+texts = st.text(max_size=64)
+
+MESSAGES = {
+    State: st.builds(
+        State,
+        session=texts,
+        episode=counts,
+        step=counts,
+        sim_time_s=finite,
+        sent_ns=counts,
+        frames=st.binary(min_size=1, max_size=1).map(lambda byte: byte * wire.FRAMES_BYTES),
+        speed_mps=finite,
+        final=st.booleans(),
+    ),
+    Command: st.builds(
+        Command,
+        session=texts,
+        episode=counts,
+        step=counts,
+        mode=st.sampled_from(wire.COMMAND_MODES),
+        action=st.lists(units, min_size=1, max_size=4),
+        policy_id=texts,
+        received_ns=counts,
+        inference_ns=counts,
+        sent_ns=counts,
+        reason=texts,
+    ),
+    Feedback: st.builds(
+        Feedback,
+        vehicle=texts,
+        session=texts,
+        episode=st.integers(-1, 9),
+        step=st.integers(-1, 9),
+        mode=texts,
+        action=st.lists(units, max_size=4),
+        speed_mps=finite,
+        self_braking=st.booleans(),
+        faults=st.lists(texts, max_size=3),
+        sent_ns=counts,
+    ),
+    Health: st.builds(
+        Health,
+        vehicle_id=texts,
+        vehicle=texts,
+        mode=texts,
+        reason=texts,
+        needs_rearm=st.booleans(),
+        accepted=counts,
+        superseded=counts,
+        rejected=st.dictionaries(st.sampled_from([r.value for r in Reason]), counts),
+        deadline_misses=counts,
+        safe_stops=counts,
+        policy_id=texts,
+        inference_ms=st.dictionaries(st.sampled_from(["p50", "p99", "max"]), finite),
+        uptime_s=finite,
+        sent_ns=counts,
+    ),
+}
+
+
+def as_map(message) -> dict:
+    return msgspec.msgpack.decode(wire.encode(message))
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+def test_round_trip(kind):
+    @given(MESSAGES[kind])
+    def check(message):
+        assert DECODERS[kind](wire.encode(message)) == message
+
+    check()
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+def test_random_bytes_never_raise(kind):
+    @given(st.binary(max_size=300))
+    def check(payload):
+        assert isinstance(DECODERS[kind](payload), Rejection)
+
+    check()
+
+
+@given(st.data())
+def test_a_damaged_message_never_raises(data):
+    payload = bytearray(wire.encode(make_state(3)))
+    position = data.draw(st.integers(0, len(payload) - 1))
+    payload[position] ^= data.draw(st.integers(1, 255))
+    cut = data.draw(st.integers(0, len(payload)))
+    wire.decode_state(bytes(payload))
+    wire.decode_state(bytes(payload[:cut]))
+
+
+def test_the_state_has_exactly_the_contracts_fields():
+    assert set(as_map(make_state(0))) == {
+        "schema", "session", "episode", "step", "sim_time_s", "sent_ns",
+        "frames", "speed_mps", "final",
+    }  # fmt: skip
+
+
+def test_the_command_has_exactly_the_contracts_fields():
+    assert set(Command.__struct_fields__) == {
+        "schema", "session", "episode", "step", "mode", "action", "policy_id",
+        "received_ns", "inference_ns", "sent_ns", "reason",
+    }  # fmt: skip
+
+
+def test_frames_keep_their_order():
+    pixels = np.random.default_rng(0).integers(0, 256, wire.FRAMES_SHAPE, dtype=np.uint8)
+    state = wire.decode_state(wire.encode(make_state(0, frames=pixels.tobytes())))
+    assert isinstance(state, State)
+    np.testing.assert_array_equal(state.frames_array(), pixels)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"schema": 2}, Reason.SCHEMA),
+        ({"frames": bytes(7199)}, Reason.FRAMES_SIZE),
+        ({"frames": b""}, Reason.FRAMES_SIZE),
+        ({"frames": bytes(70_000)}, Reason.OVERSIZED),
+        ({"speed_mps": math.nan}, Reason.NOT_FINITE),
+        ({"sim_time_s": math.inf}, Reason.NOT_FINITE),
+        ({"step": -1}, Reason.MALFORMED),
+        ({"step": "3"}, Reason.MALFORMED),
+        ({"final": None}, Reason.MALFORMED),
+        ({"session": "x" * 257}, Reason.MALFORMED),
+    ],
+)
+def test_a_bad_state_is_rejected_by_reason(changes, reason):
+    payload = msgspec.msgpack.encode({**as_map(make_state(0)), **changes})
+    rejection = wire.decode_state(payload)
+    assert isinstance(rejection, Rejection)
+    assert rejection.reason is reason
+
+
+def test_a_missing_field_is_malformed_and_a_further_one_is_ignored():
+    fields = as_map(make_state(0))
+    assert isinstance(wire.decode_state(msgspec.msgpack.encode({**fields, "more": 1})), State)
+    del fields["step"]
+    rejection = wire.decode_state(msgspec.msgpack.encode(fields))
+    assert isinstance(rejection, Rejection)
+    assert rejection.reason is Reason.MALFORMED
+
+
+def test_another_schema_is_named_even_where_its_fields_differ():
+    rejection = wire.decode_state(msgspec.msgpack.encode({"schema": 9, "step": "nine"}))
+    assert isinstance(rejection, Rejection)
+    assert rejection.reason is Reason.SCHEMA
+
+
+@pytest.mark.parametrize("action", [[], [1.01], [-2.0]])
+def test_a_command_outside_the_range_is_rejected(action):
+    command = Command(
+        session="a", episode=0, step=0, mode="drive", action=action, policy_id="p",
+        received_ns=0, inference_ns=0, sent_ns=0,
+    )  # fmt: skip
+    assert isinstance(wire.decode_command(wire.encode(command)), Rejection)
+
+
+@pytest.mark.parametrize(
+    "nested", [b"\x91" * 60_000, b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff"]
+)
+def test_hostile_nesting_and_lengths(nested):
+    assert isinstance(wire.decode_state(b"\x82\xa6schema\x01\xa1x" + nested), Rejection)
+
+
+def test_keys():
+    assert wire.key("hunter01", "state") == "phil/hunter01/state"
+    for bad in ("", "a/b", "*", "a" * 65, "a\n", "h\u00fcnter"):
+        with pytest.raises(UserError):
+            wire.key(bad, "state")

@@ -1,0 +1,133 @@
+"""A vehicle of arithmetic: dead time, rate limit and first-order lag before the wheels obey.
+
+It integrates its own motion up to the time it is asked about, so that it needs no thread, and a
+test with made-up times sees exactly what a process sees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import ClassVar, Deque, Dict, NamedTuple, Optional, Tuple
+
+from edge_runtime.vehicles.interface import ActionLimit, Vehicle, VehicleReport
+from edge_runtime.wire import CONTROL_PERIOD_S
+
+COMMAND_TIMEOUT_S = 2 * CONTROL_PERIOD_S
+_INTEGRATION_STEP_S = 0.005
+# After this long without a command it has braked to a stand, whatever it did before.
+_LONGEST_GAP_S = 10.0
+
+
+class MockParameters(NamedTuple):
+    """The actuators and the body of the mock. Rates are in full pedal or steering per second."""
+
+    dead_time_s: float = 0.02
+    time_constant_s: float = 0.05
+    slew_per_s: float = 40.0
+    acceleration_mps2: float = 5.0  # at full pedal, the same for the brake
+    max_speed_mps: float = 15.0
+
+
+class MockState(NamedTuple):
+    """Actuator positions in -1 to 1, and the speed."""
+
+    pedal: float = -1.0
+    steering: float = 0.0
+    speed_mps: float = 0.0
+
+
+def advance(
+    state: MockState, pedal: float, steering: float, step_s: float, parameters: MockParameters
+) -> MockState:
+    """One integration step towards the targets `pedal` and `steering`."""
+    position = _follow(state.pedal, pedal, step_s, parameters)
+    speed_mps = state.speed_mps + position * parameters.acceleration_mps2 * step_s
+    return MockState(
+        pedal=position,
+        steering=_follow(state.steering, steering, step_s, parameters),
+        speed_mps=min(max(speed_mps, 0.0), parameters.max_speed_mps),
+    )
+
+
+def _follow(position: float, target: float, step_s: float, parameters: MockParameters) -> float:
+    """First-order lag towards the target, no faster than the actuator's rate."""
+    change = (target - position) * (1.0 - math.exp(-step_s / parameters.time_constant_s))
+    most = parameters.slew_per_s * step_s
+    return position + min(max(change, -most), most)
+
+
+class MockVehicle(Vehicle):
+    """Takes pedal and steering; brakes by itself when no command came for 2 T."""
+
+    name: ClassVar[str] = "mock"
+    # A full swing within one control period: 20 / s is 2.0 in T = 0.1 s, so that every action
+    # of a policy goes through unchanged. What the body does with it is the lag's business.
+    limits: ClassVar[Dict[str, ActionLimit]] = {
+        "pedal": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
+        "steering": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
+    }
+
+    def __init__(self, parameters: Optional[MockParameters] = None) -> None:
+        self._parameters = parameters or MockParameters()
+        self._state = MockState()
+        self._now_s: Optional[float] = None
+        self._commanded_s = -math.inf
+        self._on_the_way: Deque[Tuple[float, float, float]] = deque()
+        self._target = (-1.0, 0.0)
+
+    def enable(self, now_s: float) -> None:
+        """Start its time; it stands with the brake on."""
+        self._now_s = now_s
+
+    def command(self, action: Dict[str, float], now_s: float) -> None:
+        """An action that a policy leaves out is zero: no pedal, wheels straight."""
+        self._integrate(now_s)
+        self._commanded_s = now_s
+        effective_s = now_s + self._parameters.dead_time_s
+        self._on_the_way.append(
+            (effective_s, action.get("pedal", 0.0), action.get("steering", 0.0))
+        )
+
+    def brake(self, now_s: float) -> None:
+        """Full brake without the dead time of the command's way."""
+        self._integrate(now_s)
+        self._on_the_way.clear()
+        self._commanded_s = now_s
+        self._target = (-1.0, self._target[1])
+
+    def feedback(self, now_s: float) -> VehicleReport:
+        """Where the actuators are and how fast the body is."""
+        self._integrate(now_s)
+        return VehicleReport(
+            action={"pedal": self._state.pedal, "steering": self._state.steering},
+            speed_mps=self._state.speed_mps,
+            self_braking=self._is_left_alone(now_s),
+            faults=[],
+        )
+
+    def close(self) -> None:
+        """Nothing to free; the brake comes on with the last command's age."""
+        self._on_the_way.clear()
+        self._target = (-1.0, self._target[1])
+
+    def _is_left_alone(self, now_s: float) -> bool:
+        return now_s - self._commanded_s > COMMAND_TIMEOUT_S
+
+    def _integrate(self, until_s: float) -> None:
+        if self._now_s is None:
+            raise RuntimeError("the vehicle was not enabled")
+        self._now_s = max(self._now_s, until_s - _LONGEST_GAP_S)
+        while until_s - self._now_s > 1e-9:
+            step_s = min(_INTEGRATION_STEP_S, until_s - self._now_s)
+            pedal, steering = self._target_at(self._now_s + step_s)
+            self._state = advance(self._state, pedal, steering, step_s, self._parameters)
+            self._now_s += step_s
+
+    def _target_at(self, now_s: float) -> Tuple[float, float]:
+        while self._on_the_way and self._on_the_way[0][0] <= now_s:
+            _, pedal, steering = self._on_the_way.popleft()
+            self._target = (pedal, steering)
+        if self._is_left_alone(now_s):
+            self._target = (-1.0, self._target[1])
+        return self._target

@@ -1,0 +1,88 @@
+"""Gives a vehicle its commands and publishes its feedback, from a thread of its own.
+
+So the feedback goes on when the control loop hangs, and shows the vehicle braking by itself.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Callable, Optional, Sequence
+
+from edge_runtime.vehicles.interface import Vehicle, VehicleReport
+from edge_runtime.wire import SAFE_STOP, TOPICS, Command, Feedback
+
+_PERIOD_S = 1.0 / TOPICS["feedback"].rate_hz
+_JOIN_S = 0.5
+
+
+class VehicleRunner:
+    """Owns the vehicle: all calls to it happen under its lock.
+
+    `action_names` are the policy's, in the order of a command's action.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, action_names: Sequence[str], publish: Callable[[Feedback], None]
+    ) -> None:
+        self._vehicle = vehicle
+        self._action_names = action_names
+        self._publish = publish
+        self._lock = threading.Lock()
+        self._last: Optional[Command] = None
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
+
+    @property
+    def name(self) -> str:
+        """The vehicle's, as `--vehicle` knows it."""
+        return self._vehicle.name
+
+    def start(self) -> None:
+        """Enable the vehicle and start its feedback."""
+        with self._lock:
+            self._vehicle.enable(time.monotonic())
+        self._thread.start()
+
+    def command(self, command: Command) -> None:
+        """Hand a command to the vehicle. Its mode alone means brake in a safe stop."""
+        with self._lock:
+            self._last = command
+            now_s = time.monotonic()
+            if command.mode == SAFE_STOP:
+                self._vehicle.brake(now_s)
+            else:
+                self._vehicle.command(dict(zip(self._action_names, command.action)), now_s)
+
+    def close(self) -> None:
+        """Brake, end the feedback, close the driver."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join(_JOIN_S)
+        with self._lock:
+            self._vehicle.brake(time.monotonic())
+            self._vehicle.close()
+
+    def _run(self) -> None:
+        next_s = time.monotonic()
+        while not self._stopping.wait(max(0.0, next_s - time.monotonic())):
+            # Absolute deadlines; after a long pause one report, not one for each missed period.
+            next_s = max(next_s + _PERIOD_S, time.monotonic())
+            with self._lock:
+                report = self._vehicle.feedback(time.monotonic())
+                last = self._last
+            self._publish(self._feedback(report, last))
+
+    def _feedback(self, report: VehicleReport, last: Optional[Command]) -> Feedback:
+        return Feedback(
+            vehicle=self._vehicle.name,
+            session=last.session if last else "",
+            episode=last.episode if last else -1,
+            step=last.step if last else -1,
+            mode=last.mode if last else "standby",
+            action=[report.action.get(name, 0.0) for name in self._action_names],
+            speed_mps=report.speed_mps,
+            self_braking=report.self_braking,
+            faults=report.faults,
+            sent_ns=time.time_ns(),
+        )

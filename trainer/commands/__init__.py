@@ -1,0 +1,15 @@
+"""The commands of ``python -m trainer``, one module each."""
+
+from types import ModuleType
+
+from trainer.commands import bench, evaluate, export, human, plot, train
+
+COMMANDS: dict[str, ModuleType] = {
+    "train": train,
+    "human": human,
+    "evaluate": evaluate,
+    "export": export,
+    "plot": plot,
+    "bench": bench,
+}
+"""Name -> module with ``add_arguments(parser)``, ``run(arguments)`` and ``EXAMPLE``."""

@@ -1,0 +1,57 @@
+"""Drive test episodes with a policy and report how well it does."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from edge_runtime.cli import write_json_out
+from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
+from edge_runtime.files import check_writable
+from trainer.commands.options import add_scenario, not_negative, positive
+from trainer.drivers import load_driver, make_environment
+from trainer.evaluation import CONDITIONS, drive_episodes
+from trainer.progress import ProgressBar
+
+EXAMPLE = "example: python -m trainer evaluate runs/phil_1 --runs 50 --out result.json"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("policy", help="an .onnx file, a RUN_DIR, a HUMAN_DIR or the word expert")
+    add_scenario(parser)
+    parser.add_argument(
+        "--condition",
+        choices=CONDITIONS,
+        default="nominal",
+        help="nominal, or Gaussian noise of 5 %% of the control domain on the command",
+    )
+    parser.add_argument("--runs", type=positive, default=50, help="episodes")
+    parser.add_argument(
+        "--seed", type=not_negative, default=0, help="of the first episode; the next has one more"
+    )
+    parser.add_argument("--out", metavar="R.json", help="also write the report to this file")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Evaluate and print the report; returns the exit status."""
+    if arguments.out:
+        check_writable(arguments.out)
+    env = make_environment(arguments.scenario)
+    driver, policy_id = load_driver(arguments.policy, env)
+    seeds = range(arguments.seed, arguments.seed + arguments.runs)
+    goals = 0
+    with ProgressBar("evaluating", arguments.runs) as bar:
+
+        def on_episode(result: EpisodeResult) -> None:
+            nonlocal goals
+            goals += result.outcome == GOAL
+            bar.advance(success=f"{goals / (bar.done + 1):.2f}")
+
+        results = drive_episodes(env, driver, seeds, arguments.condition, on_episode)
+    report = summarise(results, arguments.scenario, arguments.condition, policy_id, arguments.seed)
+    print(json.dumps(report, indent=2))
+    if arguments.out:
+        detail = [result.as_dict() for result in results]
+        write_json_out(arguments.out, {**report, "per_episode": detail})
+    return 0

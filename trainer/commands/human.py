@@ -1,0 +1,69 @@
+"""Train the DAgger human model from interventions."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from edge_runtime.cli import write_json_out
+from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
+from trainer.drivers import make_environment
+from trainer.files import make_directory
+from trainer.human.dagger import HumanTraining
+from trainer.human.model import HumanModelConfig
+from trainer.progress import ProgressBar
+
+EXAMPLE = "example: python -m trainer human --scenario left_turn --out runs/human"
+DEFAULTS = HumanModelConfig()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_scenario(parser)
+    parser.add_argument("--out", required=True, metavar="HUMAN_DIR", help="directory of the model")
+    parser.add_argument("--seed", type=not_negative, default=0, help="of everything")
+    parser.add_argument(
+        "--episodes", type=positive, default=DEFAULTS.episodes, help="episodes (table A7)"
+    )
+    parser.add_argument(
+        "--frames",
+        type=int,
+        choices=[1, 2],
+        default=DEFAULTS.frames,
+        help="frames that the model sees: table A4 has 1; 2 show speed as a person sees it",
+    )
+    parser.add_argument(
+        "--updates-per-episode",
+        type=positive,
+        default=DEFAULTS.updates_per_episode,
+        help="gradient steps after each episode",
+    )
+    add_threads(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train the model, showing progress; returns the exit status."""
+    set_threads(arguments.threads)
+    config = HumanModelConfig(
+        frames=arguments.frames,
+        episodes=arguments.episodes,
+        updates_per_episode=arguments.updates_per_episode,
+    )
+    directory = Path(arguments.out)
+    make_directory(directory)
+    training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)
+    with ProgressBar("human model", config.episodes) as bar:
+        for episode in training.episodes():
+            bar.advance(
+                demonstrations=str(episode.demonstrations),
+                interventions=str(episode.interventions),
+                loss=f"{episode.loss:.3f}",
+                outcome=episode.outcome,
+            )
+    about = {"scenario": arguments.scenario, "seed": arguments.seed, "config": asdict(config)}
+    training.model.save(directory, about)
+    report = {**about, "demonstrations": training.model.demonstrations}
+    write_json_out(str(directory / "human.json"), report)
+    print(f"human model from {training.model.demonstrations} demonstrated steps: {directory}")
+    return 0

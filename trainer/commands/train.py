@@ -1,0 +1,159 @@
+"""Train a policy with human guidance."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import deque
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from edge_runtime.episode_report import GOAL
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes
+from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
+from trainer.drivers import CHECKPOINT_FILE
+from trainer.files import make_directory
+from trainer.learner.algorithms import ALGORITHMS
+from trainer.learner.config import LearnerConfig
+from trainer.plots import write_learning_curve
+from trainer.progress import ProgressBar
+from trainer.training.config import RunConfig
+from trainer.training.metrics import EpisodeMetrics
+from trainer.training.run import CONFIG_FILE, TrainingRun
+
+EXAMPLE = (
+    "example: python -m trainer train --scenario left_turn --algorithm phil_td3 --seed 1 "
+    "--episodes 120 --out runs/phil_1"
+)
+DEFAULTS = RunConfig()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_scenario(parser)
+    parser.add_argument(
+        "--algorithm", choices=list(ALGORITHMS), default=DEFAULTS.algorithm, help="which learner"
+    )
+    parser.add_argument("--seed", type=not_negative, default=DEFAULTS.seed, help="of everything")
+    parser.add_argument(
+        "--episodes", type=positive, default=DEFAULTS.episodes, help="episodes to train in all"
+    )
+    parser.add_argument(
+        "--human",
+        default=DEFAULTS.human,
+        metavar="expert|HUMAN_DIR",
+        help="who guides: the scripted expert, or a model trained by `trainer human`",
+    )
+    parser.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
+    parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learner's device")
+    parser.add_argument(
+        "--max-minutes",
+        type=float,
+        default=None,
+        metavar="MIN",
+        help="stop after the episode that passes this time (default: no limit)",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"change a setting: {', '.join(_settings())}",
+    )
+    add_threads(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train, showing progress; returns the exit status."""
+    if arguments.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("no CUDA device is available; use --device cpu")
+    set_threads(arguments.threads)
+    config = _config(arguments)
+    run_dir = Path(arguments.out)
+    _check_directory(run_dir, config, arguments.resume)
+    make_directory(run_dir)
+    training = TrainingRun(config, run_dir, arguments.resume)
+    deadline_s = time.monotonic() + 60.0 * arguments.max_minutes if arguments.max_minutes else None
+    with ProgressBar("training", config.episodes, training.episode) as bar:
+        training.train(_Reporter(bar), deadline_s)
+    write_learning_curve(run_dir)
+    print(f"{training.episode} episodes, {training.replay.added} steps: {run_dir}")
+    return 0
+
+
+class _Reporter:
+    """Feeds the progress bar from the episodes' metrics: means over the last twenty."""
+
+    def __init__(self, bar: ProgressBar) -> None:
+        self.bar = bar
+        self.recent: deque[EpisodeMetrics] = deque(maxlen=20)
+        self.validation = "-"
+
+    def __call__(self, metrics: EpisodeMetrics) -> None:
+        self.recent.append(metrics)
+        if metrics.validation_success == metrics.validation_success:
+            self.validation = f"{metrics.validation_success:.2f}"
+        count = len(self.recent)
+        self.bar.advance(
+            return_=f"{sum(m.episode_return for m in self.recent) / count:.1f}",
+            distance=f"{sum(m.distance_m for m in self.recent) / count:.1f} m",
+            success=f"{sum(m.outcome == GOAL for m in self.recent) / count:.2f}",
+            validation=self.validation,
+        )
+
+
+def _config(arguments: argparse.Namespace) -> RunConfig:
+    config = RunConfig(
+        scenario=arguments.scenario,
+        algorithm=arguments.algorithm,
+        seed=arguments.seed,
+        episodes=arguments.episodes,
+        human=arguments.human,
+        device=arguments.device,
+    )
+    for assignment in arguments.set:
+        config = _with_setting(config, assignment)
+    return config
+
+
+def _settings() -> dict[str, Any]:
+    """Every setting that ``--set`` may change, with its default."""
+    run = ("guided_share", "penalise_stuck", "evaluate_every", "evaluation_runs")
+    own = {name: getattr(DEFAULTS, name) for name in (*run, "checkpoint_every")}
+    return own | {f.name: getattr(DEFAULTS.learner, f.name) for f in fields(LearnerConfig)}
+
+
+def _with_setting(config: RunConfig, assignment: str) -> RunConfig:
+    name, _, text = assignment.partition("=")
+    settings = _settings()
+    if name not in settings:
+        raise UserError(f"--set {assignment}: no setting {name!r}; there is {', '.join(settings)}")
+    kind = type(settings[name])
+    try:
+        value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
+    except (ValueError, KeyError):
+        raise UserError(f"--set {assignment}: {text!r} is no {kind.__name__}") from None
+    if name in {f.name for f in fields(LearnerConfig)}:
+        return replace(config, learner=replace(config.learner, **{name: value}))
+    return replace(config, **{name: value})
+
+
+def _check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
+    """Refuse to overwrite a run, or to resume one under other settings."""
+    started = (run_dir / CHECKPOINT_FILE).is_file()
+    if started and not resume:
+        raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
+    if resume and not started:
+        raise UserError(f"{run_dir} holds no checkpoint to resume from")
+    if resume:
+        saved = json.loads(read_bytes(run_dir / CONFIG_FILE, "run config"))
+        wanted = config.as_dict()
+        changed = [key for key in wanted if key != "episodes" and saved.get(key) != wanted[key]]
+        if changed:
+            raise UserError(f"{run_dir} was trained with another {', '.join(changed)}")

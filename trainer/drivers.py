@@ -1,0 +1,108 @@
+"""Who can drive: the expert, a human model, a run's actor, an exported policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edge_runtime.errors import UserError
+from trainer.files import load_torch
+from trainer.human.expert import LeftTurnExpert
+from trainer.human.guide import Driver
+from trainer.human.model import MODEL_FILE, load_human_model
+from trainer.human.trigger import LeftTurnTrigger
+from trainer.learner.networks import Actor
+from trainer.scenarios import SCENARIOS
+
+CHECKPOINT_FILE = "checkpoint.pt"
+BEST_FILE = "best_actor.pt"
+
+EXPERTS: dict[str, Callable[[Any], LeftTurnExpert]] = {"left_turn": LeftTurnExpert}
+TRIGGERS: dict[str, Callable[[Any], LeftTurnTrigger]] = {"left_turn": LeftTurnTrigger}
+"""Scenario -> who knows how to drive it, and when to take over."""
+
+
+class NetworkDriver:
+    """A policy network at the wheel."""
+
+    def __init__(self, actor: Actor) -> None:
+        self.actor = actor.eval()
+
+    def reset(self) -> None:
+        """Networks have no memory."""
+
+    @torch.no_grad()
+    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """pi(s), float32 [action size]."""
+        return self.actor(torch.from_numpy(observation)[None])[0].numpy()
+
+
+class OnnxDriver:
+    """An exported policy file at the wheel, run by the edge runtime's own loader."""
+
+    def __init__(self, path: Path) -> None:
+        from edge_runtime.policy import load_policy
+
+        self.policy = load_policy(str(path), allow_unsigned=True)
+
+    def reset(self) -> None:
+        """Policies have no memory."""
+
+    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The policy's action, float32 [action size]."""
+        return self.policy.act(observation)
+
+
+def make_environment(scenario: str) -> Any:
+    """The scenario's environment, without wrappers.
+
+    Raises:
+        UserError: no such scenario.
+    """
+    if scenario not in SCENARIOS:
+        raise UserError(f"unknown scenario {scenario!r}; there is {', '.join(SCENARIOS)}")
+    return gymnasium.make(SCENARIOS[scenario]).unwrapped
+
+
+def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
+    """The driver that the word or path ``policy`` names, and its policy id.
+
+    Raises:
+        UserError: nothing there that drives.
+    """
+    if policy == "expert":
+        return EXPERTS[env.scenario](env), "expert"
+    path = Path(policy)
+    if path.suffix == ".onnx":
+        driver = OnnxDriver(path)
+        return driver, driver.policy.policy_id
+    if (path / MODEL_FILE).is_file():
+        actor, _ = load_human_model(path)
+        return NetworkDriver(actor), f"human:{path.name}"
+    actor, state = load_actor(path)
+    return NetworkDriver(actor), f"run:{path.name}:{state['episode']}"
+
+
+def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
+    """A run's actor: the best on the validation seeds, or the last one where none was validated.
+
+    Returns:
+        The network, and a dict with ``scenario``, ``algorithm``, ``seed``, ``episode``.
+    """
+    for name in (BEST_FILE, CHECKPOINT_FILE):
+        if (run_dir / name).is_file():
+            state = load_torch(run_dir / name)
+            weights = state["actor"] if name == BEST_FILE else state["learner"]["actor"]
+            actor = Actor(action_size=len(weights["head.6.bias"]))
+            actor.load_state_dict(weights)
+            return actor, {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
+    raise UserError(
+        f"{run_dir} holds no policy: expected an .onnx file, a training run, "
+        "a human model's directory, or the word expert"
+    )

@@ -1,0 +1,69 @@
+"""Driving episodes in process, and what they amount to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from edge_runtime.episode_report import EpisodeResult
+from trainer.human.guide import Driver
+
+COMMAND_NOISE = 0.05 * 2.0
+"""Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
+CONDITIONS = ("nominal", "noise")
+
+
+def drive_episode(env: Any, driver: Driver, seed: int, noise_std: float = 0.0) -> EpisodeResult:
+    """Drive one episode.
+
+    Args:
+        env: a scenario.
+        driver: who drives.
+        seed: of the episode, and of the noise.
+        noise_std: standard deviation of Gaussian noise on the command.
+    """
+    noise = np.random.default_rng([seed, 1])
+    observation, info = env.reset(seed=seed)
+    driver.reset()
+    actions, rewards, lateral, longitudinal = [], [], [], []
+    ended = False
+    while not ended:
+        action = driver.act(observation)
+        if noise_std:
+            disturbed = action + noise.normal(0.0, noise_std, action.shape)
+            action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
+        actions.append([float(a) for a in action])
+        rewards.append(reward)
+        lateral.append(abs(info["lateral_acceleration_mps2"]))
+        longitudinal.append(abs(info["longitudinal_acceleration_mps2"]))
+        ended = terminated or truncated
+    return EpisodeResult(
+        seed=seed,
+        outcome=info["outcome"],
+        distance_m=float(info["distance_m"]),
+        reward=float(sum(rewards)),
+        time_s=len(actions) * env.config.control_period_s,
+        lateral_acceleration_mps2=float(np.mean(lateral)),
+        longitudinal_acceleration_mps2=float(np.mean(longitudinal)),
+        steps=len(actions),
+        actions=actions,
+    )
+
+
+def drive_episodes(
+    env: Any,
+    driver: Driver,
+    seeds: Iterable[int],
+    condition: str = "nominal",
+    on_episode: Callable[[EpisodeResult], None] = lambda result: None,
+) -> list[EpisodeResult]:
+    """Drive one episode for each seed under a condition."""
+    noise_std = COMMAND_NOISE if condition == "noise" else 0.0
+    results = []
+    for seed in seeds:
+        results.append(drive_episode(env, driver, seed, noise_std))
+        on_episode(results[-1])
+    return results

@@ -1,0 +1,189 @@
+"""From a trained actor to the policy file that may drive (contract section 4)."""
+
+from __future__ import annotations
+
+import subprocess
+import warnings
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from numpy.typing import NDArray
+
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
+from edge_runtime.onnx_file import read_onnx
+from edge_runtime.signature import SIGNATURE_SUFFIX
+from trainer.drivers import make_environment
+from trainer.learner.networks import Actor
+
+OPSET, IR_VERSION = 17, 8
+"""The oldest onnxruntime that a board may have reads these."""
+PARITY_OBSERVATIONS = 1000
+PARITY_TOLERANCE = 1e-5
+
+ACTIONS = {
+    "left_turn": Action(
+        name="pedal",
+        meaning="positive opens the throttle, negative brakes",
+        unit="aperture",
+        low=-1.0,
+        high=1.0,
+    )
+}
+"""Scenario -> what its action means to a vehicle."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """A policy file's bytes and how far onnxruntime is from torch on real observations."""
+
+    model: bytes
+    policy_id: str
+    max_difference: float
+
+
+def export_policy(actor: Actor, label: dict[str, Any], training: dict[str, Any]) -> Export:
+    """Convert, describe, check and compare.
+
+    Args:
+        actor: the network.
+        label: ``scenario``, ``algorithm``, ``seed`` and ``episode`` of the run.
+        training: the run's whole config, for the manifest.
+
+    Raises:
+        UserError: the file would not do what the network does.
+    """
+    graph = _to_onnx(actor)
+    policy_id = read_onnx(graph.SerializeToString()).weights_sha256
+    manifest = Manifest(
+        policy_id=policy_id,
+        scenario=label["scenario"],
+        algorithm=label["algorithm"],
+        observation=Observation(),
+        action=[ACTIONS[label["scenario"]]],
+        training={
+            "seed": label["seed"],
+            "episodes": label["episode"],
+            "config": training,
+            "source_revision": source_revision(),
+        },
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    graph.metadata_props.add(key=MANIFEST_KEY, value=encode_manifest(manifest))
+    onnx.checker.check_model(graph, full_check=True)
+    model = graph.SerializeToString()
+    observations = real_observations(label["scenario"], PARITY_OBSERVATIONS)
+    difference = parity(actor, model, observations)
+    if not difference < PARITY_TOLERANCE:
+        raise UserError(
+            f"onnxruntime and torch differ by {difference:.1e} (allowed: {PARITY_TOLERANCE:.0e}); "
+            "nothing was written"
+        )
+    return Export(model, policy_id, difference)
+
+
+def write_policy(export: Export, path: Path, key_file: Path | None) -> None:
+    """Write the policy file and, given a private key (PEM), its signature.
+
+    The key is read first: a wrong one leaves no unsigned file behind.
+    """
+    key = load_private_key(key_file) if key_file else None
+    signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
+    if key is None:
+        # A signature of an older file beside it would only mislead.
+        signature_path.unlink(missing_ok=True)
+    write_atomic(path, export.model)
+    if key is not None:
+        write_atomic(signature_path, key.sign(export.model))
+
+
+def load_private_key(path: Path) -> Ed25519PrivateKey:
+    """An Ed25519 private key from a PEM file (PKCS8, not encrypted).
+
+    Raises:
+        UserError: no such key.
+    """
+    try:
+        key = load_pem_private_key(read_bytes(path, "key"), password=None)
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{path} is not a private key in PEM: {error}") from error
+    if not isinstance(key, Ed25519PrivateKey):
+        raise UserError(f"{path} is not an Ed25519 key; `python -m deploy keys` makes one")
+    return key
+
+
+def real_observations(scenario: str, count: int, seed: int = 0) -> NDArray[np.uint8]:
+    """Observations [count, 2, 45, 80] from driving the scenario at random."""
+    env, random = make_environment(scenario), np.random.default_rng(seed)
+    size = env.action_space.shape
+    observation, _ = env.reset(seed=seed)
+    seen: list[NDArray[np.uint8]] = []
+    action = np.zeros(size, np.float32)
+    while len(seen) < count:
+        seen.append(observation)
+        # A pedal that wanders instead of trembling: the car gets everywhere.
+        action = np.clip(action + random.normal(0.0, 0.3, size), -1, 1).astype(np.float32)
+        observation, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            observation, _ = env.reset(seed=seed + len(seen))
+    return np.stack(seen)
+
+
+def parity(actor: Actor, model: bytes, observations: NDArray[np.uint8]) -> float:
+    """Largest absolute difference between torch and onnxruntime over the observations."""
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    with torch.no_grad():
+        wanted = actor(torch.from_numpy(observations)).numpy()
+    (got,) = session.run(["action"], {"frames": observations})
+    return float(np.abs(wanted - got).max())
+
+
+def source_revision() -> str:
+    """The repository's commit, ``-dirty`` where files differ from it, or ``unknown``."""
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return described.stdout.strip()
+
+
+def _to_onnx(actor: Actor) -> onnx.ModelProto:
+    example = torch.zeros(1, 2, 45, 80, dtype=torch.uint8)
+    buffer = BytesIO()
+    with warnings.catch_warnings():
+        # The newer exporter writes opset 18 and IR 10, which old boards refuse.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            actor.eval(),
+            (example,),
+            buffer,  # type: ignore[arg-type]  # torch's own stubs forget file objects
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=["frames"],
+            output_names=["action"],
+            dynamic_axes={"frames": {0: "batch"}, "action": {0: "batch"}},
+        )
+    model = onnx.load_from_string(buffer.getvalue())
+    opset = {entry.domain: entry.version for entry in model.opset_import}[""]
+    if (opset, model.ir_version) != (OPSET, IR_VERSION):
+        raise UserError(
+            f"torch wrote opset {opset}, IR {model.ir_version}; "
+            f"boards need opset {OPSET}, IR {IR_VERSION}"
+        )
+    return model

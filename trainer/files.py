@@ -1,0 +1,46 @@
+"""Torch files and small texts, whole or not at all."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from edge_runtime.errors import UserError
+from edge_runtime.files import write_atomic
+
+
+def save_torch(path: Path, state: Any) -> None:
+    """Write ``state`` so that a kill at any moment leaves the old file or the new one."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    write_atomic(path, buffer.getvalue())
+
+
+def load_torch(path: Path) -> Any:
+    """Read what ``save_torch`` wrote.
+
+    Raises:
+        UserError: not such a file. Only tensors and plain values are unpickled.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError) as error:
+        raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
+    except Exception as error:
+        # torch raises its own unpickling errors for foreign files.
+        raise UserError(f"{path} is not a checkpoint of this project") from error
+
+
+def make_directory(path: Path) -> None:
+    """Create a result directory.
+
+    Raises:
+        UserError: a file is in the way, or it is not allowed.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot create the directory {path}: {error.strerror}") from error

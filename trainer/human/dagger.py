@@ -1,0 +1,71 @@
+"""Training the human model: it drives, the person intervenes, and it learns from that (DAgger)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from trainer import seeds
+from trainer.drivers import EXPERTS, TRIGGERS
+from trainer.human.guide import HumanGuide
+from trainer.human.model import HumanModel, HumanModelConfig
+
+DEMONSTRATED_SHARE = 5
+"""The person drives the whole of one episode in this many: what right driving looks like when
+nothing goes wrong, which interventions alone never show."""
+
+
+@dataclass(frozen=True)
+class HumanEpisode:
+    """One episode of the human model's training."""
+
+    outcome: str
+    interventions: int
+    demonstrations: int
+    """The human's steps so far."""
+    loss: float
+
+
+class HumanTraining:
+    """Online, incremental imitation of the person at the wheel (section V).
+
+    Args:
+        env: a scenario.
+        config: tables A4 and A7.
+        seed: of weights, minibatches and episodes.
+    """
+
+    def __init__(self, env: Any, config: HumanModelConfig, seed: int) -> None:
+        self.env, self.config, self.seed = env, config, seed
+        expert = EXPERTS[env.scenario](env)
+        self.expert = expert
+        self.guide = HumanGuide(expert, TRIGGERS[env.scenario](expert))
+        self.model = HumanModel(config, seed, env.action_space.shape[0])
+
+    def episodes(self) -> Iterator[HumanEpisode]:
+        """Drive and learn, episode by episode."""
+        for episode in range(self.config.episodes):
+            interventions, outcome = self._drive(episode)
+            loss = self.model.learn(self.config.updates_per_episode)
+            yield HumanEpisode(outcome, interventions, self.model.demonstrations, loss)
+
+    def _drive(self, episode: int) -> tuple[int, str]:
+        """One episode; the number of take-overs, and the outcome."""
+        demonstrated = episode % DEMONSTRATED_SHARE == 0
+        seed = seeds.episode_seed(self.seed, seeds.TRAINING, episode)
+        observation, info = self.env.reset(seed=seed)
+        self.guide.reset()
+        interventions, ended = 0, False
+        while not ended:
+            action = self.model.act(observation)
+            intervention = None if demonstrated else self.guide.watch(observation, action)
+            if demonstrated or intervention is not None:
+                action = (
+                    self.expert.act(observation) if intervention is None else intervention.action
+                )
+                self.model.add(observation, action)
+            interventions += intervention is not None and intervention.first
+            observation, _, terminated, truncated, info = self.env.step(action)
+            ended = terminated or truncated
+        return interventions, info["outcome"]

@@ -1,0 +1,73 @@
+"""The human beside the policy: watches each action, takes over, and gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trainer.human.trigger import LeftTurnTrigger, Reason
+
+Observation = NDArray[np.uint8]
+Action = NDArray[np.float32]
+
+
+class Driver(Protocol):
+    """Anything that drives: expert, human model, policy."""
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+
+    def act(self, observation: Observation) -> Action:
+        """The action for an observation uint8 [2, 45, 80]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Intervention:
+    """A step at which the human acts."""
+
+    action: Action
+    reason: Reason
+    first: bool
+    """Whether the human took over at this step (eq. 17's intervention time)."""
+
+
+class HumanGuide:
+    """Turns trigger and driver into interventions.
+
+    Args:
+        driver: who acts while the human is in control.
+        trigger: when the human takes over.
+        hold_steps: shortest time in control; a person does not let go within a tenth of a second.
+    """
+
+    def __init__(self, driver: Driver, trigger: LeftTurnTrigger, hold_steps: int = 5) -> None:
+        self.driver, self.trigger, self.hold_steps = driver, trigger, hold_steps
+        self.reset()
+
+    def reset(self) -> None:
+        """Start an episode with the policy in control."""
+        self.driver.reset()
+        self.trigger.reset()
+        self._steps_left = 0
+        self._reason: Reason | None = None
+
+    def watch(self, observation: Observation, policy_action: Action) -> Intervention | None:
+        """What the human does about ``policy_action``: None lets it pass. Once a step."""
+        trigger = self.trigger.judge(policy_action)
+        before = self._reason
+        if trigger is not None:
+            self._steps_left = self.hold_steps
+        if self._steps_left == 0:
+            self._reason = None
+            return None
+        self._steps_left -= 1
+        if before is None:
+            # A person who takes over looks at the scene afresh.
+            self.driver.reset()
+            self._reason = trigger
+        assert self._reason is not None
+        return Intervention(self.driver.act(observation), self._reason, first=before is None)

@@ -1,0 +1,111 @@
+"""The DAgger human model of section V: imitates the human from what the human did so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edge_runtime.errors import UserError
+from trainer.files import load_torch, save_torch
+from trainer.learner.networks import Actor
+
+MODEL_FILE = "human_model.pt"
+
+
+@dataclass(frozen=True)
+class HumanModelConfig:
+    """Tables A4 and A7, and what they leave open."""
+
+    frames: int = 1
+    """Frames the model sees (table A4: one). Two show speed, as a person sees it."""
+    learning_rate: float = 1e-4
+    """Table A7."""
+    batch_size: int = 128
+    """Table A7."""
+    episodes: int = 50
+    """Table A7: maximum episode number of its training."""
+    updates_per_episode: int = 40
+    """Gradient steps after each episode. Not in the paper."""
+
+
+class HumanModel:
+    """A regression of the human's action on the picture (eq. 24 to 27).
+
+    It does not exist before the first intervention; then it starts as a copy of an untrained
+    policy network (eq. 25) and learns a little after each episode (eq. 27) from all that the
+    human has done so far: data aggregation.
+    """
+
+    def __init__(self, config: HumanModelConfig, seed: int, action_size: int = 1) -> None:
+        self.config = config
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            self.actor = Actor(action_size, config.frames)
+        self.optimiser = torch.optim.Adam(self.actor.parameters(), config.learning_rate)
+        self.random = np.random.default_rng([seed, 2])
+        self._observations: list[NDArray[np.uint8]] = []
+        self._actions: list[NDArray[np.float32]] = []
+
+    @property
+    def demonstrations(self) -> int:
+        """How many of the human's steps it has seen."""
+        return len(self._actions)
+
+    def reset(self) -> None:
+        """Nothing to forget: the model has no state within an episode."""
+
+    @torch.no_grad()
+    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """What the human would do, float32 [action size], for uint8 [2, 45, 80]."""
+        return self.actor(torch.from_numpy(observation)[None])[0].numpy()
+
+    def add(self, observation: NDArray[np.uint8], action: NDArray[np.float32]) -> None:
+        """Aggregate one step of the human's."""
+        self._observations.append(observation[-self.config.frames :].copy())
+        self._actions.append(np.asarray(action, dtype=np.float32))
+
+    def learn(self, updates: int) -> float:
+        """Take gradient steps on eq. 26; returns the last loss (nan without demonstrations)."""
+        if not self._actions:
+            return float("nan")
+        observations, actions = np.stack(self._observations), np.stack(self._actions)
+        loss = torch.tensor(float("nan"))
+        for _ in range(updates):
+            rows = self.random.integers(len(actions), size=self.config.batch_size)
+            predicted = self.actor(torch.from_numpy(observations[rows]))
+            loss = (torch.from_numpy(actions[rows]) - predicted).square().sum(dim=1).mean()
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.optimiser.step()
+        return loss.item()
+
+    def save(self, directory: Path, about: dict[str, Any]) -> None:
+        """Write the model to ``directory`` with what it was trained on."""
+        state = {
+            "actor": self.actor.state_dict(),
+            "frames": self.config.frames,
+            "action_size": self.actor.head[-1].out_features,
+            "demonstrations": self.demonstrations,
+            **about,
+        }
+        save_torch(directory / MODEL_FILE, state)
+
+
+def load_human_model(directory: Path) -> tuple[Actor, dict[str, Any]]:
+    """The network of a HUMAN_DIR and what is known of it.
+
+    Raises:
+        UserError: no human model there.
+    """
+    path = directory / MODEL_FILE
+    if not path.is_file():
+        raise UserError(f"no human model in {directory} (expected {MODEL_FILE})")
+    state = load_torch(path)
+    actor = Actor(state["action_size"], state["frames"])
+    actor.load_state_dict(state.pop("actor"))
+    return actor, state

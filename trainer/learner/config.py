@@ -1,0 +1,62 @@
+"""Hyper-parameters: tables A5 and A6, and what the paper leaves open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """One field a hyper-parameter; where the paper gives a value, it is the default."""
+
+    batch_size: int = 128
+    """Transitions in a minibatch (table A5: N)."""
+    actor_learning_rate: float = 5e-4
+    """Table A5. (The authors' code has the two rates the other way round.)"""
+    critic_learning_rate: float = 2e-4
+    """Table A5."""
+    learning_rate_decay: float = 0.996
+    """Factor on both rates, once an episode (table A5)."""
+    gamma: float = 0.95
+    """Discount factor of one control period (table A5)."""
+    tau: float = 1e-3
+    """Share of the online weights that each soft update moves into the targets (table A5)."""
+    policy_delay: int = 1
+    """Critic updates for each actor update (table A5: d)."""
+    target_noise: float = 0.2
+    """Standard deviation of the target policy smoothing (table A5: noise scale)."""
+    target_noise_bound: float = 0.5
+    """Bound of that noise; TD3's own value, the paper has none."""
+    exploration_initial: float = 1.0
+    """Standard deviation of the exploration noise in the first episode (table A5)."""
+    exploration_final: float = 0.05
+    """What it falls to (table A5)."""
+    exploration_decay: float = 0.97
+    """Factor on it, once an episode: 0.05 is reached after 98 episodes. Not in the paper."""
+    exploration_bound: float = 1.0
+    """Bound of the exploration noise (table A5: c)."""
+    replay_capacity: int = 100_000
+    """Transitions kept (table A6)."""
+    alpha: float = 0.6
+    """Priority scaling factor (table A6)."""
+    priority_offset: float = 1e-3
+    """Constant that keeps every transition drawable (table A6: epsilon)."""
+    advantage_bound: float = 4.0
+    """Bound of the exponent in the Q advantage. Unbounded it overflows: see REFERENCE notes in
+    ``trainer/README.md``."""
+    importance_sampling: bool = False
+    """Weigh the critic's losses by eq. 15 and 16, which the paper calls optional."""
+    beta: float = 1.0
+    """Initial importance exponent (table A6); it falls linearly to zero over the run."""
+    normalise_importance: bool = True
+    """Divide importance weights by their largest (not in eq. 15)."""
+    split_loss: bool = False
+    """Exact eq. 22 and 23: separate means over policy and human samples. Off: one mean over the
+    batch, as in the authors' code, since the exact form gives a handful of demonstrations half of
+    the critic's loss."""
+    cloning_weight: float = 3.0
+    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper)."""
+    intervention_penalty: float = -10.0
+    """Reward of the first step of an intervention (eq. 17: r_pen = r_fail)."""
+    warmup_steps: int = 256
+    """Environment steps before the first update."""

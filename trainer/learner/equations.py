@@ -1,0 +1,113 @@
+"""The paper's equations, one short function each.
+
+Batches come as torch tensors: ``human`` is the mask Delta as bool [n], values and errors are [n],
+actions [n, action size].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Action = NDArray[np.float32]
+
+
+def masked_action(policy_action: Action, human_action: Action | None) -> Action:
+    """Eq. 9 and 18a: the human's action where the human acts, else the policy's."""
+    return policy_action if human_action is None else human_action
+
+
+def exploration_noise(scale: float, bound: float, size: int, random: np.random.Generator) -> Action:
+    """Eq. 18b: Gaussian noise of standard deviation ``scale``, clipped to +-``bound``."""
+    noise = random.normal(0.0, scale, size)
+    return np.clip(noise, -bound, bound).astype(np.float32)
+
+
+def shaped_reward(reward: float, penalty: float, human: bool, human_before: bool) -> float:
+    """Eq. 17: the first step of an intervention, and no other, costs ``penalty`` (negative)."""
+    return reward + penalty if human and not human_before else reward
+
+
+def smoothed_target_action(action: Tensor, noise: Tensor, bound: float) -> Tensor:
+    """TD3's target policy smoothing, to both sides: noise clipped to +-``bound``, then [-1, 1]."""
+    return (action + noise.clamp(-bound, bound)).clamp(-1.0, 1.0)
+
+
+def td_target(
+    rewards: Tensor, terminals: Tensor, next_values: tuple[Tensor, Tensor], gamma: float
+) -> Tensor:
+    """The target of eq. 22: r + gamma min(Q'_1, Q'_2), and r alone at a terminal state."""
+    return rewards + gamma * (1.0 - terminals) * torch.minimum(*next_values)
+
+
+def q_advantage(human_value: Tensor, policy_value: Tensor, exponent_bound: float) -> Tensor:
+    """Eq. 21b: exp[Q'(s, a) - Q'(s, pi(s))].
+
+    The exponent is held within +-``exponent_bound``: a critic early in training can be off by
+    more than float can take the exponential of, and one infinity would end all sampling.
+    """
+    return torch.exp((human_value - policy_value).clamp(-exponent_bound, exponent_bound))
+
+
+def priority(
+    td_error: Tensor,
+    advantage: Tensor,
+    human: Tensor,
+    offset: float,
+    td_weight: float = 1.0,
+    human_td_weight: float = 1.0,
+    advantage_weight: float = 1.0,
+) -> Tensor:
+    """Eq. 13 and 21a: |delta| + epsilon, and the Q advantage where the human acted.
+
+    The weights make section VII-E's other schemes: TD alone with human weights doubled
+    (``human_td_weight=2, advantage_weight=0``), Q advantage alone (``human_td_weight=0``).
+    """
+    weight = torch.where(human, human_td_weight, td_weight)
+    return weight * td_error.abs() + offset + advantage_weight * advantage * human
+
+
+def importance_weights(probabilities: Tensor, beta: float, normalise: bool) -> Tensor:
+    """Eq. 15: p(i) ** -beta.
+
+    ``normalise`` divides by the batch's largest weight, as the paper's source of prioritised
+    replay does; without it the weights grow with the buffer and scale the learning rate.
+    """
+    weights = probabilities.pow(-beta)
+    return weights / weights.max() if normalise else weights
+
+
+def split_mean(values: Tensor, human: Tensor) -> Tensor:
+    """The mean over the policy's samples plus the mean over the human's (eq. 11, 12, 22, 23).
+
+    A part without samples adds nothing.
+    """
+    return _masked_mean(values, ~human) + _masked_mean(values, human)
+
+
+def critic_loss(
+    values: Tensor, targets: Tensor, human: Tensor, weights: Tensor, split: bool
+) -> Tensor:
+    """Eq. 22, with the importance weights of eq. 16: squared TD errors.
+
+    ``split`` is the paper's form, a mean over each kind of sample; otherwise one mean over all.
+    """
+    losses = weights * (targets - values).square()
+    return split_mean(losses, human) if split else losses.mean()
+
+
+def policy_loss(values: Tensor, human: Tensor, split: bool) -> Tensor:
+    """First term of eq. 23: -Q_1(s, pi(s)), over the policy's samples only where ``split``."""
+    return _masked_mean(-values, ~human) if split else -values.mean()
+
+
+def behaviour_cloning_loss(actions: Tensor, human_actions: Tensor, human: Tensor) -> Tensor:
+    """Second term of eq. 23 without its weight: mean squared distance to the human's actions."""
+    return _masked_mean((human_actions - actions).square().sum(dim=1), human)
+
+
+def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    # No branch on the count: this must not wait for an accelerator to answer.
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)

@@ -1,0 +1,120 @@
+"""Actor, critic and human model: the convolutional networks of tables A2, A3 and A4.
+
+Two 6x6 convolutions (6 and 16 filters), each followed by ReLU and 2x2 max pooling, then fully
+connected layers of 256, 128 and 64. Frames come as uint8 and are normalised to [0, 1] (eq. 28)
+inside the network, so that an exported policy needs no preprocessing.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor, nn
+
+FRAME_ROWS, FRAME_COLUMNS = 45, 80
+FILTERS = (6, 16)
+KERNEL = 6
+HIDDEN = (256, 128, 64)
+
+
+def _side_after_pools(side: int) -> int:
+    for _ in FILTERS:
+        side = (side - KERNEL + 1) // 2
+    return side
+
+
+FEATURES = FILTERS[-1] * _side_after_pools(FRAME_ROWS) * _side_after_pools(FRAME_COLUMNS)
+"""Length of a picture's feature vector (1,792)."""
+
+
+def normalise(frames: Tensor) -> Tensor:
+    """Frames uint8 [batch, n, 45, 80] to float in [0, 1], in the memory order convolutions like."""
+    scaled = frames.float() / 255.0
+    return scaled.contiguous(memory_format=torch.channels_last)
+
+
+class Trunk(nn.Module):
+    """The two convolutions. Maps normalised frames [batch, n, 45, 80] to features [batch, 1792]."""
+
+    def __init__(self, frames: int = 2) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(frames, FILTERS[0], KERNEL)
+        self.conv2 = nn.Conv2d(FILTERS[0], FILTERS[1], KERNEL)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, images: Tensor) -> Tensor:
+        """The features of normalised images."""
+        # Pooling before ReLU gives the same numbers and a quarter of the ReLU's work.
+        hidden = functional.relu(functional.max_pool2d(self.conv1(images), 2))
+        hidden = functional.relu(functional.max_pool2d(self.conv2(hidden), 2))
+        return torch.flatten(hidden, 1)
+
+
+def _fully_connected(inputs: int, outputs: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for width in HIDDEN:
+        layers += [nn.Linear(inputs, width), nn.ReLU()]
+        inputs = width
+    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+
+
+class Actor(nn.Module):
+    """The policy pi(s) (table A3); with ``frames=1`` the human model (table A4).
+
+    The policy's input is always the observation [batch, 2, 45, 80]; a network of one frame takes
+    the newest one, so that every policy is run and exported in the same way.
+    """
+
+    def __init__(self, action_size: int = 1, frames: int = 2) -> None:
+        super().__init__()
+        self.frames = frames
+        self.trunk = Trunk(frames)
+        self.head = _fully_connected(FEATURES, action_size)
+
+    def logits(self, features: Tensor) -> Tensor:
+        """The action before tanh, [batch, n], from the trunk's features."""
+        return self.head(features)
+
+    def from_images(self, images: Tensor) -> Tensor:
+        """The action [batch, n] in [-1, 1] from normalised images [batch, 2, 45, 80]."""
+        return torch.tanh(self.logits(self.trunk(images[:, -self.frames :])))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """The action [batch, n] in [-1, 1] from frames uint8 [batch, 2, 45, 80]."""
+        return self.from_images(normalise(frames))
+
+
+class Critic(nn.Module):
+    """The value Q(s, a) (table A2): the action joins the picture's features."""
+
+    def __init__(self, action_size: int = 1, frames: int = 2) -> None:
+        super().__init__()
+        self.frames = frames
+        self.trunk = Trunk(frames)
+        self.head = _fully_connected(FEATURES + action_size, 1)
+
+    def features(self, images: Tensor) -> Tensor:
+        """The picture's features: independent of the action, so computed once a picture."""
+        return self.trunk(images[:, -self.frames :])
+
+    def value(self, features: Tensor, action: Tensor) -> Tensor:
+        """Q, shape [batch], from features [batch, 1792] and actions [batch, n]."""
+        return self.head(torch.cat([features, action], dim=1)).squeeze(1)
+
+    def forward(self, frames: Tensor, action: Tensor) -> Tensor:
+        """Q, shape [batch], from frames uint8 [batch, 2, 45, 80] and actions [batch, n]."""
+        return self.value(self.features(normalise(frames)), action)
+
+
+class CriticPair(nn.Module):
+    """The two critics of TD3, whose smaller value is believed."""
+
+    def __init__(self, action_size: int = 1, frames: int = 2) -> None:
+        super().__init__()
+        self.first = Critic(action_size, frames)
+        self.second = Critic(action_size, frames)
+
+    @property
+    def pair(self) -> tuple[Critic, Critic]:
+        """Both, in order."""
+        return self.first, self.second

@@ -1,0 +1,83 @@
+"""Surrounding traffic: highway-env's IDM, in its lane, blind to the ego car."""
+
+from __future__ import annotations
+
+import numpy as np
+from highway_env.road.road import LaneIndex, Road
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
+
+from trainer.scenarios.geometry import Rectangle
+
+
+class TrafficVehicle(IDMVehicle):
+    """An aggressive driver: keeps its lane, follows its leader closely, yields to nobody.
+
+    Only the longitudinal half of ``IDMVehicle`` is used: a car in a straight lane needs no lane
+    choice, and its leader never changes. That takes the neighbour search, most of the cost of a
+    step, out of the loop.
+    """
+
+    DISTANCE_WANTED = 7.0
+    """Desired distance to the leader at rest, centre to centre, m."""
+    TIME_WANTED = 0.8
+    """Desired time gap, s."""
+
+    def __init__(
+        self,
+        road: Road,
+        lane_index: LaneIndex,
+        position_m: float,
+        speed_mps: float,
+        leader: Vehicle | None,
+    ) -> None:
+        lane = road.network.get_lane(lane_index)
+        heading = lane.heading_at(position_m)
+        super().__init__(
+            road,
+            lane.position(position_m, 0.0),
+            heading=heading,
+            speed=speed_mps,
+            target_lane_index=lane_index,
+            target_speed=speed_mps,
+            enable_lane_change=False,
+        )
+        self.lane, self.lane_index = lane, lane_index
+        self.leader = leader
+
+    def act(self, action: dict | str | None = None) -> None:
+        """Choose the acceleration by the intelligent driver model; the wheels stay straight."""
+        acceleration = self.acceleration(ego_vehicle=self, front_vehicle=self.leader)
+        acceleration = float(np.clip(acceleration, -self.ACC_MAX, self.ACC_MAX))
+        Vehicle.act(self, {"steering": 0.0, "acceleration": acceleration})
+
+    def on_state_update(self) -> None:
+        """Keep the lane: nothing to look up."""
+
+    @property
+    def footprint(self) -> Rectangle:
+        """The car's rectangle on the ground."""
+        x, y = self.position
+        return Rectangle(float(x), float(y), float(self.heading), self.LENGTH, self.WIDTH)
+
+
+def queue(
+    road: Road,
+    lane_index: LaneIndex,
+    positions_m: list[float],
+    speeds_mps: list[float],
+) -> list[TrafficVehicle]:
+    """Cars in one lane, the first leading; each follows the one before it.
+
+    Args:
+        road: the road they drive on (they are added to ``road.vehicles``).
+        lane_index: their lane.
+        positions_m: distances along the lane, falling.
+        speeds_mps: initial and desired speed of each.
+    """
+    cars: list[TrafficVehicle] = []
+    for position_m, speed_mps in zip(positions_m, speeds_mps, strict=True):
+        leader = cars[-1] if cars else None
+        cars.append(TrafficVehicle(road, lane_index, position_m, speed_mps, leader))
+    road.vehicles.extend(cars)
+    return cars

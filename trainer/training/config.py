@@ -1,0 +1,43 @@
+"""What a training run is: everything that decides its result."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from trainer.learner.config import LearnerConfig
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """A run's settings; the same settings on the same machine give the same weights."""
+
+    scenario: str = "left_turn"
+    algorithm: str = "phil_td3"
+    seed: int = 0
+    episodes: int = 400
+    """Episodes to train (table A5: at most 400)."""
+    human: str = "expert"
+    """Who guides: the word expert, or a human model's directory."""
+    guided_share: int = 1
+    """The human watches one episode in this many. (The authors' code: 3 in the left turn.)"""
+    penalise_stuck: bool = False
+    """Whether taking over from a car that only waits too long is penalised, too. A stuck car
+    looks like one that rightly waits, so the penalty teaches to fear waiting."""
+    evaluate_every: int = 20
+    """Episodes between two evaluations on the validation seeds; 0: never."""
+    evaluation_runs: int = 20
+    """Episodes of such an evaluation."""
+    checkpoint_every: int = 10
+    """Episodes between two checkpoints."""
+    device: str = "cpu"
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> RunConfig:
+        """The inverse of ``as_dict``."""
+        return RunConfig(**{**values, "learner": LearnerConfig(**values["learner"])})

@@ -1,0 +1,89 @@
+"""A run's metrics: one row an episode, to CSV and to TensorBoard."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+from torch.utils.tensorboard import SummaryWriter
+
+from edge_runtime.files import write_atomic
+
+METRICS_FILE = "metrics.csv"
+
+
+@dataclass
+class EpisodeMetrics:
+    """One training episode; a mean over its steps or updates where not said otherwise."""
+
+    episode: int
+    total_steps: int
+    """Environment steps since the run began."""
+    steps: int
+    episode_return: float
+    """Sum of the rewards, without the shaping of eq. 17."""
+    distance_m: float
+    """Surviving distance."""
+    outcome: str
+    interventions: int
+    human_steps: int
+    exploration_std: float
+    critic_loss: float
+    policy_loss: float
+    cloning_loss: float
+    value: float
+    """Mean Q_1 of the batches."""
+    policy_priority: float
+    """Mean priority of the policy's transitions at the episode's end."""
+    human_priority: float
+    environment_s: float
+    """Time spent in the environment and with the human."""
+    acting_s: float
+    learning_s: float
+    validation_success: float
+    """Success rate on the validation seeds (nan where the episode ended without one)."""
+    validation_distance_m: float
+
+
+NAMES = [f.name for f in fields(EpisodeMetrics)]
+
+
+class MetricsWriter:
+    """Appends rows; a run that is resumed drops the rows after its checkpoint first."""
+
+    def __init__(self, run_dir: Path, from_episode: int = 0) -> None:
+        self.path = run_dir / METRICS_FILE
+        kept = [row for row in read_metrics(run_dir) if int(row["episode"]) < from_episode]
+        text = io.StringIO()
+        writer = csv.DictWriter(text, NAMES)
+        writer.writeheader()
+        writer.writerows(kept)
+        write_atomic(str(self.path), text.getvalue().encode())
+        self._file = self.path.open("a", newline="")
+        self._csv = csv.DictWriter(self._file, NAMES)
+        self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=from_episode)
+
+    def add(self, metrics: EpisodeMetrics) -> None:
+        """Write one episode's row."""
+        row = asdict(metrics)
+        self._csv.writerow(row)
+        self._file.flush()
+        for name, value in row.items():
+            if isinstance(value, (int, float)) and value == value:
+                self._board.add_scalar(name, value, metrics.episode)
+
+    def close(self) -> None:
+        """Flush and close both."""
+        self._file.close()
+        self._board.close()
+
+
+def read_metrics(run_dir: Path) -> list[dict[str, str]]:
+    """The rows of a run; empty where it has none."""
+    path = run_dir / METRICS_FILE
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))

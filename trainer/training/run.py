@@ -1,0 +1,281 @@
+"""One training run: algorithm 1 around an environment, a human and a learner."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_runtime.episode_report import GOAL
+from edge_runtime.files import write_json
+from trainer import seeds
+from trainer.drivers import (
+    BEST_FILE,
+    CHECKPOINT_FILE,
+    EXPERTS,
+    TRIGGERS,
+    NetworkDriver,
+    load_driver,
+    make_environment,
+)
+from trainer.evaluation import drive_episodes
+from trainer.files import load_torch, save_torch
+from trainer.human.guide import HumanGuide, Intervention
+from trainer.learner import equations
+from trainer.learner.algorithms import ALGORITHMS
+from trainer.learner.replay import ReplayBuffer
+from trainer.learner.td3 import Losses, TD3Learner
+from trainer.training.config import RunConfig
+from trainer.training.metrics import EpisodeMetrics, MetricsWriter
+
+CONFIG_FILE = "config.json"
+
+
+@dataclass
+class _Tally:
+    """What an episode adds up while it is driven."""
+
+    rewards: float = 0.0
+    interventions: int = 0
+    human_steps: int = 0
+    steps: int = 0
+    environment_s: float = 0.0
+    acting_s: float = 0.0
+    learning_s: float = 0.0
+    losses: list[Losses] = field(default_factory=list)
+
+    def mean_losses(self) -> NDArray[np.float64]:
+        """Critic, policy and cloning loss and value, averaged; nan without an update."""
+        if not self.losses:
+            return np.full(4, np.nan)
+        return np.mean([losses[:4] for losses in self.losses], axis=0)
+
+
+class TrainingRun:
+    """Trains for some episodes and keeps everything in a directory.
+
+    Args:
+        config: what to train.
+        run_dir: where config, metrics, checkpoint and the best actor go.
+        resume: go on from the checkpoint in ``run_dir``.
+    """
+
+    def __init__(self, config: RunConfig, run_dir: Path, resume: bool = False) -> None:
+        self.config, self.run_dir = config, run_dir
+        self.algorithm = ALGORITHMS[config.algorithm]
+        self.env = make_environment(config.scenario)
+        self.validation_env = make_environment(config.scenario)
+        action_size = self.env.action_space.shape[0]
+        self.learner = TD3Learner(
+            config.learner, self.algorithm, config.seed, action_size, config.device
+        )
+        self.replay = ReplayBuffer(
+            config.learner.replay_capacity, action_size, config.learner.alpha
+        )
+        self.guide = self._make_guide()
+        self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
+        self.drawing = seeds.stream(config.seed, seeds.REPLAY)
+        self.episode = 0
+        self.best_validation = (-1.0, -1.0)
+        if resume:
+            self._load()
+        write_json(str(run_dir / CONFIG_FILE), config.as_dict())
+
+    def train(
+        self,
+        on_episode: Callable[[EpisodeMetrics], None] = lambda metrics: None,
+        deadline_s: float | None = None,
+    ) -> None:
+        """Train until the configured number of episodes, or ``time.monotonic() > deadline_s``."""
+        metrics_writer = MetricsWriter(self.run_dir, self.episode)
+        try:
+            while self.episode < self.config.episodes:
+                metrics = self._episode()
+                self.episode += 1
+                last = self.episode == self.config.episodes
+                late = deadline_s is not None and time.monotonic() > deadline_s
+                self._validate(metrics, at_end=last or late)
+                metrics_writer.add(metrics)
+                if last or late or self.episode % self.config.checkpoint_every == 0:
+                    self.save()
+                on_episode(metrics)
+                if late:
+                    break
+        finally:
+            metrics_writer.close()
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        save_torch(
+            self.run_dir / CHECKPOINT_FILE,
+            {
+                **self._label(),
+                "learner": self.learner.state_dict(),
+                "replay": _as_tensors(self.replay.state_dict()),
+                "exploration": self.exploration.bit_generator.state,
+                "drawing": self.drawing.bit_generator.state,
+                "best_validation": self.best_validation,
+            },
+        )
+
+    def _load(self) -> None:
+        state = load_torch(self.run_dir / CHECKPOINT_FILE)
+        self.episode = state["episode"]
+        self.learner.load_state_dict(state["learner"])
+        self.replay.load_state_dict(_as_arrays(state["replay"]))
+        self.exploration.bit_generator.state = state["exploration"]
+        self.drawing.bit_generator.state = state["drawing"]
+        self.best_validation = tuple(state["best_validation"])
+
+    def _make_guide(self) -> HumanGuide | None:
+        if not self.algorithm.guided:
+            return None
+        expert = EXPERTS[self.config.scenario](self.env)
+        trigger = TRIGGERS[self.config.scenario](expert)
+        driver, _ = load_driver(self.config.human, self.env)
+        return HumanGuide(driver, trigger)
+
+    def _episode(self) -> EpisodeMetrics:
+        config, tally = self.config, _Tally()
+        seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
+        observation, info = self.env.reset(seed=seed)
+        self.replay.start_episode(observation)
+        guided = self.guide is not None and self.episode % config.guided_share == 0
+        if self.guide is not None:
+            self.guide.reset()
+        ended = False
+        while not ended:
+            observation, ended, info = self._step(observation, guided, tally)
+        self.learner.decay_learning_rates()
+        return self._summary(tally, info)
+
+    def _step(
+        self, observation: NDArray[np.uint8], guided: bool, tally: _Tally
+    ) -> tuple[NDArray[np.uint8], bool, dict[str, Any]]:
+        """One control period: act, let the human take over, store, learn."""
+        began_s = time.perf_counter()
+        policy_action = self._explore(self.learner.act(observation))
+        acted_s = time.perf_counter()
+        intervention = None
+        if guided and self.guide is not None:
+            intervention = self.guide.watch(observation, policy_action)
+        human_action = None if intervention is None else intervention.action
+        action = equations.masked_action(policy_action, human_action)
+        next_observation, reward, terminated, truncated, info = self.env.step(action)
+        shaped = self._shape(reward, intervention)
+        self.replay.add(action, shaped, next_observation, terminated, intervention is not None)
+        moved_s = time.perf_counter()
+        if self.replay.added >= self.config.learner.warmup_steps:
+            tally.losses.append(self._learn())
+        tally.steps += 1
+        tally.rewards += reward
+        tally.human_steps += intervention is not None
+        tally.interventions += intervention is not None and intervention.first
+        tally.acting_s += acted_s - began_s
+        tally.environment_s += moved_s - acted_s
+        tally.learning_s += time.perf_counter() - moved_s
+        return next_observation, terminated or truncated, info
+
+    def _explore(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        noise = equations.exploration_noise(
+            self._exploration_std(),
+            self.config.learner.exploration_bound,
+            len(action),
+            self.exploration,
+        )
+        return np.clip(action + noise, -1.0, 1.0)
+
+    def _exploration_std(self) -> float:
+        c = self.config.learner
+        return max(c.exploration_final, c.exploration_initial * c.exploration_decay**self.episode)
+
+    def _shape(self, reward: float, intervention: Intervention | None) -> float:
+        if intervention is None or not self.algorithm.penalty:
+            return reward
+        if intervention.reason == "stuck" and not self.config.penalise_stuck:
+            return reward
+        penalty = self.config.learner.intervention_penalty
+        return equations.shaped_reward(reward, penalty, True, not intervention.first)
+
+    def _learn(self) -> Losses:
+        c = self.config.learner
+        batch = self.replay.sample(c.batch_size, self.drawing)
+        beta = (
+            c.beta * (1.0 - self.episode / self.config.episodes) if c.importance_sampling else 0.0
+        )
+        losses = self.learner.update(batch, beta)
+        self.replay.update_priorities(batch.indices, losses.priorities)
+        return losses
+
+    def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
+        """Evaluate on the validation seeds where due, and keep the best actor."""
+        every = self.config.evaluate_every
+        if not every or not (at_end or self.episode % every == 0):
+            return
+        chosen = [
+            seeds.episode_seed(self.config.seed, seeds.VALIDATION, run)
+            for run in range(self.config.evaluation_runs)
+        ]
+        results = drive_episodes(self.validation_env, self._driver(), chosen)
+        success = float(np.mean([result.outcome == GOAL for result in results]))
+        distance_m = float(np.mean([result.distance_m for result in results]))
+        metrics.validation_success, metrics.validation_distance_m = success, distance_m
+        reward = float(np.mean([result.reward for result in results]))
+        if (success, reward) >= self.best_validation:
+            self.best_validation = (success, reward)
+            state = {**self._label(), "actor": self.learner.actor.state_dict()}
+            save_torch(self.run_dir / BEST_FILE, state)
+
+    def _driver(self) -> NetworkDriver:
+        return NetworkDriver(self.learner.actor)
+
+    def _label(self) -> dict[str, Any]:
+        c = self.config
+        return {
+            "scenario": c.scenario,
+            "algorithm": c.algorithm,
+            "seed": c.seed,
+            "episode": self.episode,
+        }
+
+    def _summary(self, tally: _Tally, info: dict[str, Any]) -> EpisodeMetrics:
+        critic, policy, cloning, value = map(float, tally.mean_losses())
+        policy_priority, human_priority = self.replay.mean_priorities()
+        return EpisodeMetrics(
+            episode=self.episode,
+            total_steps=self.replay.added,
+            steps=tally.steps,
+            episode_return=float(tally.rewards),
+            distance_m=float(info["distance_m"]),
+            outcome=info["outcome"],
+            interventions=tally.interventions,
+            human_steps=tally.human_steps,
+            exploration_std=self._exploration_std(),
+            critic_loss=critic,
+            policy_loss=policy,
+            cloning_loss=cloning,
+            value=value,
+            policy_priority=policy_priority,
+            human_priority=human_priority,
+            environment_s=tally.environment_s,
+            acting_s=tally.acting_s,
+            learning_s=tally.learning_s,
+            validation_success=float("nan"),
+            validation_distance_m=float("nan"),
+        )
+
+
+def _as_tensors(state: dict[str, Any]) -> dict[str, Any]:
+    """Arrays as tensors: what a checkpoint may hold without arbitrary unpickling."""
+    import torch
+
+    return {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in state.items()}
+
+
+def _as_arrays(state: dict[str, Any]) -> dict[str, Any]:
+    return {k: v.numpy() if hasattr(v, "numpy") else v for k, v in state.items()}
