@@ -30,7 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed", type=not_negative, default=0, help="of the first episode; the next has one more"
     )
-    parser.add_argument("--out", metavar="R.json", help="also write the report to this file")
+    parser.add_argument(
+        "--out",
+        metavar="R.json",
+        help="write the report, with each episode, to this file instead of printing it",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -50,8 +54,14 @@ def run(arguments: argparse.Namespace) -> int:
 
         results = drive_episodes(env, driver, seeds, arguments.condition, on_episode)
     report = summarise(results, arguments.scenario, arguments.condition, policy_id, arguments.seed)
-    print(json.dumps(report, indent=2))
-    if arguments.out:
-        detail = [result.as_dict() for result in results]
-        write_json_out(arguments.out, {**report, "per_episode": detail})
+    if not arguments.out:
+        print(json.dumps(report, indent=2))
+        return 0
+    detail = [result.as_dict() for result in results]
+    write_json_out(arguments.out, {**report, "per_episode": detail})
+    distance_m = report["surviving_distance_m"]
+    print(
+        f"{arguments.runs} episodes: success {report['success_rate']:.0%}, surviving distance "
+        f"{distance_m['mean']:.2f} ± {distance_m['std']:.2f} m: {arguments.out}"
+    )
     return 0

@@ -146,7 +146,8 @@ class TD3Learner:
             "actor_optimiser",
             "critic_optimiser",
         ):
-            getattr(self, name).load_state_dict(state[name])
+            # Optimisers keep the very tensors they are given.
+            getattr(self, name).load_state_dict(copy.deepcopy(state[name]))
         self.noise.set_state(state["noise"])
         self.updates = state["updates"]
 

@@ -7,7 +7,7 @@ road crosses the path from the left and never yields.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -76,7 +76,6 @@ class LeftTurnConfig:
     metres_per_pixel: float = 0.5
     """The picture shows 40 m x 22.5 m of ground and does not move: 30 m of the main road to the
     left, so that a car at 6 m/s is seen for longer than the turn takes."""
-    extras: dict[str, Any] = field(default_factory=dict)
 
 
 class LeftTurnEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -181,10 +180,13 @@ class LeftTurnEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _spawn_traffic(self) -> list[TrafficVehicle]:
         c, random = self.config, self.np_random
         crossing_m = LANE_REACH_M + 0.5 * c.lane_width_m
-        positions = [crossing_m - float(random.uniform(*c.first_car_m))]
-        for _ in range(c.traffic_cars - 1):
-            gap_m = c.long_gap_m if random.random() < c.long_gap_share else c.short_gap_m
-            positions.append(positions[-1] - float(random.uniform(*gap_m)))
+        positions: list[float] = []
+        for _ in range(c.traffic_cars):
+            if positions:
+                gap_m = c.long_gap_m if random.random() < c.long_gap_share else c.short_gap_m
+                positions.append(positions[-1] - float(random.uniform(*gap_m)))
+            else:
+                positions.append(crossing_m - float(random.uniform(*c.first_car_m)))
         speeds = [float(v) for v in random.uniform(*c.traffic_speed_mps, size=c.traffic_cars)]
         return queue(self.road, ("west", "east", 0), positions, speeds)
 

@@ -1,0 +1,52 @@
+"""The operator beside an unattended drive: re-arms the vehicle after a safe stop.
+
+A runtime with a vehicle attached never drives again by itself. In the demo nobody sits there, so
+this stands in for the person and says each time what it does.
+"""
+
+from __future__ import annotations
+
+import threading
+from types import TracebackType
+
+from edge_runtime.errors import UserError
+from edge_runtime.operator_commands import ask
+
+POLL_INTERVAL_S = 0.5
+
+
+class Operator:
+    """Watches one vehicle's status for the length of a ``with`` block and re-arms it."""
+
+    def __init__(self, endpoint: str, vehicle_id: str) -> None:
+        self.endpoint, self.vehicle_id = endpoint, vehicle_id
+        self.rearms = 0
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="operator")
+
+    def __enter__(self) -> Operator:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._end.wait(POLL_INTERVAL_S):
+            try:
+                status = ask(self.endpoint, self.vehicle_id, "status")
+                if status["needs_rearm"] and status["mode"] == "safe_stop":
+                    reply = ask(self.endpoint, self.vehicle_id, "rearm")
+                    if reply["accepted"]:
+                        self.rearms += 1
+                        reason = status["reason"]
+                        print(f"operator: re-armed {self.vehicle_id} after {reason}", flush=True)
+            except UserError:
+                # Simulator or runtime not up yet, or already gone: nothing to re-arm.
+                continue

@@ -1,0 +1,223 @@
+// The networks' trunk on the CPU: uint8 frames to 1,792 features, and the gradients of its weights.
+//
+//   frames [n, 45, 80] -> 6x6 convolution,  6 filters -> 2x2 max pooling, ReLU -> [6, 20, 37]
+//                      -> 6x6 convolution, 16 filters -> 2x2 max pooling, ReLU -> [16, 7, 16]
+//
+// Forward. Pooling needs the four outputs of a 2x2 block together, and neighbours share inputs. In
+// one dimension: split the filter h into its even taps h0 and odd taps h1, and let x0, x1 and x2
+// be the inputs from 2p, 2p + 1 and 2p + 2 on, every second one. Three convolutions replace four:
+//
+//   y(2p)     = h0*x0 + h1*x1 = m0 + m1      m0 = h0*(x0 - x1)
+//   y(2p + 1) = h0*x1 + h1*x2 = m1 + m2      m1 = (h0 + h1)*x1      m2 = h1*(x2 - x1)
+//
+// In two dimensions that is 9 convolutions of 3x3 taps in place of 16, so 44% of the
+// multiplications are saved, and equal inputs still give exactly equal outputs. The 9 pictures to
+// convolve are called planes below, the 9 results products.
+//
+// Backward. A pooled output passes its gradient to one position of four, the winner, and to none
+// where ReLU is off. What remains is a list of spikes: a gradient, and where the winner's window
+// starts. The gradients of weights and inputs are sums over these lists.
+//
+// Images are independent tasks; gradients are summed in chunks of fixed size and then in order, so
+// that no result depends on the number of threads.
+
+#include <algorithm>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+namespace {
+
+// ---- vectors and sizes --------------------------------------------------------------------------
+
+#if defined(__AVX512F__)
+constexpr int LANES = 16, REGISTERS = 32;
+#elif defined(__AVX__)
+constexpr int LANES = 8, REGISTERS = 16;
+#elif defined(__aarch64__)
+constexpr int LANES = 4, REGISTERS = 32;
+#else
+constexpr int LANES = 4, REGISTERS = 16;
+#endif
+typedef float Vector __attribute__((vector_size(4 * LANES)));
+typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
+typedef uint8_t Bytes __attribute__((vector_size(LANES)));
+// The same at an address that need not be aligned.
+typedef float LooseVector __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+typedef uint8_t LooseBytes __attribute__((vector_size(LANES), aligned(1), may_alias));
+
+inline Vector load(const float* from) { return *reinterpret_cast<const LooseVector*>(from); }
+inline void store(float* to, Vector value) { *reinterpret_cast<LooseVector*>(to) = value; }
+constexpr int vectors(int floats) { return (floats + LANES - 1) / LANES; }
+
+constexpr int SIDE = 6;                         // of a filter
+constexpr int PRODUCTS = 9, TAPS = 9;           // see above
+constexpr int WIDE = REGISTERS / 8;             // vectors of positions computed together
+constexpr uint8_t OFF = 4;                      // no winner (they are 0..3): ReLU is off
+
+// A layer: its input, and the pooled outputs that are used. These are numbered along rows of PITCH
+// and computed up to SIZE, so that no loop has a remainder; what lies between is never read.
+template <int CHANNELS_, int IMAGE_PITCH_, int IMAGE_SIZE_, int FILTERS_, int GROUP_, int ROWS_,
+          int COLUMNS_>
+struct Layer {
+    static constexpr int CHANNELS = CHANNELS_, IMAGE_PITCH = IMAGE_PITCH_, IMAGE_SIZE = IMAGE_SIZE_;
+    static constexpr int FILTERS = FILTERS_, GROUP = GROUP_;  // GROUP filters computed together
+    static constexpr int ROWS = ROWS_, COLUMNS = COLUMNS_, PITCH = COLUMNS + 2;
+    static constexpr int SIZE = (ROWS * PITCH + 63) / 64 * 64, OUTPUTS = FILTERS * SIZE;
+    static constexpr int PLANE = SIZE + 2 * PITCH + 2, PLANES = PRODUCTS * CHANNELS * PLANE;
+    static constexpr int WINDOW = SIDE * CHANNELS;  // a row of a window, channels innermost
+    static constexpr int PADDED_WINDOW = vectors(WINDOW) * LANES;
+};
+// The second layer uses 19 of the first one's 20 rows.
+template <int FRAMES>
+using First = Layer<FRAMES, 80, 45 * 80, 6, 6, 19, 37>;
+using Second = Layer<6, First<1>::PITCH, First<1>::SIZE, 16, 4, 7, 16>;
+constexpr int POOLED = Second::ROWS * Second::COLUMNS, FEATURES = Second::FILTERS * POOLED;
+
+// ---- forward ------------------------------------------------------------------------------------
+
+// A channel's 9 planes: x0 - x1, x1 and x2 - x1 down and right.
+template <class L, typename Pixel>
+void make_planes(const Pixel* image, float* planes) {
+    constexpr int STRIDE = L::CHANNELS * L::PLANE, WIDTH = 2 * L::PITCH + 1;
+    for (int row = 0; row < L::ROWS + 2; ++row) {
+        const Pixel* x = image + 2 * row * L::IMAGE_PITCH;
+        float down[3][WIDTH];
+        for (int i = 0; i < WIDTH; ++i) {
+            const float x1 = x[i + L::IMAGE_PITCH];
+            down[0][i] = x[i] - x1, down[1][i] = x1, down[2][i] = x[i + 2 * L::IMAGE_PITCH] - x1;
+        }
+        for (int part = 0; part < 3; ++part) {
+            float* out = planes + 3 * part * STRIDE + row * L::PITCH;
+            for (int i = 0; i < L::PITCH; ++i) {
+                const float x1 = down[part][2 * i + 1];
+                out[i] = down[part][2 * i] - x1;
+                out[i + STRIDE] = x1;
+                out[i + 2 * STRIDE] = down[part][2 * i + 2] - x1;
+            }
+        }
+    }
+}
+
+// Weights [filter][6][6][channel] to [product][channel][tap][filter]: h0, h0 + h1 and h1 down and
+// right.
+template <class L>
+std::vector<float> split_weights(const float* weights, float scale) {
+    std::vector<float> split(PRODUCTS * L::CHANNELS * TAPS * L::FILTERS);
+    for (int filter = 0; filter < L::FILTERS; ++filter)
+        for (int channel = 0; channel < L::CHANNELS; ++channel)
+            for (int tap = 0; tap < TAPS; ++tap) {
+                const int corner = tap / 3 * 2 * SIDE + tap % 3 * 2;
+                float parts[3][3];
+                for (int down = 0; down < 3; down += 2) {
+                    const float* at = weights + channel +
+                        (filter * SIDE * SIDE + corner + down / 2 * SIDE) * L::CHANNELS;
+                    parts[down][0] = at[0] * scale, parts[down][2] = at[L::CHANNELS] * scale;
+                    parts[down][1] = parts[down][0] + parts[down][2];
+                }
+                for (int right = 0; right < 3; ++right)
+                    parts[1][right] = parts[0][right] + parts[2][right];
+                for (int product = 0; product < PRODUCTS; ++product)
+                    split[((product * L::CHANNELS + channel) * TAPS + tap) * L::FILTERS + filter] =
+                        parts[product / 3][product % 3];
+            }
+    return split;
+}
+
+// Pools a 2x2 block from its products, which lie ``stride`` apart. As in torch, the first of equals
+// wins.
+inline void pool(const float* products, int stride, float bias, float* output, uint8_t* winner) {
+    Vector down[2][3];
+    for (int right = 0; right < 3; ++right) {
+        const Vector middle = load(products + (3 + right) * stride);
+        down[0][right] = load(products + right * stride) + middle;
+        down[1][right] = middle + load(products + (6 + right) * stride);
+    }
+    Vector best = down[0][0] + down[0][1];
+    Integers place = {};
+    for (int next = 1; next < 4; ++next) {
+        const Vector value = down[next / 2][next % 2] + down[next / 2][next % 2 + 1];
+        const Integers wins = value > best;
+        best = wins ? value : best;
+        place = wins ? Integers{} + next : place;
+    }
+    best += bias;
+    const Integers on = best > 0.0f;
+    store(output, best < 0.0f ? Vector{} : best);  // not the mask: NaN should stay NaN
+    *reinterpret_cast<LooseBytes*>(winner) =
+        __builtin_convertvector(on ? place : Integers{} + OFF, Bytes);
+}
+
+// One product at WIDE vectors of positions for GROUP filters, with all sums in registers.
+template <class L>
+void multiply(const float* planes, const float* weights, float sums_out[L::GROUP][WIDE * LANES]) {
+    Vector sums[L::GROUP][WIDE] = {};
+    for (int channel = 0; channel < L::CHANNELS; ++channel, planes += L::PLANE)
+        for (int tap = 0; tap < TAPS; ++tap, weights += L::FILTERS)
+            for (int filter = 0; filter < L::GROUP; ++filter)
+                for (int i = 0; i < WIDE; ++i)
+                    sums[filter][i] +=
+                        weights[filter] * load(planes + tap / 3 * L::PITCH + tap % 3 + i * LANES);
+    for (int filter = 0; filter < L::GROUP; ++filter)
+        for (int i = 0; i < WIDE; ++i) store(&sums_out[filter][i * LANES], sums[filter][i]);
+}
+
+// Planes [product][channel][PLANE] to outputs and winners [filter][SIZE].
+template <class L>
+void convolve(const float* planes, const float* weights, const float* bias, float* outputs,
+              uint8_t* winners) {
+    constexpr int TILE = WIDE * LANES;
+    float products[PRODUCTS][L::GROUP][TILE];
+    for (int tile = 0; tile < L::SIZE; tile += TILE)
+        for (int group = 0; group < L::FILTERS; group += L::GROUP) {
+            for (int product = 0; product < PRODUCTS; ++product)
+                multiply<L>(planes + product * L::CHANNELS * L::PLANE + tile,
+                            weights + product * L::CHANNELS * TAPS * L::FILTERS + group,
+                            products[product]);
+            for (int filter = 0; filter < L::GROUP; ++filter)
+                for (int i = 0; i < TILE; i += LANES) {
+                    const int at = (group + filter) * L::SIZE + tile + i;
+                    pool(&products[0][filter][i], L::GROUP * TILE, bias[group + filter],
+                         outputs + at, winners + at);
+                }
+        }
+}
+
+// What a thread needs for one image. It starts as zeros: unused positions may hold anything, but
+// reading them should not meet slow denormal numbers.
+template <int FRAMES>
+struct ForwardScratch {
+    float planes1[First<FRAMES>::PLANES], planes2[Second::PLANES];
+    float hidden[First<FRAMES>::OUTPUTS], outputs[Second::OUTPUTS];
+    uint8_t winners1[First<FRAMES>::OUTPUTS], winners2[Second::OUTPUTS];
+};
+
+template <int FRAMES>
+void forward(const uint8_t* frames, int64_t image_stride, int64_t images, const float* weights1,
+             const float* bias1, const float* weights2, const float* bias2, float* features,
+             float* hidden, uint8_t* winners1, uint8_t* winners2, int threads) {
+    using First = First<FRAMES>;
+    const auto split1 = split_weights<First>(weights1, 1.0f / 255.0f);
+    const auto split2 = split_weights<Second>(weights2, 1.0f);
+#pragma omp parallel num_threads(threads) if (images > 1)
+    {
+        const auto scratch = std::make_unique<ForwardScratch<FRAMES>>();
+#pragma omp for schedule(dynamic)
+        for (int64_t image = 0; image < images; ++image) {
+            float* between = hidden ? hidden + image * First::OUTPUTS : scratch->hidden;
+            uint8_t* won1 = hidden ? winners1 + image * First::OUTPUTS : scratch->winners1;
+            uint8_t* won2 = hidden ? winners2 + image * Second::OUTPUTS : scratch->winners2;
+            for (int i = 0; i < FRAMES; ++i)
+                make_planes<First>(frames + image * image_stride + i * First::IMAGE_SIZE,
+                                   scratch->planes1 + i * First::PLANE);
+            convolve<First>(scratch->planes1, split1.data(), bias1, between, won1);
+            for (int i = 0; i < Second::CHANNELS; ++i)
+                make_planes<Second>(between + i * First::SIZE, scratch->planes2 + i * Second::PLANE);
+            convolve<Second>(scratch->planes2, split2.data(), bias2, scratch->outputs, won2);
+            for (int row = 0; row < Second::FILTERS * Second::ROWS; ++row)
+                std::copy_n(scratch->outputs + row / Second::ROWS * Second::SIZE +
+                                row % Second::ROWS * Second::PITCH,
+                            Second::COLUMNS, features + image * FEATURES + row * Second::COLUMNS);
+        }
+    }
+}

@@ -1,0 +1,147 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from trainer.learner.replay import ReplayBuffer
+
+
+def frame(value: int) -> np.ndarray:
+    """A picture that carries a number, so that frames can be told apart."""
+    picture = np.zeros((45, 80), np.uint8)
+    picture[0, 0], picture[0, 1] = value % 256, value // 256
+    return picture
+
+
+def number(picture: np.ndarray) -> int:
+    return int(picture[0, 0]) + 256 * int(picture[0, 1])
+
+
+class Source:
+    """Feeds episodes of numbered frames; remembers what each transition was."""
+
+    def __init__(self, buffer: ReplayBuffer) -> None:
+        self.buffer, self.next, self.stored = buffer, 0, []
+
+    def episode(self, steps: int, human: bool = False) -> None:
+        last = frame(self.next)
+        self.next += 1
+        older = last
+        self.buffer.start_episode(np.stack([last, last]))
+        for step in range(steps):
+            new = frame(self.next)
+            self.next += 1
+            self.buffer.add(
+                np.array([step / 100], np.float32),
+                float(step),
+                np.stack([last, new]),
+                terminal=step == steps - 1,
+                human=human,
+            )
+            self.stored.append((number(older), number(last), number(new), step, step == steps - 1))
+            older, last = last, new
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(1, 30), min_size=1, max_size=12), st.integers(8, 60))
+def test_a_batch_holds_only_what_was_stored_and_not_yet_forgotten(episodes, capacity):
+    buffer = ReplayBuffer(capacity)
+    source = Source(buffer)
+    for steps in episodes:
+        source.episode(steps)
+    assert len(buffer) <= capacity
+    if len(buffer) == 0:
+        return
+    batch = buffer.sample(64, np.random.default_rng(0))
+    alive = source.stored[-len(buffer) :]
+    for row in range(64):
+        older, last = (number(f) for f in batch.frames[row])
+        last_again, new = (number(f) for f in batch.next_frames[row])
+        assert last == last_again
+        step = round(float(batch.actions[row, 0]) * 100)
+        assert (older, last, new, step, bool(batch.terminals[row])) in alive
+        assert batch.rewards[row] == step
+
+
+def test_a_full_ring_keeps_the_newest():
+    buffer = ReplayBuffer(50)
+    source = Source(buffer)
+    for _ in range(5):
+        source.episode(25)
+    assert len(buffer) == 50
+    batch = buffer.sample(500, np.random.default_rng(0))
+    assert {number(f) for f in batch.next_frames[:, 1]} == {
+        new for *_, new, _, _ in source.stored[-50:]
+    }
+
+
+def test_many_short_episodes_forget_early_instead_of_mixing_pictures():
+    buffer = ReplayBuffer(40)
+    source = Source(buffer)
+    for _ in range(60):
+        source.episode(1)
+    assert 15 <= len(buffer) <= 25
+    batch = buffer.sample(64, np.random.default_rng(0))
+    assert {number(f[1]) for f in batch.next_frames} <= {s[2] for s in source.stored[-25:]}
+
+
+def test_new_transitions_get_the_highest_priority():
+    buffer = ReplayBuffer(10)
+    source = Source(buffer)
+    source.episode(3)
+    buffer.update_priorities(np.array([0, 1, 2]), np.array([0.1, 7.0, 0.2]))
+    source.episode(1)
+    probability = buffer.sample(1, np.random.default_rng(0)).probabilities
+    weights = np.array([0.1, 7.0, 0.2, 7.0]) ** 0.6
+    assert np.isclose(probability[0], weights / weights.sum()).any()
+    assert buffer._priorities[3] == 7.0
+
+
+def test_probabilities_follow_equation_20():
+    buffer = ReplayBuffer(10, alpha=0.5)
+    Source(buffer).episode(2)
+    buffer.update_priorities(np.array([0, 1]), np.array([1.0, 16.0]))
+    batch = buffer.sample(1000, np.random.default_rng(0))
+    # 1^0.5 : 16^0.5 = 1 : 4.
+    assert np.mean(batch.indices == 1) == pytest.approx(0.8, abs=0.01)
+    assert set(np.round(batch.probabilities, 12)) == {0.2, 0.8}
+
+
+def test_a_priority_that_is_no_number_is_refused_before_it_spoils_the_tree():
+    buffer = ReplayBuffer(10)
+    Source(buffer).episode(2)
+    for bad in (np.nan, np.inf, -1.0):
+        with pytest.raises(ValueError, match="finite"):
+            buffer.update_priorities(np.array([0]), np.array([bad]))
+    assert np.isfinite(buffer.sample(8, np.random.default_rng(0)).probabilities).all()
+
+
+def test_the_human_is_counted_and_its_priorities_kept_apart():
+    buffer = ReplayBuffer(100)
+    source = Source(buffer)
+    source.episode(4)
+    source.episode(6, human=True)
+    assert buffer.human_count == 6
+    buffer.update_priorities(np.arange(4), np.full(4, 2.0))
+    buffer.update_priorities(np.arange(4, 10), np.full(6, 3.0))
+    assert buffer.mean_priorities() == (2.0, 3.0)
+
+
+def test_a_restored_buffer_draws_the_same():
+    buffer = ReplayBuffer(30)
+    source = Source(buffer)
+    for _ in range(4):
+        source.episode(11)
+    buffer.update_priorities(np.arange(20), np.linspace(0.1, 5, 20))
+    copy = ReplayBuffer(30)
+    copy.load_state_dict(buffer.state_dict())
+    a, b = (which.sample(32, np.random.default_rng(3)) for which in (buffer, copy))
+    np.testing.assert_array_equal(a.indices, b.indices)
+    np.testing.assert_array_equal(a.frames, b.frames)
+    np.testing.assert_allclose(a.probabilities, b.probabilities)
+
+
+def test_a_hundred_thousand_transitions_fit_into_400_mb():
+    buffer = ReplayBuffer(100_000)
+    size = sum(value.nbytes for value in vars(buffer).values() if isinstance(value, np.ndarray))
+    assert size + buffer._tree._nodes.nbytes < 400e6

@@ -1,0 +1,208 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from trainer.learner import equations
+from trainer.learner.algorithms import ALGORITHMS, PHIL
+from trainer.learner.config import LearnerConfig
+from trainer.learner.networks import FEATURES, Actor, Critic, normalise
+from trainer.learner.replay import Batch
+from trainer.learner.td3 import TD3Learner
+
+SMALL = LearnerConfig(batch_size=12)
+
+
+def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:
+    random = np.random.default_rng(seed)
+    pictures = random.integers(0, 255, (size, 3, 45, 80)).astype(np.uint8)
+    return Batch(
+        indices=np.arange(size),
+        frames=pictures[:, :2],
+        actions=random.uniform(-1, 1, (size, 1)).astype(np.float32),
+        rewards=random.normal(size=size).astype(np.float32),
+        next_frames=pictures[:, 1:],
+        terminals=(random.random(size) < 0.2).astype(np.float32),
+        human=np.arange(size) < humans,
+        probabilities=np.full(size, 1 / size),
+    )
+
+
+def weights_of(learner: TD3Learner) -> dict[str, torch.Tensor]:
+    modules = {
+        "actor": learner.actor,
+        "critics": learner.critics,
+        "target_actor": learner.target_actor,
+        "target_critics": learner.target_critics,
+    }
+    return {
+        name: torch.cat([p.detach().flatten().clone() for p in module.parameters()])
+        for name, module in modules.items()
+    }
+
+
+def test_the_networks_are_those_of_tables_a2_to_a4():
+    assert FEATURES == 16 * 7 * 16
+    assert sum(p.numel() for p in Actor().parameters()) == (
+        (2 * 36 + 1) * 6 + (6 * 36 + 1) * 16 + 1793 * 256 + 257 * 128 + 129 * 64 + 65
+    )
+    difference = sum(p.numel() for p in Critic().parameters()) - sum(
+        p.numel() for p in Actor().parameters()
+    )
+    assert difference == 256
+    assert Actor(frames=1).trunk.conv1.weight.shape == (6, 1, 6, 6)
+
+
+def test_the_trunk_equals_convolution_relu_and_pooling_as_written_in_the_paper():
+    torch.manual_seed(0)
+    actor, frames = Actor(), torch.randint(0, 256, (3, 2, 45, 80), dtype=torch.uint8)
+    trunk = actor.trunk
+    hidden = frames.float() / 255
+    for layer in (trunk.conv1, trunk.conv2):
+        hidden = torch.nn.functional.conv2d(hidden, layer.weight, layer.bias)
+        hidden = torch.nn.functional.max_pool2d(torch.relu(hidden), 2)
+    torch.testing.assert_close(trunk(normalise(frames)), hidden.flatten(1))
+
+
+def test_an_update_is_the_papers_losses_and_plain_adam():
+    """One update against the same written out with autograd and a fresh optimiser."""
+    config = replace(SMALL, target_noise=0.0)
+    learner, batch = TD3Learner(config, PHIL, seed=1), make_batch()
+    frames, next_frames = (torch.from_numpy(x.copy()) for x in (batch.frames, batch.next_frames))
+    actions, human = torch.from_numpy(batch.actions), torch.from_numpy(batch.human)
+    with torch.no_grad():
+        next_actions = learner.target_actor(next_frames)
+        first, second = (q(next_frames, next_actions) for q in learner.target_critics.pair)
+        target = torch.from_numpy(batch.rewards) + 0.95 * (
+            1 - torch.from_numpy(batch.terminals)
+        ) * torch.minimum(first, second)
+    values = [critic(frames, actions) for critic in learner.critics.pair]
+    critic_loss = sum(((target - value) ** 2).mean() for value in values)
+    expected = learner.critics.state_dict()
+    gradients = torch.autograd.grad(critic_loss, list(learner.critics.parameters()))
+    policy = learner.actor(frames)
+    actor_loss = -learner.critics.first(frames, policy).mean() + 3.0 * (
+        ((policy - actions) ** 2)[human].mean()
+    )
+    actor_gradients = torch.autograd.grad(actor_loss, list(learner.actor.parameters()))
+    before = weights_of(learner)
+    with torch.no_grad():
+        critic = learner.target_critics.first
+        advantage = torch.exp(critic(frames, actions) - critic(frames, policy))
+    wanted_priorities = (target - values[0]).abs() + 1e-3 + advantage * human
+
+    losses = learner.update(batch)
+
+    assert losses.critic == pytest.approx(critic_loss.item(), rel=1e-5)
+    np.testing.assert_allclose(losses.priorities, wanted_priorities.detach(), rtol=1e-4)
+    after = weights_of(learner)
+    # Adam's first step is the learning rate against the gradient's sign, wherever it is not tiny.
+    for name, flat, rate in (
+        ("critics", torch.cat([g.flatten() for g in gradients]), 2e-4),
+        ("actor", torch.cat([g.flatten() for g in actor_gradients]), 5e-4),
+    ):
+        clear = flat.abs() > 1e-5
+        assert clear.float().mean() > 0.2
+        moved = (after[name] - before[name])[clear]
+        torch.testing.assert_close(moved, -rate * flat[clear].sign(), rtol=2e-2, atol=1e-6)
+    assert expected.keys() == learner.critics.state_dict().keys()
+
+
+def test_targets_follow_by_tau():
+    learner = TD3Learner(SMALL, PHIL, seed=0)
+    before = weights_of(learner)
+    learner.update(make_batch())
+    after = weights_of(learner)
+    for online, target in (("actor", "target_actor"), ("critics", "target_critics")):
+        wanted = before[target] + 1e-3 * (after[online] - before[target])
+        torch.testing.assert_close(after[target], wanted)
+
+
+def test_a_delayed_policy_waits_for_its_turn():
+    learner = TD3Learner(replace(SMALL, policy_delay=2), PHIL, seed=0)
+    before = weights_of(learner)
+    learner.update(make_batch())
+    between = weights_of(learner)
+    assert torch.equal(before["actor"], between["actor"])
+    assert torch.equal(before["target_critics"], between["target_critics"])
+    assert not torch.equal(before["critics"], between["critics"])
+    learner.update(make_batch())
+    assert not torch.equal(between["actor"], weights_of(learner)["actor"])
+
+
+def test_critic_gradients_do_not_leak_from_the_actors_loss():
+    """Cloning weight and policy loss must leave the critics' step alone."""
+    steps = []
+    for cloning_weight in (0.0, 100.0):
+        learner = TD3Learner(replace(SMALL, cloning_weight=cloning_weight), PHIL, seed=0)
+        learner.update(make_batch())
+        steps.append(weights_of(learner)["critics"])
+    assert torch.equal(*steps)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_updates_and_its_priorities_follow_its_row(name):
+    row = ALGORITHMS[name]
+    learner, batch = TD3Learner(SMALL, row, seed=0), make_batch()
+    losses = learner.update(batch)
+    assert np.isfinite(losses[:4]).all()
+    assert (losses.cloning > 0) == row.behaviour_cloning
+    td_only = TD3Learner(SMALL, ALGORITHMS["ia_td3"], seed=0).update(batch).priorities
+    human = batch.human
+    np.testing.assert_allclose(losses.priorities[~human], td_only[~human], rtol=1e-5)
+    if row.advantage_weight:
+        bare = row.human_td_weight * (td_only[human] - 1e-3) + 1e-3
+        assert (losses.priorities[human] > bare).all()
+    else:
+        expected = row.human_td_weight * (td_only[human] - 1e-3) + 1e-3
+        np.testing.assert_allclose(losses.priorities[human], expected, rtol=1e-4)
+
+
+def test_a_batch_without_humans_and_one_of_humans_only():
+    for humans in (0, 12):
+        learner = TD3Learner(replace(SMALL, split_loss=True), PHIL, seed=0)
+        losses = learner.update(make_batch(humans=humans))
+        assert np.isfinite(losses[:4]).all()
+        assert np.isfinite(losses.priorities).all()
+
+
+def test_same_seed_same_weights_and_a_restored_learner_goes_on_alike():
+    first, second = (TD3Learner(SMALL, PHIL, seed=7) for _ in range(2))
+    for seed in range(3):
+        first.update(make_batch(seed))
+        second.update(make_batch(seed))
+    restored = TD3Learner(SMALL, PHIL, seed=99)
+    restored.load_state_dict(first.state_dict())
+    for learner in (first, second, restored):
+        learner.update(make_batch(9))
+        learner.decay_learning_rates()
+        learner.update(make_batch(10))
+    for name, flat in weights_of(first).items():
+        assert torch.equal(flat, weights_of(second)[name])
+        assert torch.equal(flat, weights_of(restored)[name])
+
+
+def test_values_of_a_terminal_state_are_learned_without_a_future():
+    """A critic that always sees the same crash learns its reward and no more."""
+    batch = replace(
+        make_batch(size=8, humans=0),
+        rewards=np.full(8, -1.0, np.float32),
+        terminals=np.ones(8, np.float32),
+    )
+    learner = TD3Learner(replace(SMALL, critic_learning_rate=2e-3), PHIL, seed=0)
+    for _ in range(60):
+        learner.update(batch)
+    with torch.no_grad():
+        value = learner.critics.first(
+            torch.from_numpy(batch.frames.copy()), torch.from_numpy(batch.actions)
+        )
+    torch.testing.assert_close(value, torch.full((8,), -1.0), atol=0.15, rtol=0)
+
+
+def test_importance_weights_reach_the_loss():
+    batch = replace(make_batch(), probabilities=np.linspace(0.01, 0.3, 12))
+    plain = TD3Learner(SMALL, PHIL, seed=0).update(batch, beta=0.0)
+    weighted = TD3Learner(SMALL, PHIL, seed=0).update(batch, beta=1.0)
+    assert weighted.critic < plain.critic
+    assert equations.importance_weights(torch.tensor([0.5]), 0.0, True).item() == 1.0

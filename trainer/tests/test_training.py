@@ -1,0 +1,165 @@
+import csv
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edge_runtime.errors import UserError
+from trainer import seeds
+from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
+from trainer.files import load_torch, save_torch
+from trainer.learner.config import LearnerConfig
+from trainer.plots import moving_average, write_learning_curve
+from trainer.training.config import RunConfig
+from trainer.training.metrics import NAMES, read_metrics
+from trainer.training.run import TrainingRun
+
+TINY = RunConfig(
+    seed=3,
+    episodes=4,
+    evaluate_every=2,
+    evaluation_runs=2,
+    checkpoint_every=1,
+    learner=LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=100),
+)
+
+
+def train(config: RunConfig, directory: Path, resume: bool = False) -> TrainingRun:
+    directory.mkdir(exist_ok=True)
+    run = TrainingRun(config, directory, resume)
+    run.train()
+    return run
+
+
+def actor_weights(run: TrainingRun) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in run.learner.actor.parameters()])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> TrainingRun:
+    return train(TINY, tmp_path_factory.mktemp("run"))
+
+
+def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
+    directory = trained.run_dir
+    assert RunConfig.from_dict(json.loads((directory / "config.json").read_text())) == TINY
+    rows = read_metrics(directory)
+    assert [int(row["episode"]) for row in rows] == [0, 1, 2, 3]
+    assert list(rows[0]) == NAMES
+    assert [row["validation_success"] != "nan" for row in rows] == [False, True, False, True]
+    assert int(rows[-1]["total_steps"]) == sum(int(row["steps"]) for row in rows)
+    assert list((directory / "tensorboard").iterdir())
+    _, label = load_actor(directory)
+    assert (label["scenario"], label["algorithm"], label["seed"]) == ("left_turn", "phil_td3", 3)
+
+
+def test_the_human_is_in_the_replay_buffer_and_in_the_metrics(trained):
+    human_steps = sum(int(row["human_steps"]) for row in read_metrics(trained.run_dir))
+    assert human_steps == trained.replay.human_count > 0
+
+
+def test_returns_leave_the_shaping_out(trained):
+    rewards = sum(float(row["episode_return"]) for row in read_metrics(trained.run_dir))
+    stored = trained.replay._rewards[: trained.replay.added].sum()
+    interventions = sum(int(row["interventions"]) for row in read_metrics(trained.run_dir))
+    assert interventions > 0
+    assert stored <= rewards + 1e-3
+    assert (rewards - stored) % 10 == pytest.approx(0, abs=1e-2) or (
+        rewards - stored
+    ) % 10 == pytest.approx(10, abs=1e-2)
+
+
+def test_the_same_seed_gives_the_same_weights(trained, tmp_path):
+    again = train(TINY, tmp_path / "again")
+    assert torch.equal(actor_weights(trained), actor_weights(again))
+
+
+def test_a_run_in_two_parts_ends_with_the_same_weights_and_metrics(trained, tmp_path):
+    directory = tmp_path / "parts"
+    train(replace(TINY, episodes=2), directory)
+    resumed = train(TINY, directory, resume=True)
+    assert torch.equal(actor_weights(trained), actor_weights(resumed))
+    for ours, whole in zip(read_metrics(directory), read_metrics(trained.run_dir), strict=True):
+        timed = {"environment_s", "acting_s", "learning_s"}
+        assert {k: v for k, v in ours.items() if k not in timed} == {
+            k: v for k, v in whole.items() if k not in timed
+        }
+
+
+def command(directory: Path, *extra: str) -> list[str]:
+    settings = ("batch_size=4", "replay_capacity=2000", "warmup_steps=100", "checkpoint_every=1",
+                "evaluate_every=0")  # fmt: skip
+    chosen = [part for setting in settings for part in ("--set", setting)]
+    return [
+        sys.executable, "-m", "trainer", "train", "--seed", "3", "--episodes", "8", "--threads",
+        "1", "--out", str(directory), *chosen, *extra,
+    ]  # fmt: skip
+
+
+def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path):
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    process = subprocess.Popen(command(killed), stderr=subprocess.DEVNULL)
+    end_s = time.monotonic() + 120
+    while len(read_metrics(killed)) < 3 and time.monotonic() < end_s:
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    assert 3 <= len(read_metrics(killed)) < 8, "killed too late to mean anything"
+    for arguments in (command(killed, "--resume"), command(whole)):
+        subprocess.run(arguments, check=True, capture_output=True)
+    a, b = (load_torch(d / CHECKPOINT_FILE) for d in (killed, whole))
+    assert a["episode"] == b["episode"] == 8
+    for name, weights in a["learner"]["actor"].items():
+        assert torch.equal(weights, b["learner"]["actor"][name])
+    assert len(read_metrics(killed)) == 8
+
+
+def test_an_unguided_algorithm_never_meets_the_human(tmp_path):
+    run = train(replace(TINY, algorithm="per_td3", episodes=2), tmp_path / "per")
+    assert run.replay.human_count == 0
+    assert all(row["interventions"] == "0" for row in read_metrics(run.run_dir))
+
+
+def test_a_deadline_ends_the_run_with_a_checkpoint(tmp_path):
+    directory = tmp_path / "late"
+    directory.mkdir()
+    run = TrainingRun(replace(TINY, checkpoint_every=100), directory)
+    run.train(deadline_s=time.monotonic() - 1)
+    assert run.episode == 1
+    assert load_torch(directory / CHECKPOINT_FILE)["episode"] == 1
+    assert (directory / BEST_FILE).exists()
+
+
+def test_a_foreign_checkpoint_is_refused(tmp_path):
+    path = tmp_path / "x.pt"
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(UserError):
+        load_torch(path)
+    save_torch(path, {"a": torch.ones(2)})
+    assert load_torch(path)["a"].tolist() == [1, 1]
+
+
+def test_learning_curve_is_a_picture(trained):
+    picture = write_learning_curve(trained.run_dir)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_moving_average_by_hand():
+    np.testing.assert_allclose(moving_average(np.array([1.0, 3.0, 5.0, 7.0]), 2), [1, 2, 4, 6])
+
+
+def test_episode_seeds_never_meet_small_test_seeds():
+    drawn = [seeds.episode_seed(1, purpose, e) for purpose in range(4) for e in range(500)]
+    assert min(drawn) >= 2**31
+    assert len(set(drawn)) == len(drawn)
+
+
+def test_metrics_are_plain_csv(trained):
+    with (trained.run_dir / "metrics.csv").open(newline="") as file:
+        assert len(list(csv.reader(file))) == 5
