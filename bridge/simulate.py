@@ -79,7 +79,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="N",
         type=non_negative_int,
         default=0,
-        help="episode i is reset with seed + i (default: %(default)s)",
+        help="episode i is reset with seed + i",
     )
     parser.add_argument(
         "--wait-edge-s",

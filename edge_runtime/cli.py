@@ -33,7 +33,9 @@ class HelpFormatter(argparse.HelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> Optional[str]:
         text = action.help or ""
-        if action.default in _WITHOUT_DEFAULT or "%(default)" in text:
+        # By identity: 0 is a default worth showing, though it equals False.
+        hidden = any(action.default is nothing for nothing in _WITHOUT_DEFAULT)
+        if hidden or "%(default)" in text:
             return text
         return f"{text} (default: %(default)s)".strip()
 

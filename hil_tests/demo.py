@@ -111,6 +111,7 @@ class Demo:
         heading("4  Test episodes in process")
         run_command(
             "trainer", "evaluate", str(self.policy), "--runs", str(EPISODES),
+            "--seed", str(FIRST_SEED), "--out", str(in_process),
         )  # fmt: skip
         heading("5  The same episodes through an edge runtime in a process of its own")
         self._simulate(EPISODES, "lockstep", "none", wire)

@@ -99,7 +99,7 @@ def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
         if (run_dir / name).is_file():
             state = load_torch(run_dir / name)
             weights = state["actor"] if name == BEST_FILE else state["learner"]["actor"]
-            actor = Actor(action_size=len(weights["head.6.bias"]))
+            actor = Actor(action_size=len(weights["head.output.bias"]))
             actor.load_state_dict(weights)
             return actor, {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
     raise UserError(

@@ -77,8 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
     config = _config(arguments)
     run_dir = Path(arguments.out)
     _check_directory(run_dir, config, arguments.resume)
-    make_directory(run_dir)
     training = TrainingRun(config, run_dir, arguments.resume)
+    make_directory(run_dir)
     deadline_s = time.monotonic() + 60.0 * arguments.max_minutes if arguments.max_minutes else None
     with ProgressBar("training", config.episodes, training.episode) as bar:
         training.train(_Reporter(bar), deadline_s)

@@ -89,7 +89,7 @@ class HumanModel:
         state = {
             "actor": self.actor.state_dict(),
             "frames": self.config.frames,
-            "action_size": self.actor.head[-1].out_features,
+            "action_size": self.actor.head.output.out_features,
             "demonstrations": self.demonstrations,
             **about,
         }

@@ -50,12 +50,21 @@ class Trunk(nn.Module):
         return torch.flatten(hidden, 1)
 
 
-def _fully_connected(inputs: int, outputs: int) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for width in HIDDEN:
-        layers += [nn.Linear(inputs, width), nn.ReLU()]
-        inputs = width
-    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+class Head(nn.Module):
+    """The fully connected layers: features [batch, inputs] to [batch, outputs]."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for width in HIDDEN:
+            layers += [nn.Linear(inputs, width), nn.ReLU()]
+            inputs = width
+        self.hidden = nn.Sequential(*layers)
+        self.output = nn.Linear(inputs, outputs)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """The last layer's values, without an activation."""
+        return self.output(self.hidden(features))
 
 
 class Actor(nn.Module):
@@ -69,7 +78,7 @@ class Actor(nn.Module):
         super().__init__()
         self.frames = frames
         self.trunk = Trunk(frames)
-        self.head = _fully_connected(FEATURES, action_size)
+        self.head = Head(FEATURES, action_size)
 
     def logits(self, features: Tensor) -> Tensor:
         """The action before tanh, [batch, n], from the trunk's features."""
@@ -91,7 +100,7 @@ class Critic(nn.Module):
         super().__init__()
         self.frames = frames
         self.trunk = Trunk(frames)
-        self.head = _fully_connected(FEATURES + action_size, 1)
+        self.head = Head(FEATURES + action_size, 1)
 
     def features(self, images: Tensor) -> Tensor:
         """The picture's features: independent of the action, so computed once a picture."""

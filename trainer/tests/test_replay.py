@@ -21,7 +21,8 @@ class Source:
     """Feeds episodes of numbered frames; remembers what each transition was."""
 
     def __init__(self, buffer: ReplayBuffer) -> None:
-        self.buffer, self.next, self.stored = buffer, 0, []
+        self.buffer, self.next = buffer, 0
+        self.stored: list[tuple[int, int, int, int, bool]] = []
 
     def episode(self, steps: int, human: bool = False) -> None:
         last = frame(self.next)

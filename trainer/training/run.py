@@ -84,7 +84,6 @@ class TrainingRun:
         self.best_validation = (-1.0, -1.0)
         if resume:
             self._load()
-        write_json(str(run_dir / CONFIG_FILE), config.as_dict())
 
     def train(
         self,
@@ -92,6 +91,7 @@ class TrainingRun:
         deadline_s: float | None = None,
     ) -> None:
         """Train until the configured number of episodes, or ``time.monotonic() > deadline_s``."""
+        write_json(self.run_dir / CONFIG_FILE, self.config.as_dict())
         metrics_writer = MetricsWriter(self.run_dir, self.episode)
         try:
             while self.episode < self.config.episodes:

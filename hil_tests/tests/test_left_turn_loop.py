@@ -1,0 +1,113 @@
+"""The left turn through a separate edge runtime, against the same drive in process."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edge_runtime.tests.harness import EdgeProcess, free_endpoint
+from hil_tests.commands import BackgroundCommand
+from trainer.drivers import OnnxDriver, make_environment
+from trainer.evaluation import drive_episodes
+from trainer.export import export_policy, write_policy
+from trainer.learner.networks import Actor
+
+EPISODES = 4
+LABEL = {"scenario": "left_turn", "algorithm": "phil_td3", "seed": 0, "episode": 0}
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory) -> Path:
+    """An untrained actor that creeps forward, exported for real."""
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        actor = Actor()
+    with torch.no_grad():
+        actor.head.output.weight.mul_(10)
+        actor.head.output.bias.add_(0.2)
+    path = tmp_path_factory.mktemp("policy") / "policy.onnx"
+    write_policy(export_policy(actor, LABEL, {}), path, None)
+    return path
+
+
+def simulate(endpoint: str, out: Path, *options: str) -> subprocess.Popen:
+    fixed = ["--env", "left_turn", "--listen", endpoint, "--out", str(out)]
+    return subprocess.Popen(
+        [sys.executable, "-m", "bridge", "simulate", *fixed, *options],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def edge(endpoint: str, policy: Path, *options: str) -> EdgeProcess:
+    arguments = ("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
+    return EdgeProcess(*arguments, *options)
+
+
+def test_lock_step_over_the_wire_is_the_drive_in_process(policy, tmp_path):
+    env = make_environment("left_turn")
+    wanted = drive_episodes(env, OnnxDriver(policy), range(EPISODES))
+    endpoint, out = free_endpoint(), tmp_path / "wire.json"
+    runtime = edge(endpoint, policy)
+    simulator = simulate(endpoint, out, "--episodes", str(EPISODES), "--clock", "lockstep")
+    try:
+        assert simulator.wait(120) == 0, simulator.stderr and simulator.stderr.read()
+        mapped = runtime.loaded_files()
+    finally:
+        runtime.end()
+    report = json.loads(out.read_text())
+    if report["safe_stops"]:
+        pytest.fail(f"the machine paused for over 200 ms: {report['safe_stop_events']}")
+    for ours, theirs in zip(report["per_episode"], wanted, strict=True):
+        assert (ours["seed"], ours["outcome"]) == (theirs.seed, theirs.outcome)
+        np.testing.assert_allclose(ours["actions"], theirs.actions, atol=1e-5)
+        assert ours["distance_m"] == pytest.approx(theirs.distance_m, abs=1e-4)
+    for heavy in ("torch", "rerun", "highway_env", "gymnasium"):
+        assert f"/{heavy}/" not in mapped
+
+
+def test_a_killed_runtime_stops_the_car_and_a_new_one_drives_on(policy, tmp_path):
+    endpoint, out = free_endpoint(), tmp_path / "kill.json"
+    runtime = edge(endpoint, policy)
+    simulator = simulate(endpoint, out, "--episodes", "1", "--clock", "realtime", "--seed", "3")
+    log = runtime.process.stderr
+    assert log is not None
+    while "now=drive" not in log.readline():
+        pass
+    time.sleep(0.5)
+    runtime.process.send_signal(signal.SIGKILL)
+    runtime.process.wait()
+    time.sleep(1.0)
+    runtime = edge(endpoint, policy)
+    try:
+        assert simulator.wait(60) == 0
+    finally:
+        runtime.end()
+    report = json.loads(out.read_text())
+    event = report["safe_stop_events"][0]
+    # 2 T plus a tick; some room for a machine with both cores busy.
+    assert event["brake_after_s"] <= 0.3 + 0.1
+    assert event["resumed_after_s"] is not None
+    applied = np.array(report["per_episode"][0]["actions"])[:, 0]
+    braking = np.flatnonzero(applied == -1.0)
+    assert len(braking) >= 5
+    assert (applied[braking[-1] + 1 :] > -1.0).any()
+
+
+def test_a_mock_vehicle_drives_along_and_latency_is_really_there(policy, tmp_path):
+    endpoint, out = free_endpoint(), tmp_path / "late.json"
+    arguments = ("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
+    with BackgroundCommand("edge_runtime", "run", *arguments, "--vehicle", "mock", ready="ready"):
+        options = ("--episodes", "2", "--clock", "lockstep", "--latency", "50ms+-10ms")
+        simulator = simulate(endpoint, out, *options)
+        assert simulator.wait(120) == 0
+    latency_ms = json.loads(out.read_text())["latency_ms"]
+    assert 80 < latency_ms["p50"] < 125
+    assert latency_ms["max"] > latency_ms["p50"] + 10

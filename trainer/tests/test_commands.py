@@ -1,0 +1,121 @@
+"""The command line as a user meets it, mistakes included."""
+
+import json
+
+import pytest
+
+from edge_runtime.cli import run_cli
+from trainer.__main__ import main
+from trainer.commands import COMMANDS
+
+
+def call(capsys, *arguments: str) -> tuple[int, str, str]:
+    """Run ``python -m trainer`` in this process: exit status, stdout, stderr."""
+    try:
+        status = run_cli(main, list(arguments))
+    except SystemExit as end:
+        status = int(end.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+WRONG = [
+    ("train", "--scenario", "moon", "--out", "x"),
+    ("train", "--algorithm", "magic", "--out", "x"),
+    ("train", "--episodes", "0", "--out", "x"),
+    ("train", "--out", "{tmp}/x", "--set", "no_such=1"),
+    ("train", "--out", "{tmp}/x", "--set", "batch_size=many"),
+    ("train", "--out", "{tmp}/x", "--set", "batch_size"),
+    ("train", "--out", "{tmp}/x", "--resume"),
+    ("train", "--out", "{tmp}/x", "--human", "{tmp}/nobody"),
+    ("train", "--out", "{tmp}/file/x"),
+    ("evaluate", "{tmp}/nothing.onnx"),
+    ("evaluate", "{tmp}/nothing"),
+    ("evaluate", "{tmp}/file"),
+    ("evaluate", "expert", "--runs", "-1"),
+    ("evaluate", "expert", "--condition", "rain"),
+    ("evaluate", "expert", "--out", "{tmp}/no/such/r.json"),
+    ("export", "{tmp}/nothing", "--out", "{tmp}/p.onnx"),
+    ("export", "{tmp}", "--out", "{tmp}/p.onnx"),
+    ("export", "{tmp}", "--out", "{tmp}/p.onnx", "--key", "{tmp}/no.key"),
+    ("plot", "{tmp}"),
+    ("human", "--out", "{tmp}/file"),
+    ("bench", "--threads", "0"),
+    ("bench", "--out", "{tmp}/no/such/b.json"),
+    (),
+]
+
+
+@pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
+def test_bad_input_gets_one_line_and_status_2(arguments, capsys, tmp_path):
+    (tmp_path / "file").write_text("a file")
+    before = sorted(tmp_path.rglob("*"))
+    status, out, err = call(capsys, *(a.format(tmp=tmp_path) for a in arguments))
+    assert status == 2
+    assert out == ""
+    assert len(err.strip().splitlines()) == 1
+    assert "Traceback" not in err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command, capsys):
+    status, out, _ = call(capsys, command, "--help")
+    assert status == 0
+    assert "example: python -m trainer" in " ".join(out.split())
+
+
+def test_evaluate_reports_what_the_contract_asks_for(capsys, tmp_path):
+    status, out, _ = call(capsys, "evaluate", "expert", "--runs", "3", "--seed", "5")
+    assert status == 0
+    report = json.loads(out)
+    assert report["success_rate"] == 1.0
+    assert report["policy_id"] == "expert"
+    assert (report["episodes"], report["seed"], report["condition"]) == (3, 5, "nominal")
+    keys = {
+        "scenario", "condition", "episodes", "success_rate", "collision_rate",
+        "surviving_distance_m", "episode_reward", "episode_time_s", "lateral_acceleration_mps2",
+        "longitudinal_acceleration_mps2", "policy_id", "seed",
+    }  # fmt: skip
+    assert keys <= set(report)
+    assert set(report["surviving_distance_m"]) == {"mean", "std"}
+
+
+def test_noise_disturbs_and_is_reproducible(capsys, tmp_path):
+    reports = []
+    for number, condition in enumerate(("noise", "noise", "nominal")):
+        out = str(tmp_path / f"{number}.json")
+        arguments = ("evaluate", "expert", "--runs", "2", "--condition", condition, "--out", out)
+        assert call(capsys, *arguments)[0] == 0
+        reports.append(json.loads((tmp_path / f"{number}.json").read_text()))
+    noisy, again, calm = ([e["actions"] for e in report["per_episode"]] for report in reports)
+    assert noisy == again != calm
+
+
+def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path):
+    """Every command once, as the README has them, on the smallest of runs."""
+    human, run = str(tmp_path / "human"), str(tmp_path / "run")
+    policy = str(tmp_path / "policy.onnx")
+    steps = [
+        ("human", "--out", human, "--episodes", "1", "--updates-per-episode", "2"),
+        ("train", "--human", human, "--out", run, "--episodes", "2", "--set", "batch_size=4",
+         "--set", "evaluation_runs=1"),
+        ("train", "--human", human, "--out", run, "--episodes", "3", "--set", "batch_size=4",
+         "--set", "evaluation_runs=1", "--resume"),
+        ("export", run, "--out", policy),
+        ("evaluate", policy, "--runs", "1"),
+        ("evaluate", run, "--runs", "1"),
+        ("evaluate", human, "--runs", "1"),
+        ("plot", run),
+    ]  # fmt: skip
+    for step in steps:
+        status, _, err = call(capsys, *step)
+        assert status == 0, err
+    again = ("train", "--human", human, "--out", run, "--episodes", "2")
+    status, _, err = call(capsys, *again)
+    assert status == 2
+    assert "--resume" in err
+    other = ("train", "--out", run, "--human", human, "--episodes", "4", "--seed", "8", "--resume")
+    status, _, err = call(capsys, *other)
+    assert status == 2
+    assert "seed" in err

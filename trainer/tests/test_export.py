@@ -1,0 +1,117 @@
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from deploy.keys import write_key_pair
+from edge_runtime.errors import UserError
+from edge_runtime.onnx_file import read_onnx
+from edge_runtime.policy import load_policy
+from trainer import export as export_module
+from trainer.export import (
+    Export,
+    export_policy,
+    load_private_key,
+    parity,
+    real_observations,
+    write_policy,
+)
+from trainer.learner.networks import Actor
+
+LABEL = {"scenario": "left_turn", "algorithm": "phil_td3", "seed": 4, "episode": 12}
+
+
+def make_actor(frames: int = 2) -> Actor:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        actor = Actor(frames=frames)
+        # Large weights: a policy whose actions spread over the whole range.
+        with torch.no_grad():
+            actor.head.output.weight.mul_(20)
+    return actor
+
+
+@pytest.fixture(scope="module")
+def exported() -> Export:
+    return export_policy(make_actor(), LABEL, {"gamma": 0.95})
+
+
+def test_the_file_is_what_the_contract_says(exported):
+    model = onnx.load_from_string(exported.model)
+    assert model.ir_version == 8
+    assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", 17)]
+    file = read_onnx(exported.model)
+    assert file.weights_sha256 == exported.policy_id
+    assert "phil.manifest" in file.metadata
+    (frames,), (action,) = model.graph.input, model.graph.output
+    assert (frames.name, action.name) == ("frames", "action")
+    shape = [d.dim_param or d.dim_value for d in frames.type.tensor_type.shape.dim]
+    assert shape == ["batch", 2, 45, 80]
+    assert frames.type.tensor_type.elem_type == onnx.TensorProto.UINT8
+
+
+def test_parity_is_measured_on_observations_that_differ(exported):
+    observations = real_observations("left_turn", 200)
+    assert len(np.unique(observations.reshape(200, -1), axis=0)) > 190
+    with torch.no_grad():
+        actions = make_actor()(torch.from_numpy(observations))
+    assert actions.std() > 0.01
+    assert exported.max_difference < 1e-5
+    assert parity(make_actor(), exported.model, observations) < 1e-5
+
+
+def test_parity_sees_a_difference(exported):
+    changed = make_actor()
+    with torch.no_grad():
+        changed.head.output.bias.add_(0.01)
+    assert parity(changed, exported.model, real_observations("left_turn", 20)) > 1e-3
+
+
+def test_an_export_that_fails_parity_writes_nothing(monkeypatch):
+    monkeypatch.setattr(export_module, "parity", lambda *_: float("nan"))
+    with pytest.raises(UserError, match="differ"):
+        export_policy(make_actor(), LABEL, {})
+
+
+def test_the_edge_runtime_drives_a_signed_file_and_agrees_with_torch(exported, tmp_path):
+    private, public = write_key_pair(tmp_path / "keys")
+    path = tmp_path / "policy.onnx"
+    write_policy(exported, path, private)
+    policy = load_policy(path, public_key=public)
+    assert policy.manifest.training["seed"] == 4
+    assert policy.manifest.training["config"] == {"gamma": 0.95}
+    assert policy.manifest.action[0].name == "pedal"
+    for frames in real_observations("left_turn", 10):
+        with torch.no_grad():
+            wanted = make_actor()(torch.from_numpy(frames)[None])[0].numpy()
+        np.testing.assert_allclose(policy.act(frames), wanted, atol=1e-5)
+
+
+def test_a_one_frame_model_exports_with_the_same_input(tmp_path):
+    exported = export_policy(make_actor(frames=1), LABEL, {})
+    path = tmp_path / "one.onnx"
+    write_policy(exported, path, None)
+    policy = load_policy(path, allow_unsigned=True)
+    frames = real_observations("left_turn", 30)[-1]
+    past = frames.copy()
+    past[0] = 0
+    assert policy.act(frames) == policy.act(past)
+
+
+def test_an_unsigned_export_removes_the_signature_of_an_older_file(exported, tmp_path):
+    private, _ = write_key_pair(tmp_path / "keys")
+    path = tmp_path / "policy.onnx"
+    write_policy(exported, path, private)
+    write_policy(exported, path, None)
+    assert not (tmp_path / "policy.onnx.sig").exists()
+
+
+def test_a_wrong_key_leaves_no_file(exported, tmp_path):
+    key = tmp_path / "wrong.key"
+    key.write_text("not a key")
+    with pytest.raises(UserError, match="not a private key"):
+        write_policy(exported, tmp_path / "policy.onnx", key)
+    assert not (tmp_path / "policy.onnx").exists()
+    _, public = write_key_pair(tmp_path / "keys")
+    with pytest.raises(UserError):
+        load_private_key(public)
