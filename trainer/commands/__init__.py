@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from trainer.commands import bench, evaluate, export, human, plot, train
+from trainer.commands import bench, evaluate, export, human, picture, plot, train
 
 COMMANDS: dict[str, ModuleType] = {
     "train": train,
@@ -10,6 +10,7 @@ COMMANDS: dict[str, ModuleType] = {
     "evaluate": evaluate,
     "export": export,
     "plot": plot,
+    "picture": picture,
     "bench": bench,
 }
 """Name -> module with ``add_arguments(parser)``, ``run(arguments)`` and ``EXAMPLE``."""

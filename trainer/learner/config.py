@@ -42,8 +42,8 @@ class LearnerConfig:
     priority_offset: float = 1e-3
     """Constant that keeps every transition drawable (table A6: epsilon)."""
     advantage_bound: float = 4.0
-    """Bound of the exponent in the Q advantage. Unbounded it overflows: see REFERENCE notes in
-    ``trainer/README.md``."""
+    """Bound of the exponent in the Q advantage. A critic that is off by more than float can take
+    the exponential of would otherwise make one priority infinite."""
     importance_sampling: bool = False
     """Weigh the critic's losses by eq. 15 and 16, which the paper calls optional."""
     beta: float = 1.0

@@ -8,8 +8,9 @@ inside the network, so that an exported policy needs no preprocessing.
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as functional
 from torch import Tensor, nn
+
+from trainer.learner.kernel.trunk import trunk_features
 
 FRAME_ROWS, FRAME_COLUMNS = 45, 80
 FILTERS = (6, 16)
@@ -27,14 +28,8 @@ FEATURES = FILTERS[-1] * _side_after_pools(FRAME_ROWS) * _side_after_pools(FRAME
 """Length of a picture's feature vector (1,792)."""
 
 
-def normalise(frames: Tensor) -> Tensor:
-    """Frames uint8 [batch, n, 45, 80] to float in [0, 1], in the memory order convolutions like."""
-    scaled = frames.float() / 255.0
-    return scaled.contiguous(memory_format=torch.channels_last)
-
-
 class Trunk(nn.Module):
-    """The two convolutions. Maps normalised frames [batch, n, 45, 80] to features [batch, 1792]."""
+    """The two convolutions. Maps frames uint8 [batch, n, 45, 80] to features [batch, 1792]."""
 
     def __init__(self, frames: int = 2) -> None:
         super().__init__()
@@ -42,12 +37,12 @@ class Trunk(nn.Module):
         self.conv2 = nn.Conv2d(FILTERS[0], FILTERS[1], KERNEL)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, images: Tensor) -> Tensor:
-        """The features of normalised images."""
-        # Pooling before ReLU gives the same numbers and a quarter of the ReLU's work.
-        hidden = functional.relu(functional.max_pool2d(self.conv1(images), 2))
-        hidden = functional.relu(functional.max_pool2d(self.conv2(hidden), 2))
-        return torch.flatten(hidden, 1)
+    def forward(self, frames: Tensor) -> Tensor:
+        """The features of pictures: by the compiled kernel where there is one."""
+        first, second = self.conv1, self.conv2
+        assert first.bias is not None
+        assert second.bias is not None
+        return trunk_features(frames, first.weight, first.bias, second.weight, second.bias)
 
 
 class Head(nn.Module):
@@ -80,17 +75,9 @@ class Actor(nn.Module):
         self.trunk = Trunk(frames)
         self.head = Head(FEATURES, action_size)
 
-    def logits(self, features: Tensor) -> Tensor:
-        """The action before tanh, [batch, n], from the trunk's features."""
-        return self.head(features)
-
-    def from_images(self, images: Tensor) -> Tensor:
-        """The action [batch, n] in [-1, 1] from normalised images [batch, 2, 45, 80]."""
-        return torch.tanh(self.logits(self.trunk(images[:, -self.frames :])))
-
     def forward(self, frames: Tensor) -> Tensor:
         """The action [batch, n] in [-1, 1] from frames uint8 [batch, 2, 45, 80]."""
-        return self.from_images(normalise(frames))
+        return torch.tanh(self.head(self.trunk(frames[:, -self.frames :])))
 
 
 class Critic(nn.Module):
@@ -102,9 +89,9 @@ class Critic(nn.Module):
         self.trunk = Trunk(frames)
         self.head = Head(FEATURES + action_size, 1)
 
-    def features(self, images: Tensor) -> Tensor:
+    def features(self, frames: Tensor) -> Tensor:
         """The picture's features: independent of the action, so computed once a picture."""
-        return self.trunk(images[:, -self.frames :])
+        return self.trunk(frames[:, -self.frames :])
 
     def value(self, features: Tensor, action: Tensor) -> Tensor:
         """Q, shape [batch], from features [batch, 1792] and actions [batch, n]."""
@@ -112,7 +99,7 @@ class Critic(nn.Module):
 
     def forward(self, frames: Tensor, action: Tensor) -> Tensor:
         """Q, shape [batch], from frames uint8 [batch, 2, 45, 80] and actions [batch, n]."""
-        return self.value(self.features(normalise(frames)), action)
+        return self.value(self.features(frames), action)
 
 
 class CriticPair(nn.Module):

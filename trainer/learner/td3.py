@@ -14,7 +14,7 @@ from torch import Tensor
 from trainer.learner import equations
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
-from trainer.learner.networks import Actor, CriticPair, normalise
+from trainer.learner.networks import Actor, CriticPair
 from trainer.learner.replay import Batch
 
 
@@ -75,14 +75,14 @@ class TD3Learner:
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
         """One step of algorithm 1 on a drawn minibatch; ``beta`` is eq. 15's exponent."""
         c = self.config
-        images, next_images = self._images(batch.frames), self._images(batch.next_frames)
+        frames, next_frames = self._tensor(batch.frames), self._tensor(batch.next_frames)
         actions, human = self._tensor(batch.actions), self._tensor(batch.human)
         weights = equations.importance_weights(
             self._tensor(batch.probabilities).float(), beta, c.normalise_importance
         )
-        targets = self._targets(batch, next_images)
+        targets = self._targets(batch, next_frames)
 
-        features = [critic.features(images) for critic in self.critics.pair]
+        features = [critic.features(frames) for critic in self.critics.pair]
         values = [
             critic.value(feature, actions)
             for critic, feature in zip(self.critics.pair, features, strict=True)
@@ -91,10 +91,10 @@ class TD3Learner:
             equations.critic_loss(value, targets, human, weights, c.split_loss) for value in values
         )
         critic_loss = first + second
-        policy_actions = self.actor.from_images(images)
+        policy_actions = self.actor(frames)
         policy, cloning = self._actor_losses(features[0].detach(), policy_actions, actions, human)
         priorities = self._priorities(
-            targets - values[0].detach(), images, actions, policy_actions.detach(), human
+            targets - values[0].detach(), frames, actions, policy_actions.detach(), human
         )
 
         self.critic_optimiser.zero_grad()
@@ -152,15 +152,15 @@ class TD3Learner:
         self.updates = state["updates"]
 
     @torch.no_grad()
-    def _targets(self, batch: Batch, next_images: Tensor) -> Tensor:
+    def _targets(self, batch: Batch, next_frames: Tensor) -> Tensor:
         c = self.config
-        next_actions = self.target_actor.from_images(next_images)
+        next_actions = self.target_actor(next_frames)
         noise = c.target_noise * torch.randn(
             next_actions.shape, generator=self.noise, device=self.device
         )
         next_actions = equations.smoothed_target_action(next_actions, noise, c.target_noise_bound)
         first, second = (
-            critic.value(critic.features(next_images), next_actions)
+            critic.value(critic.features(next_frames), next_actions)
             for critic in self.target_critics.pair
         )
         return equations.td_target(
@@ -182,7 +182,7 @@ class TD3Learner:
     def _priorities(
         self,
         td_errors: Tensor,
-        images: Tensor,
+        frames: Tensor,
         actions: Tensor,
         policy_actions: Tensor,
         human: Tensor,
@@ -192,7 +192,7 @@ class TD3Learner:
         advantage = torch.zeros_like(td_errors)
         if row.advantage_weight and bool(human.any()):
             critic = self.target_critics.first
-            features = critic.features(images[human])
+            features = critic.features(frames[human])
             advantage[human] = equations.q_advantage(
                 critic.value(features, actions[human]),
                 critic.value(features, policy_actions[human]),
@@ -218,8 +218,5 @@ class TD3Learner:
                 list(target.parameters()), list(online.parameters()), self.config.tau
             )
 
-    def _images(self, frames: NDArray[np.uint8]) -> Tensor:
-        return normalise(self._tensor(frames))
-
     def _tensor(self, array: NDArray[Any]) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+        return torch.from_numpy(array).to(self.device)

@@ -224,8 +224,8 @@ class LeftTurnEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return info if outcome is None else {**info, "outcome": outcome}
 
     def _caption(self) -> str:
-        time_s = self.steps * self.config.control_period_s
-        return f"{time_s:4.1f} s   {self.ego.speed:3.1f} m/s   {self.distance_m:4.1f} m"
+        time_s, goal_m = self.steps * self.config.control_period_s, self.config.goal_m
+        return f"{time_s:.1f} s\n{self.ego.speed:.1f} m/s\n{self.distance_m:.1f} of {goal_m:.0f} m"
 
 
 LANE_REACH_M = 100.0

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from trainer.scenarios.geometry import Rectangle, corners
 
 PIXELS_PER_METRE = 16
-LEFT_M, TOP_M, WIDTH_M, HEIGHT_M = -30.0, -8.0, 44.0, 26.0
+LEFT_M, TOP_M, WIDTH_M, HEIGHT_M = -30.0, -7.0, 46.0, 25.0
 COLOURS = {
     "ground": (222, 229, 216),
     "road": (92, 97, 105),
@@ -43,7 +43,9 @@ def draw_scene(
         _draw_vehicle(pen, vehicle)
     if frames is not None:
         _inset_frames(image, frames)
-    pen.text((16, size[1] - 34), caption, fill=COLOURS["text"], font_size=20)
+    pen.multiline_text(
+        (size[0] - 12, size[1] - 12), caption, COLOURS["text"], anchor="rd", font_size=15
+    )
     return np.asarray(image)
 
 
@@ -97,10 +99,14 @@ def _draw_vehicle(pen: ImageDraw.ImageDraw, vehicle: dict[str, Any]) -> None:
 
 
 def _inset_frames(image: Image.Image, frames: NDArray[np.uint8]) -> None:
-    """What the policy sees, enlarged, in the lower right corner: the older frame first."""
-    scale, margin = 2.2, 14
+    """What the policy sees, enlarged, in the lower left corner: the older frame first."""
+    scale, margin = 2.3, 12
     size = (int(frames.shape[2] * scale), int(frames.shape[1] * scale))
-    for place, frame in enumerate(reversed(frames)):
+    top = image.height - size[1] - margin
+    pen = ImageDraw.Draw(image)
+    for place, (frame, when) in enumerate(zip(frames, ("0.1 s ago", "now"), strict=True)):
         inset = Image.fromarray(frame).resize(size, Image.Resampling.NEAREST).convert("RGB")
-        left = image.width - (place + 1) * (size[0] + margin)
-        image.paste(inset, (left, image.height - size[1] - margin))
+        left = margin + place * (size[0] + margin)
+        image.paste(inset, (left, top))
+        text = f"the policy sees, {when}"
+        pen.text((left, top - 20), text, fill=COLOURS["text"], font_size=14)

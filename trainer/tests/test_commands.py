@@ -39,6 +39,8 @@ WRONG = [
     ("export", "{tmp}", "--out", "{tmp}/p.onnx"),
     ("export", "{tmp}", "--out", "{tmp}/p.onnx", "--key", "{tmp}/no.key"),
     ("plot", "{tmp}"),
+    ("picture", "expert", "--out", "{tmp}/no/such/p.png"),
+    ("picture", "{tmp}/nobody", "--out", "{tmp}/p.png"),
     ("human", "--out", "{tmp}/file"),
     ("bench", "--threads", "0"),
     ("bench", "--out", "{tmp}/no/such/b.json"),
@@ -107,6 +109,7 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path):
         ("evaluate", run, "--runs", "1"),
         ("evaluate", human, "--runs", "1"),
         ("plot", run),
+        ("picture", policy, "--time", "1", "--out", str(tmp_path / "scene.png")),
     ]  # fmt: skip
     for step in steps:
         status, _, err = call(capsys, *step)

@@ -7,7 +7,7 @@ import torch
 from trainer.learner import equations
 from trainer.learner.algorithms import ALGORITHMS, PHIL
 from trainer.learner.config import LearnerConfig
-from trainer.learner.networks import FEATURES, Actor, Critic, normalise
+from trainer.learner.networks import FEATURES, Actor, Critic
 from trainer.learner.replay import Batch
 from trainer.learner.td3 import TD3Learner
 
@@ -62,7 +62,7 @@ def test_the_trunk_equals_convolution_relu_and_pooling_as_written_in_the_paper()
     for layer in (trunk.conv1, trunk.conv2):
         hidden = torch.nn.functional.conv2d(hidden, layer.weight, layer.bias)
         hidden = torch.nn.functional.max_pool2d(torch.relu(hidden), 2)
-    torch.testing.assert_close(trunk(normalise(frames)), hidden.flatten(1))
+    torch.testing.assert_close(trunk(frames), hidden.flatten(1))
 
 
 def test_an_update_is_the_papers_losses_and_plain_adam():

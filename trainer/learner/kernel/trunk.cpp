@@ -50,13 +50,13 @@ inline Vector load(const float* from) { return *reinterpret_cast<const LooseVect
 inline void store(float* to, Vector value) { *reinterpret_cast<LooseVector*>(to) = value; }
 constexpr int vectors(int floats) { return (floats + LANES - 1) / LANES; }
 
-constexpr int SIDE = 6;                         // of a filter
-constexpr int PRODUCTS = 9, TAPS = 9;           // see above
-constexpr int WIDE = REGISTERS / 16;            // vectors of positions computed together
-constexpr uint8_t OFF = 4;                      // no winner (they are 0..3): ReLU is off
+constexpr int SIDE = 6;                // of a filter
+constexpr int PRODUCTS = 9, TAPS = 9;  // see above
+constexpr int WIDE = REGISTERS / 16;   // vectors of positions computed together
+constexpr uint8_t OFF = 4;             // in the place of a winner (0..3): ReLU is off
 
-// A layer: its input, and the pooled outputs that are used. These are numbered along rows of PITCH
-// and computed up to SIZE, so that no loop has a remainder; what lies between is never read.
+// A layer: its image, and the pooled outputs that are used, ROWS x COLUMNS. They are numbered along
+// rows of PITCH and computed up to SIZE, so that no loop has a remainder. The surplus is not used.
 template <int CHANNELS_, int IMAGE_PITCH_, int IMAGE_SIZE_, int FILTERS_, int GROUP_, int ROWS_,
           int COLUMNS_>
 struct Layer {
@@ -67,16 +67,20 @@ struct Layer {
     static constexpr int PLANE = SIZE + 2 * PITCH + 2, PLANES = PRODUCTS * CHANNELS * PLANE;
     static constexpr int WINDOW = SIDE * CHANNELS;  // a row of a window, channels innermost
     static constexpr int PADDED_WINDOW = vectors(WINDOW) * LANES;
+    static constexpr int LAST_WINDOW = (2 * ROWS - 1) * IMAGE_PITCH + 2 * COLUMNS - 1;
+    static_assert((LAST_WINDOW + (SIDE - 1) * IMAGE_PITCH) * CHANNELS + PADDED_WINDOW <=
+                      IMAGE_SIZE * CHANNELS,
+                  "whole vectors must not leave the image");
 };
 // The second layer uses 19 of the first one's 20 rows.
 template <int FRAMES>
-using First = Layer<FRAMES, 80, 45 * 80, 6, 6, 19, 37>;
-using Second = Layer<6, First<1>::PITCH, First<1>::SIZE, 16, 8, 7, 16>;
+using FirstLayer = Layer<FRAMES, 80, 45 * 80, 6, 6, 19, 37>;
+using Second = Layer<6, FirstLayer<1>::PITCH, FirstLayer<1>::SIZE, 16, 8, 7, 16>;
 constexpr int POOLED = Second::ROWS * Second::COLUMNS, FEATURES = Second::FILTERS * POOLED;
 
 // ---- forward ------------------------------------------------------------------------------------
 
-// A channel's 9 planes: x0 - x1, x1 and x2 - x1 down and right.
+// A channel's 9 planes: x0 - x1, x1 and x2 - x1 in both directions.
 template <class L, typename Pixel>
 void make_planes(const Pixel* image, float* planes) {
     constexpr int STRIDE = L::CHANNELS * L::PLANE, WIDTH = 2 * L::PITCH + 1;
@@ -99,8 +103,8 @@ void make_planes(const Pixel* image, float* planes) {
     }
 }
 
-// Weights [filter][6][6][channel] to [product][channel][tap][filter]: h0, h0 + h1 and h1 down and
-// right.
+// Weights [filter][6][6][channel] to [product][channel][tap][filter]: h0, h0 + h1 and h1 in both
+// directions.
 template <class L>
 std::vector<float> split_weights(const float* weights, float scale) {
     std::vector<float> split(PRODUCTS * L::CHANNELS * TAPS * L::FILTERS);
@@ -110,8 +114,8 @@ std::vector<float> split_weights(const float* weights, float scale) {
                 const int corner = tap / 3 * 2 * SIDE + tap % 3 * 2;
                 float parts[3][3];
                 for (int down = 0; down < 3; down += 2) {
-                    const float* at = weights + channel +
-                        (filter * SIDE * SIDE + corner + down / 2 * SIDE) * L::CHANNELS;
+                    const int row = filter * SIDE * SIDE + corner + down / 2 * SIDE;
+                    const float* at = weights + row * L::CHANNELS + channel;
                     parts[down][0] = at[0] * scale, parts[down][2] = at[L::CHANNELS] * scale;
                     parts[down][1] = parts[down][0] + parts[down][2];
                 }
@@ -124,8 +128,8 @@ std::vector<float> split_weights(const float* weights, float scale) {
     return split;
 }
 
-// Pools a 2x2 block from its products, which lie ``stride`` apart. As in torch, the first of equals
-// wins.
+// Adds up blocks of 2x2 outputs from their products, which lie ``stride`` apart, and pools them. As
+// in torch, the first of equals wins.
 inline void pool(const float* products, int stride, float bias, float* output, uint8_t* winner) {
     Vector down[2][3];
     for (int right = 0; right < 3; ++right) {
@@ -142,15 +146,15 @@ inline void pool(const float* products, int stride, float bias, float* output, u
         place = wins ? Integers{} + next : place;
     }
     best += bias;
-    const Integers on = best > 0.0f;
-    store(output, best < 0.0f ? Vector{} : best);  // not the mask: NaN should stay NaN
+    const Integers on = best > Vector{};
+    store(output, best < Vector{} ? Vector{} : best);  // not the mask: NaN should stay NaN
     *reinterpret_cast<LooseBytes*>(winner) =
         __builtin_convertvector(on ? place : Integers{} + OFF, Bytes);
 }
 
 // One product at WIDE vectors of positions for GROUP filters, with all sums in registers.
 template <class L>
-void multiply(const float* planes, const float* weights, float sums_out[L::GROUP][WIDE * LANES]) {
+void multiply(const float* planes, const float* weights, float products[L::GROUP][WIDE * LANES]) {
     Vector sums[L::GROUP][WIDE] = {};
     for (int channel = 0; channel < L::CHANNELS; ++channel, planes += L::PLANE)
         for (int tap = 0; tap < TAPS; ++tap, weights += L::FILTERS)
@@ -159,7 +163,7 @@ void multiply(const float* planes, const float* weights, float sums_out[L::GROUP
                     sums[filter][i] +=
                         weights[filter] * load(planes + tap / 3 * L::PITCH + tap % 3 + i * LANES);
     for (int filter = 0; filter < L::GROUP; ++filter)
-        for (int i = 0; i < WIDE; ++i) store(&sums_out[filter][i * LANES], sums[filter][i]);
+        for (int i = 0; i < WIDE; ++i) store(&products[filter][i * LANES], sums[filter][i]);
 }
 
 // Planes [product][channel][PLANE] to outputs and winners [filter][SIZE].
@@ -187,16 +191,17 @@ void convolve(const float* planes, const float* weights, const float* bias, floa
 // reading them should not meet slow denormal numbers.
 template <int FRAMES>
 struct ForwardScratch {
-    float planes1[First<FRAMES>::PLANES], planes2[Second::PLANES];
-    float hidden[First<FRAMES>::OUTPUTS], outputs[Second::OUTPUTS];
-    uint8_t winners1[First<FRAMES>::OUTPUTS], winners2[Second::OUTPUTS];
+    using First = FirstLayer<FRAMES>;
+    float planes1[First::PLANES], planes2[Second::PLANES];
+    float hidden[First::OUTPUTS], outputs[Second::OUTPUTS];
+    uint8_t winners1[First::OUTPUTS], winners2[Second::OUTPUTS];
 };
 
 template <int FRAMES>
 void forward(const uint8_t* frames, int64_t image_stride, int64_t images, const float* weights1,
              const float* bias1, const float* weights2, const float* bias2, float* features,
              float* hidden, uint8_t* winners1, uint8_t* winners2, int threads) {
-    using First = First<FRAMES>;
+    using First = FirstLayer<FRAMES>;
     const auto split1 = split_weights<First>(weights1, 1.0f / 255.0f);
     const auto split2 = split_weights<Second>(weights2, 1.0f);
 #pragma omp parallel num_threads(threads) if (images > 1)
@@ -212,7 +217,8 @@ void forward(const uint8_t* frames, int64_t image_stride, int64_t images, const 
                                    scratch->planes1 + i * First::PLANE);
             convolve<First>(scratch->planes1, split1.data(), bias1, between, won1);
             for (int i = 0; i < Second::CHANNELS; ++i)
-                make_planes<Second>(between + i * First::SIZE, scratch->planes2 + i * Second::PLANE);
+                make_planes<Second>(between + i * First::SIZE,
+                                    scratch->planes2 + i * Second::PLANE);
             convolve<Second>(scratch->planes2, split2.data(), bias2, scratch->outputs, won2);
             for (int row = 0; row < Second::FILTERS * Second::ROWS; ++row)
                 std::copy_n(scratch->outputs + row / Second::ROWS * Second::SIZE +
@@ -324,23 +330,23 @@ struct Gradients {
 
 template <int FRAMES>
 struct Sums {
-    Gradients<First<FRAMES>> first;
+    Gradients<FirstLayer<FRAMES>> first;
     Gradients<Second> second;
 };
 
-// What a thread needs for one image. Channels are innermost; windows are read and written over the
-// end by less than a vector.
+// What a thread needs for one image; channels are innermost.
 template <int FRAMES>
 struct BackwardScratch {
-    float image[First<FRAMES>::IMAGE_SIZE * FRAMES + LANES];
-    float hidden[First<FRAMES>::OUTPUTS + LANES], hidden_gradients[First<FRAMES>::OUTPUTS + LANES];
-    Spike spikes[First<FRAMES>::SIZE];
+    using First = FirstLayer<FRAMES>;
+    float image[First::IMAGE_SIZE * FRAMES];
+    float hidden[First::OUTPUTS], hidden_gradients[First::OUTPUTS];
+    Spike spikes[First::SIZE];  // of one filter at a time
 };
 
 template <int FRAMES>
 void backward_image(const float* weights2, const uint8_t* winners1, const uint8_t* winners2,
                     const float* gradients, BackwardScratch<FRAMES>& scratch, Sums<FRAMES>& sums) {
-    using First = First<FRAMES>;
+    using First = FirstLayer<FRAMES>;
     Spike* spikes = scratch.spikes;
     const auto sum = [spikes](int count) {
         float total = 0;
@@ -372,7 +378,7 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
               const float* hidden, const uint8_t* winners1, const uint8_t* winners2,
               const float* gradients, float* to_weights1, float* to_bias1, float* to_weights2,
               float* to_bias2, int threads) {
-    using First = First<FRAMES>;
+    using First = FirstLayer<FRAMES>;
     std::vector<float> padded2(Second::FILTERS * SIDE * Second::PADDED_WINDOW);
     for (int row = 0; row < Second::FILTERS * SIDE; ++row)
         std::copy_n(weights2 + row * Second::WINDOW, Second::WINDOW,
@@ -384,7 +390,8 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
 #pragma omp for schedule(dynamic)
         for (int64_t first = 0; first < images; first += CHUNK)
             for (int64_t image = first; image < std::min(images, first + CHUNK); ++image) {
-                interleave<FRAMES>(frames + image * image_stride, First::IMAGE_SIZE, scratch->image);
+                interleave<FRAMES>(frames + image * image_stride, First::IMAGE_SIZE,
+                                   scratch->image);
                 interleave<First::FILTERS>(hidden + image * First::OUTPUTS, First::SIZE,
                                            scratch->hidden);
                 backward_image<FRAMES>(padded2.data(), winners1 + image * First::OUTPUTS,
@@ -393,7 +400,10 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
             }
     }
     Sums<FRAMES> total = {};
-    for (const Sums<FRAMES>& part : sums) total.first.add(part.first), total.second.add(part.second);
+    for (const Sums<FRAMES>& part : sums) {
+        total.first.add(part.first);
+        total.second.add(part.second);
+    }
     total.first.write(1.0f / 255.0f, to_weights1, to_bias1);
     total.second.write(1.0f, to_weights2, to_bias2);
 }
@@ -403,15 +413,14 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
 // ---- interface ----------------------------------------------------------------------------------
 //
 // Frames are [images][channels][45][80] with ``image_stride`` bytes between images and 1 or 2
-// channels; weights and their gradients are [filter][6][6][channel]. What the backward pass needs
-// (hidden, winners1, winners2: trunk_saved() numbers an image) may be null if there will be none.
+// channels; weights and their gradients are [filter][6][6][channel]. What a backward pass will need
+// is kept in hidden and winners1, trunk_hidden() numbers an image each, and in winners2,
+// trunk_outputs() numbers an image. All three are null if there will be none.
 
 extern "C" {
 
-void trunk_saved(int* hidden, int* winners1, int* winners2) {
-    *hidden = *winners1 = First<1>::OUTPUTS;
-    *winners2 = Second::OUTPUTS;
-}
+int trunk_hidden() { return FirstLayer<1>::OUTPUTS; }
+int trunk_outputs() { return Second::OUTPUTS; }
 
 void trunk_forward(const uint8_t* frames, int64_t image_stride, int64_t images, int channels,
                    const float* weights1, const float* bias1, const float* weights2,

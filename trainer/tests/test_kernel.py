@@ -1,0 +1,221 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import onnx
+import pytest
+import torch
+from torch import Tensor
+
+from trainer.learner import kernel
+from trainer.learner.kernel import trunk
+from trainer.learner.kernel.trunk import trunk_features
+
+needs_kernel = pytest.mark.skipif(
+    kernel.load("trunk") is None, reason="there is no compiler here, or PHIL_KERNEL=0"
+)
+
+
+def _pictures(batch: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (batch, 3, 45, 80), dtype=torch.uint8, generator=generator)
+
+
+def _parameters(frames: int, seed: int = 0) -> list[Tensor]:
+    """As torch initialises them, channels last like the networks' own."""
+    torch.manual_seed(seed)
+    return [
+        parameter.detach().requires_grad_()
+        for layer in (torch.nn.Conv2d(frames, 6, 6), torch.nn.Conv2d(6, 16, 6))
+        for parameter in (layer.weight.to(memory_format=torch.channels_last), layer.bias)
+        if parameter is not None
+    ]
+
+
+def _gradients(
+    frames: Tensor, parameters: list[Tensor], slopes: Tensor
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    features = trunk_features(frames, *parameters)
+    return features.detach(), torch.autograd.grad(features, parameters, slopes.to(features.dtype))
+
+
+def _slopes(batch: int) -> Tensor:
+    return torch.randn(batch, 1792, generator=torch.Generator().manual_seed(1))
+
+
+def _check(frames: Tensor, parameters: list[Tensor]) -> None:
+    """Features and gradients against the torch path in double precision."""
+    slopes = _slopes(len(frames))
+    features, gradients = _gradients(frames, parameters, slopes)
+    exact = [parameter.detach().double().requires_grad_() for parameter in parameters]
+    right_features, right_gradients = _gradients(frames, exact, slopes)
+    assert features.dtype == torch.float32
+    torch.testing.assert_close(features.double(), right_features, rtol=1e-5, atol=2e-6)
+    for gradient, right in zip(gradients, right_gradients, strict=True):
+        scale = right.abs().max().item()
+        torch.testing.assert_close(gradient.double(), right, rtol=0, atol=3e-6 * scale)
+
+
+@needs_kernel
+@pytest.mark.parametrize("batch", [1, 2, 7, 8, 9, 33])
+@pytest.mark.parametrize("frames", [slice(0, 2), slice(1, 3), slice(2, 3)])
+def test_features_and_gradients_are_those_of_torch(batch: int, frames: slice) -> None:
+    pictures = _pictures(batch)[:, frames]
+    _check(pictures, _parameters(pictures.shape[1]))
+
+
+@needs_kernel
+def test_any_memory_layout_will_do() -> None:
+    pictures = _pictures(8)[::2, [2, 0]].transpose(2, 3).contiguous().transpose(2, 3)
+    parameters = [parameter.detach().contiguous() for parameter in _parameters(2)]
+    _check(pictures, [parameter.requires_grad_() for parameter in parameters])
+
+
+@needs_kernel
+def test_without_gradients_the_features_are_the_same() -> None:
+    frames, parameters = _pictures(5)[:, :2], _parameters(2)
+    with torch.no_grad():
+        features = trunk_features(frames, *parameters)
+    assert not features.requires_grad
+    assert torch.equal(features, trunk_features(frames, *parameters))
+
+
+@needs_kernel
+@pytest.mark.parametrize("level", [0, 1, 128, 255])
+def test_ties_go_to_the_first_position_as_in_torch(level: int) -> None:
+    # Everywhere the four candidates of a pooling are equal.
+    _check(torch.full((3, 2, 45, 80), level, dtype=torch.uint8), _parameters(2))
+
+
+@needs_kernel
+def test_nothing_passes_where_relu_is_off() -> None:
+    weight1, bias1, weight2, _ = _parameters(1)
+    off = torch.full((16,), -1e6, requires_grad=True)
+    features, gradients = _gradients(
+        _pictures(2)[:, :1], [weight1, bias1, weight2, off], _slopes(2)
+    )
+    assert not features.any()
+    assert not any(gradient.any() for gradient in gradients)
+
+
+@needs_kernel
+def test_the_number_of_threads_does_not_matter() -> None:
+    frames, parameters, slopes = _pictures(45)[:, 1:], _parameters(2), _slopes(45)
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(_gradients(frames, parameters, slopes))
+    finally:
+        torch.set_num_threads(before)
+    first_features, first_gradients = results[0]
+    for features, gradients in results[1:]:
+        assert torch.equal(features, first_features)
+        for gradient, first in zip(gradients, first_gradients, strict=True):
+            assert torch.equal(gradient, first)
+
+
+@needs_kernel
+def test_not_a_number_is_not_hidden() -> None:
+    parameters = _parameters(2)
+    parameters[1] = torch.full((6,), float("nan"))
+    assert trunk_features(_pictures(1)[:, :2], *parameters).isnan().all()
+
+
+def test_an_empty_batch() -> None:
+    assert trunk_features(_pictures(0)[:, :2], *_parameters(2)).shape == (0, 1792)
+
+
+class _Network(torch.nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.items = torch.nn.ParameterList(_parameters(2))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return trunk_features(frames, *self.items)
+
+
+@needs_kernel
+def test_exports_hold_torch_operations() -> None:
+    frames, network = _pictures(2)[:, :2], _Network()
+    exported = torch.export.export(network, (frames,))
+    assert "conv2d" in str(exported.graph)
+    torch.testing.assert_close(exported.module()(frames), network(frames))
+
+
+@needs_kernel
+@pytest.mark.filterwarnings("ignore:.*legacy TorchScript:DeprecationWarning")
+def test_onnx_holds_torch_operations(tmp_path: Path) -> None:
+    file = tmp_path / "network.onnx"
+    torch.onnx.export(_Network(), (_pictures(2)[:, :2],), str(file), dynamo=False)
+    assert [node.op_type for node in onnx.load(file).graph.node].count("Conv") == 2
+
+
+def test_other_pictures_take_the_torch_path() -> None:
+    weight1, bias1, *second = _parameters(3)
+    features = trunk_features(_pictures(2), weight1, bias1, *second)
+    right = trunk._torch_features(_pictures(2), weight1, bias1, *second)
+    assert torch.equal(features, right)
+
+
+_PROGRAM = """
+import torch
+from trainer.learner import kernel
+from trainer.learner.kernel.trunk import trunk_features
+frames = torch.zeros(2, 1, 45, 80, dtype=torch.uint8)
+features = trunk_features(
+    frames, torch.ones(6, 1, 6, 6), torch.ones(6), torch.ones(16, 6, 6, 6), torch.zeros(16)
+)
+assert (features == 216).all(), features
+trunk_features(
+    frames, torch.ones(6, 1, 6, 6), torch.ones(6), torch.ones(16, 6, 6, 6), torch.zeros(16)
+)
+print("kernel" if kernel.load("trunk") else "torch")
+"""
+
+
+def _start(cache: Path, **environment: str) -> subprocess.Popen[str]:
+    settings = {**os.environ, "XDG_CACHE_HOME": str(cache), "PHIL_KERNEL": "1", **environment}
+    return subprocess.Popen(
+        [sys.executable, "-c", _PROGRAM],
+        env=settings,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def _finish(process: subprocess.Popen[str]) -> tuple[str, str]:
+    output, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    return output.strip(), errors
+
+
+@pytest.mark.parametrize("compiler", ["/bin/false", "/no/such/compiler"])
+def test_without_a_compiler_torch_does_the_work(tmp_path: Path, compiler: str) -> None:
+    output, errors = _finish(_start(tmp_path, CXX=compiler))
+    assert output == "torch"
+    assert len(errors.splitlines()) == 1
+    assert "4 times slower" in errors
+    assert list(tmp_path.rglob("*.so")) == []
+
+
+def test_the_kernel_can_be_turned_off(tmp_path: Path) -> None:
+    assert _finish(_start(tmp_path, PHIL_KERNEL="0")) == ("torch", "")
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way of a directory")
+    output, errors = _finish(_start(blocked))
+    assert output == "torch"
+    assert len(errors.splitlines()) == 1
+
+
+@needs_kernel
+def test_two_processes_may_build_at_once(tmp_path: Path) -> None:
+    processes = [_start(tmp_path) for _ in range(2)]
+    assert [_finish(process) for process in processes] == [("kernel", "")] * 2
+    assert [path.suffix for path in (tmp_path / "phil-hil").iterdir()] == [".so"]
