@@ -146,7 +146,7 @@ def test_exports_hold_torch_operations() -> None:
 
 
 @needs_kernel
-@pytest.mark.filterwarnings("ignore:.*legacy TorchScript:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_onnx_holds_torch_operations(tmp_path: Path) -> None:
     file = tmp_path / "network.onnx"
     torch.onnx.export(_Network(), (_pictures(2)[:, :2],), str(file), dynamo=False)
