@@ -6,7 +6,6 @@ import shlex
 import socket
 import subprocess
 import sys
-from types import TracebackType
 
 from edge_runtime.errors import UserError
 
@@ -57,12 +56,7 @@ class BackgroundCommand:
     def __enter__(self) -> BackgroundCommand:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._process.poll() is None:
             self._process.terminate()
         try:

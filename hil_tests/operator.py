@@ -7,7 +7,6 @@ this stands in for the person and says each time what it does.
 from __future__ import annotations
 
 import threading
-from types import TracebackType
 
 from edge_runtime.errors import UserError
 from edge_runtime.operator_commands import ask
@@ -28,12 +27,7 @@ class Operator:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._end.set()
         self._thread.join()
 

@@ -6,21 +6,20 @@ road crosses the path from the left and never yields.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from highway_env.road.lane import LineType, StraightLane
-from highway_env.road.road import Road, RoadNetwork
+from highway_env.road.road import Road
 from numpy.typing import NDArray
 
 from trainer.scenarios.ego import EgoVehicle, PathTracker
 from trainer.scenarios.geometry import Rectangle, overlap
 from trainer.scenarios.path import LeftTurnPath
 from trainer.scenarios.rasteriser import COLUMNS, ROWS, Rasteriser
+from trainer.scenarios.roads import LANE_REACH_M, NEAR_LANE, road_areas, t_intersection
 from trainer.scenarios.scene import draw_scene
 from trainer.scenarios.traffic import TrafficVehicle, queue
 
@@ -104,9 +103,9 @@ class LeftTurnEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
         self.path = LeftTurnPath((half, c.straight_m + c.lane_width_m), c.straight_m, 3 * half)
         self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel)
-        self.road_areas = _road_areas(c.lane_width_m)
+        self.road_areas = road_areas(c.lane_width_m)
         self._background = self.rasteriser.background(self.road_areas)
-        self.network = _network(c, self.path)
+        self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
         self.frames = np.zeros((2, ROWS, COLUMNS), np.uint8)
         self.steps = 0
         self.distance_m = 0.0
@@ -188,7 +187,7 @@ class LeftTurnEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             else:
                 positions.append(crossing_m - float(random.uniform(*c.first_car_m)))
         speeds = [float(v) for v in random.uniform(*c.traffic_speed_mps, size=c.traffic_cars)]
-        return queue(self.road, ("west", "east", 0), positions, speeds)
+        return queue(self.road, NEAR_LANE, positions, speeds)
 
     def _frame(self) -> NDArray[np.uint8]:
         cars = [car.footprint for car in self.traffic]
@@ -226,32 +225,6 @@ class LeftTurnEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _caption(self) -> str:
         time_s, goal_m = self.steps * self.config.control_period_s, self.config.goal_m
         return f"{time_s:.1f} s\n{self.ego.speed:.1f} m/s\n{self.distance_m:.1f} of {goal_m:.0f} m"
-
-
-LANE_REACH_M = 100.0
-"""How far the main road goes on to either side."""
-
-
-def _network(config: LeftTurnConfig, path: LeftTurnPath) -> RoadNetwork:
-    network, half = RoadNetwork(), 0.5 * config.lane_width_m
-    lines = (LineType.STRIPED, LineType.CONTINUOUS)
-    main = {"width": config.lane_width_m, "line_types": lines}
-    reach = LANE_REACH_M
-    network.add_lane("west", "east", StraightLane((-reach, half), (reach, half), **main))
-    network.add_lane("east", "west", StraightLane((reach, -half), (-reach, -half), **main))
-    nodes = ("south", "turn", "exit", "goal")
-    for start, end, lane in zip(
-        nodes, nodes[1:], path.lanes(config.goal_m, config.lane_width_m), strict=False
-    ):
-        network.add_lane(start, end, lane)
-    return network
-
-
-def _road_areas(lane_width_m: float) -> list[Rectangle]:
-    """The paved ground: the main road across, the side road from below."""
-    width_m, side_m = 2 * lane_width_m, 40.0
-    side_road = Rectangle(0.0, 0.5 * side_m, 0.5 * math.pi, side_m, width_m)
-    return [Rectangle(0.0, 0.0, 0.0, 2 * LANE_REACH_M, width_m), side_road]
 
 
 def _vehicle_dict(number: int, shape: Rectangle, speed_mps: float, ego: bool) -> dict[str, Any]:

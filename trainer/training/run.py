@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,28 +31,9 @@ from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
+from trainer.training.tally import Tally
 
 CONFIG_FILE = "config.json"
-
-
-@dataclass
-class _Tally:
-    """What an episode adds up while it is driven."""
-
-    rewards: float = 0.0
-    interventions: int = 0
-    human_steps: int = 0
-    steps: int = 0
-    environment_s: float = 0.0
-    acting_s: float = 0.0
-    learning_s: float = 0.0
-    losses: list[Losses] = field(default_factory=list)
-
-    def mean_losses(self) -> NDArray[np.float64]:
-        """Critic, policy and cloning loss and value, averaged; nan without an update."""
-        if not self.losses:
-            return np.full(4, np.nan)
-        return np.mean([losses[:4] for losses in self.losses], axis=0)
 
 
 class TrainingRun:
@@ -141,7 +121,7 @@ class TrainingRun:
         return HumanGuide(driver, trigger)
 
     def _episode(self) -> EpisodeMetrics:
-        config, tally = self.config, _Tally()
+        config, tally = self.config, Tally()
         seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
         self.replay.start_episode(observation)
@@ -152,10 +132,10 @@ class TrainingRun:
         while not ended:
             observation, ended, info = self._step(observation, guided, tally)
         self.learner.decay_learning_rates()
-        return self._summary(tally, info)
+        return tally.summary(self._exploration_std(), self.episode, self.replay, info)
 
     def _step(
-        self, observation: NDArray[np.uint8], guided: bool, tally: _Tally
+        self, observation: NDArray[np.uint8], guided: bool, tally: Tally
     ) -> tuple[NDArray[np.uint8], bool, dict[str, Any]]:
         """One control period: act, let the human take over, store, learn."""
         began_s = time.perf_counter()
@@ -242,32 +222,6 @@ class TrainingRun:
             "seed": c.seed,
             "episode": self.episode,
         }
-
-    def _summary(self, tally: _Tally, info: dict[str, Any]) -> EpisodeMetrics:
-        critic, policy, cloning, value = map(float, tally.mean_losses())
-        policy_priority, human_priority = self.replay.mean_priorities()
-        return EpisodeMetrics(
-            episode=self.episode,
-            total_steps=self.replay.added,
-            steps=tally.steps,
-            episode_return=float(tally.rewards),
-            distance_m=float(info["distance_m"]),
-            outcome=info["outcome"],
-            interventions=tally.interventions,
-            human_steps=tally.human_steps,
-            exploration_std=self._exploration_std(),
-            critic_loss=critic,
-            policy_loss=policy,
-            cloning_loss=cloning,
-            value=value,
-            policy_priority=policy_priority,
-            human_priority=human_priority,
-            environment_s=tally.environment_s,
-            acting_s=tally.acting_s,
-            learning_s=tally.learning_s,
-            validation_success=float("nan"),
-            validation_distance_m=float("nan"),
-        )
 
 
 def _as_tensors(state: dict[str, Any]) -> dict[str, Any]:
