@@ -31,8 +31,9 @@ class LearnerConfig:
     """Standard deviation of the exploration noise in the first episode (table A5)."""
     exploration_final: float = 0.05
     """What it falls to (table A5)."""
-    exploration_decay: float = 0.97
-    """Factor on it, once an episode: 0.05 is reached after 98 episodes. Not in the paper."""
+    exploration_decay: float = 0.9
+    """Factor on it, once an episode: 0.05 is reached after 29 episodes. Not in the paper; the
+    human shows what to explore, and noise that calls the human in teaches little else."""
     exploration_bound: float = 1.0
     """Bound of the exploration noise (table A5: c)."""
     replay_capacity: int = 100_000
@@ -54,8 +55,9 @@ class LearnerConfig:
     """Exact eq. 22 and 23: separate means over policy and human samples. Off: one mean over the
     batch, as in the authors' code, since the exact form gives a handful of demonstrations half of
     the critic's loss."""
-    cloning_weight: float = 3.0
-    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper)."""
+    cloning_weight: float = 10.0
+    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). With 3, as
+    in the authors' code, the policy forgets the human before the critic knows better."""
     intervention_penalty: float = -10.0
     """Reward of the first step of an intervention (eq. 17: r_pen = r_fail)."""
     warmup_steps: int = 256

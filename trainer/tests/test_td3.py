@@ -82,7 +82,7 @@ def test_an_update_is_the_papers_losses_and_plain_adam():
     expected = learner.critics.state_dict()
     gradients = torch.autograd.grad(critic_loss, list(learner.critics.parameters()))
     policy = learner.actor(frames)
-    actor_loss = -learner.critics.first(frames, policy).mean() + 3.0 * (
+    actor_loss = -learner.critics.first(frames, policy).mean() + 10.0 * (
         ((policy - actions) ** 2)[human].mean()
     )
     actor_gradients = torch.autograd.grad(actor_loss, list(learner.actor.parameters()))
