@@ -27,7 +27,7 @@ FIRST_SEED = 0
 RECORDED_EPISODES = 2
 TRAINING_EPISODES = 150
 TRAINING_MINUTES = 4.5
-COLUMNS = ("drive", "success", "surviving distance", "latency p50", "p99", "safe stops")
+COLUMNS = ("drive", "success", "distance, m", "p50, ms", "p99, ms", "safe stops")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -66,9 +66,8 @@ class Demo:
         self.recording = directory / "drive.rrd"
         self.reports = {
             "in process": directory / "in_process.json",
-            "over the wire": directory / "wire.json",
-            f"over the wire, {LATENCY.replace('+-', ' ± ')} each way": directory
-            / "wire_latency.json",
+            "over Zenoh": directory / "wire.json",
+            "... 50 ± 10 ms each way": directory / "wire_latency.json",
         }
 
     def offer_kept(self) -> bool:
@@ -95,6 +94,7 @@ class Demo:
             "trainer", "train", "--human", str(self.human_dir), "--out", str(self.run_dir),
             "--seed", str(seed), "--episodes", str(TRAINING_EPISODES),
             "--max-minutes", f"{minutes:g}", "--set", "batch_size=64",
+            "--set", "evaluate_every=10", "--set", "evaluation_runs=30",
         )  # fmt: skip
         shutil.copy(self.run_dir / "learning_curve.png", self.directory / "learning_curve.png")
         heading("3  The actor becomes a signed policy file")
@@ -126,7 +126,9 @@ class Demo:
 
     def show(self) -> None:
         """The table, and where everything is."""
-        table = Table(title="Left turn, the same seeds")
+        table = Table(
+            title="Left turn, the same seeds; latency from state sent to command received"
+        )
         for column in COLUMNS:
             table.add_column(column, justify="left" if column == COLUMNS[0] else "right")
         for name, path in self.reports.items():
@@ -180,8 +182,8 @@ def summary_cells(report: dict[str, Any]) -> list[str]:
     distance, latency = report["surviving_distance_m"], report.get("latency_ms")
     return [
         f"{report['success_rate']:.0%}",
-        f"{distance['mean']:.2f} ± {distance['std']:.2f} m",
-        f"{latency['p50']:.1f} ms" if latency else "-",
-        f"{latency['p99']:.1f} ms" if latency else "-",
+        f"{distance['mean']:.2f} ± {distance['std']:.2f}",
+        f"{latency['p50']:.1f}" if latency else "-",
+        f"{latency['p99']:.1f}" if latency else "-",
         str(report.get("safe_stops", "-")),
     ]

@@ -14,7 +14,7 @@ LINE_INTERVAL_S = 15.0
 class ProgressBar:
     """Counts to ``total`` and shows a few live figures; written to stderr.
 
-    Use as a context manager and call ``advance`` with the figures, e.g. ``success="0.85"``.
+    Use as a context manager and call ``advance`` with the figures, e.g. ``{"success": "0.85"}``.
     """
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
@@ -43,8 +43,8 @@ class ProgressBar:
         if self._bar:
             self._bar.stop()
 
-    def advance(self, **figures: str) -> None:
-        """One more is done."""
+    def advance(self, figures: dict[str, str]) -> None:
+        """One more is done; ``figures`` are shown as name and value."""
         self.done += 1
         text = "  ".join(f"{name} {value}" for name, value in figures.items())
         if self._bar:

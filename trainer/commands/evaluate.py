@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         def on_episode(result: EpisodeResult) -> None:
             nonlocal goals
             goals += result.outcome == GOAL
-            bar.advance(success=f"{goals / (bar.done + 1):.2f}")
+            bar.advance({"success": f"{goals / (bar.done + 1):.2f}"})
 
         results = drive_episodes(env, driver, seeds, arguments.condition, on_episode)
     report = summarise(results, arguments.scenario, arguments.condition, policy_id, arguments.seed)

@@ -56,10 +56,12 @@ def run(arguments: argparse.Namespace) -> int:
     with ProgressBar("human model", config.episodes) as bar:
         for episode in training.episodes():
             bar.advance(
-                demonstrations=str(episode.demonstrations),
-                interventions=str(episode.interventions),
-                loss=f"{episode.loss:.3f}",
-                outcome=episode.outcome,
+                {
+                    "demonstrations": str(episode.demonstrations),
+                    "interventions": str(episode.interventions),
+                    "loss": f"{episode.loss:.3f}",
+                    "outcome": episode.outcome,
+                }
             )
     about = {"scenario": arguments.scenario, "seed": arguments.seed, "config": asdict(config)}
     training.model.save(directory, about)

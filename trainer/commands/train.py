@@ -101,10 +101,12 @@ class _Reporter:
             self.validation = f"{metrics.validation_success:.2f}"
         count = len(self.recent)
         self.bar.advance(
-            return_=f"{sum(m.episode_return for m in self.recent) / count:.1f}",
-            distance=f"{sum(m.distance_m for m in self.recent) / count:.1f} m",
-            success=f"{sum(m.outcome == GOAL for m in self.recent) / count:.2f}",
-            validation=self.validation,
+            {
+                "return": f"{sum(m.episode_return for m in self.recent) / count:.1f}",
+                "distance": f"{sum(m.distance_m for m in self.recent) / count:.1f} m",
+                "success": f"{sum(m.outcome == GOAL for m in self.recent) / count:.2f}",
+                "validation": self.validation,
+            }
         )
 
 

@@ -11,7 +11,7 @@ from trainer.drivers import EXPERTS, TRIGGERS
 from trainer.human.guide import HumanGuide
 from trainer.human.model import HumanModel, HumanModelConfig
 
-DEMONSTRATED_SHARE = 5
+DEMONSTRATED_SHARE = 2
 """The person drives the whole of one episode in this many: what right driving looks like when
 nothing goes wrong, which interventions alone never show."""
 

@@ -29,7 +29,7 @@ class HumanModelConfig:
     """Table A7."""
     episodes: int = 50
     """Table A7: maximum episode number of its training."""
-    updates_per_episode: int = 40
+    updates_per_episode: int = 60
     """Gradient steps after each episode. Not in the paper."""
 
 
