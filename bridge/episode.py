@@ -16,8 +16,8 @@ from edge_runtime.cli import UserError
 from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.wire import CONTROL_PERIOD_S, State
 
-PublishScene = Callable[[Any, int, int, float], None]
-"""Called with environment, episode, step, simulated time (s) after every state."""
+PublishScene = Callable[[Any, int, int, float, float | None], None]
+"""Called with environment, episode, step, simulated time (s), newest round trip (ms)."""
 OnTick = Callable[[int, int, Decision], None]
 """Called with episode, step, decision after every tick."""
 
@@ -81,7 +81,14 @@ class EpisodeRunner:
         )
 
     def _show(self, state: State) -> None:
-        self._publish_scene(self._environment, state.episode, state.step, state.sim_time_s)
+        answered = self._clock.latencies_ms
+        self._publish_scene(
+            self._environment,
+            state.episode,
+            state.step,
+            state.sim_time_s,
+            answered[-1] if answered else None,
+        )
 
     def _action(self, decision: Decision) -> np.ndarray:
         """The command's action, full brake, or (before the first command) hands off: zeros."""

@@ -53,14 +53,21 @@ class SimulatorPort:
         """Send an encoded state to the edge runtime (and to viewers)."""
         self._states.put(payload)
 
-    def publish_scene(self, environment: Any, episode: int, step: int, sim_time_s: float) -> None:
+    def publish_scene(
+        self,
+        environment: Any,
+        episode: int,
+        step: int,
+        sim_time_s: float,
+        round_trip_ms: float | None,
+    ) -> None:
         """Send the scene, if the environment has one and anybody is listening."""
         somebody: Any = self._scenes.matching_status
         if not somebody.matching:
             return
         scene = scene_of(environment)
         if scene is not None:
-            self._scenes.put(encode_scene(scene, episode, step, sim_time_s))
+            self._scenes.put(encode_scene(scene, episode, step, sim_time_s, round_trip_ms))
 
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""

@@ -34,6 +34,8 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
     episode: int
     step: int
     sim_time_s: float
+    round_trip_ms: float | None = None
+    """Of the newest command: from its state sent until it acts, injected delays included."""
     roads: list[list[Point]] = []
     road_width_m: float = 4.0
     path: list[Point] = []
@@ -52,10 +54,16 @@ def scene_key(vehicle_id: str) -> str:
     return f"phil/{check_vehicle_id(vehicle_id)}/scene"
 
 
-def encode_scene(scene: dict[str, Any], episode: int, step: int, sim_time_s: float) -> bytes:
+def encode_scene(
+    scene: dict[str, Any],
+    episode: int,
+    step: int,
+    sim_time_s: float,
+    round_trip_ms: float | None = None,
+) -> bytes:
     """Encode an environment's ``scene()`` with its place in time as a MessagePack map."""
-    stamped = {**scene, "episode": episode, "step": step, "sim_time_s": sim_time_s}
-    return _ENCODER.encode(stamped)
+    stamps = {"episode": episode, "step": step, "sim_time_s": sim_time_s}
+    return _ENCODER.encode({**scene, **stamps, "round_trip_ms": round_trip_ms})
 
 
 def decode_scene(payload: bytes) -> Scene | None:

@@ -51,7 +51,7 @@ def test_a_view_records_the_drive_and_ends_with_the_simulator(tmp_path):
             assert run.wait() == 0, run.errors
         assert view.wait(20) == 0, view.errors
     found = verify(recording)
-    entities = ("frames/now", "road/ego/body", "action/asked", "latency/uplink", "mode/mode")
+    entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
     assert [entity for entity in entities if entity not in found] == []
 
 

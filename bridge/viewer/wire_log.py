@@ -28,7 +28,7 @@ SERIES = {
     "speed/vehicle": ORANGE,
     "latency/uplink": BLUE,
     "latency/inference": GREEN,
-    "latency/downlink": ORANGE,
+    "latency/round_trip": ORANGE,
 }
 
 
@@ -73,7 +73,6 @@ class WireLog:
         if sent_ns is not None:
             self._scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
         self._scalar("latency/inference", command.inference_ns * 1e-6)
-        self._scalar("latency/downlink", (arrived_ns - command.sent_ns) * 1e-6)
         driving = command.mode == "drive"
         level = rr.TextLogLevel.INFO if driving else rr.TextLogLevel.WARN
         self._tell(command.mode, command.reason, level)
@@ -101,6 +100,8 @@ class WireLog:
         if self._drawn_episode != scene.episode:
             self._drawn_episode = scene.episode
             draw_ground(self._recording, scene)
+        if scene.round_trip_ms is not None:
+            self._scalar("latency/round_trip", scene.round_trip_ms)
         draw_cars(self._recording, scene, self._told or SILENT)
 
     def write_unreadable(self, topic: str, why: str) -> None:
