@@ -87,6 +87,21 @@ def simulate(folder: Path, endpoint: str, env: str, options: Sequence[str]) -> d
     return read(out)
 
 
+def simulate_undisturbed(
+    folder: Path, endpoint: str, env: str, options: Sequence[str], attempts: int = 4
+) -> dict[str, Any]:
+    """Run ``simulate`` again where the machine itself stood still for over 2 T in the middle.
+
+    Both ends live in wall time, so a test machine that pauses causes a rightful safe stop. The
+    reasons of those are the edge runtime's; what a test injects shows as ``no_command``.
+    """
+    for _ in range(attempts):
+        report = simulate(folder, endpoint, env, options)
+        if all(event["reason"] == "no_command" for event in report["safe_stop_events"]):
+            return report
+    raise AssertionError(f"disturbed {attempts} times: {report['safe_stop_events']}")
+
+
 def read(path: Path) -> dict[str, Any]:
     """Return a JSON report."""
     return json.loads(path.read_text())

@@ -17,6 +17,7 @@ from bridge.tests.processes import (
     read,
     refuse,
     simulate,
+    simulate_undisturbed,
     start_edge,
     start_simulate,
     wait_until_driving,
@@ -50,8 +51,8 @@ def test_lock_step_over_the_wire_is_the_same_drive_as_in_process(tmp_path):
     policy, endpoint = make_policy(tmp_path), free_endpoint()
     with start_edge(endpoint, policy):
         options = ["--episodes", "3", "--seed", "40"]
-        report = simulate(tmp_path, endpoint, TOY, options)
-        again = simulate(tmp_path, endpoint, TOY, options)
+        report = simulate_undisturbed(tmp_path, endpoint, TOY, options)
+        again = simulate_undisturbed(tmp_path, endpoint, TOY, options)
     assert set(report) >= CONTRACT_KEYS
     assert report["rejected"] == {}
     assert report["safe_stops"] == report["deadline_misses"] == 0
@@ -67,7 +68,7 @@ def test_virtual_latency_repeats_itself_over_the_wire(tmp_path):
     policy, endpoint = make_policy(tmp_path), free_endpoint()
     options = ["--episodes", "2", "--latency", "60ms+-30ms,loss=10%"]
     with start_edge(endpoint, policy):
-        first, again = (simulate(tmp_path, endpoint, TOY, options) for _ in range(2))
+        first, again = (simulate_undisturbed(tmp_path, endpoint, TOY, options) for _ in range(2))
     assert first["per_episode"] == again["per_episode"]
     assert first["latency_ms"]["p50"] > 100
     assert first["latency_spec"] == "delay=60ms,jitter=30ms,loss=10%"
