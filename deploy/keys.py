@@ -44,5 +44,10 @@ def write_key_pair(directory: Path) -> tuple[Path, Path]:
     finally:
         os.umask(before)
     public = key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
-    write_atomic(public_path, public)
+    try:
+        write_atomic(public_path, public)
+    except UserError:
+        # Half a pair would make the next try refuse to overwrite it.
+        private_path.unlink()
+        raise
     return private_path, public_path

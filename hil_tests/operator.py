@@ -21,6 +21,7 @@ class Operator:
         self.endpoint, self.vehicle_id = endpoint, vehicle_id
         self.rearms = 0
         self._end = threading.Event()
+        self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._watch, name="operator")
 
     def __enter__(self) -> Operator:
@@ -30,8 +31,17 @@ class Operator:
     def __exit__(self, *_: object) -> None:
         self._end.set()
         self._thread.join()
+        if self._failure is not None:
+            raise self._failure
 
     def _watch(self) -> None:
+        try:
+            self._poll()
+        except Exception as error:
+            # Nobody would re-arm any more: whoever waits for this drive must hear of it.
+            self._failure = error
+
+    def _poll(self) -> None:
         while not self._end.wait(POLL_INTERVAL_S):
             try:
                 status = ask(self.endpoint, self.vehicle_id, "status")

@@ -33,6 +33,7 @@ class NetworkDriver:
 
     def __init__(self, actor: Actor) -> None:
         self.actor = actor.eval()
+        self.device = next(actor.parameters()).device
 
     def reset(self) -> None:
         """Networks have no memory."""
@@ -40,7 +41,8 @@ class NetworkDriver:
     @torch.no_grad()
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         """pi(s), float32 [action size]."""
-        return self.actor(torch.from_numpy(observation)[None])[0].numpy()
+        frames = torch.from_numpy(observation)[None].to(self.device)
+        return self.actor(frames)[0].cpu().numpy()
 
 
 class OnnxDriver:
@@ -85,6 +87,11 @@ def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
     if (path / MODEL_FILE).is_file():
         actor, _ = load_human_model(path)
         return NetworkDriver(actor), f"human:{path.name}"
+    if not path.is_dir():
+        raise UserError(
+            f"{policy} is no policy: expected an .onnx file, a training run, "
+            "a human model's directory, or the word expert"
+        )
     actor, state = load_actor(path)
     return NetworkDriver(actor), f"run:{path.name}:{state['episode']}"
 
@@ -97,12 +104,17 @@ def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
     """
     for name in (BEST_FILE, CHECKPOINT_FILE):
         if (run_dir / name).is_file():
-            state = load_torch(run_dir / name)
-            weights = state["actor"] if name == BEST_FILE else state["learner"]["actor"]
-            actor = Actor(action_size=len(weights["head.output.bias"]))
-            actor.load_state_dict(weights)
-            return actor, {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
-    raise UserError(
-        f"{run_dir} holds no policy: expected an .onnx file, a training run, "
-        "a human model's directory, or the word expert"
-    )
+            return _read_actor(run_dir / name)
+    raise UserError(f"{run_dir} holds no training run ({BEST_FILE} or {CHECKPOINT_FILE})")
+
+
+def _read_actor(path: Path) -> tuple[Actor, dict[str, Any]]:
+    state = load_torch(path)
+    try:
+        weights = state["actor"] if path.name == BEST_FILE else state["learner"]["actor"]
+        actor = Actor(action_size=len(weights["head.output.bias"]))
+        actor.load_state_dict(weights)
+        label = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise UserError(f"{path} is not a checkpoint of this project") from error
+    return actor, label

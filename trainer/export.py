@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import warnings
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -19,7 +18,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.files import check_writable, read_bytes, write_atomic
 from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
 from edge_runtime.onnx_file import read_onnx
 from edge_runtime.signature import SIGNATURE_SUFFIX
@@ -75,7 +74,7 @@ def export_policy(actor: Actor, label: dict[str, Any], training: dict[str, Any])
             "seed": label["seed"],
             "episodes": label["episode"],
             "config": training,
-            "source_revision": source_revision(),
+            "source_revision": training.get("source_revision", "unknown"),
         },
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
@@ -99,6 +98,7 @@ def write_policy(export: Export, path: Path, key_file: Path | None) -> None:
     """
     key = load_private_key(key_file) if key_file else None
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
+    check_writable(signature_path)
     if key is None:
         # A signature of an older file beside it would only mislead.
         signature_path.unlink(missing_ok=True)
@@ -146,21 +146,6 @@ def parity(actor: Actor, model: bytes, observations: NDArray[np.uint8]) -> float
         wanted = actor(torch.from_numpy(observations)).numpy()
     (got,) = session.run(["action"], {"frames": observations})
     return float(np.abs(wanted - got).max())
-
-
-def source_revision() -> str:
-    """The repository's commit, ``-dirty`` where files differ from it, or ``unknown``."""
-    try:
-        described = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return described.stdout.strip()
 
 
 def _to_onnx(actor: Actor) -> onnx.ModelProto:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
-from edge_runtime.files import check_writable, read_bytes
-from trainer.commands.options import existing_directory
+from edge_runtime.errors import UserError
+from edge_runtime.files import check_writable
+from trainer.commands.options import existing_directory, read_json
 from trainer.drivers import load_actor
 from trainer.export import export_policy, load_private_key, write_policy
 from trainer.training.run import CONFIG_FILE
@@ -26,11 +26,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Export, check, sign; returns the exit status."""
     run_dir = existing_directory(arguments.run_dir, "run directory")
     out, key = Path(arguments.out), Path(arguments.key) if arguments.key else None
+    if out.suffix != ".onnx":
+        raise UserError(f"--out {out}: a policy file's name ends in .onnx")
     check_writable(out)
     if key:
         load_private_key(key)
     actor, label = load_actor(run_dir)
-    training = json.loads(read_bytes(run_dir / CONFIG_FILE, "run config"))
+    training = read_json(run_dir / CONFIG_FILE, "run config")
     export = export_policy(actor, label, training)
     write_policy(export, out, key)
     signed = "signed" if key else "not signed"

@@ -39,6 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=DEFAULTS.updates_per_episode,
         help="gradient steps after each episode",
     )
+    parser.add_argument(
+        "--demonstrated-share",
+        type=not_negative,
+        default=DEFAULTS.demonstrated_share,
+        metavar="N",
+        help="the person drives the whole of one episode in N; 0: interventions only, as the paper",
+    )
     add_threads(parser)
 
 
@@ -49,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         frames=arguments.frames,
         episodes=arguments.episodes,
         updates_per_episode=arguments.updates_per_episode,
+        demonstrated_share=arguments.demonstrated_share,
     )
     directory = Path(arguments.out)
     make_directory(directory)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes
 from trainer.scenarios import SCENARIOS
 
 
@@ -22,16 +26,16 @@ def add_threads(parser: argparse.ArgumentParser) -> None:
     """``--threads``."""
     parser.add_argument(
         "--threads",
-        type=positive,
-        default=None,
+        type=not_negative,
+        default=0,
         metavar="N",
-        help="processor threads of the learner (default: all cores)",
+        help="processor threads of the learner; 0: all cores",
     )
 
 
-def set_threads(count: int | None) -> None:
-    """Limit torch's threads; results are reproducible for one count."""
-    if count is not None:
+def set_threads(count: int) -> None:
+    """Limit torch's threads; 0 leaves them as they are."""
+    if count:
         torch.set_num_threads(count)
 
 
@@ -44,10 +48,33 @@ def positive(text: str) -> int:
 
 
 def not_negative(text: str) -> int:
-    """An argparse type: an integer of at least zero."""
+    """An argparse type: an integer of at least zero that fits into 63 bits, as seeds must."""
     value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
+    if not 0 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"{text} is not a number from 0 to 2**63 - 1")
+    return value
+
+
+def positive_float(text: str) -> float:
+    """An argparse type: a finite number above zero."""
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number above zero")
+    return value
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Raises:
+        UserError: no file, or something else in it.
+    """
+    try:
+        value = json.loads(read_bytes(path, what))
+    except ValueError as error:
+        raise UserError(f"{what} {path} is not JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise UserError(f"{what} {path} holds no JSON object")
     return value
 
 

@@ -7,8 +7,9 @@ import io
 
 from PIL import Image
 
+from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
-from trainer.commands.options import add_scenario, not_negative
+from trainer.commands.options import add_scenario, not_negative, positive_float
 from trainer.drivers import load_driver, make_environment
 
 EXAMPLE = "example: python -m trainer picture expert --seed 3 --time 2.5 --out scene.png"
@@ -20,13 +21,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scenario(parser)
     parser.add_argument("--seed", type=not_negative, default=0, help="of the episode")
     parser.add_argument(
-        "--time", type=float, default=3.0, metavar="S", help="simulated seconds from the start"
+        "--time",
+        type=positive_float,
+        default=3.0,
+        metavar="S",
+        help="simulated seconds from the start",
     )
     parser.add_argument("--out", required=True, metavar="F.png", help="the picture")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Drive to the moment and draw it; returns the exit status."""
+    if not arguments.out.endswith(".png"):
+        raise UserError(f"--out {arguments.out}: the picture is a .png")
     check_writable(arguments.out)
     env = make_environment(arguments.scenario)
     driver, _ = load_driver(arguments.policy, env)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections import deque
 from dataclasses import fields, replace
@@ -14,8 +13,15 @@ import torch
 
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
-from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
+from trainer.commands.options import (
+    add_scenario,
+    add_threads,
+    not_negative,
+    positive,
+    positive_float,
+    read_json,
+    set_threads,
+)
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.files import make_directory
 from trainer.learner.algorithms import ALGORITHMS
@@ -54,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learner's device")
     parser.add_argument(
         "--max-minutes",
-        type=float,
+        type=positive_float,
         default=None,
         metavar="MIN",
         help="stop after the episode that passes this time (default: no limit)",
@@ -118,6 +124,7 @@ def _config(arguments: argparse.Namespace) -> RunConfig:
         episodes=arguments.episodes,
         human=arguments.human,
         device=arguments.device,
+        threads=arguments.threads,
     )
     for assignment in arguments.set:
         config = _with_setting(config, assignment)
@@ -154,8 +161,10 @@ def _check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
     if resume and not started:
         raise UserError(f"{run_dir} holds no checkpoint to resume from")
     if resume:
-        saved = json.loads(read_bytes(run_dir / CONFIG_FILE, "run config"))
+        saved = read_json(run_dir / CONFIG_FILE, "run config")
         wanted = config.as_dict()
         changed = [key for key in wanted if key != "episodes" and saved.get(key) != wanted[key]]
         if changed:
             raise UserError(f"{run_dir} was trained with another {', '.join(changed)}")
+        if config.episodes < saved["episodes"]:
+            raise UserError(f"{run_dir} is a run of {saved['episodes']} episodes, not fewer")

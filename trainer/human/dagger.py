@@ -11,10 +11,6 @@ from trainer.drivers import EXPERTS, TRIGGERS
 from trainer.human.guide import HumanGuide
 from trainer.human.model import HumanModel, HumanModelConfig
 
-DEMONSTRATED_SHARE = 2
-"""The person drives the whole of one episode in this many: what right driving looks like when
-nothing goes wrong, which interventions alone never show."""
-
 
 @dataclass(frozen=True)
 class HumanEpisode:
@@ -52,8 +48,9 @@ class HumanTraining:
 
     def _drive(self, episode: int) -> tuple[int, str]:
         """One episode; the number of take-overs, and the outcome."""
-        demonstrated = episode % DEMONSTRATED_SHARE == 0
-        seed = seeds.episode_seed(self.seed, seeds.TRAINING, episode)
+        share = self.config.demonstrated_share
+        demonstrated = share > 0 and episode % share == share - 1
+        seed = seeds.episode_seed(self.seed, seeds.HUMAN_EPISODES, episode)
         observation, info = self.env.reset(seed=seed)
         self.guide.reset()
         interventions, ended = 0, False

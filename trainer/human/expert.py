@@ -20,7 +20,7 @@ class LeftTurnExpert:
     START_MARGIN_M = 1.5
     KEEP_MARGIN_M = 0.3
     POINT_OF_NO_RETURN_M = 8.0
-    """Path length at which the nose comes within 0.3 m of the cars of the near lane."""
+    """Path length at which the nose comes within 0.5 m of the cars of the near lane."""
     APPROACH_MPS2 = 1.5
     """Comfortable deceleration towards the stop line; full brake is kept for surprises."""
     CRUISE_MPS = 5.2

@@ -11,10 +11,23 @@ import torch
 from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
+from trainer import seeds
 from trainer.files import load_torch, save_torch
 from trainer.learner.networks import Actor
+from trainer.ranges import FROM_ONE, FROM_ZERO, check_ranges
 
 MODEL_FILE = "human_model.pt"
+
+
+RANGES = {
+    "frames": (1, 2),
+    "learning_rate": FROM_ZERO,
+    "batch_size": FROM_ONE,
+    "episodes": FROM_ONE,
+    "updates_per_episode": FROM_ONE,
+    "demonstrated_share": FROM_ZERO,
+}
+"""What each number may be."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +44,22 @@ class HumanModelConfig:
     """Table A7: maximum episode number of its training."""
     updates_per_episode: int = 60
     """Gradient steps after each episode. Not in the paper."""
+    demonstrated_share: int = 2
+    """The person drives the whole of one episode in this many, from the second on; 0: never.
+    Interventions alone, the paper's only source, show little of what right driving looks like
+    when nothing goes wrong."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, RANGES)
 
 
 class HumanModel:
     """A regression of the human's action on the picture (eq. 24 to 27).
 
-    It does not exist before the first intervention; then it starts as a copy of an untrained
-    policy network (eq. 25) and learns a little after each episode (eq. 27) from all that the
-    human has done so far: data aggregation.
+    Until the first intervention it is what eq. 25 starts from, an untrained policy network (with
+    table A4's one frame); ``learn`` does nothing before there is something to imitate. Then it
+    learns a little after each episode (eq. 27) from all that the human has done so far: data
+    aggregation.
     """
 
     def __init__(self, config: HumanModelConfig, seed: int, action_size: int = 1) -> None:
@@ -47,7 +68,7 @@ class HumanModel:
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames)
         self.optimiser = torch.optim.Adam(self.actor.parameters(), config.learning_rate)
-        self.random = np.random.default_rng([seed, 2])
+        self.random = seeds.stream(seed, seeds.HUMAN_BATCHES)
         self._observations: list[NDArray[np.uint8]] = []
         self._actions: list[NDArray[np.float32]] = []
 
@@ -106,6 +127,9 @@ def load_human_model(directory: Path) -> tuple[Actor, dict[str, Any]]:
     if not path.is_file():
         raise UserError(f"no human model in {directory} (expected {MODEL_FILE})")
     state = load_torch(path)
-    actor = Actor(state["action_size"], state["frames"])
-    actor.load_state_dict(state.pop("actor"))
+    try:
+        actor = Actor(state["action_size"], state["frames"])
+        actor.load_state_dict(state.pop("actor"))
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise UserError(f"{path} is not a human model of this project") from error
     return actor, state

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from trainer.ranges import ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
+
 
 @dataclass(frozen=True)
 class LearnerConfig:
@@ -56,9 +58,38 @@ class LearnerConfig:
     batch, as in the authors' code, since the exact form gives a handful of demonstrations half of
     the critic's loss."""
     cloning_weight: float = 10.0
-    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). With 3, as
-    in the authors' code, the policy forgets the human before the critic knows better."""
+    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). With 3 the
+    policy forgets the human before the critic knows better: see ``results/README.md``."""
     intervention_penalty: float = -10.0
     """Reward of the first step of an intervention (eq. 17: r_pen = r_fail)."""
     warmup_steps: int = 256
     """Environment steps before the first update."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, RANGES)
+
+
+RANGES = {
+    "batch_size": FROM_ONE,
+    "actor_learning_rate": FROM_ZERO,
+    "critic_learning_rate": FROM_ZERO,
+    "learning_rate_decay": SHARE,
+    "gamma": SHARE,
+    "tau": SHARE,
+    "policy_delay": FROM_ONE,
+    "target_noise": FROM_ZERO,
+    "target_noise_bound": FROM_ZERO,
+    "exploration_initial": FROM_ZERO,
+    "exploration_final": FROM_ZERO,
+    "exploration_decay": SHARE,
+    "exploration_bound": FROM_ZERO,
+    "replay_capacity": FROM_ONE,
+    "alpha": SHARE,
+    "priority_offset": FROM_ZERO,
+    "advantage_bound": FROM_ZERO,
+    "beta": SHARE,
+    "cloning_weight": FROM_ZERO,
+    "intervention_penalty": ANY,
+    "warmup_steps": FROM_ONE,
+}
+"""What each number may be."""

@@ -77,11 +77,8 @@ class ReplayBuffer:
     def mean_priorities(self) -> tuple[float, float]:
         """Mean priority of the policy's and of the human's transitions (nan where none)."""
         alive = self._alive()
-        human = self._human[alive]
-        return tuple(  # type: ignore[return-value]
-            float(np.mean(self._priorities[alive][which])) if which.any() else float("nan")
-            for which in (~human, human)
-        )
+        human, priorities = self._human[alive], self._priorities[alive]
+        return _mean(priorities[~human]), _mean(priorities[human])
 
     def start_episode(self, frames: NDArray[np.uint8]) -> None:
         """Take the first observation [2, 45, 80] of an episode."""
@@ -188,3 +185,7 @@ class ReplayBuffer:
             self.update_priorities(slot, np.zeros(1))
             self._oldest += 1
         return number
+
+
+def _mean(values: NDArray[np.float64]) -> float:
+    return float(values.mean()) if len(values) else float("nan")

@@ -7,6 +7,7 @@ import pytest
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
 from trainer.commands import COMMANDS
+from trainer.files import save_torch
 
 
 def call(capsys, *arguments: str) -> tuple[int, str, str]:
@@ -26,6 +27,12 @@ WRONG = [
     ("train", "--out", "{tmp}/x", "--set", "no_such=1"),
     ("train", "--out", "{tmp}/x", "--set", "batch_size=many"),
     ("train", "--out", "{tmp}/x", "--set", "batch_size"),
+    ("train", "--out", "{tmp}/x", "--set", "batch_size=0"),
+    ("train", "--out", "{tmp}/x", "--set", "gamma=nan"),
+    ("train", "--out", "{tmp}/x", "--set", "evaluation_runs=0"),
+    ("train", "--out", "{tmp}/x", "--seed", "99999999999999999999999"),
+    ("train", "--out", "{tmp}/x", "--max-minutes", "0"),
+    ("train", "--out", "{tmp}/x", "--max-minutes", "nan"),
     ("train", "--out", "{tmp}/x", "--resume"),
     ("train", "--out", "{tmp}/x", "--human", "{tmp}/nobody"),
     ("train", "--out", "{tmp}/file/x"),
@@ -38,11 +45,14 @@ WRONG = [
     ("export", "{tmp}/nothing", "--out", "{tmp}/p.onnx"),
     ("export", "{tmp}", "--out", "{tmp}/p.onnx"),
     ("export", "{tmp}", "--out", "{tmp}/p.onnx", "--key", "{tmp}/no.key"),
+    ("export", "{tmp}", "--out", "{tmp}/p.txt"),
+    ("picture", "expert", "--time", "-1", "--out", "{tmp}/p.png"),
+    ("picture", "expert", "--out", "{tmp}/p.jpg"),
     ("plot", "{tmp}"),
     ("picture", "expert", "--out", "{tmp}/no/such/p.png"),
     ("picture", "{tmp}/nobody", "--out", "{tmp}/p.png"),
     ("human", "--out", "{tmp}/file"),
-    ("bench", "--threads", "0"),
+    ("bench", "--threads", "-1"),
     ("bench", "--out", "{tmp}/no/such/b.json"),
     (),
 ]
@@ -118,7 +128,27 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path):
     status, _, err = call(capsys, *again)
     assert status == 2
     assert "--resume" in err
+    fewer = ("train", "--out", run, "--human", human, "--episodes", "2", "--set", "batch_size=4",
+             "--set", "evaluation_runs=1", "--resume")  # fmt: skip
+    status, _, err = call(capsys, *fewer)
+    assert status == 2
+    assert "not fewer" in err
     other = ("train", "--out", run, "--human", human, "--episodes", "4", "--seed", "8", "--resume")
     status, _, err = call(capsys, *other)
     assert status == 2
     assert "seed" in err
+
+
+@pytest.mark.parametrize("content", ["[]", "{", "null"])
+def test_a_broken_config_is_said_in_one_line(content, capsys, tmp_path):
+    (tmp_path / "checkpoint.pt").write_bytes(b"x")
+    (tmp_path / "config.json").write_text(content)
+    status, _, err = call(capsys, "train", "--out", str(tmp_path), "--resume")
+    assert (status, len(err.strip().splitlines())) == (2, 1)
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "best_actor.pt", "human_model.pt"])
+def test_a_foreign_torch_file_is_said_in_one_line(name, capsys, tmp_path):
+    save_torch(tmp_path / name, {"something": 1})
+    status, _, err = call(capsys, "evaluate", str(tmp_path), "--runs", "1")
+    assert (status, len(err.strip().splitlines())) == (2, 1)

@@ -65,27 +65,47 @@ def test_the_trunk_equals_convolution_relu_and_pooling_as_written_in_the_paper()
     torch.testing.assert_close(trunk(frames), hidden.flatten(1))
 
 
-def test_an_update_is_the_papers_losses_and_plain_adam():
+def disturb_targets(learner: TD3Learner) -> None:
+    """Make the targets differ from the online networks, as they do after some updates."""
+    random = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for module in (learner.target_actor, learner.target_critics):
+            for p in module.parameters():
+                p.add_(0.02 * torch.randn(p.shape, generator=random))
+
+
+def smoothing_noise(learner: TD3Learner, shape: tuple[int, ...]) -> torch.Tensor:
+    """The noise that the learner will draw next, without drawing it from the learner."""
+    random = torch.Generator()
+    random.set_state(learner.noise.get_state())
+    return (0.2 * torch.randn(shape, generator=random)).clamp(-0.5, 0.5)
+
+
+@pytest.mark.parametrize("split", [False, True])
+def test_an_update_is_the_papers_losses_and_plain_adam(split):
     """One update against the same written out with autograd and a fresh optimiser."""
-    config = replace(SMALL, target_noise=0.0)
-    learner, batch = TD3Learner(config, PHIL, seed=1), make_batch()
+    learner, batch = TD3Learner(replace(SMALL, split_loss=split), PHIL, seed=1), make_batch()
+    disturb_targets(learner)
     frames, next_frames = (torch.from_numpy(x.copy()) for x in (batch.frames, batch.next_frames))
     actions, human = torch.from_numpy(batch.actions), torch.from_numpy(batch.human)
     with torch.no_grad():
-        next_actions = learner.target_actor(next_frames)
+        noise = smoothing_noise(learner, actions.shape)
+        next_actions = (learner.target_actor(next_frames) + noise).clamp(-1.0, 1.0)
         first, second = (q(next_frames, next_actions) for q in learner.target_critics.pair)
         target = torch.from_numpy(batch.rewards) + 0.95 * (
             1 - torch.from_numpy(batch.terminals)
         ) * torch.minimum(first, second)
     values = [critic(frames, actions) for critic in learner.critics.pair]
-    critic_loss = sum(((target - value) ** 2).mean() for value in values)
-    expected = learner.critics.state_dict()
+    errors = [(target - value) ** 2 for value in values]
+    critic_loss = sum(e[human].mean() + e[~human].mean() if split else e.mean() for e in errors)
     gradients = torch.autograd.grad(critic_loss, list(learner.critics.parameters()))
     policy = learner.actor(frames)
-    actor_loss = -learner.critics.first(frames, policy).mean() + 10.0 * (
-        ((policy - actions) ** 2)[human].mean()
+    policy_values = learner.critics.first(frames, policy)
+    policy_loss = -(policy_values[~human] if split else policy_values).mean()
+    cloning_loss = ((policy - actions) ** 2)[human].mean()
+    actor_gradients = torch.autograd.grad(
+        policy_loss + 10.0 * cloning_loss, list(learner.actor.parameters())
     )
-    actor_gradients = torch.autograd.grad(actor_loss, list(learner.actor.parameters()))
     before = weights_of(learner)
     with torch.no_grad():
         critic = learner.target_critics.first
@@ -95,6 +115,8 @@ def test_an_update_is_the_papers_losses_and_plain_adam():
     losses = learner.update(batch)
 
     assert losses.critic == pytest.approx(critic_loss.item(), rel=1e-5)
+    assert losses.policy == pytest.approx(policy_loss.item(), rel=1e-4)
+    assert losses.cloning == pytest.approx(cloning_loss.item(), rel=1e-5)
     np.testing.assert_allclose(losses.priorities, wanted_priorities.detach(), rtol=1e-4)
     after = weights_of(learner)
     # Adam's first step is the learning rate against the gradient's sign, wherever it is not tiny.
@@ -106,7 +128,18 @@ def test_an_update_is_the_papers_losses_and_plain_adam():
         assert clear.float().mean() > 0.2
         moved = (after[name] - before[name])[clear]
         torch.testing.assert_close(moved, -rate * flat[clear].sign(), rtol=2e-2, atol=1e-6)
-    assert expected.keys() == learner.critics.state_dict().keys()
+
+
+def test_each_decay_scales_both_learning_rates():
+    learner = TD3Learner(replace(SMALL, learning_rate_decay=0.9), PHIL, seed=0)
+    for factor in (1.0, 0.9, 0.81):
+        (actor,), (critics,) = (
+            [group["lr"] for group in optimiser.param_groups]
+            for optimiser in (learner.actor_optimiser, learner.critic_optimiser)
+        )
+        assert actor == pytest.approx(5e-4 * factor)
+        assert critics == pytest.approx(2e-4 * factor)
+        learner.decay_learning_rates()
 
 
 def test_targets_follow_by_tau():

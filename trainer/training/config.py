@@ -6,11 +6,25 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from trainer.learner.config import LearnerConfig
+from trainer.ranges import FROM_ONE, FROM_ZERO, check_ranges
+
+RANGES = {
+    "seed": (0, 2**63 - 1),
+    "episodes": FROM_ONE,
+    "guided_share": FROM_ONE,
+    "evaluate_every": FROM_ZERO,
+    "evaluation_runs": FROM_ONE,
+    "checkpoint_every": FROM_ONE,
+    "threads": FROM_ZERO,
+}
+"""What each number may be."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """A run's settings; the same settings on the same machine give the same weights."""
+    """A run's settings; the same settings on the same machine give the same
+    weights (with the compiled kernel or without it, not across the two).
+    """
 
     scenario: str = "left_turn"
     algorithm: str = "phil_td3"
@@ -31,7 +45,13 @@ class RunConfig:
     checkpoint_every: int = 10
     """Episodes between two checkpoints."""
     device: str = "cpu"
+    threads: int = 0
+    """Processor threads of the learner; 0: as many as torch takes. Another number sums in another
+    order, and gives other weights."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self, RANGES)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
@@ -40,4 +60,5 @@ class RunConfig:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> RunConfig:
         """The inverse of ``as_dict``."""
-        return RunConfig(**{**values, "learner": LearnerConfig(**values["learner"])})
+        known = {name: values[name] for name in RunConfig.__dataclass_fields__}
+        return RunConfig(**{**known, "learner": LearnerConfig(**values["learner"])})

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
 
+from edge_runtime.episode_report import GOAL
 from edge_runtime.files import write_atomic
 
 METRICS_FILE = "metrics.csv"
@@ -70,6 +71,7 @@ class MetricsWriter:
         row = asdict(metrics)
         self._csv.writerow(row)
         self._file.flush()
+        row["success"] = float(metrics.outcome == GOAL)
         for name, value in row.items():
             if isinstance(value, (int, float)) and value == value:
                 self._board.add_scalar(name, value, metrics.episode)

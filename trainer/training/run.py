@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from edge_runtime.episode_report import GOAL
+from edge_runtime.errors import UserError
 from edge_runtime.files import write_json
 from trainer import seeds
 from trainer.drivers import (
@@ -29,6 +31,7 @@ from trainer.learner import equations
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner
+from trainer.revision import source_revision
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 from trainer.training.tally import Tally
@@ -71,7 +74,8 @@ class TrainingRun:
         deadline_s: float | None = None,
     ) -> None:
         """Train until the configured number of episodes, or ``time.monotonic() > deadline_s``."""
-        write_json(self.run_dir / CONFIG_FILE, self.config.as_dict())
+        about = {**self.config.as_dict(), "source_revision": source_revision()}
+        write_json(self.run_dir / CONFIG_FILE, about)
         metrics_writer = MetricsWriter(self.run_dir, self.episode)
         try:
             while self.episode < self.config.episodes:
@@ -104,7 +108,13 @@ class TrainingRun:
         )
 
     def _load(self) -> None:
-        state = load_torch(self.run_dir / CHECKPOINT_FILE)
+        path = self.run_dir / CHECKPOINT_FILE
+        try:
+            self._restore(load_torch(path))
+        except (KeyError, TypeError, RuntimeError) as error:
+            raise UserError(f"{path} does not fit this run") from error
+
+    def _restore(self, state: dict[str, Any]) -> None:
         self.episode = state["episode"]
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(_as_arrays(state["replay"]))
@@ -226,10 +236,8 @@ class TrainingRun:
 
 def _as_tensors(state: dict[str, Any]) -> dict[str, Any]:
     """Arrays as tensors: what a checkpoint may hold without arbitrary unpickling."""
-    import torch
-
     return {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in state.items()}
 
 
 def _as_arrays(state: dict[str, Any]) -> dict[str, Any]:
-    return {k: v.numpy() if hasattr(v, "numpy") else v for k, v in state.items()}
+    return {k: v.numpy() if isinstance(v, torch.Tensor) else v for k, v in state.items()}

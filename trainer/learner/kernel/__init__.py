@@ -21,8 +21,8 @@ from pathlib import Path
 _LOGGER = logging.getLogger(__name__)
 _FLAGS = ("-std=c++17", "-O3", "-march=native", "-fPIC", "-shared")
 _OPENMP = "-fopenmp"
-_TIMEOUT = 120.0
-"""Seconds for a build; it takes a few."""
+_TIMEOUT_S = 120.0
+"""For a build; it takes a few."""
 
 
 class _BuildError(Exception):
@@ -80,7 +80,12 @@ def _failure(command: list[str]) -> str | None:
     """Run the compiler; the first line of its complaint, or None if it had none."""
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT, check=False
+            command,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_TIMEOUT_S,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{command[0]} cannot be run: {error}"

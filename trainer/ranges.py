@@ -1,0 +1,29 @@
+"""Checks of settings: every number of a config has a range, and a wrong one gets one line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from edge_runtime.errors import UserError
+
+Range = tuple[float, float]
+ANY: Range = (-math.inf, math.inf)
+FROM_ONE: Range = (1, math.inf)
+FROM_ZERO: Range = (0, math.inf)
+SHARE: Range = (0, 1)
+
+
+def check_ranges(config: Any, ranges: Mapping[str, Range]) -> None:
+    """Raise UserError unless every named field of ``config`` is finite and within its range."""
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name)
+        if not (math.isfinite(value) and low <= value <= high):
+            raise UserError(f"{name} = {value} is out of range: {_text(low, high)}")
+
+
+def _text(low: float, high: float) -> str:
+    if math.isinf(low):
+        return "it must be a finite number"
+    return f"at least {low}" if math.isinf(high) else f"{low} to {high}"
