@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench lock clean
+.PHONY: help install demo test lint format bench lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -22,11 +22,8 @@ install: $(STAMP)  ## the virtual environment with the locked dependencies
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
 
-test: $(STAMP)  ## every quick test (real processes and real Zenoh sessions included)
-	$(BIN)/python -m pytest -m 'not slow'
-
-test-slow: $(STAMP)  ## the long suites
-	$(BIN)/python -m pytest -m slow
+test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
+	$(BIN)/python -m pytest
 
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .

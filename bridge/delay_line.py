@@ -14,19 +14,22 @@ Action = Callable[[], None]
 class DelayLine:
     """Runs actions at their time on the monotonic clock, on a thread of its own.
 
-    ``close`` must be called: the thread is no daemon of an ending process.
+    ``close`` ends the thread; as a daemon, a forgotten one does not hold up the process's end.
+    What an action raises ends the line, and is raised by the next ``push`` or ``close``.
     """
 
     def __init__(self) -> None:
         self._heap: EventHeap[Action] = EventHeap()
         self._changed = threading.Condition()
         self._closed = False
+        self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="delay-line", daemon=True)
         self._thread.start()
 
     def push(self, release_s: float, action: Action) -> None:
         """Run ``action`` at ``release_s`` (monotonic seconds); at once if that has passed."""
         with self._changed:
+            self._raise_failure()
             self._heap.push(release_s, action)
             self._changed.notify()
 
@@ -41,10 +44,18 @@ class DelayLine:
             self._closed = True
             self._changed.notify()
         self._thread.join()
+        self._raise_failure()
 
     def _run(self) -> None:
-        while (action := self._next_action()) is not None:
-            action()
+        try:
+            while (action := self._next_action()) is not None:
+                action()
+        except Exception as error:  # Handed to whoever uses the line.
+            self._failure = error
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
 
     def _next_action(self) -> Action | None:
         """Sleep until an action is due and return it; None once the line is closed."""

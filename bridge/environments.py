@@ -16,11 +16,11 @@ from gymnasium.spaces import Box
 from edge_runtime.cli import UserError
 from edge_runtime.wire import FRAMES_SHAPE
 
-SCENARIOS = {
-    "left_turn": "trainer.scenarios:phil/LeftTurn-v0",
-    "congestion": "trainer.scenarios:phil/Congestion-v0",
-}
-"""Scenario word on the command line -> gymnasium id, with the module that registers it."""
+SCENARIOS = {"left_turn": "phil/LeftTurn-v0"}
+"""Scenario word on the command line and in the report -> gymnasium id."""
+_REGISTERED_BY = {"phil": "trainer.scenarios"}
+"""Namespace of a gymnasium id -> the module that registers it."""
+_NOT_BUILT_YET = ("congestion", "phil/Congestion-v0")
 
 HINT = f"use {', '.join(SCENARIOS)}, a gymnasium id, or module:id"
 _NAME = re.compile(r"(?:\w+(?:\.\w+)*:)?[^:\s]+")
@@ -32,16 +32,36 @@ def make_environment(name: str) -> gymnasium.Env[Any, Any]:
     Raises UserError for an unknown name, a module that does not import, or an environment whose
     observation or action space the wire cannot carry.
     """
-    environment_id = SCENARIOS.get(name, name)
+    if _bare_id(name) in _NOT_BUILT_YET:
+        raise UserError(f"environment {name!r} is not built yet; {HINT}")
+    environment_id = _qualified_id(name)
     if not _NAME.fullmatch(environment_id):
         raise UserError(f"{name!r} names no environment; {HINT}")
     try:
         environment = gymnasium.make(environment_id)
-    except (gymnasium.error.Error, ImportError) as error:
-        first_line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise UserError(f"no environment {name!r}: {first_line} ({HINT})") from error
+    except (Exception, SystemExit) as error:  # A module may raise anything when it is imported.
+        first_line = (str(error).splitlines() or [""])[0]
+        what = f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__
+        raise UserError(f"no environment {name!r}: {what} ({HINT})") from error
     _check_spaces(environment, name)
     return environment
+
+
+def scenario_of(name: str) -> str:
+    """Return the scenario word for any form of an environment's name; the name if it has none."""
+    words = {environment_id: word for word, environment_id in SCENARIOS.items()}
+    return words.get(_bare_id(name), name)
+
+
+def _bare_id(name: str) -> str:
+    return name.rpartition(":")[2]
+
+
+def _qualified_id(name: str) -> str:
+    """Return the gymnasium id, with the module that registers it where that is known."""
+    environment_id = SCENARIOS.get(name, name)
+    module = _REGISTERED_BY.get(environment_id.partition("/")[0])
+    return environment_id if module is None else f"{module}:{environment_id}"
 
 
 def _check_spaces(environment: gymnasium.Env[Any, Any], name: str) -> None:

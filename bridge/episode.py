@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 
 from bridge.clock import Clock
@@ -35,6 +37,7 @@ class EpisodeRunner:
     ) -> None:
         self.safe_stops = SafeStopLog(CONTROL_PERIOD_S)
         self.deadline_misses = 0
+        self._under_way: State | None = None
         self._environment = environment
         self._clock = clock
         self._session = session
@@ -42,7 +45,22 @@ class EpisodeRunner:
         self._on_tick = on_tick
 
     def run(self, episode: int, seed: int) -> EpisodeResult:
-        """Drive one episode to its end; the seed decides the environment and the link."""
+        """Drive one episode to its end; the seed decides the environment and the link.
+
+        Where it is cut short (^C, a fault of the environment) a final state goes out as well, so
+        that the edge runtime stands by instead of stopping for a link that seems to be lost.
+        """
+        self._under_way = None
+        try:
+            return self._drive(episode, seed)
+        except BaseException:
+            if self._under_way is not None:
+                cut = self._under_way
+                final = msgspec.structs.replace(cut, step=cut.step + 1, final=True)
+                self._clock.finish(final)
+            raise
+
+    def _drive(self, episode: int, seed: int) -> EpisodeResult:
         observation, info = self._environment.reset(seed=seed)
         self._clock.begin(episode, seed)
         steps: list[_Step] = []
@@ -50,6 +68,7 @@ class EpisodeRunner:
         while not ended:
             state = self._state(episode, len(steps), observation, info)
             self._show(state)
+            self._under_way = state
             decision = self._clock.exchange(state)
             action = self._action(decision)
             observation, reward, terminated, truncated, info = self._environment.step(action)
@@ -59,6 +78,7 @@ class EpisodeRunner:
         final = self._state(episode, len(steps), observation, info, final=True)
         self._show(final)
         self._clock.finish(final)
+        self._under_way = None
         return _result(seed, steps, info)
 
     def _state(
@@ -107,26 +127,38 @@ class EpisodeRunner:
 class _Step:
     def __init__(self, action: np.ndarray, reward: float, info: dict[str, Any]) -> None:
         self.action = [float(value) for value in action]
-        self.reward = reward
+        self.reward = _finite("reward", reward)
         # An environment need not report accelerations; then they count as zero.
-        self.lateral_mps2 = abs(float(info.get("lateral_acceleration_mps2", 0.0)))
-        self.longitudinal_mps2 = abs(float(info.get("longitudinal_acceleration_mps2", 0.0)))
+        self.lateral_mps2 = abs(_number(info, "lateral_acceleration_mps2"))
+        self.longitudinal_mps2 = abs(_number(info, "longitudinal_acceleration_mps2"))
 
 
 def _speed_mps(info: dict[str, Any]) -> float:
     try:
-        return float(info["speed_mps"])
+        return _finite("speed_mps", info["speed_mps"])
     except KeyError:
         raise UserError(
             "the environment's info holds no speed_mps, which every state needs"
         ) from None
 
 
+def _number(info: dict[str, Any], name: str) -> float:
+    return _finite(name, info.get(name, 0.0))
+
+
+def _finite(name: str, value: Any) -> float:
+    """Return the number; the wire and the report can carry no other than finite ones."""
+    number = float(value)
+    if not math.isfinite(number):
+        raise UserError(f"the environment's {name} is {number}, not a finite number")
+    return number
+
+
 def _result(seed: int, steps: list[_Step], info: dict[str, Any]) -> EpisodeResult:
     return EpisodeResult(
         seed=seed,
         outcome=str(info.get("outcome") or "ended"),
-        distance_m=float(info.get("distance_m", 0.0)),
+        distance_m=_number(info, "distance_m"),
         reward=float(sum(step.reward for step in steps)),
         time_s=round(len(steps) * CONTROL_PERIOD_S, 6),
         lateral_acceleration_mps2=float(np.mean([step.lateral_mps2 for step in steps])),

@@ -10,6 +10,7 @@ from typing import Any
 
 import zenoh
 
+from bridge.edge_counts import EdgeCounts
 from bridge.environments import scene_of
 from bridge.scene import encode_scene, scene_key
 from edge_runtime.cli import UserError
@@ -18,6 +19,7 @@ from edge_runtime.wire import key
 
 CommandHandler = Callable[[bytes], None]
 EDGE_POLL_S = 0.1
+QUERY_S = 1.0
 
 
 def simulator_key(vehicle_id: str) -> str:
@@ -42,6 +44,11 @@ class SimulatorPort:
         )
         self._token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
         self._commands: Any = None
+        self.edge_counts = EdgeCounts()
+        self._health = zenoh_session.declare_subscriber(
+            key(vehicle_id, "health"),
+            lambda sample: self.edge_counts.observe_message(sample.payload.to_bytes()),
+        )
 
     def on_command(self, handler: CommandHandler) -> None:
         """Call ``handler(payload)`` for every command, on Zenoh's thread: it must be quick."""
@@ -72,8 +79,7 @@ class SimulatorPort:
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
         give_up_s = time.monotonic() + limit_s
-        alive = key(self._vehicle_id, "alive")
-        while not any(reply.ok for reply in self._zenoh.liveliness().get(alive, timeout=1.0)):
+        while not self._edge_is_there():
             if time.monotonic() >= give_up_s:
                 raise UserError(
                     f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
@@ -81,9 +87,26 @@ class SimulatorPort:
                 )
             time.sleep(EDGE_POLL_S)
 
+    def note_edge_counts(self) -> None:
+        """Ask the edge runtime for its counts now: before and after the drive."""
+        for reply in self._status_replies():
+            if reply.ok is not None:
+                self.edge_counts.observe_status(reply.ok.payload.to_bytes())
+
+    def _edge_is_there(self) -> bool:
+        """Its token is seen, or it answers: the board's Zenoh can lose the token for a while."""
+        alive = key(self._vehicle_id, "alive")
+        tokens = self._zenoh.liveliness().get(alive, timeout=QUERY_S)
+        return any(reply.ok for reply in tokens) or any(
+            reply.ok for reply in self._status_replies()
+        )
+
+    def _status_replies(self) -> Any:
+        return self._zenoh.get(key(self._vehicle_id, "status"), timeout=QUERY_S)
+
     def close(self) -> None:
         """Undeclare everything: a callback left open hangs the process at its end."""
-        for declared in (self._commands, self._token, self._scenes, self._states):
+        for declared in (self._commands, self._health, self._token, self._scenes, self._states):
             if declared is not None:
                 declared.undeclare()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -20,6 +21,15 @@ def latency_summary(latencies_ms: Sequence[float]) -> dict[str, float | None]:
     return {"p50": float(p50), "p99": float(p99), "max": float(max(latencies_ms))}
 
 
+def rejections(by_edge: Mapping[str, int], by_simulator: Mapping[str, int]) -> dict[str, Any]:
+    """Return the report's counts of rejected messages by reason: of each side, and the sum."""
+    return {
+        "rejected": dict(Counter(by_edge) + Counter(by_simulator)),
+        "rejected_by_edge": dict(by_edge),
+        "rejected_by_simulator": dict(by_simulator),
+    }
+
+
 def make_report(
     results: Sequence[EpisodeResult],
     safe_stop_events: Sequence[SafeStopEvent],
@@ -30,7 +40,7 @@ def make_report(
     """Join the summary of the episodes with what happened on the wire.
 
     ``settings`` holds scenario, policy_id, seed, clock and latency_spec; ``counts`` holds
-    deadline_misses, tick_overruns and rejected.
+    deadline_misses, tick_overruns and ``rejections``.
     """
     return {
         **summarise(
@@ -60,5 +70,5 @@ def summary_line(report: Mapping[str, Any]) -> str:
     return (
         f"{report['episodes']} episodes: {report['success_rate']:.0%} goal, "
         f"{report['collision_rate']:.0%} collision; {times}; {report['safe_stops']} safe stops, "
-        f"{report['deadline_misses']} deadline misses, {rejected} rejected commands"
+        f"{report['deadline_misses']} deadline misses, {rejected} rejected messages"
     )

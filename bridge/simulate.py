@@ -12,14 +12,14 @@ import gymnasium
 from bridge.arguments import non_negative_int, non_negative_seconds, positive_int
 from bridge.clock import Clock, Publish
 from bridge.command_check import CommandCheck
-from bridge.environments import SCENARIOS, make_environment
+from bridge.environments import SCENARIOS, make_environment, scenario_of
 from bridge.episode import EpisodeRunner
 from bridge.latency import GRAMMAR, LatencySpec, parse_spec
 from bridge.lockstep import LockStepClock
 from bridge.port import SimulatorPort, open_port
 from bridge.progress import EpisodeBar, episode_bar
 from bridge.realtime import RealTimeClock
-from bridge.report import make_report, summary_line
+from bridge.report import make_report, rejections, summary_line
 from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, write_json_out
 from edge_runtime.files import check_writable
@@ -156,9 +156,11 @@ def _drive(
 ) -> dict[str, Any]:
     runner = EpisodeRunner(environment, clock, port.session, port.publish_scene, bar.tick)
     results = []
+    port.note_edge_counts()
     for episode in range(settings.episodes):
         results.append(runner.run(episode, settings.seed + episode))
         bar.done(episode + 1)
+    port.note_edge_counts()
     return make_report(
         results,
         runner.safe_stops.events,
@@ -166,10 +168,10 @@ def _drive(
         counts={
             "deadline_misses": runner.deadline_misses,
             "tick_overruns": clock.tick_overruns,
-            "rejected": dict(check.rejected),
+            **rejections(port.edge_counts.rejected, check.rejected),
         },
         settings={
-            "scenario": settings.env,
+            "scenario": scenario_of(settings.env),
             "policy_id": check.policy_id,
             "seed": settings.seed,
             "clock": settings.clock,

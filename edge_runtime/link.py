@@ -10,6 +10,7 @@ import zenoh
 
 from edge_runtime import __version__, log
 from edge_runtime.manifest import Manifest
+from edge_runtime.presence import Presence
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
 _PUBLISHED = ("command", "feedback", "health")
@@ -59,8 +60,10 @@ class Link:
             session.declare_subscriber(key(self.vehicle_id, "state"), state_came),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
             session.declare_queryable(key(self.vehicle_id, "rearm"), rearm_asked),
-            session.liveliness().declare_token(key(self.vehicle_id, "alive")),
         ]
+        presence = Presence(session, key(self.vehicle_id, "alive"))
+        self._declared.append(presence)
+        presence.start()
 
     def send(self, topic: str, message: Message) -> None:
         """Publish a message. A failure is logged: the receiver's own watchdog handles it."""
@@ -71,9 +74,11 @@ class Link:
 
     def close(self) -> None:
         """Undeclare all, the token first, then close the session (it hangs at exit otherwise)."""
-        for declared in [*reversed(self._declared), *self._publishers.values()]:
-            declared.undeclare()
-        self._session.close()
+        try:
+            for declared in [*reversed(self._declared), *self._publishers.values()]:
+                declared.undeclare()
+        finally:
+            self._session.close()
 
     def _status(self, health: Health) -> Dict[str, Any]:
         status: Dict[str, Any] = msgspec.to_builtins(health)

@@ -18,6 +18,7 @@ MANIFEST_SCHEMA = 1
 
 # The runtime must know how to stop each action safely (limiter.py), so it takes only these.
 ACTION_NAMES = ("pedal", "steering")
+FULL_BRAKE = -1.0
 
 
 class Observation(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,4 +106,9 @@ def _check_action(action: Action) -> None:
     if not (finite and -1.0 <= action.low < action.high <= 1.0):
         raise UserError(
             f"the range of {action.name} is {action.low} to {action.high}; it must lie in -1 to 1"
+        )
+    if action.name == "pedal" and action.low != FULL_BRAKE:
+        raise UserError(
+            f"the range of pedal begins at {action.low}, not {FULL_BRAKE}: it could not brake"
+            " fully in a safe stop"
         )

@@ -30,7 +30,7 @@ def rearm(arguments: argparse.Namespace) -> int:
     reply = ask(arguments.connect, arguments.vehicle_id, "rearm")
     if not reply["accepted"]:
         raise UserError(f"{arguments.vehicle_id} was not re-armed: {reply['detail']}")
-    print(f"{arguments.vehicle_id} is re-armed; it drives with the next fresh state")
+    print(f"{arguments.vehicle_id} is re-armed; it drives after 5 fresh states in a row")
     return 0
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from pathlib import Path
 from typing import Iterator, List, Optional, Tuple
 
@@ -113,7 +115,9 @@ def _open(data: bytes) -> onnxruntime.InferenceSession:
     options.inter_op_num_threads = 1
     options.log_severity_level = 4
     try:
-        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        # It prints "EP Error" on stdout for some broken files; stdout belongs to our reports.
+        with contextlib.redirect_stdout(io.StringIO()):
+            return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no narrower base
         raise UserError(f"onnxruntime does not load it: {error}") from None
 

@@ -59,9 +59,13 @@ def _serve(
     stop: StopSignal,
 ) -> int:
     session = open_session(connect=config.connect, mode="peer")
-    link = Link(session, config.vehicle_id, policy.manifest)
-    runner = _attach(vehicle, policy, link)
-    loop = ControlLoop(policy, controller, link, runner)
+    try:
+        link = Link(session, config.vehicle_id, policy.manifest)
+        runner = _attach(vehicle, policy, link)
+        loop = ControlLoop(policy, controller, link, runner)
+    except BaseException:
+        session.close()  # An open session would hang the process at its exit.
+        raise
     stop.on_stop = loop.stop
     # What is loaded stays: the collector need not look at it again in the middle of a drive.
     gc.collect()

@@ -55,9 +55,13 @@ def check_trust(
             " sign it, or allow it with --allow-unsigned"
         )
     signature = read_bytes(signature_path, "signature")
-    key_pem = _find_public_key(public_key)
-    if key_pem is not None:
-        verify(policy_bytes, signature, key_pem)
+    key_path = _find_public_key(public_key)
+    if key_path is not None:
+        key_pem = read_bytes(key_path, "public key")
+        try:
+            verify(policy_bytes, signature, key_pem)
+        except UserError as error:
+            raise UserError(f"signature {signature_path}, public key {key_path}: {error}") from None
         return VERIFIED
     if allow_unsigned:
         return UNVERIFIED
@@ -67,12 +71,10 @@ def check_trust(
     )
 
 
-def _find_public_key(public_key: Optional[PathLike]) -> Optional[bytes]:
+def _find_public_key(public_key: Optional[PathLike]) -> Optional[PathLike]:
     if public_key is not None:
-        return read_bytes(public_key, "public key")
-    if DEFAULT_PUBLIC_KEY.exists():
-        return read_bytes(DEFAULT_PUBLIC_KEY, "public key")
-    return None
+        return public_key
+    return DEFAULT_PUBLIC_KEY if DEFAULT_PUBLIC_KEY.exists() else None
 
 
 def _load_key(public_key_pem: bytes) -> Ed25519PublicKey:

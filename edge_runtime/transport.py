@@ -23,14 +23,16 @@ MODES = ("router", "peer", "client")
 LEASE_MS = 1000
 RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 
-_ENDPOINT = re.compile(r"(tcp|udp|tls|quic)/(\[[0-9A-Fa-f:.]+\]|[^\s\[\]/:]+):(\d{1,5})")
+_ENDPOINT = re.compile(r"(tcp|udp)/(\[[0-9A-Fa-f:.]+\]|[^\s\[\]/:]+):(\d{1,5})")
 
 
 def check_endpoint(endpoint: str) -> str:
     """The endpoint itself; UserError if it is not PROTOCOL/HOST:PORT."""
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 1 <= int(match.group(3)) <= 65535:
-        raise UserError(f"endpoint {endpoint!r} is not valid: write it as {DEFAULT_ENDPOINT}")
+        raise UserError(
+            f"endpoint {endpoint!r} is not valid: write it as {DEFAULT_ENDPOINT} (tcp or udp)"
+        )
     return endpoint
 
 
@@ -79,7 +81,7 @@ def _check_port_is_free(endpoint: str) -> None:
     """Zenoh's own message for a busy port names neither the port nor the cause."""
     protocol, address = endpoint.split("/", 1)
     host, port = address.rsplit(":", 1)
-    kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
+    kind = socket.SOCK_STREAM if protocol == "tcp" else socket.SOCK_DGRAM
     try:
         family, _, _, _, target = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
     except OSError:
@@ -105,6 +107,6 @@ def _explain(text: str, listen: Optional[str], connect: Optional[str]) -> str:
     if connect is not None and listen is None:
         return (
             f"nobody answers at {connect}; start the simulator first, or name its address with"
-            " --connect (a refused certificate or password looks the same)"
+            " --connect"
         )
     return f"Zenoh cannot open {listen or connect}: {text}"

@@ -6,9 +6,12 @@ import shlex
 import socket
 import subprocess
 import sys
+import tempfile
+import time
 
 from edge_runtime.errors import UserError
 
+START_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 10.0
 
 
@@ -27,31 +30,35 @@ def run_command(*arguments: str) -> None:
 class BackgroundCommand:
     """``python -m ...`` running beside us for the length of a ``with`` block.
 
+    Its output is kept aside and quoted if it fails.
+
     Args:
         arguments: module and its arguments.
-        ready: text of the line on its standard output that says it has started; None: no wait.
+        ready: text of its output that says it has started; None: no wait.
     """
 
     def __init__(self, *arguments: str, ready: str | None = None) -> None:
         print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
         self.name = " ".join(arguments[:2])
+        self._output = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115 (closed in __exit__)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", *arguments],
-            stdout=subprocess.PIPE if ready else subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL if ready else None,
-            text=True,
+            [sys.executable, "-m", *arguments], stdout=self._output, stderr=subprocess.STDOUT
         )
         if ready:
             self._wait_for(ready)
 
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it has ended by itself.
 
-    def wait(self, timeout_s: float) -> int:
-        """The exit status, once it has ended by itself."""
-        return self._process.wait(timeout_s)
+        Raises:
+            UserError: it failed, or it goes on.
+        """
+        try:
+            status = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise UserError(f"python -m {self.name} did not end within {timeout_s} s") from None
+        if status:
+            raise self._failure()
 
     def __enter__(self) -> BackgroundCommand:
         return self
@@ -64,13 +71,24 @@ class BackgroundCommand:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._output.close()
 
     def _wait_for(self, ready: str) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            if ready in line:
-                return
-        raise UserError(f"python -m {self.name} ended with status {self._process.wait()}")
+        end_s = time.monotonic() + START_TIMEOUT_S
+        while ready not in self._said():
+            if self._process.poll() is not None or time.monotonic() > end_s:
+                failure = self._failure()
+                self.__exit__()
+                raise failure
+            time.sleep(0.02)
+
+    def _said(self) -> str:
+        self._output.seek(0)
+        return self._output.read()
+
+    def _failure(self) -> UserError:
+        last = (self._said().strip().splitlines() or ["it said nothing"])[-1]
+        return UserError(f"python -m {self.name}: {last}")
 
 
 def free_endpoint() -> str:

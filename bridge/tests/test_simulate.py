@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from bridge.environments import make_environment, scenario_of
 from bridge.tests.processes import (
     SHORT_TOY,
     SLOW_TOY,
@@ -151,6 +152,9 @@ def test_nobody_comes_and_one_line_says_what_to_start(tmp_path):
         (["--env", "phil/Nowhere-v0"], "Nowhere"),
         (["--env", "no_such_module:X-v0"], "no_such_module"),
         (["--env", "CartPole-v1"], "uint8"),
+        (["--env", "bridge.tests.broken_module:X-v0"], "RuntimeError: two"),
+        (["--env", "congestion"], "not built yet"),
+        (["--env", "phil/Congestion-v0"], "not built yet"),
         (["--env", "::"], "module:id"),
         (["--env", TOY, "--latency", "fast"], "latency"),
         (["--env", TOY, "--episodes", "0"], "at least 1"),
@@ -166,6 +170,31 @@ def test_bad_input_is_one_line_and_status_2(options, part, capsys):
     assert part in line
 
 
+def test_a_number_that_is_not_finite_is_one_line_and_status_2(tmp_path):
+    policy, endpoint, out = make_policy(tmp_path), free_endpoint(), tmp_path / "never.json"
+    env = "bridge.tests.toy:BridgeToyNan-v0"
+    with start_edge(endpoint, policy), start_simulate(endpoint, out, env) as run:
+        assert run.wait() == 2
+    assert "reward is nan" in run.errors
+    assert len(run.errors.splitlines()) == 1
+
+
+def test_what_the_edge_rejects_is_in_the_report(tmp_path):
+    policy, endpoint = make_policy(tmp_path), free_endpoint()
+    options = ["--latency", "up.delay=100ms,up.jitter=80ms"]
+    with start_edge(endpoint, policy):
+        report = simulate(tmp_path, endpoint, TOY, options)
+    assert report["rejected_by_edge"]["stale"] > 0
+    assert report["rejected"]["stale"] >= report["rejected_by_edge"]["stale"]
+
+
+@pytest.mark.parametrize("name", ["left_turn", "phil/LeftTurn-v0"])
+def test_a_scenario_is_found_by_word_and_by_id(name):
+    environment = make_environment(name)
+    assert scenario_of(name) == "left_turn"
+    environment.close()
+
+
 def test_an_interrupted_run_writes_no_report(tmp_path):
     endpoint, out = free_endpoint(), tmp_path / "half.json"
     policy = make_policy(tmp_path, "constant")
@@ -173,4 +202,9 @@ def test_an_interrupted_run_writes_no_report(tmp_path):
         wait_until_driving(edge)
         run.process.send_signal(signal.SIGTERM)
         assert run.wait(10) == 130
+        time.sleep(0.5)
+        # The final state came: at rest, not stopped because a link seems to be lost.
+        assert edge.end() == 0
+    assert "now=standby" in edge.log
+    assert "now=safe_stop" not in edge.log.split("now=standby")[-1]
     assert list(tmp_path.glob("*half*")) == []

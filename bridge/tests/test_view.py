@@ -9,7 +9,9 @@ import sys
 import time
 
 import pytest
+import rerun as rr
 
+from bridge.port import open_port
 from bridge.scene import Scene, SceneVehicle, decode_scene, encode_scene
 from bridge.tests.processes import (
     SLOW_TOY,
@@ -22,7 +24,8 @@ from bridge.tests.processes import (
 from bridge.tests.toy import ToyEnv
 from bridge.viewer.shapes import outline, view_bounds
 from bridge.viewer.timeline import Timeline
-from edge_runtime.tests.harness import free_endpoint, wait_until
+from bridge.viewer.wire_log import WireLog
+from edge_runtime.tests.harness import free_endpoint, make_state, wait_until
 
 
 def verify(recording):
@@ -100,6 +103,26 @@ def test_bad_input_is_one_line_and_status_2(options, part, capsys, monkeypatch, 
     assert refuse(["view", "--connect", free_endpoint(), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
+
+
+def test_a_simulator_of_another_vehicle_is_one_line_and_no_file(tmp_path, capsys):
+    endpoint, recording = free_endpoint(), tmp_path / "other.rrd"
+    with open_port(endpoint, "other"):
+        options = ["--connect", endpoint, "--save", str(recording), "--wait-s", "0.2"]
+        assert refuse(["view", *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--vehicle-id" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_late_viewer_does_not_call_it_silence(monkeypatch):
+    log = WireLog(rr.RecordingStream("test"))
+    events = []
+    monkeypatch.setattr(log, "_event", lambda text, *_: events.append(text))
+    log.write_state(make_state(50), 10**18)
+    assert events == []
+    log.write_state(make_state(53), 10**18 + 3 * 10**8)
+    assert events == ["no command: the simulator brakes by itself"]
 
 
 def test_a_scene_survives_the_wire_with_numpy_numbers_inside():

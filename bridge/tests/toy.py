@@ -19,11 +19,14 @@ PERIOD_S = 0.1
 class ToyEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """Full pedal is 3 m/s2, full brake -4 m/s2; the picture's brightness follows the distance."""
 
-    def __init__(self, goal_m: float = GOAL_M, max_steps: int = 80, wall_s: float = 0.0) -> None:
+    def __init__(
+        self, goal_m: float = GOAL_M, max_steps: int = 80, wall_s: float = 0.0, reward: float = 0.1
+    ) -> None:
         self.observation_space = spaces.Box(0, 255, (2, 45, 80), np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.brake_action = np.array([-1.0], np.float32)
         self._goal_m, self._max_steps, self._wall_s = goal_m, max_steps, wall_s
+        self._reward = reward
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -45,7 +48,7 @@ class ToyEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         arrived = self._distance_m >= self._goal_m
         late = self._steps >= self._max_steps
         outcome = "goal" if arrived else "timeout" if late else None
-        return self._frames.copy(), 0.1, arrived, late, self._info(acceleration, outcome)
+        return self._frames.copy(), self._reward, arrived, late, self._info(acceleration, outcome)
 
     def scene(self) -> dict[str, Any]:
         car = {"id": 0, "x": self._distance_m, "y": 0.0, "heading_rad": 0.0, "length_m": 4.0}
@@ -73,6 +76,7 @@ VARIANTS: dict[str, dict[str, float]] = {
     "BridgeToyShort-v0": {"max_steps": 25},
     # Long, and slow enough for a person (or a test) to kill something in the middle.
     "BridgeToySlow-v0": {"goal_m": 1000.0, "max_steps": 60, "wall_s": 0.02},
+    "BridgeToyNan-v0": {"reward": float("nan")},
 }
 for name, options in VARIANTS.items():
     if name not in gymnasium.registry:

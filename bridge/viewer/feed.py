@@ -23,6 +23,8 @@ from edge_runtime.wire import check_vehicle_id, key
 
 WIRE_TOPICS = ("state", "command", "feedback", "health")
 RETRY_S = 0.2
+TOKEN_S = 1.0
+"""A simulator that is there has this time to say so, however short the wait asked for."""
 QUEUE_MESSAGES = 2000
 """About a minute of real time, all topics together."""
 
@@ -41,6 +43,7 @@ class Feed:
 
     def __init__(self) -> None:
         self.simulator_gone = threading.Event()
+        self.simulator_seen = threading.Event()
         self.dropped = 0
         self._queue: queue.Queue[Heard] = queue.Queue(QUEUE_MESSAGES)
 
@@ -68,12 +71,14 @@ class Feed:
             self.simulator_gone.set()
         else:
             self.simulator_gone.clear()
+            self.simulator_seen.set()
 
 
 @contextlib.contextmanager
 def open_feed(connect: str, vehicle_id: str, wait_s: float = 0.0) -> Iterator[Feed]:
-    """Listen to one vehicle; UserError if nobody answers at ``connect`` within ``wait_s``."""
+    """Listen to one vehicle; UserError if its simulator is not at ``connect`` within ``wait_s``."""
     check_vehicle_id(vehicle_id)
+    give_up_s = time.monotonic() + wait_s
     session = _connect(connect, wait_s)
     try:
         feed = Feed()
@@ -84,12 +89,21 @@ def open_feed(connect: str, vehicle_id: str, wait_s: float = 0.0) -> Iterator[Fe
         token = simulator_key(vehicle_id)
         declared.append(liveliness.declare_subscriber(token, feed.watch, history=True))
         try:
+            _wait_for_simulator(feed, give_up_s, vehicle_id, connect)
             yield feed
         finally:
             for subscriber in declared:
                 subscriber.undeclare()
     finally:
         session.close()
+
+
+def _wait_for_simulator(feed: Feed, give_up_s: float, vehicle_id: str, endpoint: str) -> None:
+    """Without it, a view of a vehicle that is not there would never see it go, and never end."""
+    if not feed.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
+        raise UserError(
+            f"no simulator with vehicle id {vehicle_id} at {endpoint}; name it with --vehicle-id"
+        )
 
 
 def _connect(endpoint: str, wait_s: float) -> zenoh.Session:

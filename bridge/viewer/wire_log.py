@@ -39,7 +39,7 @@ class WireLog:
         self._recording = recording
         self._timeline = Timeline()
         self._told, self._reason = "", ""
-        self._heard_command_ns = 0
+        self._heard_command_ns: int | None = None
         self._sent_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
         self._edge_counts: dict[str, int] = {}
         self._drawn_episode = -1
@@ -58,6 +58,9 @@ class WireLog:
             self._event(f"episode {state.episode} begins")
         if state.final:
             self._event(f"episode {state.episode} ends at step {state.step}")
+        if self._heard_command_ns is None:
+            # A viewer that comes late has not yet had the time to hear one.
+            self._heard_command_ns = arrived_ns
         silent = arrived_ns - self._heard_command_ns > SILENCE_LIMIT_S * 1e9
         # Between two episodes nobody owes a command.
         if silent and state.step > 0 and not state.final:

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Optional
+from typing import Any, Callable, Dict, List, Optional, Sequence
 
 from edge_runtime import wire
 from edge_runtime.operator_commands import ask
@@ -59,21 +59,22 @@ class EdgeProcess:
     """`python -m edge_runtime run` as a process of its own."""
 
     def __init__(
-        self, *arguments: str, python: str = sys.executable, cwd: Optional[Path] = None
+        self,
+        *arguments: str,
+        python: str = sys.executable,
+        cwd: Optional[Path] = None,
+        python_flags: Sequence[str] = (),
+        stderr: Any = subprocess.PIPE,
     ) -> None:
         self.process = subprocess.Popen(
-            [python, "-m", "edge_runtime", "run", *arguments],
+            [python, *python_flags, "-m", "edge_runtime", "run", *arguments],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=stderr,
             text=True,
             cwd=cwd,
         )
         assert self.process.stdout is not None
         self.ready_line = self.process.stdout.readline().strip()
-
-    def loaded_files(self) -> str:
-        """What the process has mapped into its memory."""
-        return Path(f"/proc/{self.process.pid}/maps").read_text()
 
     def end(self, timeout_s: float = PATIENCE_S) -> int:
         """SIGTERM, then the exit status. Afterwards `log` holds its stderr."""

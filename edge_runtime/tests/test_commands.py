@@ -117,7 +117,7 @@ def test_a_busy_port_is_named():
 
 
 @pytest.mark.parametrize(
-    "endpoint", ["", "tcp", "tcp/host", "tcp/host:0", "tcp/host:70000", "x/h:1"]
+    "endpoint", ["", "tcp", "tcp/host", "tcp/host:0", "tcp/host:70000", "tls/h:1", "quic/h:1"]
 )
 def test_malformed_endpoints(endpoint):
     with pytest.raises(UserError, match="write it as"):

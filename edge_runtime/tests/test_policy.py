@@ -127,6 +127,32 @@ def test_an_action_that_nobody_can_stop_is_refused(tmp_path):
     refused(tmp_path / "p.onnx", "does not know how to stop", allow_unsigned=True)
 
 
+def test_a_pedal_without_a_full_brake_is_refused(tmp_path):
+    weak = type(PEDAL)(name="pedal", meaning="no brake", unit="aperture", low=0.0, high=1.0)
+    write_policy(tmp_path / "p.onnx", actions=(weak,))
+    refused(tmp_path / "p.onnx", "could not brake", allow_unsigned=True)
+
+
+def test_what_onnxruntime_prints_stays_off_stdout(tmp_path, monkeypatch, capfd):
+    def fail(*_, **__):
+        print("EP Error")
+        raise ValueError("broken\ngraph")
+
+    monkeypatch.setattr("onnxruntime.InferenceSession", fail)
+    write_policy(tmp_path / "p.onnx")
+    refused(tmp_path / "p.onnx", "broken graph", allow_unsigned=True)
+    assert capfd.readouterr().out == ""
+
+
+def test_a_bad_signature_names_its_files(make_policy):
+    signed = make_policy()
+    signed.path.with_name(f"{signed.path.name}.sig").write_bytes(bytes(64))
+    with pytest.raises(UserError) as caught:
+        load_policy(signed.path, signed.public_key)
+    assert f"{signed.path}.sig" in str(caught.value)
+    assert str(signed.public_key) in str(caught.value)
+
+
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + bytes(99)])
 def test_foreign_files_are_refused(tmp_path, content):
     (tmp_path / "p.onnx").write_bytes(content)

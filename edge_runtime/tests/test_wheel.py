@@ -93,8 +93,11 @@ def test_the_boards_python_and_versions(wheel, make_policy, tmp_path):
     # The board's Zenoh against the workstation's, over the wire.
     endpoint = free_endpoint()
     flags = (*signed.flags, "--connect", endpoint)
-    with Simulator(endpoint) as simulator, EdgeProcess(*flags, python=python, cwd=tmp_path) as edge:
-        simulator.wait_for_edge()
-        command = simulator.ask(make_state(0))
-        assert (command.mode, command.action) == ("drive", [-1.0])
+    with EdgeProcess(*flags, python=python, cwd=tmp_path) as edge:
+        # The edge first, then one simulator after the other: each must see that it is alive.
+        for session in ("first", "second"):
+            with Simulator(endpoint) as simulator:
+                simulator.wait_for_edge()
+                command = simulator.ask(make_state(0, session=session, final=True))
+                assert (command.mode, command.action) == ("drive", [-1.0])
         assert edge.end() == 0

@@ -1,0 +1,57 @@
+"""What the edge runtime rejected during a drive, from its health messages. No socket."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+
+import msgspec
+
+from edge_runtime.wire import Health, decode_health
+
+
+class EdgeCounts:
+    """Adds up how the edge's counts grow; the first health seen is where they stood before.
+
+    Two threads report here: health messages on Zenoh's, answers to the status query on the
+    caller's.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._rejected: Counter[str] = Counter()
+        self._last: Health | None = None
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Return the states rejected by reason, without zeros."""
+        with self._lock:
+            return dict(self._rejected)
+
+    def observe_message(self, payload: bytes) -> None:
+        """Take a health message; one that cannot be read is left out."""
+        health = decode_health(payload)
+        if isinstance(health, Health):
+            self.observe(health)
+
+    def observe_status(self, payload: bytes) -> None:
+        """Take the JSON answer to the status query, which holds the fields of a health message."""
+        try:
+            self.observe(msgspec.json.decode(payload, type=Health))
+        except msgspec.MsgspecError:
+            return
+
+    def observe(self, health: Health) -> None:
+        """Add what is new since the last health."""
+        with self._lock:
+            last = self._last
+            if last is not None and health.sent_ns <= last.sent_ns:
+                return  # A message and an answer have overtaken one another.
+            self._last = health
+            if last is None:
+                return
+            # A restarted edge runtime has a younger clock, and counts from zero.
+            before = last.rejected if health.uptime_s >= last.uptime_s else {}
+            grown = Counter(health.rejected)
+            grown.subtract(before)
+            self._rejected += grown

@@ -1,0 +1,84 @@
+"""The demo, whole but small: every step once, and again from what it kept."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from edge_runtime.cli import run_cli
+from edge_runtime.errors import UserError
+from hil_tests.__main__ import main
+from hil_tests.commands import BackgroundCommand
+from hil_tests.demo import Demo
+
+SMALL = ("--episodes", "2", "--human-episodes", "2", "--runs", "1", "--minutes", "1")
+
+
+def demo(out: Path) -> subprocess.CompletedProcess:
+    """Run the demo as a person would, without a terminal."""
+    arguments = [sys.executable, "-m", "hil_tests", "demo", "--out", str(out), *SMALL]
+    return subprocess.run(
+        arguments, capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False
+    )
+
+
+@pytest.mark.timeout(400)
+def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(tmp_path):
+    first = demo(tmp_path / "demo")
+    # A policy of two episodes may well drive badly (status 1); anything else is a fault.
+    assert first.returncode in (0, 1), first.stderr
+    made = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert made >= {
+        "left_turn.onnx", "left_turn.onnx.sig", "learning_curve.png", "drive.rrd",
+        "in_process.json", "wire.json", "wire_latency.json", "keys", "run", "human",
+    }  # fmt: skip
+    reports = [
+        json.loads((tmp_path / "demo" / f"{name}.json").read_text())
+        for name in ("in_process", "wire", "wire_latency")
+    ]
+    assert len({report["policy_id"] for report in reports}) == 1
+    assert reports[2]["latency_ms"]["p50"] > 80
+    for text in ("in process", "over Zenoh", "each way", "safe stops"):
+        assert text in first.stdout
+    policy = (tmp_path / "demo" / "left_turn.onnx").read_bytes()
+    second = demo(tmp_path / "demo")
+    assert second.returncode == first.returncode
+    assert "is kept" in second.stdout
+    assert "trainer train" not in second.stdout
+    assert (tmp_path / "demo" / "left_turn.onnx").read_bytes() == policy
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("demo", "--out", "{tmp}/file"),
+        ("demo", "--out", "{tmp}"),
+        ("demo", "--seed", "-3"),
+        ("demo", "--minutes", "0"),
+        ("demo", "--runs", "none"),
+        (),
+    ],
+)
+def test_bad_input_gets_one_line_and_touches_nothing(arguments, capsys, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    try:
+        status = run_cli(main, [a.format(tmp=tmp_path) for a in arguments])
+    except SystemExit as end:
+        status = int(end.code or 0)
+    assert status == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_policy_without_signature_or_key_is_not_offered(tmp_path):
+    kept = Demo(tmp_path, runs=1)
+    kept.policy.write_bytes(b"x")
+    assert not kept.offer_kept()
+
+
+def test_a_background_command_that_fails_says_why(tmp_path):
+    missing = str(tmp_path / "none.onnx")
+    with pytest.raises(UserError, match="does not exist"):
+        BackgroundCommand("edge_runtime", "run", "--policy", missing, ready="ready")
