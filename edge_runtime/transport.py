@@ -110,3 +110,10 @@ def _explain(text: str, listen: Optional[str], connect: Optional[str]) -> str:
             " --connect"
         )
     return f"Zenoh cannot open {listen or connect}: {text}"
+
+
+def free_endpoint() -> str:
+    """A Zenoh endpoint on loopback that nobody listens on, for demos and tests."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

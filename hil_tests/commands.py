@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import socket
 import subprocess
 import sys
 import tempfile
@@ -89,10 +88,3 @@ class BackgroundCommand:
     def _failure(self) -> UserError:
         last = (self._said().strip().splitlines() or ["it said nothing"])[-1]
         return UserError(f"python -m {self.name}: {last}")
-
-
-def free_endpoint() -> str:
-    """A Zenoh endpoint on loopback that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

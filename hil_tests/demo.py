@@ -17,7 +17,8 @@ from rich.table import Table
 from edge_runtime.cli import ArgumentParser
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
-from hil_tests.commands import BackgroundCommand, free_endpoint, run_command
+from edge_runtime.transport import free_endpoint
+from hil_tests.commands import BackgroundCommand, run_command
 from hil_tests.operator import Operator
 from trainer.commands.options import not_negative, positive, positive_float
 

@@ -6,6 +6,7 @@ this stands in for the person and says each time what it does.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 
 from edge_runtime.errors import UserError
@@ -19,7 +20,6 @@ class Operator:
 
     def __init__(self, endpoint: str, vehicle_id: str) -> None:
         self.endpoint, self.vehicle_id = endpoint, vehicle_id
-        self.rearms = 0
         self._end = threading.Event()
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._watch, name="operator")
@@ -43,14 +43,13 @@ class Operator:
 
     def _poll(self) -> None:
         while not self._end.wait(POLL_INTERVAL_S):
-            try:
-                status = ask(self.endpoint, self.vehicle_id, "status")
-                if status["needs_rearm"] and status["mode"] == "safe_stop":
-                    reply = ask(self.endpoint, self.vehicle_id, "rearm")
-                    if reply["accepted"]:
-                        self.rearms += 1
-                        reason = status["reason"]
-                        print(f"operator: re-armed {self.vehicle_id} after {reason}", flush=True)
-            except UserError:
-                # Simulator or runtime not up yet, or already gone: nothing to re-arm.
-                continue
+            # Simulator or runtime not up yet, or already gone: nothing to re-arm.
+            with contextlib.suppress(UserError):
+                self._rearm_if_needed()
+
+    def _rearm_if_needed(self) -> None:
+        status = ask(self.endpoint, self.vehicle_id, "status")
+        if not status["needs_rearm"] or status["mode"] != "safe_stop":
+            return
+        if ask(self.endpoint, self.vehicle_id, "rearm")["accepted"]:
+            print(f"operator: re-armed {self.vehicle_id} after {status['reason']}", flush=True)

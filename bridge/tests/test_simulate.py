@@ -24,8 +24,7 @@ from bridge.tests.processes import (
     wait_until_driving,
 )
 from edge_runtime.policy import load_policy
-from edge_runtime.tests.harness import free_endpoint
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 
 CONTRACT_KEYS = {
     *("scenario", "condition", "episodes", "policy_id", "seed", "success_rate", "collision_rate"),

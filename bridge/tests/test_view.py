@@ -25,7 +25,8 @@ from bridge.tests.toy import ToyEnv
 from bridge.viewer.shapes import outline, view_bounds
 from bridge.viewer.timeline import Timeline
 from bridge.viewer.wire_log import WireLog
-from edge_runtime.tests.harness import free_endpoint, make_state, wait_until
+from edge_runtime.tests.harness import make_state, wait_until
+from edge_runtime.transport import free_endpoint
 
 
 def verify(recording):

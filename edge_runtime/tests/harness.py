@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import socket
 import subprocess
 import sys
 import threading
@@ -19,13 +18,6 @@ from edge_runtime.wire import Command, Feedback, Health, State
 # This machine may be busy: waits are long, and only what must never happen has a short limit.
 PATIENCE_S = 20.0
 BLACK, WHITE = 0, 255
-
-
-def free_endpoint() -> str:
-    """An endpoint on localhost that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def make_state(step: int, **changes: Any) -> State:

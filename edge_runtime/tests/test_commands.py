@@ -10,9 +10,9 @@ import pytest
 import edge_runtime
 from edge_runtime.config import Config, load_config
 from edge_runtime.errors import UserError
-from edge_runtime.tests.harness import Simulator, free_endpoint, run_command
+from edge_runtime.tests.harness import Simulator, run_command
 from edge_runtime.tests.policies import write_policy
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 
 
 def fails_with_one_line(result, *words):

@@ -6,15 +6,8 @@ import time
 
 import pytest
 
-from edge_runtime.tests.harness import (
-    BLACK,
-    WHITE,
-    EdgeProcess,
-    Simulator,
-    free_endpoint,
-    make_state,
-    wait_until,
-)
+from edge_runtime.tests.harness import BLACK, WHITE, EdgeProcess, Simulator, make_state, wait_until
+from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
 
 UNWANTED = {"torch", "gymnasium", "highway_env", "rerun", "rerun_sdk", "onnx", "trainer", "bridge"}

@@ -58,8 +58,9 @@ class LearnerConfig:
     batch, as in the authors' code, since the exact form gives a handful of demonstrations half of
     the critic's loss."""
     cloning_weight: float = 10.0
-    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). With 3 the
-    policy forgets the human before the critic knows better: see ``results/README.md``."""
+    """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). Chosen
+    on single runs, in which a small weight let the policy forget the human before the critic knew
+    better."""
     intervention_penalty: float = -10.0
     """Reward of the first step of an intervention (eq. 17: r_pen = r_fail)."""
     warmup_steps: int = 256
