@@ -111,8 +111,11 @@ def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
 def _read_actor(path: Path) -> tuple[Actor, dict[str, Any]]:
     state = load_torch(path)
     try:
-        weights = state["actor"] if path.name == BEST_FILE else state["learner"]["actor"]
-        actor = Actor(action_size=len(weights["head.output.bias"]))
+        weights = (
+            state["actor"] if path.name == BEST_FILE else state["learning"]["learner"]["actor"]
+        )
+        frames = weights["picture.trunk.conv1.weight"].shape[1]
+        actor = Actor(len(weights["head.output.bias"]), frames)
         actor.load_state_dict(weights)
         label = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
     except (KeyError, TypeError, RuntimeError) as error:

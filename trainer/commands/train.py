@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     with ProgressBar("training", config.episodes, training.episode) as bar:
         training.train(_Reporter(bar), deadline_s)
     write_learning_curve(run_dir)
-    print(f"{training.episode} episodes, {training.replay.added} steps: {run_dir}")
+    print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
     return 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from edge_runtime.errors import UserError
 from trainer.ranges import ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
 
@@ -11,6 +12,8 @@ from trainer.ranges import ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
 class LearnerConfig:
     """One field a hyper-parameter; where the paper gives a value, it is the default."""
 
+    frames: int = 2
+    """Newest frames that actor and critics see: eq. 28's two, or the tough setting's one."""
     batch_size: int = 128
     """Transitions in a minibatch (table A5: N)."""
     actor_learning_rate: float = 5e-4
@@ -65,12 +68,22 @@ class LearnerConfig:
     """Reward of the first step of an intervention (eq. 17: r_pen = r_fail)."""
     warmup_steps: int = 256
     """Environment steps before the first update."""
+    saturation_weight: float = 0.0
+    """Weight of the mean squared action before tanh in the actor's loss. Not in the paper: a remedy
+    for policies that saturate, whose gradient vanishes."""
+    precision: str = "float32"
+    """Of the products in convolutions and first connected layers while learning: float32, or
+    bfloat16 where the processor multiplies that faster. Acting is always float32."""
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
+        if self.precision not in PRECISIONS:
+            raise UserError(f"precision must be one of {', '.join(PRECISIONS)}: {self.precision}")
 
 
+PRECISIONS = ("float32", "bfloat16")
 RANGES = {
+    "frames": (1, 2),
     "batch_size": FROM_ONE,
     "actor_learning_rate": FROM_ZERO,
     "critic_learning_rate": FROM_ZERO,
@@ -92,5 +105,6 @@ RANGES = {
     "cloning_weight": FROM_ZERO,
     "intervention_penalty": ANY,
     "warmup_steps": FROM_ONE,
+    "saturation_weight": FROM_ZERO,
 }
 """What each number may be."""

@@ -3,9 +3,15 @@
 Two 6x6 convolutions (6 and 16 filters), each followed by ReLU and 2x2 max pooling, then fully
 connected layers of 256, 128 and 64. Frames come as uint8 and are normalised to [0, 1] (eq. 28)
 inside the network, so that an exported policy needs no preprocessing.
+
+Nearly all products are in the convolutions and in what the first connected layer makes of the
+picture: ``embed``. It follows the ``torch.autocast`` around it, and is computed once a picture for
+all that is asked of it; the rest is small, and always in single precision.
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -45,39 +51,64 @@ class Trunk(nn.Module):
         return trunk_features(frames, first.weight, first.bias, second.weight, second.bias)
 
 
-class Head(nn.Module):
-    """The fully connected layers: features [batch, inputs] to [batch, outputs]."""
+class Picture(nn.Module):
+    """Convolutions, and the picture's share of the first connected layer.
 
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        layers: list[nn.Module] = []
-        for width in HIDDEN:
-            layers += [nn.Linear(inputs, width), nn.ReLU()]
-            inputs = width
-        self.hidden = nn.Sequential(*layers)
-        self.output = nn.Linear(inputs, outputs)
-
-    def forward(self, features: Tensor) -> Tensor:
-        """The last layer's values, without an activation."""
-        return self.output(self.hidden(features))
-
-
-class Actor(nn.Module):
-    """The policy pi(s) (table A3); with ``frames=1`` the human model (table A4).
-
-    The policy's input is always the observation [batch, 2, 45, 80]; a network of one frame takes
-    the newest one, so that every policy is run and exported in the same way.
+    Args:
+        frames: how many of the newest frames the network sees. The input is always the
+            observation [batch, 2, 45, 80], so that every network is run and exported alike.
+        more_inputs: of that layer beside the features; they count in its initial weights.
     """
 
-    def __init__(self, action_size: int = 1, frames: int = 2) -> None:
+    def __init__(self, frames: int = 2, more_inputs: int = 0) -> None:
         super().__init__()
         self.frames = frames
         self.trunk = Trunk(frames)
-        self.head = Head(FEATURES, action_size)
+        self.layer = nn.Linear(FEATURES, HIDDEN[0])
+        bound = (FEATURES + more_inputs) ** -0.5
+        nn.init.uniform_(self.layer.weight, -bound, bound)
+        nn.init.uniform_(self.layer.bias, -bound, bound)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """float32 [batch, 256], before the activation, from frames uint8 [batch, 2, 45, 80]."""
+        return self.layer(self.trunk(frames[:, -self.frames :])).float()
+
+
+class Head(nn.Module):
+    """The connected layers after the first one, which ends before its activation."""
+
+    def __init__(self, outputs: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [nn.ReLU()]
+        for inputs, width in pairwise(HIDDEN):
+            layers += [nn.Linear(inputs, width), nn.ReLU()]
+        self.hidden = nn.Sequential(*layers)
+        self.output = nn.Linear(HIDDEN[-1], outputs)
+
+    def forward(self, embedded: Tensor) -> Tensor:
+        """The last layer's values [batch, outputs] from [batch, 256], without an activation."""
+        return self.output(self.hidden(embedded))
+
+
+class Actor(nn.Module):
+    """The policy pi(s) (table A3); with ``frames=1`` the human model (table A4)."""
+
+    def __init__(self, action_size: int = 1, frames: int = 2) -> None:
+        super().__init__()
+        self.picture = Picture(frames)
+        self.head = Head(action_size)
+
+    def embed(self, frames: Tensor) -> Tensor:
+        """float32 [batch, 256] from frames uint8 [batch, 2, 45, 80]."""
+        return self.picture(frames)
+
+    def score(self, embedded: Tensor) -> Tensor:
+        """The action before tanh squashes it, [batch, n]."""
+        return self.head(embedded)
 
     def forward(self, frames: Tensor) -> Tensor:
         """The action [batch, n] in [-1, 1] from frames uint8 [batch, 2, 45, 80]."""
-        return torch.tanh(self.head(self.trunk(frames[:, -self.frames :])))
+        return torch.tanh(self.score(self.embed(frames)))
 
 
 class Critic(nn.Module):
@@ -85,21 +116,23 @@ class Critic(nn.Module):
 
     def __init__(self, action_size: int = 1, frames: int = 2) -> None:
         super().__init__()
-        self.frames = frames
-        self.trunk = Trunk(frames)
-        self.head = Head(FEATURES + action_size, 1)
+        self.picture = Picture(frames, more_inputs=action_size)
+        self.action = nn.Linear(action_size, HIDDEN[0], bias=False)
+        bound = (FEATURES + action_size) ** -0.5
+        nn.init.uniform_(self.action.weight, -bound, bound)
+        self.head = Head(1)
 
-    def features(self, frames: Tensor) -> Tensor:
-        """The picture's features: independent of the action, so computed once a picture."""
-        return self.trunk(frames[:, -self.frames :])
+    def embed(self, frames: Tensor) -> Tensor:
+        """float32 [batch, 256] from frames uint8 [batch, 2, 45, 80], whatever the action."""
+        return self.picture(frames)
 
-    def value(self, features: Tensor, action: Tensor) -> Tensor:
-        """Q, shape [batch], from features [batch, 1792] and actions [batch, n]."""
-        return self.head(torch.cat([features, action], dim=1)).squeeze(1)
+    def value(self, embedded: Tensor, action: Tensor) -> Tensor:
+        """Q, shape [batch], from an embedded picture [batch, 256] and actions [batch, n]."""
+        return self.head(embedded + self.action(action)).squeeze(1)
 
     def forward(self, frames: Tensor, action: Tensor) -> Tensor:
         """Q, shape [batch], from frames uint8 [batch, 2, 45, 80] and actions [batch, n]."""
-        return self.value(self.features(frames), action)
+        return self.value(self.embed(frames), action)
 
 
 class CriticPair(nn.Module):

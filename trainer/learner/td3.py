@@ -1,4 +1,8 @@
-"""The learner: twin delayed DDPG with human guidance (algorithm 1), one update at a time."""
+"""The learner: twin delayed DDPG with human guidance (algorithm 1), one update at a time.
+
+``reference.py`` is the same written plainly; this one computes nothing twice and, on an
+accelerator, never waits for a number.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +32,32 @@ class Losses(NamedTuple):
     priorities: NDArray[np.float64]
 
 
+class Minibatch(NamedTuple):
+    """A ``Batch`` as tensors on the learner's device; the fields are described there."""
+
+    frames: Tensor
+    actions: Tensor
+    rewards: Tensor
+    next_frames: Tensor
+    terminals: Tensor
+    human: Tensor
+    probabilities: Tensor
+
+
+class Outcome(NamedTuple):
+    """What one update found, on the learner's device."""
+
+    losses: Tensor
+    """Critic, policy and cloning loss and mean value: [4]."""
+    priorities: Tensor
+    """The batch's new priorities (eq. 21), [n]."""
+
+
 class TD3Learner:
     """Actor, two critics, their targets and optimisers.
 
-    Both losses are taken at the same weights, before either optimiser steps: the features of a
-    picture are then computed once for each network and shared by every term that needs them.
+    Both losses are taken at the same weights, before either optimiser steps: a picture is then
+    embedded once for each network and shared by every term that needs it.
 
     Args:
         config: hyper-parameters.
@@ -53,16 +78,12 @@ class TD3Learner:
         self.config, self.algorithm, self.device = config, algorithm, torch.device(device)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            self.actor = Actor(action_size).to(self.device)
-            self.critics = CriticPair(action_size).to(self.device)
+            self.actor = Actor(action_size, config.frames).to(self.device)
+            self.critics = CriticPair(action_size, config.frames).to(self.device)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.actor_optimiser = torch.optim.Adam(
-            self.actor.parameters(), config.actor_learning_rate, fused=True
-        )
-        self.critic_optimiser = torch.optim.Adam(
-            self.critics.parameters(), config.critic_learning_rate, fused=True
-        )
+        self.actor_optimiser = self._adam(self.actor, config.actor_learning_rate)
+        self.critic_optimiser = self._adam(self.critics, config.critic_learning_rate)
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
 
@@ -74,47 +95,53 @@ class TD3Learner:
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
         """One step of algorithm 1 on a drawn minibatch; ``beta`` is eq. 15's exponent."""
-        c = self.config
-        frames, next_frames = self._tensor(batch.frames), self._tensor(batch.next_frames)
-        actions, human = self._tensor(batch.actions), self._tensor(batch.human)
-        weights = equations.importance_weights(
-            self._tensor(batch.probabilities).float(), beta, c.normalise_importance
-        )
-        targets = self._targets(batch, next_frames)
+        columns = (getattr(batch, name) for name in Minibatch._fields)
+        minibatch = Minibatch(*(torch.from_numpy(column).to(self.device) for column in columns))
+        outcome = self.step(minibatch, torch.tensor(beta, device=self.device))
+        critic, policy, cloning, value = outcome.losses.tolist()
+        priorities = outcome.priorities.double().cpu().numpy()
+        return Losses(critic, policy, cloning, value, priorities)
 
-        features = [critic.features(frames) for critic in self.critics.pair]
+    def step(self, batch: Minibatch, beta: Tensor) -> Outcome:
+        """The same for a batch that is on the device already, and nothing read back."""
+        self.updates += 1
+        return self.change(batch, beta, with_policy=self.updates % self.config.policy_delay == 0)
+
+    def change(self, batch: Minibatch, beta: Tensor, with_policy: bool) -> Outcome:
+        """One step on all weights, or on the critics' alone: what a CUDA graph captures."""
+        c, human, actions = self.config, batch.human, batch.actions
+        targets = self._targets(batch)
+        with self._precision():
+            pictures = [critic.embed(batch.frames) for critic in self.critics.pair]
+            own_picture = self.actor.embed(batch.frames)
         values = [
-            critic.value(feature, actions)
-            for critic, feature in zip(self.critics.pair, features, strict=True)
+            critic.value(picture, actions)
+            for critic, picture in zip(self.critics.pair, pictures, strict=True)
         ]
+        weights = equations.importance_weights(
+            batch.probabilities.float(), beta, c.normalise_importance
+        )
         first, second = (
             equations.critic_loss(value, targets, human, weights, c.split_loss) for value in values
         )
         critic_loss = first + second
-        policy_actions = self.actor(frames)
-        policy, cloning = self._actor_losses(features[0].detach(), policy_actions, actions, human)
-        priorities = self._priorities(
-            targets - values[0].detach(), frames, actions, policy_actions.detach(), human
-        )
+        score = self.actor.score(own_picture)
+        own_actions = torch.tanh(score)
+        policy, cloning = self._actor_losses(pictures[0].detach(), own_actions, actions, human)
+        priorities = self._priorities(targets - values[0].detach(), batch, own_actions.detach())
 
-        self.critic_optimiser.zero_grad()
-        critic_loss.backward()
-        self.updates += 1
-        if self.updates % c.policy_delay == 0:
-            self.actor_optimiser.zero_grad()
+        _differentiate(critic_loss, self.critics)
+        if with_policy:
             loss = policy + c.cloning_weight * cloning
-            loss.backward(inputs=list(self.actor.parameters()))
+            if c.saturation_weight:
+                loss = loss + c.saturation_weight * score.square().mean()
+            _differentiate(loss, self.actor)
             self.actor_optimiser.step()
         self.critic_optimiser.step()
-        if self.updates % c.policy_delay == 0:
+        if with_policy:
             self._update_targets()
-        return Losses(
-            critic_loss.item(),
-            policy.item(),
-            cloning.item(),
-            values[0].mean().item(),
-            priorities.double().cpu().numpy(),
-        )
+        found = (critic_loss, policy, cloning, values[0].mean())
+        return Outcome(torch.stack([loss.detach() for loss in found]), priorities)
 
     def decay_learning_rates(self) -> None:
         """Once an episode (table A5)."""
@@ -151,51 +178,58 @@ class TD3Learner:
         self.noise.set_state(state["noise"])
         self.updates = state["updates"]
 
+    def _adam(self, module: torch.nn.Module, learning_rate: float) -> torch.optim.Adam:
+        # A captured graph reads its learning rate from the device.
+        on_device = self.device.type == "cuda"
+        rate = torch.tensor(learning_rate, device=self.device) if on_device else learning_rate
+        return torch.optim.Adam(module.parameters(), rate, fused=True, capturable=on_device)
+
+    def _precision(self) -> torch.autocast:
+        reduced = self.config.precision == "bfloat16"
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=reduced)
+
     @torch.no_grad()
-    def _targets(self, batch: Batch, next_frames: Tensor) -> Tensor:
+    def _targets(self, batch: Minibatch) -> Tensor:
         c = self.config
-        next_actions = self.target_actor(next_frames)
+        with self._precision():
+            own_picture = self.target_actor.embed(batch.next_frames)
+            pictures = [critic.embed(batch.next_frames) for critic in self.target_critics.pair]
+        next_actions = torch.tanh(self.target_actor.score(own_picture))
         noise = c.target_noise * torch.randn(
             next_actions.shape, generator=self.noise, device=self.device
         )
         next_actions = equations.smoothed_target_action(next_actions, noise, c.target_noise_bound)
         first, second = (
-            critic.value(critic.features(next_frames), next_actions)
-            for critic in self.target_critics.pair
+            critic.value(picture, next_actions)
+            for critic, picture in zip(self.target_critics.pair, pictures, strict=True)
         )
-        return equations.td_target(
-            self._tensor(batch.rewards), self._tensor(batch.terminals), (first, second), c.gamma
-        )
+        return equations.td_target(batch.rewards, batch.terminals, (first, second), c.gamma)
 
     def _actor_losses(
-        self, features: Tensor, policy_actions: Tensor, actions: Tensor, human: Tensor
+        self, picture: Tensor, own_actions: Tensor, actions: Tensor, human: Tensor
     ) -> tuple[Tensor, Tensor]:
         """The two terms of eq. 23, unweighted; without cloning the first is over all samples."""
         cloned = self.algorithm.behaviour_cloning
-        values = self.critics.first.value(features, policy_actions)
+        values = self.critics.first.value(picture, own_actions)
         policy = equations.policy_loss(values, human, self.config.split_loss and cloned)
         if not cloned:
             return policy, torch.zeros((), device=self.device)
-        return policy, equations.behaviour_cloning_loss(policy_actions, actions, human)
+        return policy, equations.behaviour_cloning_loss(own_actions, actions, human)
 
     @torch.no_grad()
-    def _priorities(
-        self,
-        td_errors: Tensor,
-        frames: Tensor,
-        actions: Tensor,
-        policy_actions: Tensor,
-        human: Tensor,
-    ) -> Tensor:
+    def _priorities(self, td_errors: Tensor, batch: Minibatch, own_actions: Tensor) -> Tensor:
         """Eq. 21; the target critic looks only at the human's samples, the only ones that count."""
-        c, row = self.config, self.algorithm
+        c, row, human = self.config, self.algorithm, batch.human
         advantage = torch.zeros_like(td_errors)
-        if row.advantage_weight and bool(human.any()):
+        # To pick samples is to wait for their number, which an accelerator must not.
+        looked_at = human.nonzero()[:, 0] if self.device.type == "cpu" else slice(None)
+        if row.advantage_weight and td_errors[looked_at].numel():
             critic = self.target_critics.first
-            features = critic.features(frames[human])
-            advantage[human] = equations.q_advantage(
-                critic.value(features, actions[human]),
-                critic.value(features, policy_actions[human]),
+            with self._precision():
+                picture = critic.embed(batch.frames[looked_at])
+            advantage[looked_at] = equations.q_advantage(
+                critic.value(picture, batch.actions[looked_at]),
+                critic.value(picture, own_actions[looked_at]),
                 c.advantage_bound,
             )
         return equations.priority(
@@ -218,5 +252,9 @@ class TD3Learner:
                 list(target.parameters()), list(online.parameters()), self.config.tau
             )
 
-    def _tensor(self, array: NDArray[Any]) -> Tensor:
-        return torch.from_numpy(array).to(self.device)
+
+def _differentiate(loss: Tensor, module: torch.nn.Module) -> None:
+    """Set the gradients of one module's parameters, and of no other's."""
+    parameters = list(module.parameters())
+    for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+        parameter.grad = gradient

@@ -1,5 +1,6 @@
 """The training loop around a scripted road, a scripted human and a learner that only listens."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -96,7 +97,8 @@ def scripted_run(
     run.env = ScriptedEnv(length, outcome)
     run.guide = ScriptedGuide(run, human_steps, reason)
     run.stored, run.betas, run.learned, run.written = [], [], [], []
-    add, write = run.replay.add, run.replay.update_priorities
+    replay, learner = run.learning.replay, run.learning.learner
+    add, write = replay.add, replay.update_priorities
 
     def spy_add(action, reward, next_frames, terminal, human):
         assert next_frames[1, 0, 0] == run.env.steps
@@ -115,9 +117,9 @@ def scripted_run(
         run.learned.append((batch.indices.tolist(), priorities.tolist()))
         return Losses(0.0, 0.0, 0.0, 0.0, priorities)
 
-    run.replay.add, run.replay.update_priorities = spy_add, spy_write
-    run.learner.act = lambda observation: np.array([POLICY], np.float32)
-    run.learner.update = update
+    replay.add, replay.update_priorities = spy_add, spy_write
+    learner.act = lambda observation: np.array([POLICY], np.float32)
+    learner.update = update
     return run
 
 
@@ -160,19 +162,41 @@ def test_a_timeout_ends_the_episode_but_is_not_terminal(tmp_path, outcome, termi
 def test_the_priorities_of_each_update_are_written_back(tmp_path):
     run = scripted_run(tmp_path, CONFIG, length=5)
     run.train()
-    assert len(run.learned) == 5
+    assert len(run.learned) == 4  # at the first step there is nothing to learn from
     assert run.written == run.learned
+
+
+def test_an_update_runs_beside_the_step_and_knows_what_was_stored_before_it(tmp_path):
+    run = scripted_run(tmp_path, CONFIG, length=4)
+    begun, moved, learner, env = threading.Event(), threading.Event(), run.learning.learner, run.env
+    update, step, known = learner.update, env.step, []
+
+    def slow_update(batch, beta):
+        begun.set()
+        assert moved.wait(10.0)  # so it is still at work when the environment is done
+        known.append(len(run.stored))
+        return update(batch, beta)
+
+    def step_beside(action):
+        if run.stored:
+            assert begun.wait(10.0)
+        moved.set()
+        return step(action)
+
+    learner.update, env.step = slow_update, step_beside
+    run.train()
+    assert known == [1, 2, 3]
 
 
 def test_learning_waits_for_the_warmup(tmp_path):
     config = replace(CONFIG, learner=replace(LEARNER, warmup_steps=4))
     run = scripted_run(tmp_path, config, length=6)
     run.train()
-    assert len(run.learned) == 3
+    assert len(run.learned) == 2
 
 
 @pytest.mark.parametrize(
-    ("importance_sampling", "betas"), [(True, [0.8, 0.6, 0.4, 0.2]), (False, [0.0] * 4)]
+    ("importance_sampling", "betas"), [(True, [0.6, 0.4, 0.2]), (False, [0.0] * 3)]
 )
 def test_beta_falls_to_zero_over_the_episodes(tmp_path, importance_sampling, betas):
     learner = replace(LEARNER, importance_sampling=importance_sampling, beta=0.8)
@@ -185,7 +209,9 @@ def test_learning_rates_decay_once_an_episode(tmp_path):
     learner = replace(LEARNER, learning_rate_decay=0.9)
     run = scripted_run(tmp_path, replace(CONFIG, episodes=2, learner=learner), length=3)
     rates = []
-    run.train(lambda metrics: rates.append(run.learner.actor_optimiser.param_groups[0]["lr"]))
+    run.train(
+        lambda metrics: rates.append(run.learning.learner.actor_optimiser.param_groups[0]["lr"])
+    )
     assert rates == pytest.approx([5e-4 * 0.9, 5e-4 * 0.81])
 
 

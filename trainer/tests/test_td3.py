@@ -51,13 +51,13 @@ def test_the_networks_are_those_of_tables_a2_to_a4():
         p.numel() for p in Actor().parameters()
     )
     assert difference == 256
-    assert Actor(frames=1).trunk.conv1.weight.shape == (6, 1, 6, 6)
+    assert Actor(frames=1).picture.trunk.conv1.weight.shape == (6, 1, 6, 6)
 
 
 def test_the_trunk_equals_convolution_relu_and_pooling_as_written_in_the_paper():
     torch.manual_seed(0)
     actor, frames = Actor(), torch.randint(0, 256, (3, 2, 45, 80), dtype=torch.uint8)
-    trunk = actor.trunk
+    trunk = actor.picture.trunk
     hidden = frames.float() / 255
     for layer in (trunk.conv1, trunk.conv2):
         hidden = torch.nn.functional.conv2d(hidden, layer.weight, layer.bias)
@@ -74,9 +74,8 @@ def disturb_targets(learner: TD3Learner) -> None:
                 p.add_(0.02 * torch.randn(p.shape, generator=random))
         # Fresh critics hardly feel the action; these must, or whose action it was would not show.
         learner.target_actor.head.output.bias.add_(0.5)
-        for name, p in learner.target_critics.named_parameters():
-            if name.endswith("head.hidden.0.weight"):
-                p[:, -1] += 0.5
+        for critic in learner.target_critics.pair:
+            critic.action.weight += 0.5
 
 
 def smoothing_noise(learner: TD3Learner, shape: tuple[int, ...]) -> torch.Tensor:

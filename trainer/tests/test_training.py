@@ -38,7 +38,7 @@ def train(config: RunConfig, directory: Path, resume: bool = False) -> TrainingR
 
 
 def actor_weights(run: TrainingRun) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in run.learner.actor.parameters()])
+    return torch.cat([p.detach().flatten() for p in run.learning.actor.parameters()])
 
 
 @pytest.fixture(scope="module")
@@ -61,12 +61,12 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
 
 def test_the_human_is_in_the_replay_buffer_and_in_the_metrics(trained):
     human_steps = sum(int(row["human_steps"]) for row in read_metrics(trained.run_dir))
-    assert human_steps == trained.replay.human_count > 0
+    assert human_steps == trained.learning.replay.human_count > 0
 
 
 def test_returns_leave_the_shaping_out(trained):
     rewards = sum(float(row["episode_return"]) for row in read_metrics(trained.run_dir))
-    stored = trained.replay._rewards[: trained.replay.added].sum()
+    stored = trained.learning.replay._rewards[: trained.learning.replay.added].sum()
     interventions = sum(int(row["interventions"]) for row in read_metrics(trained.run_dir))
     assert interventions > 0
     assert stored <= rewards + 1e-3
@@ -86,7 +86,7 @@ def test_a_run_in_two_parts_ends_with_the_same_weights_and_metrics(trained, tmp_
     resumed = train(TINY, directory, resume=True)
     assert torch.equal(actor_weights(trained), actor_weights(resumed))
     for ours, whole in zip(read_metrics(directory), read_metrics(trained.run_dir), strict=True):
-        timed = {"environment_s", "acting_s", "learning_s"}
+        timed = {"environment_s", "acting_s", "learning_s", "waiting_s"}
         assert {k: v for k, v in ours.items() if k not in timed} == {
             k: v for k, v in whole.items() if k not in timed
         }
@@ -115,14 +115,14 @@ def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path):
         subprocess.run(arguments, check=True, capture_output=True)
     a, b = (load_torch(d / CHECKPOINT_FILE) for d in (killed, whole))
     assert a["episode"] == b["episode"] == 8
-    for name, weights in a["learner"]["actor"].items():
-        assert torch.equal(weights, b["learner"]["actor"][name])
+    for name, weights in a["learning"]["learner"]["actor"].items():
+        assert torch.equal(weights, b["learning"]["learner"]["actor"][name])
     assert len(read_metrics(killed)) == 8
 
 
 def test_an_unguided_algorithm_never_meets_the_human(tmp_path):
     run = train(replace(TINY, algorithm="per_td3", episodes=2), tmp_path / "per")
-    assert run.replay.human_count == 0
+    assert run.learning.replay.human_count == 0
     assert all(row["interventions"] == "0" for row in read_metrics(run.run_dir))
 
 

@@ -40,9 +40,12 @@ class EpisodeMetrics:
     """Mean priority of the policy's transitions at the episode's end."""
     human_priority: float
     environment_s: float
-    """Time spent in the environment and with the human."""
+    """Time spent in the environment and with the human, while the learner updates."""
     acting_s: float
     learning_s: float
+    """Time of the updates themselves."""
+    waiting_s: float
+    """How long the loop waited for an update after the environment's step was done."""
     validation_success: float
     """Success rate on the validation seeds (nan where the episode ended without one)."""
     validation_distance_m: float

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from edge_runtime.episode_report import GOAL
@@ -28,15 +27,19 @@ from trainer.evaluation import drive_episodes
 from trainer.files import load_torch, save_torch
 from trainer.human.guide import HumanGuide, Intervention
 from trainer.learner import equations
-from trainer.learner.algorithms import ALGORITHMS
-from trainer.learner.replay import ReplayBuffer
-from trainer.learner.td3 import Losses, TD3Learner
+from trainer.learner.algorithms import ALGORITHMS, Algorithm
 from trainer.revision import source_revision
 from trainer.training.config import RunConfig
+from trainer.training.learning import Learning, ProcessorLearning
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 from trainer.training.tally import Tally
 
 CONFIG_FILE = "config.json"
+
+
+def make_learning(config: RunConfig, algorithm: Algorithm, action_size: int) -> Learning:
+    """Learner and replay on the configured device."""
+    return ProcessorLearning(config.learner, algorithm, config.seed, action_size)
 
 
 class TrainingRun:
@@ -54,15 +57,9 @@ class TrainingRun:
         self.env = make_environment(config.scenario)
         self.validation_env = make_environment(config.scenario)
         action_size = self.env.action_space.shape[0]
-        self.learner = TD3Learner(
-            config.learner, self.algorithm, config.seed, action_size, config.device
-        )
-        self.replay = ReplayBuffer(
-            config.learner.replay_capacity, action_size, config.learner.alpha
-        )
+        self.learning = make_learning(config, self.algorithm, action_size)
         self.guide = self._make_guide()
         self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
-        self.drawing = seeds.stream(config.seed, seeds.REPLAY)
         self.episode = 0
         self.best_validation = (-1.0, -1.0)
         if resume:
@@ -92,6 +89,7 @@ class TrainingRun:
                     break
         finally:
             metrics_writer.close()
+            self.learning.close()
 
     def save(self) -> None:
         """Write the checkpoint."""
@@ -99,10 +97,8 @@ class TrainingRun:
             self.run_dir / CHECKPOINT_FILE,
             {
                 **self._label(),
-                "learner": self.learner.state_dict(),
-                "replay": _as_tensors(self.replay.state_dict()),
+                "learning": self.learning.state_dict(),
                 "exploration": self.exploration.bit_generator.state,
-                "drawing": self.drawing.bit_generator.state,
                 "best_validation": self.best_validation,
             },
         )
@@ -116,10 +112,8 @@ class TrainingRun:
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.episode = state["episode"]
-        self.learner.load_state_dict(state["learner"])
-        self.replay.load_state_dict(_as_arrays(state["replay"]))
+        self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
-        self.drawing.bit_generator.state = state["drawing"]
         self.best_validation = tuple(state["best_validation"])
 
     def _make_guide(self) -> HumanGuide | None:
@@ -134,22 +128,29 @@ class TrainingRun:
         config, tally = self.config, Tally()
         seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
-        self.replay.start_episode(observation)
+        self.learning.start_episode(observation)
         guided = self.guide is not None and self.episode % config.guided_share == 0
         if self.guide is not None:
             self.guide.reset()
         ended = False
         while not ended:
             observation, ended, info = self._step(observation, guided, tally)
-        self.learner.decay_learning_rates()
-        return tally.summary(self._exploration_std(), self.episode, self.replay, info)
+        return tally.summary(
+            self.episode,
+            self.learning.added,
+            self._exploration_std(),
+            self.learning.end_episode(),
+            info,
+        )
 
     def _step(
         self, observation: NDArray[np.uint8], guided: bool, tally: Tally
     ) -> tuple[NDArray[np.uint8], bool, dict[str, Any]]:
-        """One control period: act, let the human take over, store, learn."""
+        """One control period: act, let the human take over and the car move; meanwhile, learn."""
         began_s = time.perf_counter()
-        policy_action = self._explore(self.learner.act(observation))
+        policy_action = self._explore(self.learning.act(observation))
+        if self.learning.added >= self.config.learner.warmup_steps:
+            self.learning.begin(self._beta())
         acted_s = time.perf_counter()
         intervention = None
         if guided and self.guide is not None:
@@ -157,18 +158,16 @@ class TrainingRun:
         human_action = None if intervention is None else intervention.action
         action = equations.masked_action(policy_action, human_action)
         next_observation, reward, terminated, truncated, info = self.env.step(action)
-        shaped = self._shape(reward, intervention)
-        self.replay.add(action, shaped, next_observation, terminated, intervention is not None)
         moved_s = time.perf_counter()
-        if self.replay.added >= self.config.learner.warmup_steps:
-            tally.losses.append(self._learn())
+        self.learning.finish()
+        shaped = self._shape(reward, intervention)
+        self.learning.add(action, shaped, next_observation, terminated, intervention is not None)
         tally.steps += 1
         tally.rewards += reward
         tally.human_steps += intervention is not None
         tally.interventions += intervention is not None and intervention.first
         tally.acting_s += acted_s - began_s
         tally.environment_s += moved_s - acted_s
-        tally.learning_s += time.perf_counter() - moved_s
         return next_observation, terminated or truncated, info
 
     def _explore(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -192,15 +191,12 @@ class TrainingRun:
         penalty = self.config.learner.intervention_penalty
         return equations.shaped_reward(reward, penalty, True, not intervention.first)
 
-    def _learn(self) -> Losses:
+    def _beta(self) -> float:
+        """Eq. 15's exponent: zero at the end of the run, or where its weights are not used."""
         c = self.config.learner
-        batch = self.replay.sample(c.batch_size, self.drawing)
-        beta = (
+        return (
             c.beta * (1.0 - self.episode / self.config.episodes) if c.importance_sampling else 0.0
         )
-        losses = self.learner.update(batch, beta)
-        self.replay.update_priorities(batch.indices, losses.priorities)
-        return losses
 
     def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
         """Evaluate on the validation seeds where due, and keep the best actor."""
@@ -218,11 +214,11 @@ class TrainingRun:
         reward = float(np.mean([result.reward for result in results]))
         if (success, reward) >= self.best_validation:
             self.best_validation = (success, reward)
-            state = {**self._label(), "actor": self.learner.actor.state_dict()}
+            state = {**self._label(), "actor": self.learning.actor.state_dict()}
             save_torch(self.run_dir / BEST_FILE, state)
 
     def _driver(self) -> NetworkDriver:
-        return NetworkDriver(self.learner.actor)
+        return NetworkDriver(self.learning.actor)
 
     def _label(self) -> dict[str, Any]:
         c = self.config
@@ -232,12 +228,3 @@ class TrainingRun:
             "seed": c.seed,
             "episode": self.episode,
         }
-
-
-def _as_tensors(state: dict[str, Any]) -> dict[str, Any]:
-    """Arrays as tensors: what a checkpoint may hold without arbitrary unpickling."""
-    return {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in state.items()}
-
-
-def _as_arrays(state: dict[str, Any]) -> dict[str, Any]:
-    return {k: v.numpy() if isinstance(v, torch.Tensor) else v for k, v in state.items()}

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from trainer.learner.replay import ReplayBuffer
-from trainer.learner.td3 import Losses
+from trainer.training.learning import EpisodeLearning
 from trainer.training.metrics import EpisodeMetrics
 
 
@@ -22,24 +19,19 @@ class Tally:
     steps: int = 0
     environment_s: float = 0.0
     acting_s: float = 0.0
-    learning_s: float = 0.0
-    losses: list[Losses] = field(default_factory=list)
-
-    def mean_losses(self) -> list[float]:
-        """Critic, policy and cloning loss and value, averaged; nan without an update."""
-        if not self.losses:
-            return [float("nan")] * 4
-        return [float(mean) for mean in np.mean([losses[:4] for losses in self.losses], axis=0)]
 
     def summary(
-        self, exploration_std: float, episode: int, replay: ReplayBuffer, info: dict[str, Any]
+        self,
+        episode: int,
+        total_steps: int,
+        exploration_std: float,
+        learned: EpisodeLearning,
+        info: dict[str, Any],
     ) -> EpisodeMetrics:
         """The episode's metrics; ``info`` is that of its last step."""
-        critic, policy, cloning, value = self.mean_losses()
-        policy_priority, human_priority = replay.mean_priorities()
         return EpisodeMetrics(
             episode=episode,
-            total_steps=replay.added,
+            total_steps=total_steps,
             steps=self.steps,
             episode_return=float(self.rewards),
             distance_m=float(info["distance_m"]),
@@ -47,15 +39,16 @@ class Tally:
             interventions=self.interventions,
             human_steps=self.human_steps,
             exploration_std=exploration_std,
-            critic_loss=critic,
-            policy_loss=policy,
-            cloning_loss=cloning,
-            value=value,
-            policy_priority=policy_priority,
-            human_priority=human_priority,
+            critic_loss=learned.critic_loss,
+            policy_loss=learned.policy_loss,
+            cloning_loss=learned.cloning_loss,
+            value=learned.value,
+            policy_priority=learned.policy_priority,
+            human_priority=learned.human_priority,
             environment_s=self.environment_s,
             acting_s=self.acting_s,
-            learning_s=self.learning_s,
+            learning_s=learned.learning_s,
+            waiting_s=learned.waiting_s,
             validation_success=float("nan"),
             validation_distance_m=float("nan"),
         )

@@ -14,6 +14,10 @@
 // multiplications are saved, and equal inputs still give exactly equal outputs. The 9 pictures to
 // convolve are called planes below, the 9 results products.
 //
+// In reduced precision two channels' planes, and their weights, are rounded to bfloat16 and lie side
+// by side in 32 bits, a pair: one instruction multiplies and adds both, in single precision. Where
+// the processor has no such instruction, reduced precision is single precision.
+//
 // Backward. A pooled output passes its gradient to one position of four, the winner, and to none
 // where ReLU is off. What remains is a list of spikes: a gradient, and where the winner's window
 // starts. The gradients of weights and inputs are sums over these lists.
@@ -23,8 +27,14 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <cstring>
 #include <memory>
+#include <type_traits>
 #include <vector>
+
+#if defined(__AVX512BF16__)
+#include <immintrin.h>
+#endif
 
 namespace {
 
@@ -48,6 +58,29 @@ typedef uint8_t LooseBytes __attribute__((vector_size(LANES), aligned(1), may_al
 
 inline Vector load(const float* from) { return *reinterpret_cast<const LooseVector*>(from); }
 inline void store(float* to, Vector value) { *reinterpret_cast<LooseVector*>(to) = value; }
+
+#if defined(__AVX512BF16__)
+typedef uint32_t Pair;  // of bfloat16: the even channel in the lower half
+inline uint32_t bfloat16(float value) {
+    uint32_t bits;
+    std::memcpy(&bits, &value, sizeof bits);
+    return (bits + 0x7fff + (bits >> 16 & 1)) >> 16;  // to nearest, ties to even
+}
+inline void pack(const float (&channels)[2], Pair* to) {
+    *to = bfloat16(channels[0]) | bfloat16(channels[1]) << 16;
+}
+inline Vector add_product(Vector sum, Pair weight, const Pair* plane) {
+    return _mm512_dpbf16_ps(sum, (__m512bh)_mm512_loadu_si512(plane),
+                            (__m512bh)_mm512_set1_epi32(weight));
+}
+#else
+typedef float Pair;
+#endif
+inline void pack(const float (&channel)[1], float* to) { *to = channel[0]; }
+inline Vector add_product(Vector sum, float weight, const float* plane) {
+    return sum + weight * load(plane);
+}
+
 constexpr int vectors(int floats) { return (floats + LANES - 1) / LANES; }
 
 constexpr int SIDE = 6;                // of a filter
@@ -65,11 +98,20 @@ struct Layer {
     static constexpr int ROWS = ROWS_, COLUMNS = COLUMNS_, PITCH = COLUMNS + 2;
     static constexpr int SIZE = (ROWS * PITCH + 63) / 64 * 64, OUTPUTS = FILTERS * SIZE;
     static constexpr int PLANE = SIZE + 2 * PITCH + 2, PLANES = PRODUCTS * CHANNELS * PLANE;
-    static constexpr int WINDOW = SIDE * CHANNELS;  // a row of a window, channels innermost
+    // A single channel has nothing to be paired with.
+    template <typename Cell>
+    using Fitting = std::conditional_t<CHANNELS % 2 == 0, Cell, float>;
+    template <typename Cell>
+    static constexpr int PACKED = std::is_same_v<Cell, float> ? 1 : 2;  // channels in a cell
+    template <typename Cell>
+    static constexpr int STACKS = CHANNELS / PACKED<Cell>;
+    // Backward, channels are innermost; 6 are padded to 8, so that every second pixel is aligned.
+    static constexpr int CELL = CHANNELS <= 2 ? CHANNELS : (CHANNELS + 7) / 8 * 8;
+    static constexpr int WINDOW = SIDE * CELL;  // a row of a window
     static constexpr int PADDED_WINDOW = vectors(WINDOW) * LANES;
     static constexpr int LAST_WINDOW = (2 * ROWS - 1) * IMAGE_PITCH + 2 * COLUMNS - 1;
-    static_assert((LAST_WINDOW + (SIDE - 1) * IMAGE_PITCH) * CHANNELS + PADDED_WINDOW <=
-                      IMAGE_SIZE * CHANNELS,
+    static_assert((LAST_WINDOW + (SIDE - 1) * IMAGE_PITCH) * CELL + PADDED_WINDOW <=
+                      IMAGE_SIZE * CELL,
                   "whole vectors must not leave the image");
 };
 // The second layer uses 19 of the first one's 20 rows.
@@ -80,50 +122,78 @@ constexpr int POOLED = Second::ROWS * Second::COLUMNS, FEATURES = Second::FILTER
 
 // ---- forward ------------------------------------------------------------------------------------
 
-// A channel's 9 planes: x0 - x1, x1 and x2 - x1 in both directions.
-template <class L, typename Pixel>
-void make_planes(const Pixel* image, float* planes) {
-    constexpr int STRIDE = L::CHANNELS * L::PLANE, WIDTH = 2 * L::PITCH + 1;
+// The 9 planes of the channels that share a cell: x0 - x1, x1 and x2 - x1 in both directions.
+template <class L, typename Cell, typename Pixel>
+void make_planes(const Pixel* image, int channel_stride, Cell* planes) {
+    constexpr int PACKED = L::template PACKED<Cell>, STRIDE = L::template STACKS<Cell> * L::PLANE;
+    constexpr int WIDTH = 2 * L::PITCH + 1;
     for (int row = 0; row < L::ROWS + 2; ++row) {
-        const Pixel* x = image + 2 * row * L::IMAGE_PITCH;
-        float down[3][WIDTH];
-        for (int i = 0; i < WIDTH; ++i) {
-            const float x1 = x[i + L::IMAGE_PITCH];
-            down[0][i] = x[i] - x1, down[1][i] = x1, down[2][i] = x[i + 2 * L::IMAGE_PITCH] - x1;
+        float down[3][PACKED][WIDTH];
+        for (int channel = 0; channel < PACKED; ++channel) {
+            const Pixel* x = image + channel * channel_stride + 2 * row * L::IMAGE_PITCH;
+            for (int i = 0; i < WIDTH; ++i) {
+                const float x1 = x[i + L::IMAGE_PITCH];
+                down[0][channel][i] = x[i] - x1;
+                down[1][channel][i] = x1;
+                down[2][channel][i] = x[i + 2 * L::IMAGE_PITCH] - x1;
+            }
         }
         for (int part = 0; part < 3; ++part) {
-            float* out = planes + 3 * part * STRIDE + row * L::PITCH;
+            Cell* out = planes + 3 * part * STRIDE + row * L::PITCH;
             for (int i = 0; i < L::PITCH; ++i) {
-                const float x1 = down[part][2 * i + 1];
-                out[i] = down[part][2 * i] - x1;
-                out[i + STRIDE] = x1;
-                out[i + 2 * STRIDE] = down[part][2 * i + 2] - x1;
+                float left[PACKED], middle[PACKED], right[PACKED];
+                for (int channel = 0; channel < PACKED; ++channel) {
+                    const float* x = down[part][channel] + 2 * i;
+                    left[channel] = x[0] - x[1];
+                    middle[channel] = x[1];
+                    right[channel] = x[2] - x[1];
+                }
+                pack(left, out + i), pack(middle, out + STRIDE + i);
+                pack(right, out + 2 * STRIDE + i);
             }
         }
     }
 }
 
-// Weights [filter][6][6][channel] to [product][channel][tap][filter]: h0, h0 + h1 and h1 in both
-// directions.
+template <class L, typename Cell, typename Pixel>
+void make_all_planes(const Pixel* image, int channel_stride, Cell* planes) {
+    for (int stack = 0; stack < L::template STACKS<Cell>; ++stack, planes += L::PLANE)
+        make_planes<L>(image + stack * L::template PACKED<Cell> * channel_stride, channel_stride,
+                       planes);
+}
+
+// The 9 weights of a filter's tap: h0, h0 + h1 and h1 in both directions.
 template <class L>
-std::vector<float> split_weights(const float* weights, float scale) {
-    std::vector<float> split(PRODUCTS * L::CHANNELS * TAPS * L::FILTERS);
+void split_tap(const float* corner, float scale, float products[PRODUCTS]) {
+    float parts[3][3];
+    for (int down = 0; down < 3; down += 2) {
+        const float* at = corner + down / 2 * SIDE * L::CHANNELS;
+        parts[down][0] = at[0] * scale, parts[down][2] = at[L::CHANNELS] * scale;
+        parts[down][1] = parts[down][0] + parts[down][2];
+    }
+    for (int right = 0; right < 3; ++right) parts[1][right] = parts[0][right] + parts[2][right];
+    std::copy_n(&parts[0][0], PRODUCTS, products);
+}
+
+// Weights [filter][6][6][channel] to [product][stack of channels][tap][filter].
+template <class L, typename Cell>
+std::vector<Cell> split_weights(const float* weights, float scale) {
+    constexpr int PACKED = L::template PACKED<Cell>, STACKS = L::template STACKS<Cell>;
+    std::vector<Cell> split(PRODUCTS * STACKS * TAPS * L::FILTERS);
     for (int filter = 0; filter < L::FILTERS; ++filter)
-        for (int channel = 0; channel < L::CHANNELS; ++channel)
+        for (int stack = 0; stack < STACKS; ++stack)
             for (int tap = 0; tap < TAPS; ++tap) {
-                const int corner = tap / 3 * 2 * SIDE + tap % 3 * 2;
-                float parts[3][3];
-                for (int down = 0; down < 3; down += 2) {
-                    const int row = filter * SIDE * SIDE + corner + down / 2 * SIDE;
-                    const float* at = weights + row * L::CHANNELS + channel;
-                    parts[down][0] = at[0] * scale, parts[down][2] = at[L::CHANNELS] * scale;
-                    parts[down][1] = parts[down][0] + parts[down][2];
+                const int row = filter * SIDE * SIDE + tap / 3 * 2 * SIDE + tap % 3 * 2;
+                float products[PACKED][PRODUCTS];
+                for (int i = 0; i < PACKED; ++i)
+                    split_tap<L>(weights + row * L::CHANNELS + stack * PACKED + i, scale,
+                                 products[i]);
+                for (int product = 0; product < PRODUCTS; ++product) {
+                    float channels[PACKED];
+                    for (int i = 0; i < PACKED; ++i) channels[i] = products[i][product];
+                    pack(channels, &split[((product * STACKS + stack) * TAPS + tap) * L::FILTERS +
+                                          filter]);
                 }
-                for (int right = 0; right < 3; ++right)
-                    parts[1][right] = parts[0][right] + parts[2][right];
-                for (int product = 0; product < PRODUCTS; ++product)
-                    split[((product * L::CHANNELS + channel) * TAPS + tap) * L::FILTERS + filter] =
-                        parts[product / 3][product % 3];
             }
     return split;
 }
@@ -153,30 +223,31 @@ inline void pool(const float* products, int stride, float bias, float* output, u
 }
 
 // One product at WIDE vectors of positions for GROUP filters, with all sums in registers.
-template <class L>
-void multiply(const float* planes, const float* weights, float products[L::GROUP][WIDE * LANES]) {
+template <class L, typename Cell>
+void multiply(const Cell* planes, const Cell* weights, float products[L::GROUP][WIDE * LANES]) {
     Vector sums[L::GROUP][WIDE] = {};
-    for (int channel = 0; channel < L::CHANNELS; ++channel, planes += L::PLANE)
+    for (int stack = 0; stack < L::template STACKS<Cell>; ++stack, planes += L::PLANE)
         for (int tap = 0; tap < TAPS; ++tap, weights += L::FILTERS)
             for (int filter = 0; filter < L::GROUP; ++filter)
                 for (int i = 0; i < WIDE; ++i)
-                    sums[filter][i] +=
-                        weights[filter] * load(planes + tap / 3 * L::PITCH + tap % 3 + i * LANES);
+                    sums[filter][i] =
+                        add_product(sums[filter][i], weights[filter],
+                                    planes + tap / 3 * L::PITCH + tap % 3 + i * LANES);
     for (int filter = 0; filter < L::GROUP; ++filter)
         for (int i = 0; i < WIDE; ++i) store(&products[filter][i * LANES], sums[filter][i]);
 }
 
-// Planes [product][channel][PLANE] to outputs and winners [filter][SIZE].
-template <class L>
-void convolve(const float* planes, const float* weights, const float* bias, float* outputs,
+// Planes [product][stack][PLANE] to outputs and winners [filter][SIZE].
+template <class L, typename Cell>
+void convolve(const Cell* planes, const Cell* weights, const float* bias, float* outputs,
               uint8_t* winners) {
-    constexpr int TILE = WIDE * LANES;
+    constexpr int TILE = WIDE * LANES, STACKS = L::template STACKS<Cell>;
     float products[PRODUCTS][L::GROUP][TILE];
     for (int tile = 0; tile < L::SIZE; tile += TILE)
         for (int group = 0; group < L::FILTERS; group += L::GROUP) {
             for (int product = 0; product < PRODUCTS; ++product)
-                multiply<L>(planes + product * L::CHANNELS * L::PLANE + tile,
-                            weights + product * L::CHANNELS * TAPS * L::FILTERS + group,
+                multiply<L>(planes + product * STACKS * L::PLANE + tile,
+                            weights + product * STACKS * TAPS * L::FILTERS + group,
                             products[product]);
             for (int filter = 0; filter < L::GROUP; ++filter)
                 for (int i = 0; i < TILE; i += LANES) {
@@ -189,36 +260,35 @@ void convolve(const float* planes, const float* weights, const float* bias, floa
 
 // What a thread needs for one image. It starts as zeros: unused positions may hold anything, but
 // reading them should not meet slow denormal numbers.
-template <int FRAMES>
+template <int FRAMES, typename Cell>
 struct ForwardScratch {
     using First = FirstLayer<FRAMES>;
-    float planes1[First::PLANES], planes2[Second::PLANES];
+    typename First::template Fitting<Cell> planes1[First::PLANES];
+    Cell planes2[Second::PLANES];
     float hidden[First::OUTPUTS], outputs[Second::OUTPUTS];
     uint8_t winners1[First::OUTPUTS], winners2[Second::OUTPUTS];
 };
 
-template <int FRAMES>
+template <int FRAMES, typename Cell>
 void forward(const uint8_t* frames, int64_t image_stride, int64_t images, const float* weights1,
              const float* bias1, const float* weights2, const float* bias2, float* features,
              float* hidden, uint8_t* winners1, uint8_t* winners2, int threads) {
     using First = FirstLayer<FRAMES>;
-    const auto split1 = split_weights<First>(weights1, 1.0f / 255.0f);
-    const auto split2 = split_weights<Second>(weights2, 1.0f);
+    using Cell1 = typename First::template Fitting<Cell>;
+    const auto split1 = split_weights<First, Cell1>(weights1, 1.0f / 255.0f);
+    const auto split2 = split_weights<Second, Cell>(weights2, 1.0f);
 #pragma omp parallel num_threads(threads) if (images > 1)
     {
-        const auto scratch = std::make_unique<ForwardScratch<FRAMES>>();
+        const auto scratch = std::make_unique<ForwardScratch<FRAMES, Cell>>();
 #pragma omp for schedule(dynamic)
         for (int64_t image = 0; image < images; ++image) {
             float* between = hidden ? hidden + image * First::OUTPUTS : scratch->hidden;
             uint8_t* won1 = hidden ? winners1 + image * First::OUTPUTS : scratch->winners1;
             uint8_t* won2 = hidden ? winners2 + image * Second::OUTPUTS : scratch->winners2;
-            for (int i = 0; i < FRAMES; ++i)
-                make_planes<First>(frames + image * image_stride + i * First::IMAGE_SIZE,
-                                   scratch->planes1 + i * First::PLANE);
+            make_all_planes<First>(frames + image * image_stride, First::IMAGE_SIZE,
+                                   scratch->planes1);
             convolve<First>(scratch->planes1, split1.data(), bias1, between, won1);
-            for (int i = 0; i < Second::CHANNELS; ++i)
-                make_planes<Second>(between + i * First::SIZE,
-                                    scratch->planes2 + i * Second::PLANE);
+            make_all_planes<Second>(between, First::SIZE, scratch->planes2);
             convolve<Second>(scratch->planes2, split2.data(), bias2, scratch->outputs, won2);
             for (int row = 0; row < Second::FILTERS * Second::ROWS; ++row)
                 std::copy_n(scratch->outputs + row / Second::ROWS * Second::SIZE +
@@ -240,7 +310,7 @@ struct Spike {
 template <class L>
 int list_spikes(const float* gradients, int row_stride, int stride, const uint8_t* winners,
                 Spike* spikes) {
-    constexpr int RIGHT = L::CHANNELS, DOWN = L::IMAGE_PITCH * RIGHT;
+    constexpr int RIGHT = L::CELL, DOWN = L::IMAGE_PITCH * RIGHT;
     constexpr int SHIFT[] = {0, RIGHT, DOWN, DOWN + RIGHT, 0};
     int count = 0;
     for (int row = 0; row < L::ROWS; ++row)
@@ -268,8 +338,8 @@ void add_windows(const Spike* spikes, int count, const float* image, float* weig
     for (int top = 0; top < SIDE; top += TOGETHER, weights += TOGETHER * L::PADDED_WINDOW) {
         Vector sums[TOGETHER][WIDTH] = {};
         for (int i = 0; i < count; ++i) {
-            const float* window = image + spikes[i].start + top * L::IMAGE_PITCH * L::CHANNELS;
-            for (int row = 0; row < TOGETHER; ++row, window += L::IMAGE_PITCH * L::CHANNELS)
+            const float* window = image + spikes[i].start + top * L::IMAGE_PITCH * L::CELL;
+            for (int row = 0; row < TOGETHER; ++row, window += L::IMAGE_PITCH * L::CELL)
                 for (int j = 0; j < WIDTH; ++j)
                     sums[row][j] += spikes[i].gradient * load(window + j * LANES);
         }
@@ -291,8 +361,8 @@ void spread_spikes(const Spike* spikes, int count, const float* weights, float* 
             for (int j = 0; j < WIDTH; ++j)
                 filter[row][j] = load(weights + row * L::PADDED_WINDOW + j * LANES);
         for (int i = 0; i < count; ++i) {
-            float* window = image + spikes[i].start + top * L::IMAGE_PITCH * L::CHANNELS;
-            for (int row = 0; row < TOGETHER; ++row, window += L::IMAGE_PITCH * L::CHANNELS)
+            float* window = image + spikes[i].start + top * L::IMAGE_PITCH * L::CELL;
+            for (int row = 0; row < TOGETHER; ++row, window += L::IMAGE_PITCH * L::CELL)
                 for (int j = 0; j < WIDTH; ++j)
                     store(window + j * LANES,
                           load(window + j * LANES) + spikes[i].gradient * filter[row][j]);
@@ -300,12 +370,12 @@ void spread_spikes(const Spike* spikes, int count, const float* weights, float* 
     }
 }
 
-// [CHANNELS][size] to [size][CHANNELS].
-template <int CHANNELS, typename Number>
-void interleave(const Number* planar, int size, float* interleaved) {
-    for (int i = 0; i < size; ++i)
-        for (int channel = 0; channel < CHANNELS; ++channel)
-            interleaved[i * CHANNELS + channel] = planar[channel * size + i];
+// [CHANNELS][IMAGE_SIZE] to [IMAGE_SIZE][CELL]; what pads a cell is left alone.
+template <class L, typename Number>
+void interleave(const Number* planar, float* interleaved) {
+    for (int i = 0; i < L::IMAGE_SIZE; ++i)
+        for (int channel = 0; channel < L::CHANNELS; ++channel)
+            interleaved[i * L::CELL + channel] = planar[channel * L::IMAGE_SIZE + i];
 }
 
 // Gradients of a layer's parameters.
@@ -322,8 +392,10 @@ struct Gradients {
 
     void write(float scale, float* to_weights, float* to_bias) const {
         for (int row = 0; row < L::FILTERS * SIDE; ++row)
-            for (int i = 0; i < L::WINDOW; ++i)
-                *to_weights++ = weights[row / SIDE][row % SIDE][i] * scale;
+            for (int i = 0; i < SIDE * L::CHANNELS; ++i)
+                *to_weights++ =
+                    weights[row / SIDE][row % SIDE][i / L::CHANNELS * L::CELL + i % L::CHANNELS] *
+                    scale;
         std::copy_n(bias, L::FILTERS, to_bias);
     }
 };
@@ -338,8 +410,9 @@ struct Sums {
 template <int FRAMES>
 struct BackwardScratch {
     using First = FirstLayer<FRAMES>;
-    float image[First::IMAGE_SIZE * FRAMES];
-    float hidden[First::OUTPUTS], hidden_gradients[First::OUTPUTS];
+    alignas(64) float image[First::IMAGE_SIZE * First::CELL];
+    alignas(64) float hidden[First::SIZE * Second::CELL];
+    alignas(64) float hidden_gradients[First::SIZE * Second::CELL];
     Spike spikes[First::SIZE];  // of one filter at a time
 };
 
@@ -353,7 +426,7 @@ void backward_image(const float* weights2, const uint8_t* winners1, const uint8_
         for (int i = 0; i < count; ++i) total += spikes[i].gradient;
         return total;
     };
-    std::fill_n(scratch.hidden_gradients, First::OUTPUTS, 0.0f);
+    std::fill_n(scratch.hidden_gradients, First::SIZE * Second::CELL, 0.0f);
     for (int filter = 0; filter < Second::FILTERS; ++filter) {
         const int count = list_spikes<Second>(gradients + filter * POOLED, Second::COLUMNS, 1,
                                               winners2 + filter * Second::SIZE, spikes);
@@ -364,7 +437,7 @@ void backward_image(const float* weights2, const uint8_t* winners1, const uint8_
     }
     for (int filter = 0; filter < First::FILTERS; ++filter) {
         const int count = list_spikes<First>(
-            scratch.hidden_gradients + filter, First::PITCH * First::FILTERS, First::FILTERS,
+            scratch.hidden_gradients + filter, First::PITCH * Second::CELL, Second::CELL,
             winners1 + filter * First::SIZE, spikes);
         add_windows<First>(spikes, count, scratch.image, sums.first.weights[filter][0]);
         sums.first.bias[filter] += sum(count);
@@ -380,9 +453,9 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
               float* to_bias2, int threads) {
     using First = FirstLayer<FRAMES>;
     std::vector<float> padded2(Second::FILTERS * SIDE * Second::PADDED_WINDOW);
-    for (int row = 0; row < Second::FILTERS * SIDE; ++row)
-        std::copy_n(weights2 + row * Second::WINDOW, Second::WINDOW,
-                    &padded2[row * Second::PADDED_WINDOW]);
+    for (int pixel = 0; pixel < Second::FILTERS * SIDE * SIDE; ++pixel)
+        std::copy_n(weights2 + pixel * Second::CHANNELS, Second::CHANNELS,
+                    &padded2[pixel / SIDE * Second::PADDED_WINDOW + pixel % SIDE * Second::CELL]);
     std::vector<Sums<FRAMES>> sums((images + CHUNK - 1) / CHUNK);
 #pragma omp parallel num_threads(threads) if (images > CHUNK)
     {
@@ -390,10 +463,8 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
 #pragma omp for schedule(dynamic)
         for (int64_t first = 0; first < images; first += CHUNK)
             for (int64_t image = first; image < std::min(images, first + CHUNK); ++image) {
-                interleave<FRAMES>(frames + image * image_stride, First::IMAGE_SIZE,
-                                   scratch->image);
-                interleave<First::FILTERS>(hidden + image * First::OUTPUTS, First::SIZE,
-                                           scratch->hidden);
+                interleave<First>(frames + image * image_stride, scratch->image);
+                interleave<Second>(hidden + image * First::OUTPUTS, scratch->hidden);
                 backward_image<FRAMES>(padded2.data(), winners1 + image * First::OUTPUTS,
                                        winners2 + image * Second::OUTPUTS,
                                        gradients + image * FEATURES, *scratch, sums[first / CHUNK]);
@@ -415,7 +486,8 @@ void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const
 // Frames are [images][channels][45][80] with ``image_stride`` bytes between images and 1 or 2
 // channels; weights and their gradients are [filter][6][6][channel]. What a backward pass will need
 // is kept in hidden and winners1, trunk_hidden() numbers an image each, and in winners2,
-// trunk_outputs() numbers an image. All three are null if there will be none.
+// trunk_outputs() numbers an image. All three are null if there will be none. ``reduced`` asks the
+// forward pass for bfloat16.
 
 extern "C" {
 
@@ -425,8 +497,9 @@ int trunk_outputs() { return Second::OUTPUTS; }
 void trunk_forward(const uint8_t* frames, int64_t image_stride, int64_t images, int channels,
                    const float* weights1, const float* bias1, const float* weights2,
                    const float* bias2, float* features, float* hidden, uint8_t* winners1,
-                   uint8_t* winners2, int threads) {
-    const auto run = channels == 1 ? forward<1> : forward<2>;
+                   uint8_t* winners2, int reduced, int threads) {
+    const auto run = channels == 1 ? (reduced ? forward<1, Pair> : forward<1, float>)
+                                   : (reduced ? forward<2, Pair> : forward<2, float>);
     run(frames, image_stride, images, weights1, bias1, weights2, bias2, features, hidden, winners1,
         winners2, threads);
 }

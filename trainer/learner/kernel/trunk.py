@@ -89,7 +89,7 @@ def _library() -> ctypes.CDLL | None:
     if library is not None:
         pointer, threads = ctypes.c_void_p, ctypes.c_int
         pictures = (pointer, ctypes.c_int64, ctypes.c_int64, ctypes.c_int)
-        library.trunk_forward.argtypes = (*pictures, *(pointer,) * 8, threads)
+        library.trunk_forward.argtypes = (*pictures, *(pointer,) * 8, ctypes.c_int, threads)
         library.trunk_backward.argtypes = (*pictures, *(pointer,) * 9, threads)
         library.trunk_forward.restype = library.trunk_backward.restype = None
     return library
@@ -130,6 +130,7 @@ def _forward(
         *(tensor.data_ptr() for tensor in given),
         features.data_ptr(),
         *(None if tensor is None else tensor.data_ptr() for tensor in saved),
+        torch.is_autocast_enabled("cpu"),
         torch.get_num_threads(),
     )
     return features

@@ -1,0 +1,200 @@
+"""Replay and learner beside the environment: one update while one step is driven.
+
+The order is fixed, so that a run depends on its seed alone: in each control period the policy acts,
+an update on what was stored before is begun, the environment takes its step, the update is
+finished, and only then the step is stored.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from trainer import seeds
+from trainer.learner.algorithms import Algorithm
+from trainer.learner.config import LearnerConfig
+from trainer.learner.networks import Actor
+from trainer.learner.replay import Batch, ReplayBuffer
+from trainer.learner.td3 import Losses, TD3Learner
+
+Observation = NDArray[np.uint8]
+Action = NDArray[np.float32]
+
+
+class Learning(Protocol):
+    """What a training loop asks of a learner with its replay buffer, wherever they are."""
+
+    added: int
+    """Transitions stored since the run began."""
+
+    @property
+    def actor(self) -> Actor:
+        """The policy network, as of the last finished update."""
+        ...
+
+    def act(self, observation: Observation) -> Action:
+        """pi(s), float32 [action size]; not between ``begin`` and ``finish``."""
+        ...
+
+    def start_episode(self, observation: Observation) -> None:
+        """Take an episode's first observation."""
+
+    def add(
+        self, action: Action, reward: float, observation: Observation, terminal: bool, human: bool
+    ) -> None:
+        """Store a transition that led to ``observation``."""
+
+    def begin(self, beta: float) -> None:
+        """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
+
+    def finish(self) -> None:
+        """Wait until the update that was begun is done, if one was."""
+
+    def end_episode(self) -> EpisodeLearning:
+        """What was learned since the last call; learning rates decay (table A5)."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave."""
+
+    def close(self) -> None:
+        """Let go of threads and memory."""
+
+
+class EpisodeLearning:
+    """What the updates of an episode amount to."""
+
+    def __init__(
+        self,
+        mean_losses: NDArray[np.float64] | None,
+        learning_s: float,
+        waiting_s: float,
+        mean_priorities: tuple[float, float],
+    ) -> None:
+        nothing = np.full(4, np.nan)
+        losses = nothing if mean_losses is None else mean_losses
+        self.critic_loss, self.policy_loss, self.cloning_loss, self.value = map(float, losses)
+        self.learning_s, self.waiting_s = learning_s, waiting_s
+        self.policy_priority, self.human_priority = mean_priorities
+
+
+class ProcessorLearning:
+    """``Learning`` on the processor: updates run in a thread of their own.
+
+    All of the learner's torch calls come from that thread: a second one would bring a second pool
+    of OpenMP threads, and the two would fight for the same cores.
+
+    Args:
+        config: hyper-parameters.
+        algorithm: the row of the table of switches.
+        seed: of weights, noise and draws.
+        action_size: length of an action.
+    """
+
+    def __init__(
+        self, config: LearnerConfig, algorithm: Algorithm, seed: int, action_size: int
+    ) -> None:
+        self.config = config
+        self.learner = TD3Learner(config, algorithm, seed, action_size)
+        self.replay = ReplayBuffer(config.replay_capacity, action_size, config.alpha)
+        self._random = seeds.stream(seed, seeds.REPLAY)
+        self._thread = ThreadPoolExecutor(1, "learner")
+        self._begun: tuple[Batch, Future[tuple[Losses, float]]] | None = None
+        self._forget_episode()
+
+    @property
+    def added(self) -> int:
+        """Transitions stored since the run began."""
+        return self.replay.added
+
+    @property
+    def actor(self) -> Actor:
+        """The policy network, as of the last finished update."""
+        return self.learner.actor
+
+    def act(self, observation: Observation) -> Action:
+        """pi(s), float32 [action size]; not between ``begin`` and ``finish``."""
+        return self._thread.submit(self.learner.act, observation).result()
+
+    def start_episode(self, observation: Observation) -> None:
+        """Take an episode's first observation."""
+        self.replay.start_episode(observation)
+
+    def add(
+        self, action: Action, reward: float, observation: Observation, terminal: bool, human: bool
+    ) -> None:
+        """Store a transition that led to ``observation``."""
+        self.replay.add(action, reward, observation, terminal, human)
+
+    def begin(self, beta: float) -> None:
+        """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
+        batch = self.replay.sample(self.config.batch_size, self._random)
+        self._begun = batch, self._thread.submit(self._update, batch, beta)
+
+    def finish(self) -> None:
+        """Wait until the update that was begun is done, if one was."""
+        if self._begun is None:
+            return
+        began_s = time.perf_counter()
+        batch, update = self._begun
+        losses, learning_s = update.result()
+        self._waiting_s += time.perf_counter() - began_s
+        self._learning_s += learning_s
+        self._losses.append(losses[:4])
+        self.replay.update_priorities(batch.indices, losses.priorities)
+        self._begun = None
+
+    def end_episode(self) -> EpisodeLearning:
+        """What was learned since the last call; learning rates decay (table A5)."""
+        self.learner.decay_learning_rates()
+        mean_losses = np.mean(self._losses, axis=0) if self._losses else None
+        priorities = self.replay.mean_priorities()
+        learned = EpisodeLearning(mean_losses, self._learning_s, self._waiting_s, priorities)
+        self._forget_episode()
+        return learned
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on."""
+        replay = self.replay.state_dict()
+        return {
+            "learner": self.learner.state_dict(),
+            # Tensors: what a checkpoint may hold without arbitrary unpickling.
+            "replay": {
+                name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+                for name, value in replay.items()
+            },
+            "drawing": self._random.bit_generator.state,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave."""
+        self.learner.load_state_dict(state["learner"])
+        self.replay.load_state_dict(
+            {
+                name: value.numpy() if isinstance(value, torch.Tensor) else value
+                for name, value in state["replay"].items()
+            }
+        )
+        self._random.bit_generator.state = state["drawing"]
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._thread.shutdown()
+
+    def _update(self, batch: Batch, beta: float) -> tuple[Losses, float]:
+        began_s = time.perf_counter()
+        losses = self.learner.update(batch, beta)
+        return losses, time.perf_counter() - began_s
+
+    def _forget_episode(self) -> None:
+        self._losses: list[tuple[float, ...]] = []
+        self._learning_s = self._waiting_s = 0.0
