@@ -1,4 +1,5 @@
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -124,6 +125,42 @@ def test_not_a_number_is_not_hidden() -> None:
     assert trunk_features(_pictures(1)[:, :2], *parameters).isnan().all()
 
 
+@needs_kernel
+@pytest.mark.parametrize("frames", [slice(0, 2), slice(2, 3)])
+def test_reduced_precision_is_near_and_does_not_depend_on_threads(frames: slice) -> None:
+    pictures = _pictures(9)[:, frames]
+    parameters, slopes = _parameters(pictures.shape[1]), _slopes(9)
+    right_features, right_gradients = _gradients(pictures, parameters, slopes)
+    before = torch.get_num_threads()
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        with torch.autocast("cpu", torch.bfloat16):
+            features = trunk_features(pictures, *parameters)
+        gradients = torch.autograd.grad(features, parameters, slopes)
+        torch.set_num_threads(before)
+        if threads == 1:
+            first_features, first_gradients = features, gradients
+        assert torch.equal(features, first_features)
+        assert all(map(torch.equal, gradients, first_gradients))
+    # bfloat16 keeps 8 bits of each factor, and its errors average out in the sums.
+    assert (features - right_features).norm() < 0.01 * right_features.norm()
+    for gradient, right in zip(gradients, right_gradients, strict=True):
+        # A rounded value may win its pooling where it did not before.
+        assert (gradient - right).norm() < 0.2 * right.norm()
+
+
+@needs_kernel
+@pytest.mark.parametrize("level", [0, 1, 128, 255])
+def test_in_reduced_precision_ties_stay_ties(level: int) -> None:
+    """The first of equal candidates wins, so a flat picture sends each gradient the same way."""
+    pictures, parameters = torch.full((1, 2, 45, 80), level, dtype=torch.uint8), _parameters(2)
+    _, (right, *_) = _gradients(pictures, parameters, _slopes(1))
+    with torch.autocast("cpu", torch.bfloat16):
+        features = trunk_features(pictures, *parameters)
+    (gradient,) = torch.autograd.grad(features, parameters[:1], _slopes(1))
+    assert (gradient - right).norm() <= 0.02 * right.norm()
+
+
 def test_an_empty_batch() -> None:
     assert trunk_features(_pictures(0)[:, :2], *_parameters(2)).shape == (0, 1792)
 
@@ -176,10 +213,10 @@ print("kernel" if kernel.load("trunk") else "torch")
 """
 
 
-def _start(cache: Path, **environment: str) -> subprocess.Popen[str]:
+def _start(cache: Path, program: str = _PROGRAM, **environment: str) -> subprocess.Popen[str]:
     settings = {**os.environ, "XDG_CACHE_HOME": str(cache), "PHIL_KERNEL": "1", **environment}
     return subprocess.Popen(
-        [sys.executable, "-c", _PROGRAM],
+        [sys.executable, "-c", program],
         env=settings,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -212,6 +249,34 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path) -> None:
     output, errors = _finish(_start(blocked))
     assert output == "torch"
     assert len(errors.splitlines()) == 1
+
+
+_ON_ANOTHER_PROCESSOR = """
+import torch
+from trainer.learner import kernel
+from trainer.learner.kernel.trunk import _torch_features, trunk_features
+frames = torch.randint(0, 256, (5, 2, 45, 80), dtype=torch.uint8)
+layers = torch.nn.Conv2d(2, 6, 6), torch.nn.Conv2d(6, 16, 6)
+parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
+right = _torch_features(frames, *parameters)
+wanted = torch.autograd.grad(right.square().sum(), parameters)
+for reduced in (False, True):
+    with torch.autocast("cpu", torch.bfloat16, enabled=reduced):
+        features = trunk_features(frames, *parameters)
+    torch.testing.assert_close(features, right, rtol=1e-4, atol=1e-5)
+    for gradient, true in zip(torch.autograd.grad(features.square().sum(), parameters), wanted):
+        assert (gradient - true).norm() < 1e-4 * true.norm()
+print("kernel" if kernel.load("trunk") else "torch")
+"""
+
+
+@needs_kernel
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the flags are those of x86-64")
+@pytest.mark.parametrize("flags", ["-mno-avx512f", "-mno-avx512f -mno-avx"])
+def test_processors_with_shorter_vectors_compute_the_same(tmp_path: Path, flags: str) -> None:
+    """Also: without bfloat16 instructions, reduced precision is single precision."""
+    process = _start(tmp_path, _ON_ANOTHER_PROCESSOR, CXX=f"c++ {flags}")
+    assert _finish(process) == ("kernel", "")
 
 
 @needs_kernel

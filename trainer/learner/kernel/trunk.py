@@ -29,6 +29,8 @@ def trunk_features(
 
     Differentiable once with respect to the parameters. The compiled kernel serves the networks of
     this project on the CPU; anything else, and every export, takes the torch operations.
+    Under ``torch.autocast`` the kernel's forward pass multiplies in bfloat16, where the processor
+    can; sums, features and gradients stay in single precision.
 
     Args:
         frames: uint8 [batch, n, 45, 80] with n = 1 or 2. A slice of a longer stack of frames,
