@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,16 +48,19 @@ class Crossing:
             for s_m in np.arange(0.0, config.goal_m + 10.0, TABLE_STEP_M)
         ]
         self._covered_x = np.array(stretch)
+        self._first_cell = int(np.argmax(np.isfinite(self._covered_x[:, 0])))
 
     def clear(self, horizon_s: float, margin_m: float, plan: PedalPlan) -> bool:
         """Whether nothing comes within ``margin_m`` along the lane during ``horizon_s``."""
         time_s, s_m = self._ego_motion(horizon_s, plan)
         cells = np.minimum((s_m / TABLE_STEP_M).astype(int), len(self._covered_x) - 1)
+        if cells[-1] < self._first_cell:
+            return True
         rear_x, front_x = self._covered_x[cells].T
         for car in self.env.traffic:
             car_x = car.position[0] + car.speed * time_s
             reach_m = 0.5 * car.LENGTH + margin_m
-            if np.any((car_x + reach_m > rear_x) & (car_x - reach_m < front_x)):
+            if ((car_x + reach_m > rear_x) & (car_x - reach_m < front_x)).any():
                 return False
         return True
 
@@ -68,8 +72,7 @@ class Crossing:
         steps, held = round(horizon_s / dt_s), round(plan.hold_s / dt_s)
         held_mps2 = plan.pedal * (c.throttle_mps2 if plan.pedal > 0 else c.brake_mps2)
         speed_mps, s_m = self.env.ego.speed, self.env.distance_m
-        positions = np.empty(steps + 1)
-        positions[0] = s_m
+        positions = [s_m]
         for step in range(steps):
             # As the car itself: the position takes the speed at the start of the interval.
             s_m += speed_mps * dt_s
@@ -77,8 +80,8 @@ class Crossing:
                 speed_mps = min(max(speed_mps + held_mps2 * dt_s, 0.0), c.max_speed_mps)
             elif plan.then_mps is not None and speed_mps < plan.then_mps:
                 speed_mps = min(speed_mps + c.throttle_mps2 * dt_s, plan.then_mps)
-            positions[step + 1] = s_m
-        return np.linspace(0.0, steps * dt_s, steps + 1), positions
+            positions.append(s_m)
+        return _instants(steps, dt_s), np.array(positions)
 
     def _footprint(self, s_m: float) -> Rectangle:
         pose = self.env.path.pose(s_m)
@@ -86,6 +89,11 @@ class Crossing:
         # In the bend the tracked car points inwards by the slip angle.
         slip_rad = math.asin(0.5 * length_m * self.env.path.curvature(s_m))
         return Rectangle(pose.x, pose.y, pose.heading - slip_rad, length_m, width_m)
+
+
+@cache
+def _instants(steps: int, dt_s: float) -> NDArray[np.float64]:
+    return np.linspace(0.0, steps * dt_s, steps + 1)
 
 
 def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[float, float]:

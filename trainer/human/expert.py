@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,12 +57,12 @@ class LeftTurnExpert:
         return env.distance_m + stopping_m > self.POINT_OF_NO_RETURN_M
 
     def _go(self) -> float:
-        return float(np.clip(2.0 * (self.CRUISE_MPS - self.env.ego.speed), -1.0, 1.0))
+        return min(max(2.0 * (self.CRUISE_MPS - self.env.ego.speed), -1.0), 1.0)
 
     def _wait(self) -> float:
         """Slow down on a speed that falls with the distance to the line, and stand there."""
         to_line_m = self.env.config.stop_line_m - self.env.distance_m
-        wanted_mps = float(np.sqrt(2.0 * self.APPROACH_MPS2 * max(to_line_m - 0.5, 0.0)))
+        wanted_mps = math.sqrt(2.0 * self.APPROACH_MPS2 * max(to_line_m - 0.5, 0.0))
         if wanted_mps == 0.0:
             return -1.0
-        return float(np.clip(wanted_mps - self.env.ego.speed, -1.0, 0.3))
+        return min(max(wanted_mps - self.env.ego.speed, -1.0), 0.3)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from highway_env.road.road import Road
 from highway_env.utils import wrap_to_pi
 from highway_env.vehicle.kinematics import Vehicle
@@ -22,6 +21,7 @@ class EgoVehicle(Vehicle):
 
     MAX_STEERING_RAD = math.pi / 4
     speed: float
+    heading: float
 
     def __init__(
         self, road: Road, position: tuple[float, float], heading: float, speed: float
@@ -43,6 +43,8 @@ class EgoVehicle(Vehicle):
         self.action["acceleration"] = min(max(acceleration_mps2, lowest), highest)
         self.action["steering"] = steering_rad
         self.step(dt_s)
+        # A plain float again: arithmetic on numpy's scalars is many times slower.
+        self.heading = float(self.heading)
         self.speed = min(max(self.speed, 0.0), max_speed_mps)
         self.longitudinal_acceleration_mps2 = (self.speed - before_mps) / dt_s
         self.lateral_acceleration_mps2 = self.speed * (self.heading - before_rad) / dt_s
@@ -53,8 +55,7 @@ class EgoVehicle(Vehicle):
     @property
     def footprint(self) -> Rectangle:
         """The car's rectangle on the ground."""
-        x, y = self.position
-        return Rectangle(float(x), float(y), float(self.heading), self.LENGTH, self.WIDTH)
+        return Rectangle(*self.position.tolist(), self.heading, self.LENGTH, self.WIDTH)
 
 
 class PathTracker:
@@ -77,7 +78,7 @@ class PathTracker:
     def steering(self, ego: EgoVehicle, s_m: float, offset_m: float, dt_s: float) -> float:
         """The front-wheel angle in rad for the car at arc length ``s_m``, ``offset_m`` right."""
         limit = self.INTEGRAL_LIMIT_MS
-        self.integral_ms = float(np.clip(self.integral_ms + offset_m * dt_s, -limit, limit))
+        self.integral_ms = min(max(self.integral_ms + offset_m * dt_s, -limit), limit)
         curvature = self.path.curvature(s_m)
         # In a bend the car's centre moves at the slip angle to its heading.
         slip_rad = math.asin(0.5 * ego.LENGTH * curvature)
@@ -89,4 +90,4 @@ class PathTracker:
             - self.OFFSET_GAIN_RAD_PER_M * offset_m
             - self.INTEGRAL_GAIN_RAD_PER_MS * self.integral_ms
         )
-        return float(np.clip(angle, -ego.MAX_STEERING_RAD, ego.MAX_STEERING_RAD))
+        return min(max(angle, -ego.MAX_STEERING_RAD), ego.MAX_STEERING_RAD)

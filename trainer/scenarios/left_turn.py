@@ -132,7 +132,7 @@ class LeftTurnEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Hold the pedal for one control interval."""
         c = self.config
-        pedal = float(np.clip(action[0], -1.0, 1.0))
+        pedal = min(max(float(action[0]), -1.0), 1.0)
         acceleration_mps2 = pedal * (c.throttle_mps2 if pedal > 0 else c.brake_mps2)
         steering_rad = self.tracker.steering(
             self.ego, self.distance_m, self._offset_m, c.control_period_s
@@ -143,7 +143,7 @@ class LeftTurnEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             car.step(c.control_period_s)
         self.ego.drive(acceleration_mps2, steering_rad, c.max_speed_mps, c.control_period_s)
         self.steps += 1
-        self.distance_m, self._offset_m = self.path.project(*self.ego.position)
+        self.distance_m, self._offset_m = self.path.project(*self.ego.position.tolist())
         self.frames[0] = self.frames[1]
         self.frames[1] = self._frame()
         outcome = self._outcome()

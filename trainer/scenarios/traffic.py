@@ -6,6 +6,7 @@ import numpy as np
 from highway_env.road.road import LaneIndex, Road
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from numpy.typing import NDArray
 
 from trainer.scenarios.geometry import Rectangle
 
@@ -43,22 +44,27 @@ class TrafficVehicle(IDMVehicle):
             enable_lane_change=False,
         )
         self.lane, self.lane_index = lane, lane_index
+        self._direction = super().direction
         self.leader = leader
 
     def act(self, action: dict | str | None = None) -> None:
         """Choose the acceleration by the intelligent driver model; the wheels stay straight."""
         acceleration = self.acceleration(ego_vehicle=self, front_vehicle=self.leader)
-        acceleration = float(np.clip(acceleration, -self.ACC_MAX, self.ACC_MAX))
+        acceleration = float(min(max(acceleration, -self.ACC_MAX), self.ACC_MAX))
         Vehicle.act(self, {"steering": 0.0, "acceleration": acceleration})
 
     def on_state_update(self) -> None:
         """Keep the lane: nothing to look up."""
 
     @property
+    def direction(self) -> NDArray[np.float64]:
+        """Where the car points, a unit vector [2]: always the same, as it never steers."""
+        return self._direction
+
+    @property
     def footprint(self) -> Rectangle:
         """The car's rectangle on the ground."""
-        x, y = self.position
-        return Rectangle(float(x), float(y), float(self.heading), self.LENGTH, self.WIDTH)
+        return Rectangle(*self.position.tolist(), float(self.heading), self.LENGTH, self.WIDTH)
 
 
 def queue(
