@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.geometry import Rectangle, corners
 from trainer.scenarios.left_turn import LeftTurnEnv
+from trainer.scenarios.traffic import TrafficVehicle
 
 TABLE_STEP_M = 0.1
 
@@ -49,20 +50,19 @@ class Crossing:
         ]
         self._covered_x = np.array(stretch)
         self._first_cell = int(np.argmax(np.isfinite(self._covered_x[:, 0])))
+        """Where the ego car first reaches into the lane."""
 
     def clear(self, horizon_s: float, margin_m: float, plan: PedalPlan) -> bool:
         """Whether nothing comes within ``margin_m`` along the lane during ``horizon_s``."""
         time_s, s_m = self._ego_motion(horizon_s, plan)
         cells = np.minimum((s_m / TABLE_STEP_M).astype(int), len(self._covered_x) - 1)
         if cells[-1] < self._first_cell:
-            return True
+            return True  # The ego car does not get as far as the lane.
         rear_x, front_x = self._covered_x[cells].T
-        for car in self.env.traffic:
-            car_x = car.position[0] + car.speed * time_s
-            reach_m = 0.5 * car.LENGTH + margin_m
-            if ((car_x + reach_m > rear_x) & (car_x - reach_m < front_x)).any():
-                return False
-        return True
+        cars, reach_m = self.env.traffic, 0.5 * TrafficVehicle.LENGTH + margin_m
+        start_x = np.array([car.position[0] for car in cars])[:, None]
+        car_x = start_x + np.array([car.speed for car in cars])[:, None] * time_s
+        return not np.any((car_x + reach_m > rear_x) & (car_x - reach_m < front_x))
 
     def _ego_motion(
         self, horizon_s: float, plan: PedalPlan

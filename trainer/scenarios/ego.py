@@ -55,7 +55,8 @@ class EgoVehicle(Vehicle):
     @property
     def footprint(self) -> Rectangle:
         """The car's rectangle on the ground."""
-        return Rectangle(*self.position.tolist(), self.heading, self.LENGTH, self.WIDTH)
+        x, y = self.position.tolist()
+        return Rectangle(x, y, self.heading, self.LENGTH, self.WIDTH)
 
 
 class PathTracker:

@@ -55,15 +55,15 @@ class Rasteriser:
         dx = self._column_x[left:right] - shape.x
         dy = (self._row_y[top:bottom] - shape.y)[:, None]
         if sin == 0.0:
-            # Along the picture's rows, as most traffic: a row times a column instead of a field.
-            along, across = dx * cos, dy * cos
+            # Parallel to the rows, as most traffic is: a row times a column instead of a field.
+            along, across = dx, dy
         else:
             along, across = dx * cos + dy * sin, dy * cos - dx * sin
         inside = self._covered(along, shape.length) * self._covered(across, shape.width)
         patch = picture[top:bottom, left:right]
         patch += inside * (value - patch)
 
-    def _covered(self, offset_m: NDArray[np.float64], side_m: float) -> NDArray[np.float64]:
+    def _covered(self, offset_m: NDArray[np.floating], side_m: float) -> NDArray[np.floating]:
         """How much of a pixel lies between two sides, by its offset from their middle."""
         share = (0.5 * side_m - np.abs(offset_m)) / self.metres_per_pixel + 0.5
         # np.clip costs more than the arithmetic on arrays this small.

@@ -24,7 +24,12 @@ def t_intersection(path: LeftTurnPath, goal_m: float, lane_width_m: float) -> Ro
     for start, end, y in (("west", "east", half), ("east", "west", -half)):
         direction = 1.0 if start == "west" else -1.0
         lane = StraightLane(
-            (-direction * reach, y), (direction * reach, y), lane_width_m, line_types=lines
+            (-direction * reach, y),
+            (direction * reach, y),
+            lane_width_m,
+            line_types=lines,
+            # The cars' own desired speeds are what limits them.
+            speed_limit=None,
         )
         network.add_lane(start, end, lane)
     nodes = ("south", "turn", "exit", "goal")

@@ -34,8 +34,9 @@ class TrafficVehicle(IDMVehicle):
     ) -> None:
         lane = road.network.get_lane(lane_index)
         heading = lane.heading_at(position_m)
+        # Without a road at first: highway-env would search all lanes for the one named here.
         super().__init__(
-            road,
+            None,
             lane.position(position_m, 0.0),
             heading=heading,
             speed=speed_mps,
@@ -43,7 +44,7 @@ class TrafficVehicle(IDMVehicle):
             target_speed=speed_mps,
             enable_lane_change=False,
         )
-        self.lane, self.lane_index = lane, lane_index
+        self.road, self.lane, self.lane_index = road, lane, lane_index
         self._direction = super().direction
         self.leader = leader
 
@@ -64,7 +65,8 @@ class TrafficVehicle(IDMVehicle):
     @property
     def footprint(self) -> Rectangle:
         """The car's rectangle on the ground."""
-        return Rectangle(*self.position.tolist(), float(self.heading), self.LENGTH, self.WIDTH)
+        x, y = self.position.tolist()
+        return Rectangle(x, y, float(self.heading), self.LENGTH, self.WIDTH)
 
 
 def queue(
