@@ -8,9 +8,10 @@ import json
 from edge_runtime.cli import write_json_out
 from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
 from edge_runtime.files import check_writable
-from trainer.commands.options import add_scenario, not_negative, positive
+from trainer.commands.options import add_scenario, not_negative, positive, set_threads
 from trainer.drivers import load_driver, make_environment
 from trainer.evaluation import CONDITIONS, drive_episodes
+from trainer.parallel import WORTH_STARTING, choose_jobs, drive_episodes_in_parallel
 from trainer.progress import ProgressBar
 
 EXAMPLE = "example: python -m trainer evaluate runs/phil_1 --runs 50 --out result.json"
@@ -31,6 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed", type=not_negative, default=0, help="of the first episode; the next has one more"
     )
     parser.add_argument(
+        "--jobs",
+        type=not_negative,
+        default=0,
+        metavar="N",
+        help="processes; they change the time taken, never a result. "
+        f"0: one a core from {WORTH_STARTING} episodes on, below that a single one",
+    )
+    parser.add_argument(
         "--out",
         metavar="R.json",
         help="write the report, with each episode, to this file instead of printing it",
@@ -44,6 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     env = make_environment(arguments.scenario)
     driver, policy_id = load_driver(arguments.policy, env)
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
+    jobs = min(arguments.jobs or choose_jobs(arguments.runs), arguments.runs)
     goals = 0
     with ProgressBar("evaluating", arguments.runs) as bar:
 
@@ -52,7 +62,13 @@ def run(arguments: argparse.Namespace) -> int:
             goals += result.outcome == GOAL
             bar.advance({"success": f"{goals / (bar.done + 1):.2f}"})
 
-        results = drive_episodes(env, driver, seeds, arguments.condition, on_episode)
+        if jobs == 1:
+            set_threads(1)  # As each worker: the last bits must not depend on how many drive.
+            results = drive_episodes(env, driver, seeds, arguments.condition, on_episode)
+        else:
+            results = drive_episodes_in_parallel(
+                arguments.policy, arguments.scenario, seeds, jobs, arguments.condition, on_episode
+            )
     report = summarise(results, arguments.scenario, arguments.condition, policy_id, arguments.seed)
     if not arguments.out:
         print(json.dumps(report, indent=2))

@@ -1,0 +1,115 @@
+"""Episodes over several processes: the results of one process, sooner."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+import torch
+
+from edge_runtime.episode_report import EpisodeResult
+from edge_runtime.errors import UserError
+from trainer.drivers import load_driver, make_environment
+from trainer.evaluation import drive_episodes
+from trainer.human.guide import Driver
+
+WORTH_STARTING = 100
+"""Episodes from which on processes pay: each spends 2 s on its imports first, which is as long as
+some 40 to 100 episodes take, by what drives."""
+
+
+def choose_jobs(runs: int) -> int:
+    """How many processes drive ``runs`` episodes soonest: this one alone, or one a core."""
+    return min(len(os.sched_getaffinity(0)), runs) if runs >= WORTH_STARTING else 1
+
+
+def drive_episodes_in_parallel(
+    policy: str,
+    scenario: str,
+    seeds: Sequence[int],
+    jobs: int,
+    condition: str = "nominal",
+    on_episode: Callable[[EpisodeResult], None] = lambda result: None,
+) -> list[EpisodeResult]:
+    """Drive one episode for each seed under a condition, in ``jobs`` worker processes.
+
+    Args:
+        policy: who drives, as in `trainer.drivers.load_driver`.
+        scenario: what is driven.
+        seeds: of the episodes.
+        jobs: number of processes.
+        condition: one of `trainer.evaluation.CONDITIONS`.
+        on_episode: called with each result, in the order of the seeds.
+
+    Returns:
+        The results in the order of the seeds; to the bit what `drive_episodes` gives on one torch
+        thread, whatever ``jobs`` is.
+
+    Raises:
+        UserError: nothing there that drives, or a worker died.
+    """
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, context, initializer=_start_worker)
+    results = []
+    try:
+        with _interrupts_blocked():
+            futures: list[Future[EpisodeResult]] = [
+                pool.submit(_drive, policy, scenario, seed, condition) for seed in seeds
+            ]
+        for future in futures:
+            results.append(future.result())
+            on_episode(results[-1])
+    except BrokenProcessPool as error:
+        raise UserError(
+            f"a worker process died after {len(results)} of {len(seeds)} episodes; "
+            "where memory is short, fewer jobs need less"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return results
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Processes started here never see ^C, which a terminal sends to all: their parent ends them.
+
+    Blocked, not ignored: a ^C of this moment reaches the parent afterwards.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker() -> None:
+    torch.set_num_threads(1)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+
+
+def _die_with_parent() -> None:
+    """A killed parent can end nobody, and a worker would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+@cache
+def _cockpit(policy: str, scenario: str) -> tuple[Any, Driver]:
+    """Environment and driver, made once in a worker; here, so that a UserError finds its way."""
+    env = make_environment(scenario)
+    return env, load_driver(policy, env)[0]
+
+
+def _drive(policy: str, scenario: str, seed: int, condition: str) -> EpisodeResult:
+    env, driver = _cockpit(policy, scenario)
+    return drive_episodes(env, driver, [seed], condition)[0]
