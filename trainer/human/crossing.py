@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.geometry import Rectangle, corners
 from trainer.scenarios.left_turn import LeftTurnEnv
-from trainer.scenarios.traffic import TrafficVehicle
 
 TABLE_STEP_M = 0.1
 
@@ -59,9 +58,10 @@ class Crossing:
         if cells[-1] < self._first_cell:
             return True  # The ego car does not get as far as the lane.
         rear_x, front_x = self._covered_x[cells].T
-        cars, reach_m = self.env.traffic, 0.5 * TrafficVehicle.LENGTH + margin_m
-        start_x = np.array([car.position[0] for car in cars])[:, None]
-        car_x = start_x + np.array([car.speed for car in cars])[:, None] * time_s
+        # All cars at once; the shape holds without any, too.
+        cars = [(car.position[0], car.speed, car.LENGTH) for car in self.env.traffic]
+        x, speed_mps, length_m = np.array(cars).reshape(-1, 3).T[:, :, None]
+        car_x, reach_m = x + speed_mps * time_s, 0.5 * length_m + margin_m
         return not np.any((car_x + reach_m > rear_x) & (car_x - reach_m < front_x))
 
     def _ego_motion(

@@ -52,6 +52,14 @@ def test_a_near_car_blocks_and_a_far_one_does_not(first_car_m, clear):
     assert Crossing(env).clear(6.0, 1.5, LeftTurnExpert.GO) is clear
 
 
+def test_foresight_takes_each_car_at_its_own_length():
+    env = environment(first_car_m=(60.0, 60.0))
+    crossing = Crossing(env)
+    assert crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
+    env.traffic[0].LENGTH = 90.0
+    assert not crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
+
+
 def test_trigger_takes_over_before_a_crash_and_lets_braking_pass():
     env = environment(first_car_m=(9.0, 9.0), ego_speed_mps=(5.0, 5.0))
     trigger = LeftTurnTrigger(LeftTurnExpert(env))
