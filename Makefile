@@ -3,9 +3,12 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PEERS := .venv-peers
+PEERS_STAMP := $(PEERS)/.installed
+BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format bench lock clean
+.PHONY: help install demo test lint format bench bench-quick lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -35,13 +38,26 @@ format: $(STAMP)  ## mend what ruff can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(STAMP)  ## learner, environment and training speed as JSON
-	$(BIN)/python -m trainer bench --out runs/bench.json
+# Peers have an environment of their own: what they need is no dependency of ours.
+$(PEERS_STAMP): requirements/peers.txt | $(STAMP)
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --requirement requirements/peers.txt
+	@touch $@
+
+bench: $(STAMP) $(PEERS_STAMP)  ## speed and memory beside peers: tables, and JSON in results/bench
+	@mkdir -p $(BENCH)
+	for threads in 1 2; do \
+		$(BIN)/python -m trainer bench --threads $$threads --peers $(PEERS)/bin/python \
+			--out $(BENCH)/threads_$$threads.json || exit; \
+	done
+
+bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table only
+	$(BIN)/python -m trainer bench --quick --threads 1
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new
 	echo 'torch==2.13.0' >> requirements/workstation.txt.new
 	mv requirements/workstation.txt.new requirements/workstation.txt
 
-clean:  ## remove caches and the virtual environment; trained runs stay
-	rm -rf $(VENV) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache
+clean:  ## remove caches and the virtual environments; trained runs stay
+	rm -rf $(VENV) $(PEERS) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -1,41 +1,57 @@
-"""Measure learner, environment and whole training."""
+"""Measure learner, environment, whole training, replay and memory, and compare with peers."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import platform
-import tempfile
-import time
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
-from edge_runtime.cli import write_json_out
+from edge_runtime.cli import UserError, write_json_out
 from edge_runtime.files import check_writable
+from trainer.benches.effort import FULL, QUICK, Effort
+from trainer.benches.environment import measure_environment
+from trainer.benches.learner import measure_learner
+from trainer.benches.machine import about
+from trainer.benches.memory import measure_memory
+from trainer.benches.replay import measure_replay
+from trainer.benches.table import show
+from trainer.benches.training import measure_training
+from trainer.benches.turns import Tick
 from trainer.commands.options import add_threads, set_threads
-from trainer.drivers import make_environment
-from trainer.export import real_observations
-from trainer.learner.algorithms import PHIL
-from trainer.learner.config import LearnerConfig
-from trainer.learner.replay import ReplayBuffer
-from trainer.learner.td3 import TD3Learner
+from trainer.progress import ProgressBar
 from trainer.scenarios import SCENARIOS
-from trainer.training.config import RunConfig
-from trainer.training.run import TrainingRun
 
-EXAMPLE = "example: python -m trainer bench --threads 2 --out bench.json"
-TRANSITIONS = 1000
-UPDATES = 30
-STEPS = 4000
-TRAINING_EPISODES = 6
+EXAMPLE = "example: python -m trainer bench --threads 2 --peers .venv-peers/bin/python --out b.json"
+
+ROUNDS: dict[str, Callable[[Effort], int]] = {
+    "learner": lambda effort: effort.learner_rounds,
+    "environment": lambda effort: effort.environment_rounds * len(SCENARIOS),
+    "training": lambda effort: effort.training_episodes,
+    "replay": lambda effort: 1,
+    "memory": lambda effort: 1,
+}
+"""What can be measured, and how often each moves the progress bar."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
+    parser.add_argument(
+        "--only",
+        type=_parts,
+        default=list(ROUNDS),
+        metavar="PART,...",
+        help=f"measure these only, of {', '.join(ROUNDS)} (default: all)",
+    )
+    parser.add_argument(
+        "--peers",
+        metavar="PYTHON",
+        help="an interpreter that has stable-baselines3 (`make bench` makes one); "
+        "without it that peer is left out",
+    )
+    parser.add_argument("--quick", action="store_true", help="few rounds: a look only")
     add_threads(parser)
 
 
@@ -43,78 +59,59 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure and print; returns the exit status."""
     if arguments.out:
         check_writable(arguments.out)
+    peers = _interpreter(arguments.peers) if arguments.peers else None
     set_threads(arguments.threads)
-    report = {
-        "threads": torch.get_num_threads(),
-        "processor": platform.processor() or platform.machine(),
-        "learner_ms_per_update": learner_ms_per_update(),
-        "environment_steps_per_s": {name: environment_steps_per_s(name) for name in SCENARIOS},
-        "train_s_per_10k_steps": train_s_per_10k_steps(),
-    }
-    print(json.dumps(report, indent=2))
-    if arguments.out:
-        write_json_out(arguments.out, report)
+    effort = QUICK if arguments.quick else FULL
+    with ProgressBar("bench", sum(ROUNDS[name](effort) for name in arguments.only)) as bar:
+        report = measure(arguments.only, effort, peers, lambda done: bar.advance({"last": done}))
+    show(report)
+    write_json_out(arguments.out, report)
     return 0
 
 
-def learner_ms_per_update() -> float:
-    """Median of whole PHIL-TD3 updates at batch 128: drawing, update, new priorities."""
-    config, random = LearnerConfig(), np.random.default_rng(0)
-    learner, replay = TD3Learner(config, PHIL, seed=0), _filled_replay(random)
-    times_ms = []
-    for _ in range(UPDATES):
-        began_s = time.perf_counter()
-        batch = replay.sample(config.batch_size, random)
-        losses = learner.update(batch)
-        replay.update_priorities(batch.indices, losses.priorities)
-        times_ms.append(1e3 * (time.perf_counter() - began_s))
-    return float(np.median(times_ms))
+def measure(parts: list[str], effort: Effort, peers: Path | None, tick: Tick) -> dict[str, Any]:
+    """The report: machine and versions, the contract's three figures, and each part in full."""
+    work: dict[str, Callable[[], dict[str, Any]]] = {
+        "learner": lambda: measure_learner(effort, peers, tick),
+        "environment": lambda: measure_environment(effort, tick),
+        "training": lambda: measure_training(effort, tick),
+        "replay": lambda: _ticked("replay", tick, measure_replay(effort)),
+        "memory": lambda: _ticked("memory", tick, measure_memory(effort)),
+    }
+    figures = {name: work[name]() for name in parts}
+    return {**about(), **contract_figures(figures), **figures}
 
 
-def environment_steps_per_s(scenario: str) -> float:
-    """Steps a second with observation, resets included, under a wandering pedal."""
-    env = make_environment(scenario)
-    random = np.random.default_rng(0)
-    actions = random.uniform(-1, 1, (STEPS, *env.action_space.shape)).astype(np.float32)
-    env.reset(seed=0)
-    began_s = time.perf_counter()
-    for step, action in enumerate(actions):
-        _, _, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:
-            env.reset(seed=step)
-    return STEPS / (time.perf_counter() - began_s)
+def contract_figures(figures: dict[str, Any]) -> dict[str, Any]:
+    """The figures under the names that others read."""
+    named: dict[str, Any] = {}
+    if "learner" in figures:
+        named["learner_ms_per_update"] = figures["learner"]["ms_per_update"]
+    if "environment" in figures:
+        named["environment_steps_per_s"] = {
+            scenario: figure["steps_per_s"] for scenario, figure in figures["environment"].items()
+        }
+    if "training" in figures:
+        named["train_s_per_10k_steps"] = figures["training"]["s_per_10k_steps"]
+    return named
 
 
-def train_s_per_10k_steps() -> dict[str, float]:
-    """Seconds for 10,000 steps of PHIL-TD3 in the left turn, scaled up, and where they go."""
-    config = RunConfig(
-        episodes=TRAINING_EPISODES,
-        evaluate_every=0,
-        checkpoint_every=TRAINING_EPISODES + 1,
-        learner=LearnerConfig(warmup_steps=128),
-    )
-    parts = {"environment": 0.0, "acting": 0.0, "learning": 0.0}
-    updated_steps = 0
-
-    def add(metrics: Any) -> None:
-        nonlocal updated_steps
-        if metrics.critic_loss != metrics.critic_loss or metrics.total_steps - metrics.steps < 128:
-            return
-        updated_steps += metrics.steps
-        for name in parts:
-            parts[name] += getattr(metrics, f"{name}_s")
-
-    with tempfile.TemporaryDirectory() as directory:
-        TrainingRun(config, Path(directory)).train(add)
-    scaled = {name: 1e4 * seconds / updated_steps for name, seconds in parts.items()}
-    return {"total": sum(scaled.values()), **scaled}
+def _ticked(name: str, tick: Tick, figures: dict[str, Any]) -> dict[str, Any]:
+    tick(name)
+    return figures
 
 
-def _filled_replay(random: np.random.Generator) -> ReplayBuffer:
-    replay = ReplayBuffer(2 * TRANSITIONS)
-    observations = real_observations("left_turn", TRANSITIONS + 1)
-    replay.start_episode(observations[0])
-    for observation in observations[1:]:
-        action = random.uniform(-1, 1, 1).astype(np.float32)
-        replay.add(action, float(random.normal()), observation, False, random.random() < 0.2)
-    return replay
+def _parts(text: str) -> list[str]:
+    chosen = text.split(",")
+    for name in chosen:
+        if name not in ROUNDS:
+            raise argparse.ArgumentTypeError(f"{name!r} is none of {', '.join(ROUNDS)}")
+    # In the table's order, each once.
+    return [name for name in ROUNDS if name in chosen]
+
+
+def _interpreter(text: str) -> Path:
+    """The path as given: a virtual environment's python is a link that must not be followed."""
+    if not (os.path.isfile(text) and os.access(text, os.X_OK)):
+        raise UserError(f"--peers {text} is no interpreter; `make bench` makes one in .venv-peers")
+    return Path(os.path.abspath(text))

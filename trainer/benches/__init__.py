@@ -1,0 +1,1 @@
+"""What ``python -m trainer bench`` measures, a module for each idea."""
