@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,16 @@ import torch
 from trainer.benches.effort import Effort
 from trainer.benches.experience import Experience, fill, gather, save
 from trainer.benches.peer_process import PeerProcess
-from trainer.benches.reference import reference_learner
 from trainer.benches.turns import Contender, Rounds, Tick, compare, median, take_turns
 from trainer.benches.updates import Learner, Updates
 from trainer.learner.algorithms import PHIL
 from trainer.learner.config import LearnerConfig
+from trainer.learner.reference import ReferenceLearner
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import TD3Learner
 
 TRANSITIONS = 1000
-OURS, REFERENCE, SB3 = "ours", "reference", "stable_baselines3"
+OURS, FLOAT32, REFERENCE, SB3 = "ours", "ours_float32", "reference", "stable_baselines3"
 SB3_SCRIPT = Path(__file__).with_name("sb3_td3.py")
 
 
@@ -39,7 +40,8 @@ def measure_learner(effort: Effort, sb3_python: Path | None, tick: Tick) -> dict
     count = effort.updates_per_round
     learners: dict[str, Learner] = {
         OURS: TD3Learner(config, PHIL, seed=0),
-        REFERENCE: reference_learner(config, PHIL, seed=0),
+        FLOAT32: TD3Learner(replace(config, precision="float32"), PHIL, seed=0),
+        REFERENCE: ReferenceLearner(config, PHIL, seed=0),
     }
     updates = {name: _updates(learner, config, experience) for name, learner in learners.items()}
     contenders: dict[str, Contender] = {

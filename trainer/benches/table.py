@@ -10,12 +10,15 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-ENVIRONMENT_BAR, TRAINING_BAR, REPLAY_BAR_MB = 10.0, 1.15, 400.0
-"""At least as many times highway-env's steps; at most as many times the learner alone; at most."""
+SB3_BAR, ENVIRONMENT_BAR, TRAINING_BAR, REPLAY_BAR_MB = 4.0, 10.0, 1.15, 400.0
+"""At least as many times Stable-Baselines3's updates and highway-env's steps; at most as many times
+the learner alone; at most."""
 
+SB3 = "stable_baselines3"
 PEERS = {
+    "ours_float32": "the same in float32",
     "reference": "plain eager version",
-    "stable_baselines3": "Stable-Baselines3 TD3",
+    SB3: "Stable-Baselines3 TD3",
     "highway_env_grayscale": "highway-env grayscale",
 }
 FILE_WIDTH = 120
@@ -68,8 +71,9 @@ def _learner(figures: dict[str, Any]) -> Iterator[Row]:
             f"{ours_ms:.1f}",
             f"{peer['ms_per_update']:.1f}  {PEERS[name]}",
             _times(peer["ratio"]),
+            _bar(f"≥ {SB3_BAR:g}", peer["ratio"]["of_medians"] >= SB3_BAR) if name == SB3 else "",
         )
-    if "stable_baselines3" not in figures["peers"]:
+    if SB3 not in figures["peers"]:
         yield Row(what, f"{ours_ms:.1f}", WITHOUT_SB3)
     yield Row("updates/s", f"{figures['updates_per_s']:.1f}")
 

@@ -54,7 +54,7 @@ class _Watch:
     def __init__(self, run: TrainingRun, effort: Effort, tick: Tick) -> None:
         config = run.config.learner
         alone = TD3Learner(config, run.algorithm, run.config.seed)
-        self.updates = Updates(alone, run.replay, config.batch_size)
+        self.updates = Updates(alone, run.learning.replay, config.batch_size)
         self.warmup_steps = config.warmup_steps
         self.effort, self.tick = effort, tick
         self.episodes: list[Episode] = []
