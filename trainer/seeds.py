@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-TRAINING, VALIDATION, EXPLORATION, REPLAY, HUMAN_EPISODES, HUMAN_BATCHES = range(6)
+TRAINING, VALIDATION, EXPLORATION, REPLAY, HUMAN_EPISODES, HUMAN_BATCHES, GUIDANCE = range(7)
 """Purposes, each with a stream of its own."""
 
 

@@ -133,8 +133,8 @@ def _config(arguments: argparse.Namespace) -> RunConfig:
 
 def _settings() -> dict[str, Any]:
     """Every setting that ``--set`` may change, with its default."""
-    run = ("guided_share", "penalise_stuck", "evaluate_every", "evaluation_runs")
-    own = {name: getattr(DEFAULTS, name) for name in (*run, "checkpoint_every")}
+    run = ("guided_share", "penalise_stuck", "poor_guidance_share", "evaluate_every")
+    own = {name: getattr(DEFAULTS, name) for name in (*run, "evaluation_runs", "checkpoint_every")}
     return own | {f.name: getattr(DEFAULTS.learner, f.name) for f in fields(LearnerConfig)}
 
 

@@ -34,7 +34,10 @@ ALGORITHMS: dict[str, Algorithm] = {
     ),
     "phil_td_only": replace(PHIL, human_td_weight=2.0, advantage_weight=0.0),
     "phil_q_advantage_only": replace(PHIL, human_td_weight=0.0),
+    "phil_advantage_0.1": replace(PHIL, advantage_weight=0.1),
+    "phil_advantage_100": replace(PHIL, advantage_weight=100.0),
     "phil_without_cloning": replace(PHIL, behaviour_cloning=False),
+    "phil_without_tdqa": replace(PHIL, advantage_weight=0.0),
     "phil_without_shaping": replace(PHIL, penalty=False),
 }
 """Command-line name -> switches. The first four are the paper's; the rest take PHIL-TD3 apart."""

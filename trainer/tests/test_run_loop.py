@@ -242,3 +242,15 @@ def test_the_human_watches_one_episode_in_guided_share(tmp_path):
     assert [human for *_, human in run.stored] == [
         step == 2 and episode % 3 == 0 for episode in range(7) for step in (1, 2)
     ]
+
+
+def test_poor_guidance_replaces_its_share_of_the_demonstrations_by_random_actions(tmp_path):
+    config = replace(CONFIG, episodes=3, poor_guidance_share=1 / 3)
+    run = scripted_run(tmp_path, config, length=200, human_steps=tuple(range(1, 201)))
+    run.train()
+    done = np.array([action for action, *_ in run.stored])
+    poor = done[done != np.float32(HUMAN)]
+    assert len(poor) == pytest.approx(200, abs=40)
+    assert np.abs(poor).max() <= 1.0
+    assert np.std(poor) == pytest.approx(3**-0.5, abs=0.08)  # uniform over the whole range
+    assert all(human for *_, human in run.stored)

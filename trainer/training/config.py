@@ -6,12 +6,13 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from trainer.learner.config import LearnerConfig
-from trainer.ranges import FROM_ONE, FROM_ZERO, check_ranges
+from trainer.ranges import FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
 RANGES = {
     "seed": (0, 2**63 - 1),
     "episodes": FROM_ONE,
     "guided_share": FROM_ONE,
+    "poor_guidance_share": SHARE,
     "evaluate_every": FROM_ZERO,
     "evaluation_runs": FROM_ONE,
     "checkpoint_every": FROM_ONE,
@@ -38,6 +39,8 @@ class RunConfig:
     penalise_stuck: bool = False
     """Whether taking over from a car that only waits too long is penalised, too. A stuck car
     looks like one that rightly waits, so the penalty teaches to fear waiting."""
+    poor_guidance_share: float = 0.0
+    """Share of the human's actions that are replaced by random ones (section VII-E: one third)."""
     evaluate_every: int = 20
     """Episodes between two evaluations on the validation seeds; 0: never."""
     evaluation_runs: int = 20

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,7 @@ class TrainingRun:
         self.learning = make_learning(config, self.algorithm, action_size)
         self.guide = self._make_guide()
         self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
+        self.guidance = seeds.stream(config.seed, seeds.GUIDANCE)
         self.episode = 0
         self.best_validation = (-1.0, -1.0)
         if resume:
@@ -99,6 +101,7 @@ class TrainingRun:
                 **self._label(),
                 "learning": self.learning.state_dict(),
                 "exploration": self.exploration.bit_generator.state,
+                "guidance": self.guidance.bit_generator.state,
                 "best_validation": self.best_validation,
             },
         )
@@ -114,6 +117,7 @@ class TrainingRun:
         self.episode = state["episode"]
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
+        self.guidance.bit_generator.state = state["guidance"]
         self.best_validation = tuple(state["best_validation"])
 
     def _make_guide(self) -> HumanGuide | None:
@@ -154,7 +158,7 @@ class TrainingRun:
         acted_s = time.perf_counter()
         intervention = None
         if guided and self.guide is not None:
-            intervention = self.guide.watch(observation, policy_action)
+            intervention = self._spoil(self.guide.watch(observation, policy_action))
         human_action = None if intervention is None else intervention.action
         action = equations.masked_action(policy_action, human_action)
         next_observation, reward, terminated, truncated, info = self.env.step(action)
@@ -169,6 +173,14 @@ class TrainingRun:
         tally.acting_s += acted_s - began_s
         tally.environment_s += moved_s - acted_s
         return next_observation, terminated or truncated, info
+
+    def _spoil(self, intervention: Intervention | None) -> Intervention | None:
+        """Make a demonstration a random action as often as the poor guidance setting asks for."""
+        share = self.config.poor_guidance_share
+        if intervention is None or not share or self.guidance.random() >= share:
+            return intervention
+        random = self.guidance.uniform(-1.0, 1.0, intervention.action.shape)
+        return replace(intervention, action=random.astype(np.float32))
 
     def _explore(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         noise = equations.exploration_noise(
