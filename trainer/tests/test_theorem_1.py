@@ -1,0 +1,142 @@
+"""Theorem 1 on finite MDPs, by value iteration: what intervention shaping keeps, and when.
+
+The proof builds a potential, r_pen / gamma on the states that the human finds unacceptable and 0
+elsewhere. Its full shaping term also gives the penalty back (-r_pen / gamma) when such a state is
+left; eq. 17 has no such term, and eq. A4 silently takes it to be 0. So the theorem holds in full
+for the potential, and for eq. 17 where a consistent human calls unacceptable only what no optimal
+policy enters: an optimal policy then never pays, and every other one can only lose. A human whose
+judgement wavers, or who dislikes the optimal way, changes the optimum.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from trainer.learner import equations
+
+GAMMA, PENALTY = 0.9, -10.0
+STATES, ACTIONS = 6, 3
+Table = NDArray[np.float64]
+
+
+class Mdp(NamedTuple):
+    """A continuing decision process."""
+
+    transitions: Table
+    """Probability of each next state, [state, action, next state]."""
+    rewards: Table
+    """[state, action, next state]."""
+
+
+def random_mdp(seed: int, deterministic: bool = False) -> Mdp:
+    random = np.random.default_rng(seed)
+    if deterministic:
+        transitions = np.eye(STATES)[random.integers(STATES, size=(STATES, ACTIONS))]
+    else:
+        transitions = random.dirichlet(np.full(STATES, 0.3), size=(STATES, ACTIONS))
+    return Mdp(transitions, random.normal(size=(STATES, ACTIONS, STATES)))
+
+
+def optimal_values(mdp: Mdp) -> Table:
+    """Q*, [state, action], by value iteration."""
+    values = np.zeros((STATES, ACTIONS))
+    for _ in range(400):
+        ahead = mdp.rewards + GAMMA * values.max(axis=1)
+        values = (mdp.transitions * ahead).sum(axis=2)
+    return values
+
+
+def optimal_actions(values: Table) -> NDArray[np.bool_]:
+    """Which actions are optimal, [state, action]."""
+    return values > values.max(axis=1, keepdims=True) - 1e-6
+
+
+def entered_by(actions: NDArray[np.bool_], mdp: Mdp) -> NDArray[np.bool_]:
+    """States that these actions may lead to, [state]."""
+    return ((mdp.transitions > 0) & actions[:, :, None]).any(axis=(0, 1))
+
+
+def potential_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
+    """Eq. A1 with the potential of eq. A2."""
+    potential = np.where(unacceptable, PENALTY / GAMMA, 0.0)
+    return mdp._replace(rewards=mdp.rewards + GAMMA * potential - potential[:, None, None])
+
+
+def intervention_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
+    """Eq. 17 as the trainer has it: the human takes over where an unacceptable state comes next.
+
+    The human stays in control while the car is in one, so that only entering is penalised.
+    """
+    rewards = mdp.rewards.copy()
+    for state, action, following in np.ndindex(rewards.shape):
+        rewards[state, action, following] = equations.shaped_reward(
+            rewards[state, action, following],
+            PENALTY,
+            human=bool(unacceptable[following]),
+            human_before=bool(unacceptable[state]),
+        )
+    return mdp._replace(rewards=rewards)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.lists(st.booleans(), min_size=STATES, max_size=STATES))
+def test_the_proofs_potential_changes_no_optimal_policy_whatever_the_human_dislikes(seed, disliked):
+    mdp, unacceptable = random_mdp(seed), np.array(disliked)
+    values = optimal_values(mdp)
+    shaped = optimal_values(potential_shaped(mdp, unacceptable))
+    potential = np.where(unacceptable, PENALTY / GAMMA, 0.0)
+    np.testing.assert_allclose(shaped, values - potential[:, None], atol=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6))
+def test_intervention_shaping_keeps_the_optimum_where_only_bad_states_are_unacceptable(seed):
+    mdp = random_mdp(seed, deterministic=True)
+    values = optimal_values(mdp)
+    best = optimal_actions(values)
+    unacceptable = ~entered_by(best, mdp)
+    assume(unacceptable.any())
+    shaped = optimal_values(intervention_shaped(mdp, unacceptable))
+    np.testing.assert_allclose(shaped.max(axis=1), values.max(axis=1), atol=1e-6)
+    np.testing.assert_array_equal(optimal_actions(shaped), best)
+    assert (shaped <= values + 1e-6).all()
+
+
+@pytest.fixture
+def detour() -> Mdp:
+    """From state 0, action 0 leads straight on through 1 to the reward in 2, action 1 to the same
+    by a longer way through 3 and 4; then all begins anew. Action 2 stays."""
+    transitions, rewards = np.zeros((STATES, ACTIONS, STATES)), np.zeros((STATES, ACTIONS, STATES))
+    following = {0: (1, 3, 0), 1: (2, 2, 1), 2: (0, 0, 0), 3: (4, 4, 3), 4: (2, 2, 4), 5: (0, 0, 5)}
+    for state, states in following.items():
+        for action, after in enumerate(states):
+            transitions[state, action, after] = 1.0
+    rewards[:, :, 2] = 5.0
+    return Mdp(transitions, rewards)
+
+
+def test_a_human_who_dislikes_the_optimal_way_changes_the_optimum(detour):
+    """The assumption broken: what eq. 17 adds is no potential's difference."""
+    unacceptable = np.arange(STATES) == 1
+    assert optimal_actions(optimal_values(detour))[0].tolist() == [True, False, False]
+    shaped = optimal_values(intervention_shaped(detour, unacceptable))
+    assert optimal_actions(shaped)[0].tolist() == [False, True, False]
+    # The proof's own potential, which gives the penalty back, would have kept it.
+    kept = optimal_values(potential_shaped(detour, unacceptable))
+    assert optimal_actions(kept)[0].tolist() == [True, False, False]
+
+
+def test_a_human_whose_judgement_wavers_changes_the_optimum(detour):
+    """Remark 2: with a chance of 0.8, the human finds the way through state 1 unacceptable.
+
+    The penalty is then a random one, of this mean; a potential over states cannot waver.
+    """
+    wavering = intervention_shaped(detour, np.arange(STATES) == 1)
+    mixed = detour._replace(rewards=0.2 * detour.rewards + 0.8 * wavering.rewards)
+    assert optimal_actions(optimal_values(mixed))[0].tolist() == [False, True, False]
