@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trainer.learner.ledger import Ledger
 from trainer.learner.sum_tree import Indices, SumTree
 
 FRAME_SHAPE = (45, 80)
-FRAMES_PER_TRANSITION = 1.05
-"""Stored pictures for each transition: one, and one more at the start of each episode."""
 
 
 @dataclass(frozen=True)
@@ -52,31 +51,31 @@ class ReplayBuffer:
     def __init__(self, capacity: int, action_size: int = 1, alpha: float = 0.6) -> None:
         self.capacity = capacity
         self.alpha = alpha
-        self.added = 0
-        self._frames_added = 0
-        self._oldest = 0
-        self._frame_slots = int(capacity * FRAMES_PER_TRANSITION) + 3
-        self._pictures = np.empty((self._frame_slots, *FRAME_SHAPE), np.uint8)
-        self._frame_ids = np.zeros((capacity, 3), np.int64)
+        self._ledger = Ledger(capacity)
+        self._pictures = np.empty((self._ledger.frame_slots, *FRAME_SHAPE), np.uint8)
         self._actions = np.zeros((capacity, action_size), np.float32)
         self._rewards = np.zeros(capacity, np.float32)
         self._terminals = np.zeros(capacity, np.float32)
         self._human = np.zeros(capacity, np.bool_)
         self._priorities = np.zeros(capacity)
         self._tree = SumTree(capacity)
-        self._current: tuple[int, int] | None = None
 
     def __len__(self) -> int:
-        return self.added - self._oldest
+        return len(self._ledger)
+
+    @property
+    def added(self) -> int:
+        """Transitions stored since the run began."""
+        return self._ledger.added
 
     @property
     def human_count(self) -> int:
         """How many of the kept transitions are the human's."""
-        return int(self._human[self._alive()].sum())
+        return int(self._human[self._ledger.alive].sum())
 
     def mean_priorities(self) -> tuple[float, float]:
         """Mean priority of the policy's and of the human's transitions (nan where none)."""
-        alive = self._alive()
+        alive = self._ledger.alive
         human, priorities = self._human[alive], self._priorities[alive]
         return _mean(priorities[~human]), _mean(priorities[human])
 
@@ -84,7 +83,7 @@ class ReplayBuffer:
         """Take the first observation [2, 45, 80] of an episode."""
         older = self._add_picture(frames[0])
         newer = older if np.array_equal(frames[0], frames[1]) else self._add_picture(frames[1])
-        self._current = (older, newer)
+        self._ledger.start_episode(older, newer)
 
     def add(
         self,
@@ -95,20 +94,13 @@ class ReplayBuffer:
         human: bool,
     ) -> None:
         """Store a transition with the highest priority that any other has (algorithm 1)."""
-        if self._current is None:
-            raise RuntimeError("start_episode comes before add")
+        self._ledger.check_started()
         priority = self._highest_priority()
-        older, newer = self._current
-        newest = self._add_picture(next_frames[1])
-        slot = self.added % self.capacity
-        self._frame_ids[slot] = older, newer, newest
+        slot = self._ledger.add_transition(self._add_picture(next_frames[1]))
         self._actions[slot] = action
         self._rewards[slot] = reward
         self._terminals[slot] = terminal
         self._human[slot] = human
-        self.added += 1
-        self._oldest = max(self._oldest, self.added - self.capacity)
-        self._current = (newer, newest)
         self.update_priorities(np.array([slot]), np.array([priority]))
 
     def sample(self, count: int, random: np.random.Generator) -> Batch:
@@ -124,13 +116,10 @@ class ReplayBuffer:
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on, without the unused part of the arrays."""
-        used, pictures = min(self.added, self.capacity), min(self._frames_added, self._frame_slots)
+        used, pictures = self._ledger.used, self._ledger.used_frames
         return {
-            "added": self.added,
-            "frames_added": self._frames_added,
-            "oldest": self._oldest,
+            **self._ledger.state_dict(),
             "pictures": self._pictures[:pictures],
-            "frame_ids": self._frame_ids[:used],
             "actions": self._actions[:used],
             "rewards": self._rewards[:used],
             "terminals": self._terminals[:used],
@@ -140,20 +129,17 @@ class ReplayBuffer:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave; the next episode begins with ``start_episode``."""
-        self.added = state["added"]
-        self._frames_added = state["frames_added"]
-        self._oldest = state["oldest"]
-        used, pictures = len(state["rewards"]), len(state["pictures"])
+        self._ledger.load_state_dict(state)
+        used, pictures = self._ledger.used, self._ledger.used_frames
         self._pictures[:pictures] = state["pictures"]
-        for name in ("frame_ids", "actions", "rewards", "terminals", "human", "priorities"):
+        for name in ("actions", "rewards", "terminals", "human", "priorities"):
             getattr(self, f"_{name}")[:used] = state[name]
-        alive = self._alive()
+        alive = self._ledger.alive
         if len(alive):
             self._tree[alive] = self._priorities[alive] ** self.alpha
-        self._current = None
 
     def _gather(self, indices: Indices) -> Batch:
-        slots = self._frame_ids[indices] % self._frame_slots
+        slots = self._ledger.frame_ids[indices] % self._ledger.frame_slots
         pictures = self._pictures[slots]
         return Batch(
             indices=indices,
@@ -166,24 +152,19 @@ class ReplayBuffer:
             probabilities=self._tree[indices] / self._tree.total,
         )
 
-    def _alive(self) -> Indices:
-        return np.arange(self._oldest, self.added, dtype=np.int64) % self.capacity
-
     def _highest_priority(self) -> float:
         if len(self) == 0:
             return 1.0
-        return float(self._priorities[: min(self.added, self.capacity)].max())
+        return float(self._priorities[: self._ledger.used].max())
 
     def _add_picture(self, picture: NDArray[np.uint8]) -> int:
         """Store a picture and return its running number; forget transitions that lose theirs."""
-        number = self._frames_added
-        self._pictures[number % self._frame_slots] = picture
-        self._frames_added += 1
-        lost = number - self._frame_slots
-        while len(self) and self._frame_ids[self._oldest % self.capacity, 0] <= lost:
-            slot = np.array([self._oldest % self.capacity])
-            self.update_priorities(slot, np.zeros(1))
-            self._oldest += 1
+        number, lost = self._ledger.add_picture()
+        self._pictures[number % self._ledger.frame_slots] = picture
+        for slot in lost:
+            # Not 0 ** alpha, which is one where alpha is zero.
+            self._priorities[slot] = 0.0
+            self._tree[np.array([slot])] = np.zeros(1)
         return number
 
 

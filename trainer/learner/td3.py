@@ -19,6 +19,7 @@ from trainer.learner import equations
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor, CriticPair
+from trainer.learner.optimiser import load_adam, make_adam
 from trainer.learner.replay import Batch
 
 
@@ -82,8 +83,8 @@ class TD3Learner:
             self.critics = CriticPair(action_size, config.frames).to(self.device)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.actor_optimiser = self._adam(self.actor, config.actor_learning_rate)
-        self.critic_optimiser = self._adam(self.critics, config.critic_learning_rate)
+        self.actor_optimiser = make_adam(self.actor, config.actor_learning_rate, self.device)
+        self.critic_optimiser = make_adam(self.critics, config.critic_learning_rate, self.device)
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
 
@@ -165,24 +166,12 @@ class TD3Learner:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""
-        for name in (
-            "actor",
-            "critics",
-            "target_actor",
-            "target_critics",
-            "actor_optimiser",
-            "critic_optimiser",
-        ):
-            # Optimisers keep the very tensors they are given.
-            getattr(self, name).load_state_dict(copy.deepcopy(state[name]))
+        for name in ("actor", "critics", "target_actor", "target_critics"):
+            getattr(self, name).load_state_dict(state[name])
+        load_adam(self.actor_optimiser, state["actor_optimiser"])
+        load_adam(self.critic_optimiser, state["critic_optimiser"])
         self.noise.set_state(state["noise"])
         self.updates = state["updates"]
-
-    def _adam(self, module: torch.nn.Module, learning_rate: float) -> torch.optim.Adam:
-        # A captured graph reads its learning rate from the device.
-        on_device = self.device.type == "cuda"
-        rate = torch.tensor(learning_rate, device=self.device) if on_device else learning_rate
-        return torch.optim.Adam(module.parameters(), rate, fused=True, capturable=on_device)
 
     def _precision(self) -> torch.autocast:
         reduced = self.config.precision == "bfloat16"

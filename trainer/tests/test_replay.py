@@ -108,6 +108,17 @@ def test_probabilities_follow_equation_20():
     assert set(np.round(batch.probabilities, 12)) == {0.2, 0.8}
 
 
+def test_with_alpha_zero_all_are_drawn_alike_and_the_forgotten_never():
+    buffer = ReplayBuffer(40, alpha=0.0)
+    source = Source(buffer)
+    for _ in range(60):
+        source.episode(1)
+    buffer.update_priorities(buffer._ledger.alive[:3], np.array([0.5, 2.0, 9.0]))
+    batch = buffer.sample(1000, np.random.default_rng(0))
+    assert set(batch.indices) == set(buffer._ledger.alive)
+    np.testing.assert_allclose(batch.probabilities, 1 / len(buffer))
+
+
 def test_a_priority_that_is_no_number_is_refused_before_it_spoils_the_tree():
     buffer = ReplayBuffer(10)
     Source(buffer).episode(2)
@@ -145,4 +156,5 @@ def test_a_restored_buffer_draws_the_same():
 def test_a_hundred_thousand_transitions_fit_into_400_mb():
     buffer = ReplayBuffer(100_000)
     size = sum(value.nbytes for value in vars(buffer).values() if isinstance(value, np.ndarray))
+    size += buffer._ledger.frame_ids.nbytes
     assert size + buffer._tree._nodes.nbytes < 400e6

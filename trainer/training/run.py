@@ -30,6 +30,7 @@ from trainer.human.guide import HumanGuide, Intervention
 from trainer.learner import equations
 from trainer.learner.algorithms import ALGORITHMS, Algorithm
 from trainer.revision import source_revision
+from trainer.training.accelerator import AcceleratorLearning
 from trainer.training.config import RunConfig
 from trainer.training.learning import Learning, ProcessorLearning
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
@@ -40,6 +41,10 @@ CONFIG_FILE = "config.json"
 
 def make_learning(config: RunConfig, algorithm: Algorithm, action_size: int) -> Learning:
     """Learner and replay on the configured device."""
+    if config.device != "cpu":
+        return AcceleratorLearning(
+            config.learner, algorithm, config.seed, action_size, config.device
+        )
     return ProcessorLearning(config.learner, algorithm, config.seed, action_size)
 
 
