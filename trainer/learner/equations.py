@@ -69,7 +69,7 @@ def priority(
     return weight * td_error.abs() + offset + advantage_weight * advantage * human
 
 
-def importance_weights(probabilities: Tensor, beta: float, normalise: bool) -> Tensor:
+def importance_weights(probabilities: Tensor, beta: float | Tensor, normalise: bool) -> Tensor:
     """Eq. 15: p(i) ** -beta.
 
     ``normalise`` divides by the batch's largest weight, as the paper's source of prioritised

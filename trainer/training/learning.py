@@ -29,8 +29,10 @@ Action = NDArray[np.float32]
 class Learning(Protocol):
     """What a training loop asks of a learner with its replay buffer, wherever they are."""
 
-    added: int
-    """Transitions stored since the run began."""
+    @property
+    def added(self) -> int:
+        """Transitions stored since the run began."""
+        ...
 
     @property
     def actor(self) -> Actor:
