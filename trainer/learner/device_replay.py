@@ -123,12 +123,10 @@ class DeviceReplay:
     def set_priorities(self, indices: Tensor, priorities: Tensor) -> None:
         """Set the priorities p [n] of drawn transitions (eq. 21).
 
-        Of a slot named twice the last one counts. All its rows are given that value first, since
-        an accelerator writes in any order; they differ by the noise of the smoothing.
+        Of a slot named twice the last one counts; they differ by the noise of the smoothing.
         """
-        rows = torch.arange(len(indices), device=self.device)
-        last = torch.where(indices[:, None] == indices, rows, 0).amax(dim=1)
-        self.priorities.index_copy_(0, indices, priorities.double()[last])
+        agreed = last_for_all(indices, priorities.double())
+        self.priorities.index_copy_(0, indices, agreed)
 
     def priority_means(self) -> Tensor:
         """Mean priority of the policy's and of the human's transitions [2] (nan where none)."""
@@ -215,6 +213,15 @@ def pick(weights: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
     parts = torch.searchsorted(ends, masses, right=True).clamp(max=weights.shape[1] - 1)
     starts = torch.where(parts > 0, ends.gather(1, (parts - 1).clamp(min=0)), 0.0)
     return parts[:, 0], (masses - starts)[:, 0]
+
+
+def last_for_all(indices: Tensor, values: Tensor) -> Tensor:
+    """Values [n] in which all rows with the same index have what the last of them had.
+
+    To write values that differ to one place is to leave the outcome to an accelerator's mood.
+    """
+    rows = torch.arange(len(indices), device=indices.device)
+    return values[torch.where(indices[:, None] == indices, rows, 0).amax(dim=1)]
 
 
 def _layout(action_size: int) -> np.dtype[np.void]:

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trainer.learner.device_replay import DeviceReplay, pick
+from trainer.learner.device_replay import DeviceReplay, last_for_all, pick
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.staging import ROWS, Staging
 from trainer.learner.sum_tree import SumTree
@@ -129,6 +129,11 @@ def test_of_a_slot_named_twice_the_last_one_counts(bad):
     slots = torch.tensor([bad, 1, bad, 3, bad])
     replay.set_priorities(slots, torch.tensor([5.0, 2.0, 9.0, 4.0, 0.5]))
     assert replay.state_dict()["priorities"][[bad, 1, 3]].tolist() == [0.5, 2.0, 4.0]
+
+
+def test_rows_of_the_same_index_agree_on_the_last_value():
+    values = last_for_all(torch.tensor([7, 0, 7, 3, 7, 0]), torch.arange(6.0))
+    assert values.tolist() == [4, 5, 4, 3, 4, 5]
 
 
 def test_storing_a_record_again_changes_nothing():
