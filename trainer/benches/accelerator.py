@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -21,9 +20,9 @@ import torch
 
 from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
 from edge_runtime.files import check_writable
+from trainer.benches.machine import about
 from trainer.commands.options import positive
 from trainer.learner.config import LearnerConfig
-from trainer.revision import source_revision
 from trainer.training.metrics import read_metrics
 
 STEPS = 10_000
@@ -131,10 +130,8 @@ def measure_accelerator(runs: int) -> dict[str, Any]:
     if not torch.cuda.is_available():
         raise UserError("no CUDA device is available: there is nothing to measure here")
     return {
+        **about(),
         "device": torch.cuda.get_device_name(),
-        "cores": os.cpu_count(),
-        "torch": torch.__version__,
-        "source_revision": source_revision(),
         "one_run": measure_runs(1),
         "runs_at_once": measure_runs(runs),
     }
