@@ -54,4 +54,4 @@ def _train(effort: Effort) -> tuple[int, int]:
     with tempfile.TemporaryDirectory() as directory:
         run = TrainingRun(config, Path(directory))
         run.train()
-    return run.replay.added, resident_bytes("VmHWM")
+    return run.learning.added, resident_bytes("VmHWM")

@@ -16,6 +16,7 @@ from trainer.benches.updates import Updates
 from trainer.learner.config import LearnerConfig
 from trainer.learner.td3 import TD3Learner
 from trainer.training.config import RunConfig
+from trainer.training.learning import ProcessorLearning
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 
@@ -54,6 +55,7 @@ class _Watch:
     def __init__(self, run: TrainingRun, effort: Effort, tick: Tick) -> None:
         config = run.config.learner
         alone = TD3Learner(config, run.algorithm, run.config.seed)
+        assert isinstance(run.learning, ProcessorLearning)
         self.updates = Updates(alone, run.learning.replay, config.batch_size)
         self.warmup_steps = config.warmup_steps
         self.effort, self.tick = effort, tick

@@ -19,6 +19,9 @@ class Algorithm:
     """Weight of |delta| in the priority of the policy's own transitions."""
     human_td_weight: float = 1.0
     """Weight of |delta| in the priority of the human's transitions."""
+    separate_buffers: bool = False
+    """The human's transitions and the policy's lie in a buffer each (section VII-A: RD2); from
+    which one is drawn goes by how much there is in each."""
     advantage_weight: float = 1.0
     """Weight of the Q advantage in the priority of the human's transitions (eq. 21)."""
 
@@ -29,6 +32,10 @@ ALGORITHMS: dict[str, Algorithm] = {
     "phil_td3": PHIL,
     "ia_td3": replace(PHIL, advantage_weight=0.0),
     "hi_td3": replace(PHIL, advantage_weight=0.0, behaviour_cloning=False),
+    # The paper does not say whether RD2-TD3 clones; here it does, so that each row differs from
+    # PHIL-TD3 in what figure 13 is about.
+    "rd2_td3": replace(PHIL, advantage_weight=0.0, separate_buffers=True),
+    "rd2_phil": replace(PHIL, separate_buffers=True),
     "per_td3": Algorithm(
         guided=False, penalty=False, behaviour_cloning=False, advantage_weight=0.0
     ),
@@ -40,4 +47,4 @@ ALGORITHMS: dict[str, Algorithm] = {
     "phil_without_tdqa": replace(PHIL, advantage_weight=0.0),
     "phil_without_shaping": replace(PHIL, penalty=False),
 }
-"""Command-line name -> switches. The first four are the paper's; the rest take PHIL-TD3 apart."""
+"""Command-line name -> switches. The first six are the paper's; the rest take PHIL-TD3 apart."""

@@ -35,11 +35,19 @@ class DeviceReplay:
         action_size: length of an action.
         alpha: priority scaling factor (eq. 20).
         device: where all is kept.
+        separate: draw from the human's transitions and from the policy's apart, as
+            ``ReplayBuffer`` does.
     """
 
     def __init__(
-        self, capacity: int, action_size: int = 1, alpha: float = 0.6, device: str = "cpu"
+        self,
+        capacity: int,
+        action_size: int = 1,
+        alpha: float = 0.6,
+        device: str = "cpu",
+        separate: bool = False,
     ) -> None:
+        self.separate = separate
         self.capacity, self.alpha, self.device = capacity, alpha, torch.device(device)
         self._ledger = Ledger(capacity)
         self._side = math.isqrt(capacity) + 1
@@ -109,16 +117,31 @@ class DeviceReplay:
         """
         # Of priority zero are the forgotten; 0 ** alpha is one where alpha is zero.
         weights = torch.where(self.priorities > 0, self.priorities**self.alpha, 0.0)
-        table = weights.view(self._side, self._side)
-        rows = table.sum(dim=1)
-        total = rows.sum()
+        human = self._columns["human"]
+        kinds = [weights * ~human, weights * human] if self.separate else [weights]
+        tables = torch.stack(kinds).view(-1, self._side, self._side)
+        rows = tables.sum(dim=2)
+        totals = rows.sum(dim=1)
         strata = torch.arange(count, device=self.device) + torch.rand(
             count, generator=generator, device=self.device, dtype=torch.float64
         )
-        row, left_over = pick(rows.expand(count, -1), strata * (total / count))
-        column, _ = pick(table[row], left_over)
+        kind, share, strata = self._kinds(weights, human, strata / count)
+        row, left_over = pick(rows[kind], strata * totals[kind])
+        column, _ = pick(tables[kind, row], left_over)
         indices = row * self._side + column
-        return indices, self._gather(indices, weights[indices] / total)
+        return indices, self._gather(indices, share * weights[indices] / totals[kind])
+
+    def _kinds(
+        self, weights: Tensor, human: Tensor, strata: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Whose transitions the samples are of [n], those' share, and each one's place there."""
+        if not self.separate:
+            return torch.zeros_like(strata, dtype=torch.int64), torch.ones_like(strata), strata
+        alive = weights > 0
+        humans = (alive & human).sum().double() / alive.sum()
+        shares = torch.stack([1.0 - humans, humans])
+        kind = (strata >= shares[0]).long()
+        return kind, shares[kind], (strata - kind * shares[0]) / shares[kind]
 
     def set_priorities(self, indices: Tensor, priorities: Tensor) -> None:
         """Set the priorities p [n] of drawn transitions (eq. 21).

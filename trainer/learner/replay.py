@@ -46,9 +46,13 @@ class ReplayBuffer:
         capacity: transitions kept (table A6: 1e5).
         action_size: length of an action.
         alpha: priority scaling factor (eq. 20).
+        separate: draw from the human's transitions and from the policy's apart, from each as
+            often as its share of all (section VII-A: RD2).
     """
 
-    def __init__(self, capacity: int, action_size: int = 1, alpha: float = 0.6) -> None:
+    def __init__(
+        self, capacity: int, action_size: int = 1, alpha: float = 0.6, separate: bool = False
+    ) -> None:
         self.capacity = capacity
         self.alpha = alpha
         self._ledger = Ledger(capacity)
@@ -58,7 +62,7 @@ class ReplayBuffer:
         self._terminals = np.zeros(capacity, np.float32)
         self._human = np.zeros(capacity, np.bool_)
         self._priorities = np.zeros(capacity)
-        self._tree = SumTree(capacity)
+        self._trees = [SumTree(capacity) for _ in range(2 if separate else 1)]
 
     def __len__(self) -> int:
         return len(self._ledger)
@@ -105,14 +109,29 @@ class ReplayBuffer:
 
     def sample(self, count: int, random: np.random.Generator) -> Batch:
         """Draw a minibatch by priority."""
-        return self._gather(self._tree.sample(count, random))
+        if len(self._trees) == 1:
+            return self._gather(self._trees[0].sample(count, random))
+        # Stratified over both: each kind gets its share of the samples, to one.
+        strata = (np.arange(count) + random.random(count)) / count
+        policys_share = 1.0 - self.human_count / len(self)
+        policys = strata[strata < policys_share] / policys_share
+        humans = (strata[strata >= policys_share] - policys_share) / (1.0 - policys_share)
+        return self._gather(
+            np.concatenate(
+                [
+                    tree.find(share * tree.total)
+                    for tree, share in zip(self._trees, (policys, humans), strict=True)
+                    if len(share)
+                ]
+            )
+        )
 
     def update_priorities(self, indices: Indices, priorities: NDArray[np.float64]) -> None:
         """Set the priorities p of drawn transitions (eq. 21)."""
         if not np.all(np.isfinite(priorities)) or np.any(priorities < 0):
             raise ValueError("a priority must be finite and not negative")
         self._priorities[indices] = priorities
-        self._tree[indices] = priorities**self.alpha
+        self._set_weights(indices, priorities**self.alpha)
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on, without the unused part of the arrays."""
@@ -136,7 +155,7 @@ class ReplayBuffer:
             getattr(self, f"_{name}")[:used] = state[name]
         alive = self._ledger.alive
         if len(alive):
-            self._tree[alive] = self._priorities[alive] ** self.alpha
+            self._set_weights(alive, self._priorities[alive] ** self.alpha)
 
     def _gather(self, indices: Indices) -> Batch:
         slots = self._ledger.frame_ids[indices] % self._ledger.frame_slots
@@ -149,8 +168,23 @@ class ReplayBuffer:
             next_frames=pictures[:, 1:],
             terminals=self._terminals[indices],
             human=self._human[indices],
-            probabilities=self._tree[indices] / self._tree.total,
+            probabilities=self._probabilities(indices),
         )
+
+    def _probabilities(self, indices: Indices) -> NDArray[np.float64]:
+        if len(self._trees) == 1:
+            return self._trees[0][indices] / self._trees[0].total
+        human, share = self._human[indices], self.human_count / len(self)
+        policys, humans = (tree[indices] / max(tree.total, 1e-300) for tree in self._trees)
+        return np.where(human, share * humans, (1.0 - share) * policys)
+
+    def _set_weights(self, indices: Indices, weights: NDArray[np.float64]) -> None:
+        if len(self._trees) == 1:
+            self._trees[0][indices] = weights
+            return
+        human = self._human[indices]
+        for tree, own in zip(self._trees, (~human, human), strict=True):
+            tree[indices] = weights * own
 
     def _highest_priority(self) -> float:
         if len(self) == 0:
@@ -164,7 +198,7 @@ class ReplayBuffer:
         for slot in lost:
             # Not 0 ** alpha, which is one where alpha is zero.
             self._priorities[slot] = 0.0
-            self._tree[np.array([slot])] = np.zeros(1)
+            self._set_weights(np.array([slot]), np.zeros(1))
         return number
 
 

@@ -73,9 +73,10 @@ def test_it_holds_what_the_replay_buffer_holds_after_the_same(episodes, capacity
 
 
 @settings(max_examples=30, deadline=None)
-@given(EPISODES, st.integers(1, 40), st.sampled_from([0.0, 0.6]))
-def test_a_batch_is_the_drawn_slots_of_the_replay_buffer(episodes, capacity, alpha):
-    ours, theirs = DeviceReplay(capacity, alpha=alpha), ReplayBuffer(capacity, alpha=alpha)
+@given(EPISODES, st.integers(1, 40), st.sampled_from([0.0, 0.6]), st.booleans())
+def test_a_batch_is_the_drawn_slots_of_the_replay_buffer(episodes, capacity, alpha, separate):
+    ours = DeviceReplay(capacity, alpha=alpha, separate=separate)
+    theirs = ReplayBuffer(capacity, alpha=alpha, separate=separate)
     for number, (length, human) in enumerate(episodes):
         for replay in (ours, theirs):
             drive(replay, number, length, human)
@@ -120,6 +121,16 @@ def test_draws_follow_equation_20_and_are_stratified():
     # 1^0.5 : 16^0.5 : 9^0.5 = 1 : 4 : 3, and strata leave each off by at most one draw.
     np.testing.assert_allclose(np.bincount(indices), [1000, 4000, 3000], atol=1.01)
     np.testing.assert_allclose(batch.probabilities, np.array([1, 4, 3])[indices] / 8)
+
+
+def test_separate_buffers_are_drawn_from_by_their_size():
+    replay = DeviceReplay(100, alpha=1.0, separate=True)
+    drive(replay, 0, 30)
+    drive(replay, 1, 10, human=True)
+    set_priorities(replay, np.arange(30, 40), np.array([70.0] + [10.0] * 9))
+    indices, batch = replay.draw(4000, drawing())
+    assert batch.human.double().mean() == pytest.approx(0.25, abs=1e-3)
+    assert (indices == 30).double().mean() == pytest.approx(0.25 * 70 / 160, abs=1e-3)
 
 
 @pytest.mark.parametrize("bad", [0, 4])

@@ -157,4 +157,44 @@ def test_a_hundred_thousand_transitions_fit_into_400_mb():
     buffer = ReplayBuffer(100_000)
     size = sum(value.nbytes for value in vars(buffer).values() if isinstance(value, np.ndarray))
     size += buffer._ledger.frame_ids.nbytes
-    assert size + buffer._tree._nodes.nbytes < 400e6
+    assert size + buffer._trees[0]._nodes.nbytes < 400e6
+
+
+def test_separate_buffers_are_drawn_from_by_their_size_and_within_by_priority():
+    """RD2: however high the human's priorities, their number decides how often they are drawn."""
+    buffer = ReplayBuffer(100, alpha=1.0, separate=True)
+    source = Source(buffer)
+    source.episode(30)
+    source.episode(10, human=True)
+    buffer.update_priorities(np.arange(30), np.linspace(1.0, 2.0, 30))
+    buffer.update_priorities(np.arange(30, 40), np.array([70.0] + [10.0] * 9))
+    batch = buffer.sample(4000, np.random.default_rng(0))
+    assert batch.human.mean() == pytest.approx(0.25, abs=1e-3)
+    assert np.mean(batch.indices == 30) == pytest.approx(0.25 * 70 / 160, abs=0.01)
+    # Each probability is the frequency with which it is drawn.
+    drawn, counts = np.unique(batch.indices, return_counts=True)
+    where = {index: row for row, index in enumerate(batch.indices)}
+    wanted = [batch.probabilities[where[index]] for index in drawn]
+    np.testing.assert_allclose(counts / 4000, wanted, atol=0.004)
+
+
+@pytest.mark.parametrize("human", [False, True])
+def test_separate_buffers_of_which_one_is_empty(human):
+    buffer = ReplayBuffer(20, separate=True)
+    Source(buffer).episode(25, human=human)
+    batch = buffer.sample(64, np.random.default_rng(0))
+    assert (batch.human == human).all()
+    copy = ReplayBuffer(20, separate=True)
+    copy.load_state_dict(buffer.state_dict())
+    again = copy.sample(64, np.random.default_rng(0))
+    np.testing.assert_array_equal(batch.indices, again.indices)
+    assert np.isfinite(batch.probabilities).all()
+
+
+def test_a_slot_that_changes_hands_leaves_the_other_buffer():
+    buffer = ReplayBuffer(10, separate=True)
+    source = Source(buffer)
+    source.episode(10, human=True)
+    source.episode(10)
+    assert buffer.human_count == 0
+    assert not buffer.sample(64, np.random.default_rng(0)).human.any()

@@ -8,6 +8,7 @@ from trainer.learner import equations
 from trainer.learner.algorithms import ALGORITHMS, PHIL
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import FEATURES, Actor, Critic
+from trainer.learner.reference import ReferenceLearner
 from trainer.learner.replay import Batch
 from trainer.learner.td3 import TD3Learner
 
@@ -29,7 +30,7 @@ def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:
     )
 
 
-def weights_of(learner: TD3Learner) -> dict[str, torch.Tensor]:
+def weights_of(learner: TD3Learner | ReferenceLearner) -> dict[str, torch.Tensor]:
     modules = {
         "actor": learner.actor,
         "critics": learner.critics,

@@ -59,7 +59,7 @@ def optimal_actions(values: Table) -> NDArray[np.bool_]:
 
 def entered_by(actions: NDArray[np.bool_], mdp: Mdp) -> NDArray[np.bool_]:
     """States that these actions may lead to, [state]."""
-    return ((mdp.transitions > 0) & actions[:, :, None]).any(axis=(0, 1))
+    return np.any((mdp.transitions > 0) & actions[:, :, None], axis=(0, 1))
 
 
 def potential_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
@@ -76,7 +76,7 @@ def intervention_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
     rewards = mdp.rewards.copy()
     for state, action, following in np.ndindex(rewards.shape):
         rewards[state, action, following] = equations.shaped_reward(
-            rewards[state, action, following],
+            float(rewards[state, action, following]),
             PENALTY,
             human=bool(unacceptable[following]),
             human_before=bool(unacceptable[state]),

@@ -15,8 +15,10 @@ from trainer import seeds
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.files import load_torch, save_torch
 from trainer.learner.config import LearnerConfig
+from trainer.learner.replay import ReplayBuffer
 from trainer.plots import moving_average, write_learning_curve
 from trainer.training.config import RunConfig
+from trainer.training.learning import ProcessorLearning
 from trainer.training.metrics import NAMES, read_metrics
 from trainer.training.run import TrainingRun
 
@@ -41,6 +43,11 @@ def actor_weights(run: TrainingRun) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in run.learning.actor.parameters()])
 
 
+def replay(run: TrainingRun) -> ReplayBuffer:
+    assert isinstance(run.learning, ProcessorLearning)
+    return run.learning.replay
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> TrainingRun:
     return train(TINY, tmp_path_factory.mktemp("run"))
@@ -61,12 +68,12 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
 
 def test_the_human_is_in_the_replay_buffer_and_in_the_metrics(trained):
     human_steps = sum(int(row["human_steps"]) for row in read_metrics(trained.run_dir))
-    assert human_steps == trained.learning.replay.human_count > 0
+    assert human_steps == replay(trained).human_count > 0
 
 
 def test_returns_leave_the_shaping_out(trained):
     rewards = sum(float(row["episode_return"]) for row in read_metrics(trained.run_dir))
-    stored = trained.learning.replay._rewards[: trained.learning.replay.added].sum()
+    stored = replay(trained)._rewards[: trained.learning.added].sum()
     interventions = sum(int(row["interventions"]) for row in read_metrics(trained.run_dir))
     assert interventions > 0
     assert stored <= rewards + 1e-3
@@ -122,7 +129,7 @@ def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path):
 
 def test_an_unguided_algorithm_never_meets_the_human(tmp_path):
     run = train(replace(TINY, algorithm="per_td3", episodes=2), tmp_path / "per")
-    assert run.learning.replay.human_count == 0
+    assert replay(run).human_count == 0
     assert all(row["interventions"] == "0" for row in read_metrics(run.run_dir))
 
 

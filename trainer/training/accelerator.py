@@ -50,7 +50,9 @@ class AcceleratorLearning:
         if self.device.type == "cuda":
             _calculate_exactly()
         self.learner = TD3Learner(config, algorithm, seed, action_size, device)
-        self.replay = DeviceReplay(config.replay_capacity, action_size, config.alpha, device)
+        self.replay = DeviceReplay(
+            config.replay_capacity, action_size, config.alpha, device, algorithm.separate_buffers
+        )
         # Not the run's seed itself: the smoothing noise comes from that.
         drawing_seed = int(seeds.stream(seed, seeds.REPLAY).integers(2**63))
         self._drawing = torch.Generator(self.device).manual_seed(drawing_seed)

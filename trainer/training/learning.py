@@ -107,7 +107,9 @@ class ProcessorLearning:
     ) -> None:
         self.config = config
         self.learner = TD3Learner(config, algorithm, seed, action_size)
-        self.replay = ReplayBuffer(config.replay_capacity, action_size, config.alpha)
+        self.replay = ReplayBuffer(
+            config.replay_capacity, action_size, config.alpha, algorithm.separate_buffers
+        )
         self._random = seeds.stream(seed, seeds.REPLAY)
         self._thread = ThreadPoolExecutor(1, "learner")
         self._begun: tuple[Batch, Future[tuple[Losses, float]]] | None = None
