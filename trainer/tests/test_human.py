@@ -109,7 +109,7 @@ class Brakes:
 
 
 def watch(reasons: list, hold_steps: int) -> list:
-    guide = HumanGuide(Brakes(), ScriptedTrigger(reasons), hold_steps)  # type: ignore[arg-type]
+    guide = HumanGuide(Brakes(), ScriptedTrigger(reasons), hold_steps)
     observation = np.zeros((2, 45, 80), np.uint8)
     return [guide.watch(observation, FULL) for _ in reasons]
 
