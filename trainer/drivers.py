@@ -123,7 +123,8 @@ def _read_actor(path: Path) -> tuple[Actor, dict[str, Any]]:
     state = load_torch(path)
     try:
         weights = state["actor"] if path.name == BEST_FILE else state["learner"]["actor"]
-        actor = Actor(action_size=len(weights["head.output.bias"]))
+        frames = weights["trunk.conv1.weight"].shape[1]
+        actor = Actor(len(weights["head.output.bias"]), frames)
         actor.load_state_dict(weights)
         label = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
     except (KeyError, TypeError, RuntimeError) as error:

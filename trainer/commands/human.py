@@ -11,7 +11,7 @@ from trainer.commands.options import add_scenario, add_threads, not_negative, po
 from trainer.drivers import make_environment
 from trainer.files import make_directory
 from trainer.human.dagger import HumanTraining
-from trainer.human.model import HumanModelConfig
+from trainer.human.model import REFINING_PARTS, HumanModelConfig
 from trainer.progress import ProgressBar
 
 EXAMPLE = "example: python -m trainer human --scenario left_turn --out runs/human"
@@ -46,6 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="the person drives the whole of one episode in N; 0: interventions only, as the paper",
     )
+    parser.add_argument(
+        "--refining-updates",
+        type=not_negative,
+        default=DEFAULTS.refining_updates,
+        help="gradient steps after the last episode, under a learning rate that falls to zero",
+    )
     add_threads(parser)
 
 
@@ -57,6 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         episodes=arguments.episodes,
         updates_per_episode=arguments.updates_per_episode,
         demonstrated_share=arguments.demonstrated_share,
+        refining_updates=arguments.refining_updates,
     )
     directory = Path(arguments.out)
     make_directory(directory)
@@ -71,6 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
                     "outcome": episode.outcome,
                 }
             )
+    if config.refining_updates:
+        with ProgressBar("refining", REFINING_PARTS) as bar:
+            for loss in training.model.refine():
+                bar.advance({"loss": f"{loss:.3f}"})
     about = {"scenario": arguments.scenario, "seed": arguments.seed, "config": asdict(config)}
     training.model.save(directory, about)
     report = {**about, "demonstrations": training.model.demonstrations}

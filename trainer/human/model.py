@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from trainer.learner.networks import Actor
 from trainer.ranges import FROM_ONE, FROM_ZERO, check_ranges
 
 MODEL_FILE = "human_model.pt"
-
+REFINING_PARTS = 20
 
 RANGES = {
     "frames": (1, 2),
@@ -26,6 +27,7 @@ RANGES = {
     "episodes": FROM_ONE,
     "updates_per_episode": FROM_ONE,
     "demonstrated_share": FROM_ZERO,
+    "refining_updates": FROM_ZERO,
 }
 """What each number may be."""
 
@@ -48,6 +50,10 @@ class HumanModelConfig:
     """The person drives the whole of one episode in this many, from the second on; 0: never.
     Interventions alone, the paper's only source, show little of what right driving looks like
     when nothing goes wrong."""
+
+    refining_updates: int = 2000
+    """Gradient steps after the last episode, under a learning rate that falls to zero. Not in the
+    paper."""
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
@@ -104,6 +110,18 @@ class HumanModel:
             loss.backward()
             self.optimiser.step()
         return loss.item()
+
+    def refine(self) -> Iterator[float]:
+        """Learn on after the last episode, in ``REFINING_PARTS`` parts, each at a lower rate.
+
+        The rate falls linearly, and what was learned settles: the last few gradients of a steady
+        rate decide too much about a boundary as sharp as between go and wait.
+        """
+        updates, rest = divmod(self.config.refining_updates, REFINING_PARTS)
+        for part in range(REFINING_PARTS):
+            for group in self.optimiser.param_groups:
+                group["lr"] = self.config.learning_rate * (1.0 - part / REFINING_PARTS)
+            yield self.learn(updates + (part < rest))
 
     def save(self, directory: Path, about: dict[str, Any]) -> None:
         """Write the model to ``directory`` with what it was trained on."""

@@ -27,7 +27,9 @@ def straight_road(lane_width_m: float, goal_m: float) -> RoadNetwork:
         y = (lane - EGO_LANE) * lane_width_m
         ends = (-REACH_M, y), (goal_m + REACH_M, y)
         lines = (LineType.CONTINUOUS if lane == 0 else LineType.NONE, LineType.CONTINUOUS)
-        network.add_lane("start", "end", StraightLane(*ends, lane_width_m, line_types=lines))
+        # No speed limit: the cars' own desired speeds are what limits them.
+        road = StraightLane(*ends, lane_width_m, line_types=lines, speed_limit=None)
+        network.add_lane("start", "end", road)
     return network
 
 
