@@ -11,7 +11,7 @@ from trainer.commands.options import add_scenario, add_threads, not_negative, po
 from trainer.drivers import make_environment
 from trainer.files import make_directory
 from trainer.human.dagger import HumanTraining
-from trainer.human.model import REFINING_PARTS, HumanModelConfig
+from trainer.human.model import HumanModelConfig
 from trainer.progress import ProgressBar
 
 EXAMPLE = "example: python -m trainer human --scenario left_turn --out runs/human"
@@ -78,10 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
                     "outcome": episode.outcome,
                 }
             )
-    if config.refining_updates:
-        with ProgressBar("refining", REFINING_PARTS) as bar:
-            for loss in training.model.refine():
-                bar.advance({"loss": f"{loss:.3f}"})
+    with ProgressBar("refining", config.refining_parts) as bar:
+        for loss in training.model.refine():
+            bar.advance({"loss": f"{loss:.3f}"})
     about = {"scenario": arguments.scenario, "seed": arguments.seed, "config": asdict(config)}
     training.model.save(directory, about)
     report = {**about, "demonstrations": training.model.demonstrations}

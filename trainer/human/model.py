@@ -18,7 +18,6 @@ from trainer.learner.networks import Actor
 from trainer.ranges import FROM_ONE, FROM_ZERO, check_ranges
 
 MODEL_FILE = "human_model.pt"
-REFINING_PARTS = 20
 
 RANGES = {
     "frames": (1, 2),
@@ -57,6 +56,11 @@ class HumanModelConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
+
+    @property
+    def refining_parts(self) -> int:
+        """Steps in which the learning rate falls."""
+        return min(self.refining_updates, 20)
 
 
 class HumanModel:
@@ -112,15 +116,16 @@ class HumanModel:
         return loss.item()
 
     def refine(self) -> Iterator[float]:
-        """Learn on after the last episode, in ``REFINING_PARTS`` parts, each at a lower rate.
+        """Learn on after the last episode, part by part, each at a lower rate; yields the loss.
 
         The rate falls linearly, and what was learned settles: the last few gradients of a steady
         rate decide too much about a boundary as sharp as between go and wait.
         """
-        updates, rest = divmod(self.config.refining_updates, REFINING_PARTS)
-        for part in range(REFINING_PARTS):
+        parts = self.config.refining_parts
+        for part in range(parts):
             for group in self.optimiser.param_groups:
-                group["lr"] = self.config.learning_rate * (1.0 - part / REFINING_PARTS)
+                group["lr"] = self.config.learning_rate * (1.0 - part / parts)
+            updates, rest = divmod(self.config.refining_updates, parts)
             yield self.learn(updates + (part < rest))
 
     def save(self, directory: Path, about: dict[str, Any]) -> None:
