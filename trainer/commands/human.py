@@ -78,9 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
                     "outcome": episode.outcome,
                 }
             )
-    with ProgressBar("refining", config.refining_parts) as bar:
-        for loss in training.model.refine():
-            bar.advance({"loss": f"{loss:.3f}"})
+    if config.refining_updates:
+        with ProgressBar("refining", config.refining_parts) as bar:
+            for loss in training.model.refine():
+                bar.advance({"loss": f"{loss:.3f}"})
     about = {"scenario": arguments.scenario, "seed": arguments.seed, "config": asdict(config)}
     training.model.save(directory, about)
     report = {**about, "demonstrations": training.model.demonstrations}
