@@ -16,29 +16,31 @@ from gymnasium.spaces import Box
 from edge_runtime.cli import UserError
 from edge_runtime.wire import FRAMES_SHAPE
 
-SCENARIOS = {"left_turn": "phil/LeftTurn-v0"}
+SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"}
 """Scenario word on the command line and in the report -> gymnasium id."""
 _REGISTERED_BY = {"phil": "trainer.scenarios"}
 """Namespace of a gymnasium id -> the module that registers it."""
-_NOT_BUILT_YET = ("congestion", "phil/Congestion-v0")
+NOMINAL, VARIANT = CONDITIONS = ("nominal", "variant")
+"""Scenes that can be served: the one that was trained in, and one with other traffic."""
 
 HINT = f"use {', '.join(SCENARIOS)}, a gymnasium id, or module:id"
 _NAME = re.compile(r"(?:\w+(?:\.\w+)*:)?[^:\s]+")
 
 
-def make_environment(name: str) -> gymnasium.Env[Any, Any]:
+def make_environment(name: str, condition: str = NOMINAL) -> gymnasium.Env[Any, Any]:
     """Make the environment of a scenario word, a gymnasium id or ``module:id``.
+
+    Another condition than the nominal one is asked for by the keyword ``scene``.
 
     Raises UserError for an unknown name, a module that does not import, or an environment whose
     observation or action space the wire cannot carry.
     """
-    if _bare_id(name) in _NOT_BUILT_YET:
-        raise UserError(f"environment {name!r} is not built yet; {HINT}")
     environment_id = _qualified_id(name)
     if not _NAME.fullmatch(environment_id):
         raise UserError(f"{name!r} names no environment; {HINT}")
     try:
-        environment = gymnasium.make(environment_id)
+        options: dict[str, Any] = {} if condition == NOMINAL else {"scene": condition}
+        environment = gymnasium.make(environment_id, **options)
     except (Exception, SystemExit) as error:  # A module may raise anything when it is imported.
         first_line = (str(error).splitlines() or [""])[0]
         what = f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__
@@ -77,11 +79,22 @@ def _check_spaces(environment: gymnasium.Env[Any, Any], name: str) -> None:
 
 
 def brake_action(environment: gymnasium.Env[Any, Any]) -> np.ndarray:
-    """Return the full-brake action, float32 [n]: the environment's own, or -1 throughout."""
+    """Return the action of a safe stop, float32 [n]: the environment's own, or -1 throughout.
+
+    An environment whose action brakes gives full brake here; one that is steered gives the last
+    steering, and brakes by ``press_brake``.
+    """
     own = getattr(environment.unwrapped, "brake_action", None)
     if own is not None:
         return np.asarray(own, dtype=np.float32)
     return np.full(environment.action_space.shape or (1,), -1.0, dtype=np.float32)
+
+
+def press_brake(environment: gymnasium.Env[Any, Any], pressed: bool) -> None:
+    """Press or release the brake of an environment whose action only steers; others have none."""
+    press = getattr(environment.unwrapped, "press_brake", None)
+    if callable(press):
+        press(pressed)
 
 
 def scene_of(environment: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from bridge.clock import Clock
 from bridge.command_hold import Decision
-from bridge.environments import brake_action
+from bridge.environments import brake_action, press_brake
 from bridge.safe_stops import SafeStopLog
 from edge_runtime.cli import UserError
 from edge_runtime.episode_report import EpisodeResult
@@ -111,7 +111,8 @@ class EpisodeRunner:
         )
 
     def _action(self, decision: Decision) -> np.ndarray:
-        """The command's action, full brake, or (before the first command) hands off: zeros."""
+        """The command's action, the safe stop's, or (before the first command) hands off: zeros."""
+        press_brake(self._environment, bool(decision.brake_reason))
         if decision.brake_reason:
             return brake_action(self._environment)
         if decision.command is None:

@@ -39,14 +39,14 @@ def make_report(
 ) -> dict[str, Any]:
     """Join the summary of the episodes with what happened on the wire.
 
-    ``settings`` holds scenario, policy_id, seed, clock and latency_spec; ``counts`` holds
-    deadline_misses, tick_overruns and ``rejections``.
+    ``settings`` holds scenario, condition, policy_id, seed, clock and latency_spec; ``counts``
+    holds deadline_misses, tick_overruns and ``rejections``.
     """
     return {
         **summarise(
             results,
             scenario=settings["scenario"],
-            condition="nominal",  # The bridge serves an environment as it is registered.
+            condition=settings["condition"],
             policy_id=settings["policy_id"],
             seed=settings["seed"],
         ),

@@ -12,7 +12,7 @@ import gymnasium
 from bridge.arguments import non_negative_int, non_negative_seconds, positive_int
 from bridge.clock import Clock, Publish
 from bridge.command_check import CommandCheck
-from bridge.environments import SCENARIOS, make_environment, scenario_of
+from bridge.environments import CONDITIONS, NOMINAL, SCENARIOS, make_environment, scenario_of
 from bridge.episode import EpisodeRunner
 from bridge.latency import GRAMMAR, LatencySpec, parse_spec
 from bridge.lockstep import LockStepClock
@@ -38,6 +38,7 @@ class SimulateSettings:
     """What the command line asks for, checked."""
 
     env: str
+    condition: str
     episodes: int
     clock: str
     listen: str
@@ -53,6 +54,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     words = ", ".join(SCENARIOS)
     parser.add_argument(
         "--env", metavar="ENV", required=True, help=f"scenario ({words}), gymnasium id or module:id"
+    )
+    parser.add_argument(
+        "--condition",
+        choices=CONDITIONS,
+        default=NOMINAL,
+        help="the scene as trained in, or its variant with more vehicles and other types of them",
     )
     parser.add_argument(
         "--episodes", metavar="N", type=positive_int, default=1, help="episodes to drive"
@@ -94,7 +101,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def simulate(arguments: Any) -> int:
     """Run the command; UserError for anything the caller can put right."""
     settings = _check(arguments)
-    environment = make_environment(settings.env)
+    environment = make_environment(settings.env, settings.condition)
     try:
         with sigterm_as_interrupt():
             report = _serve(settings, environment)
@@ -108,6 +115,7 @@ def simulate(arguments: Any) -> int:
 def _check(arguments: Any) -> SimulateSettings:
     settings = SimulateSettings(
         env=arguments.env,
+        condition=arguments.condition,
         episodes=arguments.episodes,
         clock=arguments.clock,
         listen=check_endpoint(arguments.listen),
@@ -172,6 +180,7 @@ def _drive(
         },
         settings={
             "scenario": scenario_of(settings.env),
+            "condition": settings.condition,
             "policy_id": check.policy_id,
             "seed": settings.seed,
             "clock": settings.clock,

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
 from trainer.files import load_torch
+from trainer.human.congestion_expert import CongestionExpert
+from trainer.human.congestion_trigger import CongestionTrigger
 from trainer.human.expert import LeftTurnExpert
-from trainer.human.guide import Driver
+from trainer.human.guide import Driver, Trigger
 from trainer.human.model import MODEL_FILE, load_human_model
 from trainer.human.trigger import LeftTurnTrigger
 from trainer.learner.networks import Actor
@@ -23,9 +25,16 @@ from trainer.scenarios import SCENARIOS
 CHECKPOINT_FILE = "checkpoint.pt"
 BEST_FILE = "best_actor.pt"
 
-EXPERTS: dict[str, Callable[[Any], LeftTurnExpert]] = {"left_turn": LeftTurnExpert}
-TRIGGERS: dict[str, Callable[[Any], LeftTurnTrigger]] = {"left_turn": LeftTurnTrigger}
-"""Scenario -> who knows how to drive it, and when to take over."""
+EXPERTS: dict[str, Callable[[Any], Driver]] = {
+    "left_turn": LeftTurnExpert,
+    "congestion": CongestionExpert,
+}
+"""Scenario -> who knows how to drive it, made from its environment."""
+TRIGGERS: dict[str, Callable[[Any], Trigger]] = {
+    "left_turn": LeftTurnTrigger,
+    "congestion": CongestionTrigger,
+}
+"""Scenario -> when that expert, from whom it is made, would take over."""
 
 
 class NetworkDriver:
@@ -61,15 +70,17 @@ class OnnxDriver:
         return self.policy.act(observation)
 
 
-def make_environment(scenario: str) -> Any:
-    """The scenario's environment, without wrappers.
+def make_environment(scenario: str, condition: str = "nominal") -> Any:
+    """The scenario's environment, without wrappers, in the scene of a test condition.
 
     Raises:
         UserError: no such scenario.
     """
     if scenario not in SCENARIOS:
         raise UserError(f"unknown scenario {scenario!r}; there is {', '.join(SCENARIOS)}")
-    return gymnasium.make(SCENARIOS[scenario]).unwrapped
+    # Noise disturbs the command, not the scene: evaluation.py adds it.
+    scene = "variant" if condition == "variant" else "nominal"
+    return gymnasium.make(SCENARIOS[scenario], scene=scene).unwrapped
 
 
 def load_driver(policy: str, env: Any) -> tuple[Driver, str]:

@@ -12,7 +12,7 @@ from trainer.human.guide import Driver
 
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
-CONDITIONS = ("nominal", "noise")
+CONDITIONS = ("nominal", "noise", "variant")
 
 
 def drive_episode(env: Any, driver: Driver, seed: int, noise_std: float = 0.0) -> EpisodeResult:
@@ -60,7 +60,10 @@ def drive_episodes(
     condition: str = "nominal",
     on_episode: Callable[[EpisodeResult], None] = lambda result: None,
 ) -> list[EpisodeResult]:
-    """Drive one episode for each seed under a condition."""
+    """Drive one episode for each seed under a condition.
+
+    The variant condition is the environment's own: see ``drivers.make_environment``.
+    """
     noise_std = COMMAND_NOISE if condition == "noise" else 0.0
     results = []
     for seed in seeds:

@@ -37,7 +37,14 @@ ACTIONS = {
         unit="aperture",
         low=-1.0,
         high=1.0,
-    )
+    ),
+    "congestion": Action(
+        name="steering",
+        meaning="positive turns right, negative left (eq. 29)",
+        unit="share of the front wheels' 0.15 rad",
+        low=-1.0,
+        high=1.0,
+    ),
 }
 """Scenario -> what its action means to a vehicle."""
 

@@ -104,12 +104,12 @@ def _die_with_parent() -> None:
 
 
 @cache
-def _cockpit(policy: str, scenario: str) -> tuple[Any, Driver]:
+def _cockpit(policy: str, scenario: str, condition: str) -> tuple[Any, Driver]:
     """Environment and driver, made once in a worker; here, so that a UserError finds its way."""
-    env = make_environment(scenario)
+    env = make_environment(scenario, condition)
     return env, load_driver(policy, env)[0]
 
 
 def _drive(policy: str, scenario: str, seed: int, condition: str) -> EpisodeResult:
-    env, driver = _cockpit(policy, scenario)
+    env, driver = _cockpit(policy, scenario, condition)
     return drive_episodes(env, driver, [seed], condition)[0]

@@ -152,8 +152,8 @@ def test_nobody_comes_and_one_line_says_what_to_start(tmp_path):
         (["--env", "no_such_module:X-v0"], "no_such_module"),
         (["--env", "CartPole-v1"], "uint8"),
         (["--env", "bridge.tests.broken_module:X-v0"], "RuntimeError: two"),
-        (["--env", "congestion"], "not built yet"),
-        (["--env", "phil/Congestion-v0"], "not built yet"),
+        (["--env", TOY, "--condition", "variant"], "scene"),
+        (["--env", "congestion", "--condition", "foggy"], "foggy"),
         (["--env", "::"], "module:id"),
         (["--env", TOY, "--latency", "fast"], "latency"),
         (["--env", TOY, "--episodes", "0"], "at least 1"),
@@ -187,10 +187,18 @@ def test_what_the_edge_rejects_is_in_the_report(tmp_path):
     assert report["rejected"]["stale"] >= report["rejected_by_edge"]["stale"]
 
 
-@pytest.mark.parametrize("name", ["left_turn", "phil/LeftTurn-v0"])
-def test_a_scenario_is_found_by_word_and_by_id(name):
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [
+        ("left_turn", "left_turn"),
+        ("phil/LeftTurn-v0", "left_turn"),
+        ("congestion", "congestion"),
+        ("phil/Congestion-v0", "congestion"),
+    ],
+)
+def test_a_scenario_is_found_by_word_and_by_id(name, word):
     environment = make_environment(name)
-    assert scenario_of(name) == "left_turn"
+    assert scenario_of(name) == word
     environment.close()
 
 

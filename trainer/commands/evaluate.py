@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--condition",
         choices=CONDITIONS,
         default="nominal",
-        help="nominal, or Gaussian noise of 5 %% of the control domain on the command",
+        help="nominal; Gaussian noise of 5 %% of the control domain on the command; or the variant "
+        "scene with more vehicles and other types of them",
     )
     parser.add_argument("--runs", type=positive, default=50, help="episodes")
     parser.add_argument(
@@ -50,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print the report; returns the exit status."""
     if arguments.out:
         check_writable(arguments.out)
-    env = make_environment(arguments.scenario)
+    env = make_environment(arguments.scenario, arguments.condition)
     driver, policy_id = load_driver(arguments.policy, env)
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     jobs = min(arguments.jobs or choose_jobs(arguments.runs), arguments.runs)

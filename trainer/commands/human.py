@@ -46,6 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="the person drives the whole of one episode in N; 0: interventions only, as the paper",
     )
+    parser.add_argument(
+        "--refining-updates",
+        type=not_negative,
+        default=DEFAULTS.refining_updates,
+        help="gradient steps after the last episode, under a learning rate that falls to zero",
+    )
     add_threads(parser)
 
 
@@ -57,6 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         episodes=arguments.episodes,
         updates_per_episode=arguments.updates_per_episode,
         demonstrated_share=arguments.demonstrated_share,
+        refining_updates=arguments.refining_updates,
     )
     directory = Path(arguments.out)
     make_directory(directory)
@@ -71,6 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
                     "outcome": episode.outcome,
                 }
             )
+    if config.refining_updates:
+        with ProgressBar("refining", config.refining_parts) as bar:
+            for loss in training.model.refine():
+                bar.advance({"loss": f"{loss:.3f}"})
     about = {"scenario": arguments.scenario, "seed": arguments.seed, "config": asdict(config)}
     training.model.save(directory, about)
     report = {**about, "demonstrations": training.model.demonstrations}

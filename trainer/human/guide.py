@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.human.trigger import LeftTurnTrigger, Reason
-
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
+Reason = Literal["collision", "stuck", "heading", "offset"]
+"""Why the human takes over: a crash ahead, a car that waits for nothing, one that turns aside, one
+that drifts aside."""
 
 
 class Driver(Protocol):
@@ -22,6 +23,17 @@ class Driver(Protocol):
 
     def act(self, observation: Observation) -> Action:
         """The action for an observation uint8 [2, 45, 80]."""
+        ...
+
+
+class Trigger(Protocol):
+    """The activation conditions of section V: when a person would take over."""
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+
+    def judge(self, action: Action) -> Reason | None:
+        """Why a person would take over from ``action`` now, or None. Once a control period."""
         ...
 
 
@@ -44,7 +56,7 @@ class HumanGuide:
         hold_steps: shortest time in control; a person does not let go within a tenth of a second.
     """
 
-    def __init__(self, driver: Driver, trigger: LeftTurnTrigger, hold_steps: int = 5) -> None:
+    def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int = 5) -> None:
         self.driver, self.trigger, self.hold_steps = driver, trigger, hold_steps
         self.reset()
 

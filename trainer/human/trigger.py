@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from numpy.typing import NDArray
 
 from trainer.human.crossing import PedalPlan
 from trainer.human.expert import LeftTurnExpert
-
-Reason = Literal["collision", "stuck"]
+from trainer.human.guide import Reason
 
 
 class LeftTurnTrigger:

@@ -2,14 +2,14 @@
 
 from gymnasium.envs.registration import register, registry
 
-SCENARIOS = {"left_turn": "phil/LeftTurn-v0"}
+SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"}
 """Scenario name on the command line -> gymnasium id."""
+_CLASSES = {
+    "phil/LeftTurn-v0": "trainer.scenarios.left_turn:LeftTurnEnv",
+    "phil/Congestion-v0": "trainer.scenarios.congestion:CongestionEnv",
+}
 
-if "phil/LeftTurn-v0" not in registry:
-    # No gymnasium wrappers by default: the scenario counts its own steps and reports `timeout`.
-    register(
-        id="phil/LeftTurn-v0",
-        entry_point="trainer.scenarios.left_turn:LeftTurnEnv",
-        disable_env_checker=True,
-        order_enforce=False,
-    )
+for _id, _class in _CLASSES.items():
+    if _id not in registry:
+        # No gymnasium wrappers by default: a scenario counts its own steps and reports `timeout`.
+        register(id=_id, entry_point=_class, disable_env_checker=True, order_enforce=False)

@@ -109,7 +109,8 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path):
     human, run = str(tmp_path / "human"), str(tmp_path / "run")
     policy = str(tmp_path / "policy.onnx")
     steps = [
-        ("human", "--out", human, "--episodes", "1", "--updates-per-episode", "2"),
+        ("human", "--out", human, "--episodes", "1", "--updates-per-episode", "2",
+         "--refining-updates", "3"),
         ("train", "--human", human, "--out", run, "--episodes", "2", "--set", "batch_size=4",
          "--set", "evaluation_runs=1"),
         ("train", "--human", human, "--out", run, "--episodes", "3", "--set", "batch_size=4",

@@ -117,7 +117,7 @@ class Brakes:
 
 
 def watch(reasons: list, hold_steps: int) -> list:
-    guide = HumanGuide(Brakes(), ScriptedTrigger(reasons), hold_steps)  # type: ignore[arg-type]
+    guide = HumanGuide(Brakes(), ScriptedTrigger(reasons), hold_steps)
     observation = np.zeros((2, 45, 80), np.uint8)
     return [guide.watch(observation, FULL) for _ in reasons]
 
@@ -167,6 +167,26 @@ def test_one_frame_is_the_newest_one():
     other_now = frames.copy()
     other_now[1] = 0
     assert model.act(frames) != model.act(other_now)
+
+
+def test_refining_takes_its_updates_under_a_falling_learning_rate():
+    config = HumanModelConfig(batch_size=16, learning_rate=1e-3, refining_updates=45)
+    model, random = HumanModel(config, seed=3), np.random.default_rng(0)
+    for number in range(60):
+        shade = random.integers(0, 255)
+        model.add(np.full((2, 45, 80), shade, np.uint8), FULL if number % 2 else BRAKE)
+    before = [parameter.clone() for parameter in model.actor.parameters()]
+    rates, losses = [], []
+    for loss in model.refine():
+        losses.append(loss)
+        rates.append(model.optimiser.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-3 * (1 - part / 20) for part in range(20)])
+    # 45 updates in 20 parts: Adam counts them.
+    steps = {int(state["step"]) for state in model.optimiser.state.values()}
+    assert steps == {45}
+    moved = [not torch.equal(a, b) for a, b in zip(before, model.actor.parameters(), strict=True)]
+    assert any(moved)
+    assert np.isfinite(losses).all()
 
 
 def test_training_is_reproducible_and_survives_saving(tmp_path):

@@ -34,13 +34,14 @@ def one_thread():
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_the_results_are_those_of_one_process(policy):
-    env = make_environment("left_turn")
+@pytest.mark.parametrize("condition", ["noise", "variant"])
+def test_the_results_are_those_of_one_process(policy, condition):
+    env = make_environment("left_turn", condition)
     seeds = range(7, 14)
-    alone = drive_episodes(env, load_driver(policy, env)[0], seeds, "noise")
+    alone = drive_episodes(env, load_driver(policy, env)[0], seeds, condition)
     seen: list[int] = []
     results = drive_episodes_in_parallel(
-        policy, "left_turn", seeds, 2, "noise", lambda result: seen.append(result.seed)
+        policy, "left_turn", seeds, 2, condition, lambda result: seen.append(result.seed)
     )
     assert results == alone
     assert seen == list(seeds)

@@ -1,0 +1,76 @@
+"""When a person would take the steering wheel: the activation conditions for the congestion."""
+
+from __future__ import annotations
+
+import math
+
+from numpy.typing import NDArray
+
+from trainer.human.congestion_expert import CongestionExpert
+from trainer.human.guide import Reason
+from trainer.scenarios.geometry import Rectangle, overlap
+
+
+class CongestionTrigger:
+    """Judges the policy's action before it is carried out.
+
+    Args:
+        expert: knows the environment.
+    """
+
+    HORIZON_S = 0.8
+    """How far the judged steering is followed."""
+    MARGIN_M = 0.2
+    """Room to other cars within which one counts as hit."""
+    HEADING_RAD = 0.15
+    OFFSET_M = 1.1
+    """From the lane's middle, at the horizon."""
+
+    def __init__(self, expert: CongestionExpert) -> None:
+        self.expert = expert
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def judge(self, action: NDArray) -> Reason | None:
+        """Why a person would take over from ``action`` now, or None. Once a control period."""
+        env = self.expert.env
+        steps = round(self.HORIZON_S / env.config.control_period_s)
+        angle_rad = float(action[0]) * env.config.lambda_rad
+        for step, shape in enumerate(self._motion(angle_rad, steps), start=1):
+            if abs(shape.heading) > self.HEADING_RAD and step == 1:
+                return "heading"
+            if self._hits(shape, step * env.config.control_period_s):
+                return "collision"
+        return "offset" if abs(shape.y) > self.OFFSET_M else None
+
+    def _motion(self, angle_rad: float, steps: int) -> list[Rectangle]:
+        """The ego car's footprints under a held steering angle, at its present speed."""
+        env = self.expert.env
+        shape, dt_s = env.ego.footprint, env.config.control_period_s
+        slip_rad = math.atan(0.5 * math.tan(angle_rad))
+        move_m = env.ego.speed * dt_s
+        shapes = []
+        for _ in range(steps):
+            course_rad = shape.heading + slip_rad
+            shape = shape._replace(
+                x=shape.x + move_m * math.cos(course_rad),
+                y=shape.y + move_m * math.sin(course_rad),
+                heading=shape.heading + move_m * math.sin(slip_rad) / (0.5 * shape.length),
+            )
+            shapes.append(shape)
+        return shapes
+
+    def _hits(self, ego: Rectangle, ahead_s: float) -> bool:
+        """Whether a car beside, at its present speed, is then nearer than the margin.
+
+        Only sideways: room ahead is the pedals' matter.
+        """
+        wider = ego._replace(width=ego.width + 2.0 * self.MARGIN_M)
+        for car in self.expert.env.traffic:
+            if car.lane.start[1] == 0.0:
+                continue
+            shape = car.footprint
+            if overlap(wider, shape._replace(x=shape.x + car.speed * ahead_s)):
+                return True
+        return False

@@ -1,0 +1,81 @@
+"""Every number of the congestion scenario."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from trainer.scenarios.environment import Range, Scene
+from trainer.scenarios.vehicle_types import CARS_ONLY, MIXED, Mix
+
+
+@dataclass(frozen=True)
+class CongestionConfig:
+    """One field a number, with its reason."""
+
+    control_period_s: float = 0.1
+    """Control interval of all vehicles (section VI-A)."""
+    max_steps: int = 300
+    """Steps until the episode is cut off as a timeout; at 4 m/s the goal takes 200."""
+    lane_width_m: float = 3.5
+    goal_m: float = 80.0
+    """Distance along the road from start to goal."""
+    lambda_rad: float = 0.15
+    """Front-wheel angle at full action: eq. 29's 5 lambda pi. With 5 pi rad of steering wheel for
+    the front wheels' 45 degrees, lambda is 0.19. At 5 m/s the heading then changes by at most
+    0.015 rad a step: enough to save a car 2 s before it touches its neighbour."""
+    start_offset_m: Range = (-0.3, 0.3)
+    """The ego car's place in its lane at the start."""
+    start_heading_rad: Range = (-0.05, 0.05)
+    """Its heading: at the edges of this range the wheels held straight lead 4 m aside."""
+    ego_speed_mps: Range = (4.0, 6.0)
+    """Initial speed of the ego car."""
+    desired_speed_mps: float = 6.0
+    """Target of the IDM on the ego car's pedals (section VI-A), and of the cars behind others."""
+    brake_mps2: float = 4.0
+    """Deceleration of the ego car at most; what the brake of a safe stop does."""
+    traffic_speed_mps: Range = (4.0, 6.0)
+    """Initial speeds of traffic (section VI-A)."""
+    jam_speed_mps: Range = (4.5, 5.5)
+    """Speed of the whole jam, and ..."""
+    lane_speed_mps: Range = (-0.5, 0.5)
+    """... what each lane's first car is faster. Lanes that drifted apart at 2 m/s would leave the
+    ego car alone before half of the way."""
+    side_cars: int = 3
+    """In each neighbouring lane; with the one ahead these are the seven within 20 m."""
+    cars_behind: int = 0
+    """In the ego car's lane. They follow it as one of them: traffic keeps lanes, so a car
+    elsewhere has nothing to react to."""
+    traffic_mix: Mix = CARS_ONLY
+    side_front_m: Range = (9.0, 13.0)
+    """How far each neighbouring lane's first car is ahead, centre to centre (of cars)."""
+    gap_m: Range = (3.5, 5.5)
+    """Between bumpers in a lane, at the start."""
+    ahead_gap_m: Range = (4.0, 9.0)
+    """From the ego car to the one ahead of it."""
+    time_gap_factor: float = 0.5
+    """Share of a vehicle's usual time gap that is kept in the jam."""
+    lane_offset_m: Range = (-0.2, 0.2)
+    """Where in its lane each car drives; the narrowest gap then leaves 1.3 m to each side of an
+    ego car in mid-lane, in the variant 1.1 m."""
+    goal_reward: float = 10.0
+    fail_reward: float = -10.0
+    steer_weight: float = 0.1
+    """Scale of the steering term: this times the change of the action, which costs (eq. 32 is
+    printed without the minus sign that its text demands). With gamma 0.95 and 10 Hz the horizon is
+    2 s. A correction (the action out, across and back, 2 in all) costs 0.2; the crash that it
+    avoids is worth -3.6 seen 20 steps ahead and -0.8 seen 50 ahead, so correcting early pays. With
+    weight 1 it would pay to wait for the last second; worse, trembling at random (2/3 a step) would
+    cost 13 in discounted sum, and an early crash, which is -10, would be the best policy of a
+    beginner. With 0.1 trembling costs 1.3: felt, and never worth a crash."""
+    metres_per_pixel: float = 0.375
+    view_behind_m: float = 12.0
+    """The picture shows 30 m x 16.9 m of ground, all three lanes. It moves along the road with the
+    ego car, and neither turns nor moves aside: place and heading show as they are, and other cars'
+    movement between the two frames is their speed relative to the ego car's."""
+
+    @staticmethod
+    def of(scene: Scene) -> CongestionConfig:
+        """The numbers of a scene; the variant has more vehicles, and not only cars."""
+        if scene == "nominal":
+            return CongestionConfig()
+        return CongestionConfig(side_cars=4, cars_behind=1, traffic_mix=MIXED)

@@ -1,0 +1,115 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from trainer.drivers import NetworkDriver
+from trainer.evaluation import drive_episodes
+from trainer.human.congestion_expert import CongestionExpert
+from trainer.human.congestion_trigger import CongestionTrigger
+from trainer.human.dagger import HumanTraining
+from trainer.human.model import HumanModelConfig
+from trainer.scenarios.congestion import CongestionEnv
+from trainer.scenarios.congestion_config import CongestionConfig
+from trainer.tests.test_congestion import CENTRED, LEFT, RIGHT, STRAIGHT
+
+ALONE = replace(CENTRED, side_cars=1, side_front_m=(60.0, 60.0))
+
+
+def environment(
+    offset_m: float = 0.0, heading_rad: float = 0.0, config: CongestionConfig = CENTRED
+) -> CongestionEnv:
+    start, course = (offset_m, offset_m), (heading_rad, heading_rad)
+    env = CongestionEnv(replace(config, start_offset_m=start, start_heading_rad=course))
+    env.reset(seed=0)
+    return env
+
+
+@pytest.mark.parametrize("condition", ["nominal", "noise"])
+def test_the_expert_always_arrives(condition):
+    env = CongestionEnv()
+    results = drive_episodes(env, CongestionExpert(env), range(20), condition)
+    assert {result.outcome for result in results} == {"goal"}
+
+
+def test_the_expert_steers_back_and_then_straight():
+    for offset_m, sign in ((0.3, -1.0), (-0.3, 1.0)):
+        env = environment(offset_m)
+        expert = CongestionExpert(env)
+        assert expert.act(env.frames)[0] * sign > 0.3
+        for _ in range(80):
+            env.step(expert.act(env.frames))
+        assert abs(env.ego.position[1]) < 0.05
+        assert abs(env.ego.heading) < 0.01
+
+
+def test_the_expert_seeks_the_middle_of_the_gap():
+    env = environment()
+    expert = CongestionExpert(env)
+    assert expert.middle_m() == pytest.approx(0.0)
+    for car in env.traffic:
+        if car.position[1] < -2.0:
+            car.position[1] += 0.4
+    assert expert.middle_m() == pytest.approx(0.2)
+    assert expert.act(env.frames)[0] > 0.0
+
+
+def test_a_good_course_is_left_alone():
+    env = CongestionEnv()
+    for seed in range(10):
+        env.reset(seed=seed)
+        expert = CongestionExpert(env)
+        trigger = CongestionTrigger(expert)
+        info: dict = {}
+        while "outcome" not in info:
+            action = expert.act(env.frames)
+            assert trigger.judge(action) is None
+            *_, info = env.step(action)
+
+
+def judge(env: CongestionEnv, action: np.ndarray) -> str | None:
+    return CongestionTrigger(CongestionExpert(env)).judge(action)
+
+
+def test_turning_aside_is_taken_over():
+    assert judge(environment(heading_rad=0.1), STRAIGHT) is None
+    assert judge(environment(heading_rad=0.16), STRAIGHT) == "heading"
+    assert judge(environment(heading_rad=-0.16), STRAIGHT) == "heading"
+
+
+def test_drifting_aside_is_taken_over_even_where_the_road_is_free():
+    assert judge(environment(0.9, config=ALONE), STRAIGHT) is None
+    assert judge(environment(1.0, 0.05, ALONE), STRAIGHT) == "offset"
+    assert judge(environment(-1.0, -0.05, ALONE), STRAIGHT) == "offset"
+    # Steered back in time it is no matter.
+    assert judge(environment(1.0, 0.0, ALONE), LEFT) is None
+
+
+def test_a_side_that_will_touch_is_taken_over():
+    env = environment(0.9, 0.1)
+    assert judge(env, RIGHT) == "collision"
+    assert judge(environment(-0.9, 0.1), STRAIGHT) is None
+
+
+def test_every_crash_is_foreseen():
+    env, random = CongestionEnv(), np.random.default_rng(1)
+    trigger = CongestionTrigger(CongestionExpert(env))
+    for seed in range(25):
+        env.reset(seed=seed)
+        info: dict = {}
+        warned = False
+        while "outcome" not in info:
+            action = random.uniform(-1, 1, 1).astype(np.float32)
+            warned = warned or trigger.judge(action) is not None
+            *_, info = env.step(action)
+        if info["outcome"] in ("collision", "off_road"):
+            assert warned
+
+
+def test_the_human_model_learns_from_interventions():
+    config = HumanModelConfig(episodes=2, updates_per_episode=2, batch_size=8)
+    training = HumanTraining(CongestionEnv(), config, seed=5)
+    episodes = list(training.episodes())
+    assert episodes[0].interventions > 0
+    assert episodes[-1].demonstrations > episodes[0].demonstrations
+    assert NetworkDriver(training.model.actor).act(training.env.frames).shape == (1,)
