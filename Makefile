@@ -8,7 +8,7 @@ PEERS_STAMP := $(PEERS)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format bench bench-quick lock clean
+.PHONY: help install demo test lint format bench bench-quick bench-gpu lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -53,6 +53,10 @@ bench: $(STAMP) $(PEERS_STAMP)  ## speed and memory beside peers: tables, and JS
 
 bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table only
 	$(BIN)/python -m trainer bench --quick --threads 1
+
+bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and eight at once
+	@mkdir -p $(BENCH)
+	$(BIN)/python -m trainer.benches.accelerator --runs 8 --out $(BENCH)/gpu.json
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new

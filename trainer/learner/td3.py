@@ -20,6 +20,7 @@ from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Actor, CriticPair
 from trainer.learner.optimiser import load_adam, make_adam
+from trainer.learner.precision import multiplies_bfloat16
 from trainer.learner.replay import Batch
 
 
@@ -174,8 +175,9 @@ class TD3Learner:
         self.updates = state["updates"]
 
     def _precision(self) -> torch.autocast:
-        reduced = self.config.precision == "bfloat16"
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=reduced)
+        kind = self.device.type
+        reduced = self.config.precision == "bfloat16" and multiplies_bfloat16(kind)
+        return torch.autocast(kind, torch.bfloat16, enabled=reduced)
 
     @torch.no_grad()
     def _targets(self, batch: Minibatch) -> Tensor:
