@@ -77,7 +77,7 @@ class _Scene:
         """The observation, looking at what our rasteriser looks at."""
         view = self._env.rasteriser
         middle_m = 0.5 * view.metres_per_pixel * np.array([COLUMNS, ROWS])
-        position = np.array([view.left_m, view.top_m]) + middle_m
+        position = np.array(self._env.view_corner_m) + middle_m
         self._observation.observer_vehicle = SimpleNamespace(position=position)
         return self._observation
 

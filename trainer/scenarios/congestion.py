@@ -56,6 +56,11 @@ class CongestionEnv(DrivingEnv):
         """What a simulator applies when commands stop: the last steering. ``press_brake``, too."""
         return np.array([self._steering], dtype=np.float32)
 
+    @property
+    def view_corner_m(self) -> tuple[float, float]:
+        """Where on the ground the upper left corner of the policy's picture is, metres."""
+        return float(self.ego.position[0]) + self.rasteriser.left_m, self.rasteriser.top_m
+
     def press_brake(self, pressed: bool) -> None:
         """Full brake instead of the IDM, until released or reset: the simulator's safe stop."""
         self._braking = pressed

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from trainer.scenarios.ego import EgoVehicle
-from trainer.scenarios.rasteriser import COLUMNS, ROWS
+from trainer.scenarios.rasteriser import COLUMNS, ROWS, Rasteriser
 from trainer.scenarios.scene import draw_scene, vehicle_entry
 from trainer.scenarios.traffic import TrafficVehicle
 
@@ -62,6 +62,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     config: ScenarioConfig
     ego: EgoVehicle
     traffic: list[TrafficVehicle]
+    rasteriser: Rasteriser
 
     def __init__(self, render_mode: str | None) -> None:
         self.render_mode = render_mode
@@ -74,6 +75,11 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     def render(self) -> NDArray[np.uint8]:
         """The scene from above for a person, uint8 [height, width, 3]."""
         return draw_scene(self.scene(), self.frames, self._caption())
+
+    @property
+    def view_corner_m(self) -> tuple[float, float]:
+        """Where on the ground the upper left corner of the policy's picture is, metres."""
+        return self.rasteriser.left_m, self.rasteriser.top_m
 
     def scene(self) -> dict[str, Any]:
         """What a viewer needs to draw the scene; plain lists and numbers."""
