@@ -47,7 +47,7 @@ class HighwayPicture:
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.uint8], bool]:
         """One control interval: the observation, and whether the episode ended."""
         _, _, terminated, truncated, _ = self.env.step(action)
-        return self.observation.observe(), terminated or truncated
+        return self.scene.observation().observe(), terminated or truncated
 
 
 class _Scene:
