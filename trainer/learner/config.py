@@ -71,7 +71,7 @@ class LearnerConfig:
     saturation_weight: float = 0.0
     """Weight of the mean squared action before tanh in the actor's loss. Not in the paper: a remedy
     for policies that saturate, whose gradient vanishes."""
-    precision: str = "float32"
+    precision: str = "bfloat16"
     """Of the products in convolutions and first connected layers while learning: float32, or
     bfloat16 where the processor multiplies that faster. Acting is always float32."""
 
