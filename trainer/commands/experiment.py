@@ -24,7 +24,7 @@ from trainer.experiments.report import (
 )
 from trainer.experiments.runner import FAILED, Tally, run_units
 from trainer.experiments.store import Store
-from trainer.experiments.summary import write_summary
+from trainer.experiments.summary import BEGIN, write_summary
 from trainer.experiments.units import Unit
 from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task
 
@@ -105,6 +105,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(outcome_line(verdict, directory_of(store, name)))
     if write_summary(store.results, NAMES):
         print(f"table of all verdicts: {store.results / 'README.md'}")
+    elif SUMMARY in arguments.names:
+        raise UserError(f"{store.results / 'README.md'} has no line {BEGIN!r} for the table")
     _say_what_is_left(tally)
     return 1 if tally.count(FAILED) else 0
 

@@ -14,7 +14,6 @@ from trainer.experiments import timing
 from trainer.experiments.catalogue import EXPERIMENTS, NAMES, TIME
 from trainer.experiments.figures.style import write_figure
 from trainer.experiments.gathered import Gathered, gather
-from trainer.experiments.plan import FULL_PATH_M
 from trainer.experiments.store import BEGUN, DONE, IMPOSSIBLE, MISSING, RUNNING, Store
 from trainer.experiments.units import Unit, obstacle
 from trainer.experiments.verdict import Verdict, verdict_of, write_verdict
@@ -91,10 +90,9 @@ def print_status(store: Store, names: Sequence[str], seeds: int) -> None:
         measured = (directory_of(store, TIME) / timing.MEASURED_FILE).is_file()
         table.add_row(TIME, "measured" if measured else "-", "", "", "" if measured else "1", "")
     Console().print(table)
-    for scenario in FULL_PATH_M:
-        for unit in (unit for unit in states if states[unit] == RUNNING):
-            if unit.scenario == scenario:
-                print(f"running: {unit}, {store.holder(unit)}")
+    for unit in (unit for unit in states if states[unit] == RUNNING):
+        print(f"running: {unit}, {store.holder(unit)}")
+    warn_of_obstacles(store, states)
 
 
 def _counts(states: Iterable[str]) -> list[str]:

@@ -82,6 +82,8 @@ def run_units(tasks: Sequence[Task], jobs: int, function: Function = compute) ->
                         continue
                     receiver, job = _start(task, function)
                     running[receiver] = job
+                if not running:
+                    break  # all that waited came too late
                 for ready in wait(list(running)):
                     assert isinstance(ready, Connection)
                     job = running[ready]

@@ -51,11 +51,12 @@ def summary_lines(results: Path, names: Iterable[str]) -> list[str]:
         if verdict is None:
             lines.append(_row([name, "not run yet", "", "", "0", "undecided", command]))
             continue
+        command = f"`{verdict['command']}`"
         link = f"[{name}](experiments/{name}/verdict.md)"
         for one in verdict["claims"]:
             cells = (one["text"], one["paper"], one["ours"], str(one["seeds"]), one["holds"])
-            lines.append(_row([link, *cells, f"`{verdict['command']}`"]))
-            link = ""
+            lines.append(_row([link, *cells, command]))
+            link = command = ""
     return lines
 
 
@@ -66,6 +67,7 @@ def _read(path: Path) -> dict[str, Any] | None:
         verdict = json.loads(read_bytes(path, "verdict"))
         for one in verdict["claims"]:
             _ = [one[name] for name in ("text", "paper", "ours", "seeds", "holds")]
+        _ = verdict["command"]
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} is no verdict of this project") from error
     return dict(verdict)

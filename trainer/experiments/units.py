@@ -123,7 +123,7 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
         "unit": asdict(unit),
         "human": human,
         "test_runs": plan.test_runs,
-        "scenario": asdict(make_environment(unit.scenario).config),
+        "scenario": _numbers_of(unit.scenario),
     }
     if unit.trained:
         run = run_config(unit, plan, humans).as_dict()
@@ -156,6 +156,11 @@ def without_neutral(values: dict[str, Any]) -> dict[str, Any]:
 def human_file(scenario: str, humans: Path) -> Path:
     """Where a scenario's human model is."""
     return humans / scenario / MODEL_FILE
+
+
+@cache
+def _numbers_of(scenario: str) -> dict[str, Any]:
+    return asdict(make_environment(scenario).config)
 
 
 def _fingerprint(path: Path) -> str:

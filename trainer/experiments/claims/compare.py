@@ -23,7 +23,7 @@ from trainer.experiments.statistics import (
 from trainer.experiments.verdict import Claim, claim
 
 BY_SEED = "95 % interval of the difference, paired by seed"
-BY_EPISODE = "95 % interval of the difference, paired by training seed and test seed"
+BY_EPISODE = "95 % interval over these policies' test episodes, paired by training and test seed"
 BY_BOOTSTRAP = "95 % bootstrap interval over the seeds"
 BY_WILSON = "Wilson's 95 % intervals do not overlap"
 BY_VALUE = "the value itself"

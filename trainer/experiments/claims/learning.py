@@ -61,8 +61,8 @@ def judge_fig7(gathered: Gathered) -> list[Claim]:
             )
         )
     for scenario in SCENARIO_TITLES:
-        text = "every human-guided algorithm ends above vanilla TD3"
         for line in (IA, HI):
+            text = f"{line.label}, guided by the human, ends above vanilla TD3"
             claims.append(final_claim(gathered, scenario, "distance_m", line, [PER], text, "above"))
     return claims
 
@@ -219,12 +219,12 @@ def judge_ablation(gathered: Gathered) -> list[Claim]:
             )
         ]
     for scenario in SCENARIO_TITLES:
-        text = "the priority mechanism matters most: without cloning or shaping, more is kept"
         for other in (NO_CLONING, NO_SHAPING):
+            text = f"the priority mechanism matters most: more is kept {other.label}"
+            paper = "above the one without TDQA"
             claims.append(
-                final_claim(gathered, scenario, "distance_m", other, [NO_TDQA], text,
-                            "above without TDQA")
-            )  # fmt: skip
+                final_claim(gathered, scenario, "distance_m", other, [NO_TDQA], text, paper)
+            )
     return claims
 
 

@@ -132,7 +132,7 @@ def judge_fig10(gathered: Gathered) -> list[Claim]:
             )  # fmt: skip
         else:
             for line in (PHIL, IA, HI):
-                text = "human-guided policies are smoother than vanilla TD3's"
+                text = f"{line.label}, guided by the human, is smoother than vanilla TD3"
                 claims.append(scene_claim(*place, line, [PER], text, "smoother", -1.0))
     return claims
 

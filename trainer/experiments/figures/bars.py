@@ -87,10 +87,10 @@ def _heat_map(panel: Any, gathered: Gathered, algorithms: Sequence[str]) -> None
             share = shares[row, column]
             missing = np.isnan(share)
             text = "–" if missing else f"{100 * share:.0f}%\n{len(outcomes)} s."
-            dark = not missing and (share < 0.25 or share > 0.8)
+            dark = not missing and share > 0.6
             panel.text(column, row, text, ha="center", va="center", fontsize=9,
                        color="white" if dark else "black")  # fmt: skip
-    panel.imshow(shares, cmap="viridis_r", vmin=0.0, vmax=1.0, aspect="auto")
+    panel.imshow(shares, cmap="YlGn", vmin=0.0, vmax=1.0, aspect="auto")
     panel.set_facecolor("0.92")
     panel.set_xticks(range(len(algorithms)), [short(name) for name in algorithms], fontsize=8)
     panel.set_yticks(range(len(SCENES)), [scene.label for scene in SCENES])
@@ -124,7 +124,10 @@ def _distance_bars(
     handles, names = panel.get_legend_handles_labels()
     once = dict(zip(names, handles, strict=True))
     if once:
-        panel.legend(once.values(), once.keys(), fontsize=7, ncols=2, loc="lower center")
+        panel.legend(
+            once.values(), once.keys(), fontsize=7, ncols=len(once), loc="upper center",
+            bbox_to_anchor=(0.5, -0.12),
+        )  # fmt: skip
     panel.set_xlabel(
         "error bar: standard deviation; stars: paired t-test against PHIL-TD3", fontsize=8
     )
@@ -154,12 +157,17 @@ def draw_guidance(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
                 (good, good / 2, means_m[0]),
                 (poor, 1 - poor / 2, means_m[1]),
             ):
-                panel.text(place, middle, f"{100 * share:.1f}%\n{mean_m:.1f} m",
-                           ha="center", va="center", fontsize=7)  # fmt: skip
+                panel.text(
+                    place, middle, f"{100 * share:.1f}%\n{mean_m:.1f} m", ha="center", va="center",
+                    fontsize=7, bbox={"facecolor": "white", "alpha": 0.7, "lw": 0, "pad": 1},
+                )  # fmt: skip
         panel.axhline(0.5, color="k", lw=0.8, ls=":")
         _finish(panel, [scene.label for scene in SCENES], bool(panel.patches))
         panel.set_xlim(-0.6, len(SCENES) - 0.4)
-        panel.set_xlabel(f"below: good guidance; above, hatched: poor; {min(counts)} seeds or more")
+        panel.set_ylim(0.0, 1.0)
+        fewest, most = min(counts), max(counts)
+        seeds = f"{most} seeds" if fewest == most else f"{fewest} to {most} seeds"
+        panel.set_xlabel(f"below: good guidance; hatched: poor; {seeds}", fontsize=8)
     figure.supylabel("share of the two mean surviving distances", fontsize=9)
     return figure
 

@@ -36,7 +36,7 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
         lines: the curves of each panel.
         by_metric: rewards above and distances below (figs. 11 to 13) instead of a row a scenario.
     """
-    figure = new_figure(10.0, 6.6)
+    figure = new_figure(10.0 if by_metric else 12.0, 6.6)
     panels = figure.subplots(2, 2, sharex="col" if by_metric else "row")
     for row, scenario in enumerate(SCENARIO_TITLES):
         for column, metric in enumerate(METRICS):
@@ -46,8 +46,16 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
                 panel, 2 * place[0] + place[1], f"{METRICS[metric]}, {SCENARIO_TITLES[scenario]}"
             )
             _draw_panel(panel, gathered, lines, scenario, metric)
+        if by_metric:
+            panels[1, row].legend(
+                fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2
+            )
+        else:
+            panels[row, 1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
     for panel in panels[1]:
-        panel.set_xlabel(f"training episode (mean of {WINDOW}; band: standard deviation of seeds)")
+        panel.set_xlabel(
+            f"training episode (mean of {WINDOW}; band: standard deviation of seeds)", fontsize=9
+        )
     return figure
 
 
@@ -74,4 +82,3 @@ def _draw_panel(
     if not panel.has_data():
         note_missing(panel)
     panel.grid(alpha=0.3)
-    panel.legend(fontsize=7, loc="lower right")
