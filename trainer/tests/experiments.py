@@ -21,3 +21,13 @@ def write_human(store: Store, data: bytes = b"a human", scenario: str = "left_tu
     path = human_file(scenario, store.humans)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
+
+
+class Soon(float):
+    """A time that is still to come when it is first looked at, and over ever after."""
+
+    looked = False
+
+    def __lt__(self, other):
+        looked, self.looked = self.looked, True
+        return looked

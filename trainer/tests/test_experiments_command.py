@@ -90,8 +90,7 @@ def test_time_is_measured_once_in_turns(capsys, places, tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "PLAN", plan)
     monkeypatch.setattr(timing, "run_config", _guided_by_the_expert)
     for _ in range(2):
-        status, out, _ = call(capsys, "experiment", "time", *places)
-        assert status == 0
+        assert call(capsys, "experiment", "time", *places)[0] == 0
         path = tmp_path / "results" / "experiments" / "time" / "measured.json"
         measured = json.loads(path.read_text())
     turns = measured["turns"]

@@ -14,7 +14,7 @@ from trainer.experiments.store import BEGUN, DONE
 from trainer.experiments.units import Unit
 from trainer.experiments.work import FINISHED, KEPT_TESTS, STOPPED, Task, compute
 from trainer.human.model import HumanModel, HumanModelConfig
-from trainer.tests.experiments import TINY, UNIT, store_in
+from trainer.tests.experiments import TINY, UNIT, Soon, store_in
 from trainer.training.run import TrainingRun
 
 
@@ -75,26 +75,12 @@ def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
     assert compute(soon, ignore) == STOPPED, "time was over before it began"
     ends, seen = [], []
     while not ends or ends[-1] == STOPPED:
-        task = _stopping_after_the_next_episode(UNIT, store)
+        task = Task(UNIT, store, stop_at_s=Soon(1e18))
         ends.append(compute(task, seen.append))
         assert store.state(UNIT) == (BEGUN if ends[-1] == STOPPED else DONE)
     assert (ends, seen) == ([STOPPED, STOPPED, FINISHED], [1, 2, 3])
     for name in ("metrics.csv", "tests.json"):
         assert kept(store, name) == kept(straight, name)
-
-
-class _Soon(float):
-    """A time that is in the future once, and then in the past."""
-
-    looked = False
-
-    def __lt__(self, other):
-        looked, self.looked = self.looked, True
-        return looked
-
-
-def _stopping_after_the_next_episode(unit, store):
-    return Task(unit, store, stop_at_s=_Soon(1e18))
 
 
 def test_tests_that_came_later_are_driven_with_the_actor_that_was_kept(
