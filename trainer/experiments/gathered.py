@@ -52,8 +52,15 @@ class Outcome:
     """Condition -> test episodes."""
 
     def curve(self, metric: str) -> Numbers:
-        """A training metric over the episodes."""
-        return np.asarray(self.metrics[metric], dtype=float)
+        """A training metric, a value an episode.
+
+        Where it is measured now and then only, as validation is, the last value holds until the
+        next; the first one holds before it, too.
+        """
+        values = np.asarray(self.metrics[metric], dtype=float)
+        measured = np.flatnonzero(~np.isnan(values))
+        last = np.searchsorted(measured, np.arange(len(values)), side="right") - 1
+        return values[measured[np.maximum(last, 0)]] if len(measured) else values
 
     @property
     def best_validation(self) -> float:

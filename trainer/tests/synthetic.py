@@ -34,6 +34,7 @@ def outcome(unit: Unit, episodes: int = 100, runs: int = 50, conditions=CONDITIO
             "episode_return": 20.0 * (learned + noise) - 10.0,
             "distance_m": full_m * np.clip(learned + noise, 0.0, 1.0),
             "validation_success": success,
+            "validation_distance_m": full_m * success,
         }
     tests = {}
     for place, condition in enumerate(conditions):

@@ -1,7 +1,8 @@
 """Every figure from a made-up store: what is there, what is partly there, and nothing at all."""
 
+from typing import Any
+
 import pytest
-from matplotlib.figure import Figure
 
 from trainer.experiments import timing
 from trainer.experiments.catalogue import EXPERIMENTS
@@ -15,12 +16,12 @@ PANELS = {"fig8": 4, "fig9": 3, "fig10": 2, "fig14": 3, "fig15": 6, "table1": 1,
 SEEDS = 2
 
 
-def draw(name: str, without=lambda unit: False) -> Figure:
+def draw(name: str, without=lambda unit: False) -> Any:
     units = EXPERIMENTS[name].units(SEEDS)
     return EXPERIMENTS[name].draw(gathered(units, SEEDS, filter(without, units)))
 
 
-def texts(figure: Figure) -> str:
+def texts(figure: Any) -> str:
     found = [text.get_text() for panel in figure.axes for text in panel.texts]
     for panel in figure.axes:
         found += [panel.get_xlabel(), panel.get_title(loc="left")]
@@ -74,7 +75,8 @@ def test_the_heat_map_shows_the_share_of_all_seeds():
     made = gathered(units, SEEDS)
     reached = [o.tests["nominal"].reached for o in made.of("left_turn", "per_td3")]
     share = sum(map(sum, reached)) / sum(map(len, reached))
-    heat = EXPERIMENTS["fig9"].draw(made).axes[0]
+    figure: Any = EXPERIMENTS["fig9"].draw(made)
+    heat = figure.axes[0]
     assert heat.texts[3].get_text() == f"{100 * share:.0f}%\n2 s."
     assert heat.images[0].get_array()[0, 3] == pytest.approx(share)
 
@@ -82,7 +84,8 @@ def test_the_heat_map_shows_the_share_of_all_seeds():
 def test_bars_are_as_high_as_the_means():
     made = gathered(EXPERIMENTS["fig8"].units(SEEDS), SEEDS)
     finals = [o.curve("distance_m")[-20:].mean() for o in made.of("left_turn", "ia_td3", "tough")]
-    panel = EXPERIMENTS["fig8"].draw(made).axes[1]
+    figure: Any = EXPERIMENTS["fig8"].draw(made)
+    panel = figure.axes[1]
     assert panel.patches[3].get_height() == pytest.approx(sum(finals) / SEEDS)
 
 

@@ -2,7 +2,8 @@
 
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 
@@ -12,6 +13,7 @@ from trainer.experiments.plan import HUMAN_MODEL, REMEDY_WEIGHT
 from trainer.experiments.units import Unit, deciding, digest, obstacle, run_config, unit_id
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.tests.experiments import GUIDED, TINY, UNIT, store_in, write_human
+from trainer.training.config import RunConfig
 
 
 @pytest.fixture
@@ -115,6 +117,23 @@ def test_settings_change_one_thing_each(humans):
         normal, learner=replace(normal.learner, saturation_weight=REMEDY_WEIGHT)
     )
     assert normal.learner.batch_size == TINY.learner["batch_size"]
+
+
+@dataclass(frozen=True)
+class WithShare(RunConfig):
+    """As the loop has it that knows poor guidance."""
+
+    poor_guidance_share: float = 0.0
+
+
+def test_poor_guidance_is_one_third_and_leaves_other_ids_alone(humans, monkeypatch):
+    poor, before = replace(GUIDED, setting="poor"), unit_id(GUIDED, TINY, humans)
+    monkeypatch.setattr(units, "RunConfig", WithShare)
+    config = run_config(poor, TINY, humans)
+    share: dict[str, Any] = {"poor_guidance_share": 1 / 3}
+    assert config == replace(run_config(GUIDED, TINY, humans), **share)
+    assert "poor_guidance_share" in deciding(poor, TINY, humans)["run"]
+    assert unit_id(GUIDED, TINY, humans) == before
 
 
 @pytest.mark.parametrize(

@@ -91,6 +91,12 @@ def driven(algorithm: str, seed: int, distances_m) -> tuple[Unit, Outcome]:
     return unit, Outcome(unit, {}, {"nominal": Drives(columns)})
 
 
+def test_validation_holds_until_the_next_one():
+    values = [np.nan, np.nan, 4.0, np.nan, 6.0, np.nan]
+    outcome = Outcome(Unit("left_turn", "phil_td3", "normal", 1), {"validation": values}, {})
+    assert outcome.curve("validation").tolist() == [4.0, 4.0, 4.0, 4.0, 6.0, 6.0]
+
+
 def test_test_episodes_are_paired_by_training_seed_and_test_seed():
     first = [driven("phil_td3", seed, [21.0, 20.0 + seed, 5.0])[1] for seed in (1, 2)]
     second = [driven("ia_td3", seed, [10.0 * seed, 21.0, 21.0])[1] for seed in (2, 3)]
@@ -139,7 +145,7 @@ def test_the_made_up_phil_wins_where_it_was_made_to():
     units = EXPERIMENTS["fig7"].units(SEEDS)
     claims = EXPERIMENTS["fig7"].judge(gathered(units, SEEDS))
     best = [one for one in claims if "best asymptotic" in one.text]
-    assert [one.holds for one in best] == ["yes"] * 4
+    assert [one.holds for one in best] == ["yes"] * 6
     seven = next(one for one in claims if one.paper == "over 7 times")
     assert seven.holds == "no"
 
@@ -149,7 +155,7 @@ def test_success_bars_are_those_of_the_best_validated_seed():
     made = gathered(units, SEEDS)
     for unit in units:
         if unit.algorithm == "phil_td3" and unit.scenario == "left_turn":
-            success = np.full(100, 0.5 + 0.1 * unit.seed)
+            success = np.full(100, 0.5 + 0.1 * unit.seed)  # tests, not these, are as good as ever
             made.found[unit] = replace(made.found[unit], metrics={"validation_success": success})
     best = made.of("left_turn", "phil_td3")[-1].tests
     bars = [one for one in EXPERIMENTS["fig9"].judge(made) if "bar of this project" in one.text]

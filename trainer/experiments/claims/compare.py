@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from trainer.experiments.figures.curves import METRICS, Line
+from trainer.experiments.figures.curves import TITLES, Line
 from trainer.experiments.gathered import Gathered, Outcome, pairs, pooled
 from trainer.experiments.plan import HUMAN_MODEL, SCENARIO_TITLES, Scene
 from trainer.experiments.statistics import (
@@ -61,7 +61,7 @@ def final_claim(
     shown = [f"{line.label} {mean_estimate(list(end.values())).text()}"
              for line, end in {ours: own, **ends}.items()]  # fmt: skip
     return claim(
-        f"{SCENARIO_TITLES[scenario]}, {METRICS[metric]}: {text}",
+        f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}",
         paper,
         ", ".join(shown),
         all_of([above(each) for each in differences]),
@@ -90,7 +90,7 @@ def speed_claim(
     are lines among which ``other`` was chosen: they must be complete, too.
     """
     own, theirs = (curves(gathered, scenario, line, metric) for line in (ours, other))
-    text = f"{SCENARIO_TITLES[scenario]}, {METRICS[metric]}: {text}"
+    text = f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}"
     if own is None or theirs is None:
         return claim(text, paper, "", "undecided", 0, BY_BOOTSTRAP, None, False)
     found = efficiency(own, theirs, common)

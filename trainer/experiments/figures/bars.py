@@ -53,8 +53,8 @@ def _difficulty_panel(
                 color=colour(algorithm), alpha=1.0 if setting == NORMAL else 0.45,
                 hatch=None if setting == NORMAL else "//",
             )  # fmt: skip
-        if len(means) == 2 and means[NORMAL] != 0.0:
-            top = max(*means.values(), 0.0)
+        if len(means) == 2 and min(means.values()) > 0.0:  # of losses a ratio says nothing
+            top = max(means.values())
             text = f"{means[TOUGH] / means[NORMAL]:.2f}"
             panel.annotate(
                 text, (place, top), (0, 12), textcoords="offset points", ha="center", fontsize=9

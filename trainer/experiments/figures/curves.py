@@ -14,6 +14,9 @@ from trainer.experiments.plan import FULL_PATH_M, NORMAL, SCENARIO_TITLES
 from trainer.experiments.statistics import WINDOW, smoothed
 
 METRICS = {"episode_return": "training reward", "distance_m": "surviving distance, m"}
+"""What learning curves show: episodes in which the human may take over."""
+ALONE = "validation_distance_m"
+TITLES = {**METRICS, ALONE: "surviving distance of the policy alone, m"}
 
 
 class Line(NamedTuple):
