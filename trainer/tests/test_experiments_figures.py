@@ -54,7 +54,7 @@ def test_other_figures_have_their_panels(name, tmp_path):
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_a_missing_seed_is_said_in_the_figure(name, tmp_path):
     figure = draw(name, lambda unit: (unit.algorithm, unit.seed) == ("phil_td3", 2))
-    marks = {"fig8": "1 + 1 seeds", "fig9": "1 s.", "fig10": "(1 seeds)", "fig14": "1 seeds"}
+    marks = {"fig8": "1 + 1 seeds", "fig9": "1 s.", "fig10": "(seeds: 1)", "fig14": "1 seeds"}
     assert marks.get(name, "(1 of 2 seeds)" if name in CURVES else "(1)") in texts(figure)
     write_figure(figure, tmp_path / "figure.png")
 

@@ -73,7 +73,8 @@ def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
     store = store_in(tmp_path)
     soon = Task(UNIT, store, stop_at_s=1.0)
     assert compute(soon, ignore) == STOPPED, "time was over before it began"
-    ends, seen = [], []
+    ends: list[str] = []
+    seen: list[int] = []
     while not ends or ends[-1] == STOPPED:
         task = Task(UNIT, store, stop_at_s=Soon(1e18))
         ends.append(compute(task, seen.append))

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from trainer.experiments.figures.style import colour, letter, new_figure, note_missing, short
 from trainer.experiments.gathered import Gathered, pairs, pooled
@@ -53,7 +54,7 @@ def _box_panel(
     quantity: Quantity,
 ) -> None:
     width = 0.8 / len(algorithms)
-    drawn: dict[str, Any] = {}
+    drawn = False
     marks = []
     for group, scene in enumerate(scenes):
         own = gathered.tested(scene, algorithms[0])
@@ -68,7 +69,7 @@ def _box_panel(
                 flierprops={"markersize": 2}, medianprops={"color": "black"},
             )  # fmt: skip
             boxes["boxes"][0].set(facecolor=colour(algorithm), alpha=0.7)
-            drawn[f"{short(algorithm)} ({len(outcomes)} seeds)"] = boxes["boxes"][0]
+            drawn = True
             first, second = pairs(own, outcomes, scene.condition, quantity.column, quantity.arrived)
             if place and len(first):
                 marks.append((x, stars(paired_t(first, second))))
@@ -79,10 +80,13 @@ def _box_panel(
     panel.set_xticks(range(len(scenes)), [scene.label for scene in scenes])
     panel.set_xlim(-0.6, len(scenes) - 0.4)
     panel.grid(alpha=0.3, axis="y")
-    if drawn:
-        panel.legend(drawn.values(), drawn.keys(), fontsize=7, loc="upper left",
-                     bbox_to_anchor=(0.0, -0.08), ncols=4)  # fmt: skip
-    else:
+    seeds = {name: len(gathered.of(scenes[0].scenario, name)) for name in algorithms}
+    named = [
+        Patch(facecolor=colour(name), alpha=0.7, label=f"{short(name)} (seeds: {seeds[name]})")
+        for name in algorithms
+    ]
+    panel.legend(handles=named, fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.08), ncols=4)
+    if not drawn:
         note_missing(panel)
 
 
