@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -151,10 +152,8 @@ def units_of(names: Iterable[str], seeds: int) -> list[Unit]:
 
     Of units that equally many need, all seeds of one algorithm come before the next algorithm.
     """
-    needed: dict[Unit, int] = {}
-    for experiment in EXPERIMENTS.values():
-        for unit in experiment.units(seeds):
-            needed[unit] = needed.get(unit, 0) + 1
+    papers = [experiment for name, experiment in EXPERIMENTS.items() if name != "remedy"]
+    needed = Counter(unit for experiment in papers for unit in experiment.units(seeds))
     wanted = [u for name in names if name != TIME for u in EXPERIMENTS[name].units(seeds)]
     unique = list(dict.fromkeys(wanted))
     # The human model takes seconds, and its absence should be known before hours of training.
