@@ -8,7 +8,7 @@ PEERS_STAMP := $(PEERS)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format bench bench-quick bench-gpu lock clean
+.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -27,6 +27,10 @@ demo: $(STAMP)  ## train with a human's guidance, export, and drive through a se
 
 test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
 	$(BIN)/python -m pytest
+
+test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
+	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
+	$(BIN)/python -m pytest -m ray trainer
 
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .

@@ -60,7 +60,7 @@ def drive_episodes_in_parallel(
     pool = ProcessPoolExecutor(jobs, context, initializer=_start_worker)
     results = []
     try:
-        with _interrupts_blocked():
+        with interrupts_blocked():
             futures: list[Future[EpisodeResult]] = [
                 pool.submit(_drive, policy, scenario, seed, condition) for seed in seeds
             ]
@@ -78,7 +78,7 @@ def drive_episodes_in_parallel(
 
 
 @contextmanager
-def _interrupts_blocked() -> Iterator[None]:
+def interrupts_blocked() -> Iterator[None]:
     """Processes started here never see ^C, which a terminal sends to all: their parent ends them.
 
     Blocked, not ignored: a ^C of this moment reaches the parent afterwards.
@@ -92,10 +92,10 @@ def _interrupts_blocked() -> Iterator[None]:
 
 def _start_worker() -> None:
     torch.set_num_threads(1)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    threading.Thread(target=die_with_parent, daemon=True).start()
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
     """A killed parent can end nobody, and a worker would wait for work for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -43,9 +43,9 @@ class ProgressBar:
         if self._bar:
             self._bar.stop()
 
-    def advance(self, figures: dict[str, str]) -> None:
-        """One more is done; ``figures`` are shown as name and value."""
-        self.done += 1
+    def advance(self, figures: dict[str, str], count: int = 1) -> None:
+        """``count`` more are done; ``figures`` are shown as name and value."""
+        self.done += count
         text = "  ".join(f"{name} {value}" for name, value in figures.items())
         if self._bar:
             self._bar.update(self._task, completed=self.done, figures=text)

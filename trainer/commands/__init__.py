@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from trainer.commands import bench, evaluate, export, human, picture, plot, train
+from trainer.commands import bench, evaluate, experiment, export, human, picture, plot, train
 
 COMMANDS: dict[str, ModuleType] = {
     "train": train,
@@ -12,5 +12,6 @@ COMMANDS: dict[str, ModuleType] = {
     "plot": plot,
     "picture": picture,
     "bench": bench,
+    "experiment": experiment,
 }
 """Name -> module with ``add_arguments(parser)``, ``run(arguments)`` and ``EXAMPLE``."""

@@ -83,8 +83,7 @@ class TrainingRun:
         metrics_writer = MetricsWriter(self.run_dir, self.episode)
         try:
             while self.episode < self.config.episodes:
-                metrics = self._episode()
-                self.episode += 1
+                metrics = self.advance()
                 last = self.episode == self.config.episodes
                 late = deadline_s is not None and time.monotonic() > deadline_s
                 self._validate(metrics, at_end=last or late)
@@ -97,6 +96,12 @@ class TrainingRun:
         finally:
             metrics_writer.close()
             self.learning.close()
+
+    def advance(self) -> EpisodeMetrics:
+        """Train one episode, without validation and checkpoint."""
+        metrics = self._episode()
+        self.episode += 1
+        return metrics
 
     def save(self) -> None:
         """Write the checkpoint."""

@@ -1,0 +1,149 @@
+"""Run the paper's experiments, draw their figures and hold the results against its claims."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import time
+from pathlib import Path
+
+import torch
+
+from edge_runtime.errors import UserError
+from trainer.commands.options import not_negative, positive, positive_float
+from trainer.experiments.catalogue import NAMES, TIME, units_of
+from trainer.experiments.plan import PLAN, QUICK
+from trainer.experiments.ray_runner import run_on_ray
+from trainer.experiments.report import (
+    directory_of,
+    draw_experiment,
+    outcome_line,
+    print_status,
+    warn_of_obstacles,
+)
+from trainer.experiments.runner import FAILED, Tally, run_units
+from trainer.experiments.store import Store
+from trainer.experiments.summary import BEGIN, write_summary
+from trainer.experiments.units import Unit
+from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task
+
+EXAMPLE = "example: python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60"
+ALL, STATUS, SUMMARY = "all", "status", "summary"
+DEFAULT_SEEDS = 3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "names",
+        nargs="+",
+        metavar="NAME",
+        choices=[*NAMES, ALL, STATUS, SUMMARY],
+        help=f"{', '.join(NAMES)}; {ALL}; {STATUS}: what is done, running and missing; "
+        f"{SUMMARY}: write the table of RESULTS/README.md again",
+    )
+    parser.add_argument(
+        "--seeds", type=positive, default=DEFAULT_SEEDS, help="seeds of each training run"
+    )
+    parser.add_argument(
+        "--jobs",
+        type=not_negative,
+        default=0,
+        metavar="N",
+        help="processes of one thread each; 0: one a core",
+    )
+    parser.add_argument(
+        "--max-minutes",
+        type=positive_float,
+        default=None,
+        metavar="MIN",
+        help="begin nothing after this time, and stop what runs at its next checkpoint, five "
+        "episodes apart; the same command goes on from there (default: no limit)",
+    )
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learners' device")
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="compute on a Ray cluster instead of this machine: HOST:PORT, auto or local",
+    )
+    parser.add_argument(
+        "--draw-only", action="store_true", help="draw and judge what is there; compute nothing"
+    )
+    parser.add_argument(
+        "--results", default="results", metavar="DIR", help="results and figures, to be committed"
+    )
+    parser.add_argument(
+        "--runs", default="runs", metavar="DIR", help="checkpoints and actors, not committed"
+    )
+    parser.add_argument(
+        "--humans",
+        metavar="DIR",
+        help="holds a human model for each scenario: DIR/left_turn, ... (default: RESULTS/humans)",
+    )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="a few episodes of everything, kept in RUNS/quick: a look whose figures mean nothing",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Compute, draw and judge; returns the exit status."""
+    store, names = _store(arguments), _names(arguments.names)
+    if STATUS in arguments.names:
+        print_status(store, names, arguments.seeds)
+        return 0
+    tally = Tally(0)
+    if not arguments.draw_only and names:
+        tally = _compute(arguments, store, units_of(names, arguments.seeds))
+    for name in names:
+        late = tally.count(STOPPED) > 0 and name == TIME
+        verdict = draw_experiment(
+            store, name, arguments.seeds, arguments.device, arguments.draw_only or late
+        )
+        print(outcome_line(verdict, directory_of(store, name)))
+    if write_summary(store.results, NAMES):
+        print(f"table of all verdicts: {store.results / 'README.md'}")
+    elif SUMMARY in arguments.names:
+        raise UserError(f"{store.results / 'README.md'} has no line {BEGIN!r} for the table")
+    _say_what_is_left(tally)
+    return 1 if tally.count(FAILED) else 0
+
+
+def _store(arguments: argparse.Namespace) -> Store:
+    results, runs = Path(arguments.results), Path(arguments.runs)
+    humans = Path(arguments.humans) if arguments.humans else results / "humans"
+    if arguments.quick:
+        return Store(QUICK, runs / "quick" / "results", runs / "quick", humans)
+    return Store(PLAN, results, runs, humans)
+
+
+def _names(given: list[str]) -> list[str]:
+    """The experiments that are meant, in the catalogue's order."""
+    chosen = set(given)
+    if ALL in chosen or chosen == {STATUS}:
+        return list(NAMES)
+    return [name for name in NAMES if name in chosen]
+
+
+def _compute(arguments: argparse.Namespace, store: Store, units: list[Unit]) -> Tally:
+    if arguments.device == "cuda" and not arguments.ray and not torch.cuda.is_available():
+        raise UserError("no CUDA device is available; use --device cpu")
+    limit = arguments.max_minutes
+    stop_at_s = math.inf if limit is None else time.time() + 60.0 * limit
+    left = [unit for unit in warn_of_obstacles(store, units) if not store.done(unit)]
+    if not left:
+        return Tally(0)
+    tasks = [Task(unit, store, arguments.device, stop_at_s) for unit in left]
+    if arguments.ray:
+        return run_on_ray(tasks, arguments.ray)
+    return run_units(tasks, arguments.jobs or len(os.sched_getaffinity(0)))
+
+
+def _say_what_is_left(tally: Tally) -> None:
+    if tally.total and tally.count(FINISHED) < tally.total:
+        ends = ((STOPPED, "stopped for lack of time"), (BUSY, "elsewhere"), (FAILED, "failed"))
+        said = ", ".join(f"{tally.count(end)} {words}" for end, words in ends if tally.count(end))
+        print(f"{tally.count(FINISHED)} of {tally.total} units computed, {said}; "
+              "the same command goes on")  # fmt: skip

@@ -1,0 +1,1 @@
+"""The paper's experiments: training runs, where they are kept, how they are drawn and judged."""

@@ -1,0 +1,98 @@
+"""Claims about poor guidance: figs. 14 and 15."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from trainer.experiments.claims.compare import BY_SEED, complete, scene_claim
+from trainer.experiments.claims.learning import HI, IA, PHIL
+from trainer.experiments.figures.curves import Line
+from trainer.experiments.figures.spread import SMOOTHNESS
+from trainer.experiments.gathered import Gathered, Outcome
+from trainer.experiments.plan import POOR, SCENARIO_TITLES, SCENES, Scene
+from trainer.experiments.statistics import Estimate, above, mean_estimate
+from trainer.experiments.verdict import Claim, claim
+
+POOR_LOSS = 0.02
+"""Share of its surviving distance that poor guidance may cost PHIL-TD3."""
+PAPER_CHANGES = {"phil_td3": "nearly 0 %", "ia_td3": "loses 2.1 %", "hi_td3": "gains 3.6 %"}
+
+
+def judge_fig14(gathered: Gathered) -> list[Claim]:
+    """What poor guidance costs."""
+    changes = {line: _changes(gathered, line) for line in (PHIL, IA, HI)}
+    rules = {
+        PHIL: (f"poor guidance costs PHIL-TD3 at most {POOR_LOSS:.0%} (bar of this project)",
+               POOR_LOSS, 1.0),
+        IA: ("poor guidance degrades IA-TD3", 0.0, -1.0),
+        HI: ("poor guidance does not degrade HI-TD3", 0.0, 1.0),
+    }  # fmt: skip
+    claims = []
+    for line, (text, allowed, sign) in rules.items():
+        found = mean_estimate(list(changes[line].values()))
+        low, high = sorted((sign * found.low, sign * found.high))
+        holds = above(Estimate(sign * found.value, low, high, found.size), -allowed)
+        percent = Estimate(100 * found.value, 100 * found.low, 100 * found.high, found.size)
+        claims.append(
+            claim(
+                f"{text}, mean over the scenes",
+                PAPER_CHANGES[line.algorithm],
+                f"change of the surviving distance {percent.text(1)} %",
+                holds,
+                found.size,
+                "95 % interval over the seeds",
+                percent,
+                _guided_complete(gathered, line),
+            )
+        )
+    shared = [s for s in changes[PHIL] if s in changes[IA]]
+    found = mean_estimate([changes[PHIL][s] - changes[IA][s] for s in shared])
+    claims.append(
+        claim(
+            "PHIL-TD3 is more robust to poor guidance than IA-TD3",
+            "more",
+            f"difference of the changes {100 * found.value:.1f} percentage points",
+            above(found),
+            found.size,
+            BY_SEED,
+            None,
+            _guided_complete(gathered, PHIL) and _guided_complete(gathered, IA),
+        )
+    )
+    return claims
+
+
+def _changes(gathered: Gathered, line: Line) -> dict[int, float]:
+    """Training seed -> relative change of the distance under poor guidance, mean over the scenes
+    in which both policies of the seed were tested.
+    """
+    by_seed: dict[int, list[float]] = {}
+    for scene in SCENES:
+        good = _means(gathered.tested(scene, line.algorithm), scene)
+        poor = _means(gathered.tested(scene, line.algorithm, POOR), scene)
+        for seed in good.keys() & poor.keys():
+            by_seed.setdefault(seed, []).append(poor[seed] / good[seed] - 1.0)
+    return {seed: float(np.mean(changes)) for seed, changes in sorted(by_seed.items())}
+
+
+def _means(outcomes: list[Outcome], scene: Scene) -> Mapping[int, float]:
+    return {o.unit.seed: float(o.tests[scene.condition]["distance_m"].mean()) for o in outcomes}
+
+
+def _guided_complete(gathered: Gathered, line: Line) -> bool:
+    both = [line, Line(line.algorithm, POOR)]
+    return all(complete(gathered, scenario, both) for scenario in SCENARIO_TITLES)
+
+
+def judge_fig15(gathered: Gathered) -> list[Claim]:
+    """Smoothness under poor guidance."""
+    phil, ia, hi = (Line(line.algorithm, POOR) for line in (PHIL, IA, HI))
+    return [
+        scene_claim(
+            gathered, scene, SMOOTHNESS[scene.scenario].column, phil, [ia, hi],
+            "PHIL-TD3 drives most smoothly under poor guidance", "smallest acceleration", -1.0,
+        )
+        for scene in SCENES
+    ]  # fmt: skip

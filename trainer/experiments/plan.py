@@ -1,0 +1,78 @@
+"""How much is trained and tested for the paper's experiments: one table of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+HUMAN_MODEL = "human_model"
+"""Stands in an algorithm's place where the human model itself is tested: nothing is trained."""
+
+NORMAL, TOUGH, POOR, REMEDY = SETTINGS = ("normal", "tough", "poor", "remedy")
+"""Section VI's definition; one frame instead of two; one third of the demonstrations random; a
+price on the action before tanh, for algorithms whose policy saturates."""
+
+POOR_SHARE = 1.0 / 3.0
+"""Demonstrations replaced by random actions in the poor setting (section VII-E)."""
+REMEDY_WEIGHT = 0.1
+"""``saturation_weight`` of the remedy. Not in the paper; measured on one run of a prototype."""
+
+
+class Scene(NamedTuple):
+    """One of the six test scenes of section VII-D."""
+
+    scenario: str
+    condition: str
+    label: str
+    """As in the paper's fig. 9."""
+    title: str
+
+
+SCENES = (
+    Scene("left_turn", "nominal", "L", "left turn"),
+    Scene("left_turn", "noise", "L-N", "left turn, noise"),
+    Scene("left_turn", "variant", "L-V", "left turn, variant"),
+    Scene("congestion", "nominal", "C", "congestion"),
+    Scene("congestion", "noise", "C-N", "congestion, noise"),
+    Scene("congestion", "variant", "C-V", "congestion, variant"),
+)
+SCENARIO_TITLES = {"left_turn": "left turn", "congestion": "congestion"}
+FULL_PATH_M = {"left_turn": 21.0, "congestion": 80.0}
+"""Distance from start to goal."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What every training run of the experiments has in common."""
+
+    episodes: Mapping[str, int]
+    """Scenario -> episodes of a run."""
+    evaluate_every: int = 10
+    """Episodes between two validations; the best validated actor is the one that is tested."""
+    evaluation_runs: int = 20
+    """Episodes of a validation."""
+    test_runs: int = 50
+    """Test episodes in each scene, with the seeds 0, 1, ... for every policy (section VII-D)."""
+    checkpoint_every: int = 5
+    """Episodes between two checkpoints; it decides what a kill costs, not what a run gives."""
+    learner: Mapping[str, Any] = field(default_factory=dict)
+    """Hyper-parameters that differ from the defaults, for every algorithm alike."""
+    timed_steps: int = 10_000
+    """Training steps of each algorithm that are timed (the paper's table of time efficiency)."""
+    turn_steps: int = 100
+    """Least steps of an algorithm before the next one has its turn."""
+
+
+PLAN = Plan(episodes={"left_turn": 200, "congestion": 150})
+QUICK = Plan(
+    episodes={"left_turn": 3, "congestion": 3},
+    evaluate_every=2,
+    evaluation_runs=1,
+    test_runs=3,
+    checkpoint_every=1,
+    learner={"batch_size": 4, "warmup_steps": 16},
+    timed_steps=40,
+    turn_steps=10,
+)
+"""A look at the whole way in a minute or two; its figures mean nothing."""

@@ -1,0 +1,153 @@
+"""Means, intervals and tests, and how fast one curve gets where another one ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from trainer.plots import moving_average
+
+Numbers = NDArray[np.float64]
+Holds = Literal["yes", "no", "undecided"]
+CONFIDENCE = 0.95
+WINDOW = 20
+"""Episodes over which curves are smoothed, and final averages taken."""
+RESAMPLES = 2000
+
+
+class Estimate(NamedTuple):
+    """A number with its interval; the interval is infinite where there is too little to say."""
+
+    value: float
+    low: float
+    high: float
+    size: int
+    """Values behind it."""
+
+    def text(self, digits: int = 2, unit: str = "") -> str:
+        """As in "0.97 [0.93, 0.99]"."""
+        shown = f"{self.value:.{digits}f}{unit}"
+        if not np.isfinite([self.low, self.high]).all():
+            return shown
+        return f"{shown} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
+
+
+NOTHING = Estimate(float("nan"), float("-inf"), float("inf"), 0)
+
+
+def mean_estimate(values: Sequence[float] | Numbers) -> Estimate:
+    """Mean and Student's 95 % interval; no interval for fewer than two values."""
+    numbers = np.asarray(values, dtype=float)
+    if len(numbers) == 0:
+        return NOTHING
+    mean = float(numbers.mean())
+    if len(numbers) == 1:
+        return Estimate(mean, float("-inf"), float("inf"), 1)
+    error = float(numbers.std(ddof=1)) / len(numbers) ** 0.5
+    reach = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, len(numbers) - 1)) * error
+    return Estimate(mean, mean - reach, mean + reach, len(numbers))
+
+
+def success_estimate(successes: int, count: int) -> Estimate:
+    """Share of successes and Wilson's 95 % interval."""
+    if count == 0:
+        return NOTHING
+    interval = stats.binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
+    return Estimate(successes / count, float(interval.low), float(interval.high), count)
+
+
+def above(difference: Estimate, least: float = 0.0) -> Holds:
+    """Whether a number is above ``least``: decided where the interval lies on one side."""
+    if difference.low > least:
+        return "yes"
+    return "no" if difference.high < least else "undecided"
+
+
+def all_of(answers: Sequence[Holds]) -> Holds:
+    """Yes where all are, no where one is not."""
+    if "no" in answers or not answers:
+        return "no" if answers else "undecided"
+    return "yes" if set(answers) == {"yes"} else "undecided"
+
+
+def paired_t(first: Numbers, second: Numbers) -> float:
+    """P value of the paired t-test (two-sided); 1 where the pairs do not differ or are too few."""
+    difference = np.asarray(first, dtype=float) - np.asarray(second, dtype=float)
+    if len(difference) < 2 or np.all(difference == 0.0):
+        return 1.0
+    if np.all(difference == difference[0]):
+        return 0.0  # scipy divides by a spread of zero
+    return float(stats.ttest_rel(first, second).pvalue)
+
+
+def stars(p_value: float) -> str:
+    """The usual marks of significance."""
+    marks = ((0.001, "***"), (0.01, "**"), (0.05, "*"))
+    return next((mark for limit, mark in marks if p_value < limit), "n.s.")
+
+
+def smoothed(curves: Sequence[Numbers]) -> Numbers:
+    """Curves of several seeds, each a moving average: float [seeds, episodes]."""
+    shortest = min(len(curve) for curve in curves)
+    return np.stack([moving_average(curve[:shortest], WINDOW) for curve in curves])
+
+
+def final_average(curve: Numbers) -> float:
+    """Mean over the last episodes."""
+    return float(np.mean(curve[-WINDOW:]))
+
+
+def episodes_to_reach(curve: Numbers, level: float) -> float:
+    """Episodes until a smoothed curve first reaches a level; infinite where it never does.
+
+    The first episodes count only once the average is one of ``WINDOW`` values: before, one lucky
+    episode would do.
+    """
+    start = min(WINDOW, len(curve)) - 1
+    reached = np.flatnonzero(curve[start:] >= level - 1e-9)
+    return float(reached[0] + start + 1) if len(reached) else float("inf")
+
+
+class Efficiency(NamedTuple):
+    """How much sooner a learner gets where the best baseline ends."""
+
+    ratio: Estimate
+    """The baseline's episodes over the learner's; 95 % bootstrap interval over the seeds."""
+    episodes: float
+    baseline_episodes: float
+
+
+def efficiency(ours: Numbers, baseline: Numbers, common: bool = False) -> Efficiency:
+    """Compare smoothed curves float [seeds, episodes] by the episodes that their means need.
+
+    The level is the final value of the baseline's mean, or the lower of both where it is to be a
+    ``common`` one. A learner that never gets there has the ratio 0. The bootstrap draws whole
+    seeds, of both independently, 2000 times; with few seeds it understates the spread.
+    """
+
+    def needed(own: Numbers, other: Numbers) -> tuple[float, float]:
+        curves = (own.mean(axis=0), other.mean(axis=0))
+        level = min(curve[-1] for curve in curves) if common else curves[1][-1]
+        first, second = (episodes_to_reach(curve, level) for curve in curves)
+        return first, second
+
+    episodes, baseline_episodes = needed(ours, baseline)
+    count = min(len(ours), len(baseline))
+    low, high = float("-inf"), float("inf")
+    if count > 1:
+        random = np.random.default_rng(0)
+        ratios = []
+        for _ in range(RESAMPLES):
+            own = ours[random.integers(len(ours), size=len(ours))]
+            other = baseline[random.integers(len(baseline), size=len(baseline))]
+            first, second = needed(own, other)
+            ratios.append(second / first)
+        tail = 0.5 * (1.0 - CONFIDENCE)
+        low, high = (float(x) for x in np.quantile(ratios, (tail, 1.0 - tail)))
+    return Efficiency(
+        Estimate(baseline_episodes / episodes, low, high, count), episodes, baseline_episodes
+    )

@@ -1,0 +1,169 @@
+"""Where units live: a working directory while they are computed, a small result when they are.
+
+``runs/units/<unit>/`` holds checkpoint and actor and is not committed; ``results/units/...`` holds
+what the figures need and is. A result appears there in one rename, whole.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from edge_runtime.errors import UserError
+from edge_runtime.files import write_atomic
+from trainer.evaluation import CONDITIONS
+from trainer.experiments.plan import Plan
+from trainer.experiments.units import Unit, obstacle, unit_id
+from trainer.files import make_directory
+from trainer.training.metrics import METRICS_FILE
+
+UNIT_FILE = "config.json"
+TESTS_FILE = "tests.json"
+RESULT_FILES = (UNIT_FILE, METRICS_FILE, TESTS_FILE)
+DONE, RUNNING, BEGUN, MISSING, IMPOSSIBLE = (
+    "done",
+    "running",
+    "begun",
+    "missing",
+    "impossible",
+)
+"""What a unit can be: computed; being computed by a living process; stopped or killed with a
+checkpoint; not begun; not possible in this version."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """Units of one plan.
+
+    Args:
+        plan: what every run has in common; another plan gives other ids.
+        results: directory that is committed.
+        runs: directory that is not.
+        humans: directory with a human model for each scenario.
+    """
+
+    plan: Plan
+    results: Path
+    runs: Path
+    humans: Path
+
+    def id(self, unit: Unit) -> str:
+        """Of what decides the unit's result."""
+        return unit_id(unit, self.plan, self.humans)
+
+    def result_dir(self, unit: Unit) -> Path:
+        """Where the unit's result is, or will be."""
+        place = self.results / "units" / unit.scenario / unit.algorithm / unit.setting
+        return place / f"seed_{unit.seed}-{self.id(unit)}"
+
+    def run_dir(self, unit: Unit) -> Path:
+        """The unit's working directory."""
+        name = f"{unit.scenario}-{unit.algorithm}-{unit.setting}-{unit.seed}-{self.id(unit)}"
+        return self.runs / "units" / name
+
+    def done(self, unit: Unit) -> bool:
+        """Whether the result is there, with tests in every condition that this version knows."""
+        try:
+            tests = json.loads((self.result_dir(unit) / TESTS_FILE).read_bytes())
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except ValueError as error:
+            raise UserError(f"{self.result_dir(unit) / TESTS_FILE} is broken: {error}") from error
+        return set(CONDITIONS) <= set(tests)
+
+    def state(self, unit: Unit) -> str:
+        """One of done, running, begun, missing, impossible."""
+        if obstacle(unit, self.humans):
+            return IMPOSSIBLE
+        if self.done(unit):
+            return DONE
+        run_dir = self.run_dir(unit)
+        if not run_dir.is_dir():
+            return MISSING
+        with self.lock(unit) as free:
+            if not free:
+                return RUNNING
+        return BEGUN if (run_dir / METRICS_FILE).is_file() else MISSING
+
+    def put(self, unit: Unit, files: Mapping[str, bytes]) -> None:
+        """Store a result: it is there whole, or not at all, whenever the process is killed."""
+        target = self.result_dir(unit)
+        make_directory(target.parent)
+        _sweep(target.parent)
+        fresh = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=target.parent))
+        for name in RESULT_FILES:
+            if name in files:
+                write_atomic(fresh / name, files[name])
+        fresh.chmod(0o755)
+        if target.exists():  # without a condition that came later
+            target.rename(Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=target.parent)) / "old")
+        fresh.rename(target)
+        _sweep(target.parent)
+
+    @contextmanager
+    def lock(self, unit: Unit) -> Iterator[bool]:
+        """Hold the unit against other processes; gives whether that was possible.
+
+        The lock is the kernel's, on a file that names its holder: when a process dies, however it
+        dies, its lock is gone with it, and the next one takes over.
+        """
+        path = self.lock_file(unit)
+        make_directory(path.parent)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                yield False
+                return
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, json.dumps(_me()).encode(), 0)
+            yield True
+            os.ftruncate(descriptor, 0)
+        finally:
+            os.close(descriptor)
+
+    def lock_file(self, unit: Unit) -> Path:
+        """Beside the working directory; it stays, since removing it would let two in."""
+        run_dir = self.run_dir(unit)
+        return run_dir.with_name(f"{run_dir.name}.lock")
+
+    def holder(self, unit: Unit) -> str:
+        """Who holds the unit's lock, in words."""
+        try:
+            who = json.loads(self.lock_file(unit).read_bytes())
+        except (OSError, ValueError):
+            return "another process"
+        return f"process {who['pid']} on {who['host']}"
+
+
+_TEMPORARY = ".unfinished-"
+_ABANDONED_S = 600.0
+"""A result is a few small files, written in far less."""
+
+
+def _sweep(directory: Path) -> None:
+    """Remove what a killed ``put`` left; nobody reads it. Another process's own is left alone."""
+    for path in directory.glob(f"{_TEMPORARY}*"):
+        if path.is_dir() and _abandoned(path):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _abandoned(path: Path) -> bool:
+    try:
+        return (path / "old").exists() or time.time() - path.stat().st_mtime > _ABANDONED_S
+    except FileNotFoundError:
+        return False
+
+
+def _me() -> dict[str, object]:
+    return {"pid": os.getpid(), "host": socket.gethostname()}

@@ -1,0 +1,116 @@
+"""What an experiment says about the paper's claims, to be read by people and programs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from edge_runtime.files import write_atomic, write_json
+from trainer.experiments.gathered import Gathered
+from trainer.experiments.statistics import Estimate, Holds
+
+VERDICT_FILE, READABLE_FILE = "verdict.json", "verdict.md"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim, and what we measured about it."""
+
+    text: str
+    """The paper's claim, or a bar of this project, quoted short."""
+    paper: str
+    """The paper's number; a dash where it gives none."""
+    ours: str
+    """Our number, in words."""
+    holds: Holds
+    seeds: int
+    """Training seeds behind our number; the fewest, where several algorithms are compared."""
+    rule: str
+    """How it was decided."""
+    interval: tuple[float, float] | None = None
+    """95 % interval of the number that decides."""
+
+
+def claim(
+    text: str,
+    paper: str,
+    ours: str,
+    holds: Holds,
+    seeds: int,
+    rule: str,
+    decisive: Estimate | None = None,
+    complete: bool = True,
+) -> Claim:
+    """A claim; undecided wherever units are missing, whatever the numbers say so far."""
+    interval = None
+    if decisive is not None and math.isfinite(decisive.low) and math.isfinite(decisive.high):
+        interval = (decisive.low, decisive.high)
+    if seeds == 0:
+        ours = "not measured"
+    if not complete:
+        holds, rule = "undecided", f"{rule}; units are missing"
+    return Claim(text, paper, ours, holds, seeds, rule, interval)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """An experiment's outcome."""
+
+    name: str
+    title: str
+    claims: Sequence[Claim]
+    wanted: int
+    """Units that the experiment needs."""
+    missing: Sequence[str]
+    """Those that are not finished."""
+    figure: str | None
+    seeds: int
+
+    @property
+    def command(self) -> str:
+        """What makes it."""
+        return f"python -m trainer experiment {self.name} --seeds {self.seeds}"
+
+
+def verdict_of(
+    name: str, title: str, claims: Sequence[Claim], gathered: Gathered, figure: str
+) -> Verdict:
+    """The verdict of what was gathered."""
+    missing = [str(unit) for unit in gathered.missing]
+    return Verdict(name, title, claims, len(gathered.wanted), missing, figure, gathered.seeds)
+
+
+def write_verdict(verdict: Verdict, directory: Path) -> None:
+    """Write it as JSON and as Markdown."""
+    write_json(directory / VERDICT_FILE, as_dict(verdict))
+    write_atomic(directory / READABLE_FILE, markdown(verdict).encode())
+
+
+def as_dict(verdict: Verdict) -> dict[str, Any]:
+    """Plain values, for JSON."""
+    return {**asdict(verdict), "command": verdict.command}
+
+
+def markdown(verdict: Verdict) -> str:
+    """The verdict as a page."""
+    done = verdict.wanted - len(verdict.missing)
+    lines = [f"# {verdict.name}: {verdict.title}", ""]
+    if verdict.figure:
+        lines += [f"![{verdict.title}]({verdict.figure})", ""]
+    if verdict.wanted:
+        lines += [f"{done} of {verdict.wanted} training runs and tests, {verdict.seeds} seeds.", ""]
+    lines += [f"`{verdict.command}`", ""]
+    lines += ["| claim | paper | ours | seeds | holds | decided by |", "|---|---|---|---|---|---|"]
+    for one in verdict.claims:
+        cells = (one.text, one.paper, one.ours, str(one.seeds), one.holds, one.rule)
+        lines.append(f"| {' | '.join(map(_cell, cells))} |")
+    if verdict.missing:
+        lines += ["", "Missing:", "", *(f"- {unit}" for unit in verdict.missing)]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")

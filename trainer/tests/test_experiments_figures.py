@@ -1,0 +1,99 @@
+"""Every figure from a made-up store: what is there, what is partly there, and nothing at all."""
+
+from typing import Any
+
+import pytest
+
+from trainer.experiments import timing
+from trainer.experiments.catalogue import EXPERIMENTS
+from trainer.experiments.figures.style import LABELS, write_figure
+from trainer.learner.algorithms import ALGORITHMS
+from trainer.tests.synthetic import gathered
+
+CURVES = {"fig7": 4, "fig11": 3, "fig12": 3, "fig13": 3, "ablation": 4, "remedy": 5}
+"""Experiment -> curves in each panel."""
+PANELS = {"fig8": 4, "fig9": 3, "fig10": 2, "fig14": 3, "fig15": 6, "table1": 1, "table2": 1}
+SEEDS = 2
+
+
+def draw(name: str, without=lambda unit: False) -> Any:
+    units = EXPERIMENTS[name].units(SEEDS)
+    return EXPERIMENTS[name].draw(gathered(units, SEEDS, filter(without, units)))
+
+
+def texts(figure: Any) -> str:
+    found = [text.get_text() for panel in figure.axes for text in panel.texts]
+    for panel in figure.axes:
+        found += [panel.get_xlabel(), panel.get_title(loc="left")]
+        found += [label.get_text() for label in panel.get_xticklabels()]
+        if panel.get_legend():
+            found += [text.get_text() for text in panel.get_legend().get_texts()]
+    return "\n".join(found)
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_learning_curves_have_a_line_and_a_band_for_each_algorithm(name):
+    figure = draw(name)
+    assert len(figure.axes) == 4
+    for panel in figure.axes:
+        curves = [line for line in panel.get_lines() if len(line.get_xdata()) == 100]
+        assert len(curves) == len(panel.collections) == CURVES[name]
+        assert len({(line.get_color(), line.get_linestyle()) for line in curves}) == CURVES[name]
+    assert texts(figure).count(f"({SEEDS} of {SEEDS} seeds)") == 2 * CURVES[name]
+
+
+@pytest.mark.parametrize("name", PANELS)
+def test_other_figures_have_their_panels(name, tmp_path):
+    figure = draw(name)
+    assert len(figure.axes) == PANELS[name]
+    assert "no data yet" not in texts(figure)
+    write_figure(figure, tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_a_missing_seed_is_said_in_the_figure(name, tmp_path):
+    figure = draw(name, lambda unit: (unit.algorithm, unit.seed) == ("phil_td3", 2))
+    marks = {"fig8": "1 + 1 seeds", "fig9": "1 s.", "fig10": "(seeds: 1)", "fig14": "1 seeds"}
+    assert marks.get(name, "(1 of 2 seeds)" if name in CURVES else "(1)") in texts(figure)
+    write_figure(figure, tmp_path / "figure.png")
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_a_figure_of_nothing_can_be_drawn(name, tmp_path):
+    figure = draw(name, lambda unit: True)
+    write_figure(figure, tmp_path / "figure.png")
+    assert (
+        "no data yet" in texts(figure)
+        or "(0 of 2 seeds)" in texts(figure)
+        or "(0)" in texts(figure)
+    )
+
+
+def test_the_heat_map_shows_the_share_of_all_seeds():
+    units = EXPERIMENTS["fig9"].units(SEEDS)
+    made = gathered(units, SEEDS)
+    reached = [o.tests["nominal"].reached for o in made.of("left_turn", "per_td3")]
+    share = sum(map(sum, reached)) / sum(map(len, reached))
+    figure: Any = EXPERIMENTS["fig9"].draw(made)
+    heat = figure.axes[0]
+    assert heat.texts[3].get_text() == f"{100 * share:.0f}%\n2 s."
+    assert heat.images[0].get_array()[0, 3] == pytest.approx(share)
+
+
+def test_bars_are_as_high_as_the_means():
+    made = gathered(EXPERIMENTS["fig8"].units(SEEDS), SEEDS)
+    finals = [o.curve("distance_m")[-20:].mean() for o in made.of("left_turn", "ia_td3", "tough")]
+    figure: Any = EXPERIMENTS["fig8"].draw(made)
+    panel = figure.axes[1]
+    assert panel.patches[3].get_height() == pytest.approx(sum(finals) / SEEDS)
+
+
+def test_time_is_drawn_with_and_without_a_measurement(tmp_path):
+    turns = {name: [(100, 3.0), (100, 5.0)] for name in timing.PAPER_S}
+    assert texts(timing.draw(turns)).count("400 s") == 4
+    assert "no data yet" in texts(timing.draw(None))
+
+
+def test_every_algorithm_has_a_name_in_the_figures():
+    assert set(ALGORITHMS) <= set(LABELS)
