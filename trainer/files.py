@@ -6,6 +6,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from edge_runtime.errors import UserError
@@ -32,6 +33,22 @@ def load_torch(path: Path) -> Any:
     except Exception as error:
         # torch raises its own unpickling errors for foreign files.
         raise UserError(f"{path} is not a checkpoint of this project") from error
+
+
+def as_tensors(values: dict[str, Any]) -> dict[str, Any]:
+    """The same with arrays as tensors: what ``load_torch`` reads without arbitrary unpickling."""
+    return {
+        name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+        for name, value in values.items()
+    }
+
+
+def as_arrays(values: dict[str, Any]) -> dict[str, Any]:
+    """The inverse of ``as_tensors``."""
+    return {
+        name: value.numpy() if isinstance(value, torch.Tensor) else value
+        for name, value in values.items()
+    }
 
 
 def make_directory(path: Path) -> None:

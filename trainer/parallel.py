@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -28,7 +29,14 @@ half of the 25 ms that an episode with a network takes (10 ms with the expert)."
 
 def choose_jobs(runs: int) -> int:
     """How many processes drive ``runs`` episodes soonest: this one alone, or one a core."""
-    return min(len(os.sched_getaffinity(0)), runs) if runs >= WORTH_STARTING else 1
+    return min(cores(), runs) if runs >= WORTH_STARTING else 1
+
+
+def cores() -> int:
+    """Processor cores that this process may use, where the system tells; else all."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def drive_episodes_in_parallel(

@@ -12,6 +12,8 @@ Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
 FROM_ONE: Range = (1, math.inf)
 FROM_ZERO: Range = (0, math.inf)
+ABOVE_ZERO: Range = (2.0**-126, math.inf)
+"""From float32's smallest normal number on: what is less may become zero on its way."""
 SHARE: Range = (0, 1)
 
 
@@ -26,4 +28,6 @@ def check_ranges(config: Any, ranges: Mapping[str, Range]) -> None:
 def _text(low: float, high: float) -> str:
     if math.isinf(low):
         return "it must be a finite number"
+    if (low, high) == ABOVE_ZERO:
+        return "it must be above 0"
     return f"at least {low}" if math.isinf(high) else f"{low} to {high}"

@@ -2,6 +2,8 @@
 
 Runs are what they are in use: processes of ``python -m trainer train``, here without validation and
 checkpoints. They are watched through their metrics, and ended once each has taken its steps.
+Several algorithms or seeds at once are plain processes: without NVIDIA's MPS, which nothing here
+starts, the GPU works for one process at a time, in slices.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""The learner's whole update against its peers, in turn."""
+"""The learner's whole update against its peers, in turn.
+
+Each learns from a buffer of 1,000 transitions, not the paper's 100,000: what a full one costs is in
+``replay.py``.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,7 @@ from trainer.benches.turns import Contender, Rounds, Tick, compare, median, take
 from trainer.benches.updates import Learner, Updates
 from trainer.learner.algorithms import PHIL
 from trainer.learner.config import LearnerConfig
+from trainer.learner.precision import multiplies_bfloat16
 from trainer.learner.reference import ReferenceLearner
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import TD3Learner
@@ -31,6 +36,8 @@ SB3_SCRIPT = Path(__file__).with_name("sb3_td3.py")
 def measure_learner(effort: Effort, sb3_python: Path | None, tick: Tick) -> dict[str, Any]:
     """Milliseconds of a PHIL-TD3 update, of its reference and of Stable-Baselines3's TD3.
 
+    Ours in float32 is beside them where the processor has bfloat16; elsewhere ours is just that.
+
     Args:
         effort: rounds, and updates a round.
         sb3_python: an interpreter that has Stable-Baselines3; without it that peer is left out.
@@ -38,11 +45,12 @@ def measure_learner(effort: Effort, sb3_python: Path | None, tick: Tick) -> dict
     """
     config, experience = LearnerConfig(batch_size=effort.batch_size), gather(TRANSITIONS)
     count = effort.updates_per_round
-    learners: dict[str, Learner] = {
-        OURS: TD3Learner(config, PHIL, seed=0),
-        FLOAT32: TD3Learner(replace(config, precision="float32"), PHIL, seed=0),
-        REFERENCE: ReferenceLearner(config, PHIL, seed=0),
-    }
+    precision = _precision(config)
+    learners: dict[str, Learner] = {OURS: TD3Learner(config, PHIL, seed=0)}
+    if precision != "float32":
+        single = replace(config, precision="float32")
+        learners[FLOAT32] = TD3Learner(single, PHIL, seed=0)
+    learners[REFERENCE] = ReferenceLearner(config, PHIL, seed=0)
     updates = {name: _updates(learner, config, experience) for name, learner in learners.items()}
     contenders: dict[str, Contender] = {
         name: partial(own.run, count) for name, own in updates.items()
@@ -55,6 +63,8 @@ def measure_learner(effort: Effort, sb3_python: Path | None, tick: Tick) -> dict
         times_ms = take_turns(contenders, effort.learner_rounds, tick)
     return {
         "batch_size": config.batch_size,
+        "transitions": TRANSITIONS,
+        "precision": precision,
         "rounds": effort.learner_rounds,
         "updates_per_round": count,
         **summary(times_ms, about),
@@ -77,6 +87,11 @@ def summary(times_ms: dict[str, Rounds], about: dict[str, Any]) -> dict[str, Any
             if name != OURS
         },
     }
+
+
+def _precision(config: LearnerConfig) -> str:
+    """What our learner multiplies in on this processor: ``bfloat16`` or ``float32``."""
+    return config.precision if multiplies_bfloat16("cpu") else "float32"
 
 
 def _updates(learner: Learner, config: LearnerConfig, experience: Experience) -> Updates:

@@ -20,7 +20,7 @@ from trainer.training.learning import ProcessorLearning
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 
-PARTS = ("environment", "acting", "learning", "waiting")
+PARTS = ("environment", "acting", "storing", "learning", "waiting")
 ENDLESS = 10**6
 """Episodes; the bench stops after those it wants, so that no checkpoint is written."""
 
@@ -49,13 +49,15 @@ class _Watch:
     """Looks at a run between its episodes.
 
     The learner alone is another learner on the run's own buffer: its minibatches have the same
-    share of the human's samples, which cost more, and the run's weights stay as they are.
+    share of the human's samples, which cost more, and the run's weights stay as they are. It works
+    in the thread of the run's updates: a second pool of OpenMP threads would slow both down.
     """
 
     def __init__(self, run: TrainingRun, effort: Effort, tick: Tick) -> None:
         config = run.config.learner
         alone = TD3Learner(config, run.algorithm, run.config.seed)
         assert isinstance(run.learning, ProcessorLearning)
+        self.learning = run.learning
         self.updates = Updates(alone, run.learning.replay, config.batch_size)
         self.warmup_steps = config.warmup_steps
         self.effort, self.tick = effort, tick
@@ -68,9 +70,10 @@ class _Watch:
         whole_s = time.perf_counter() - self._began_s
         before_ms = self._own_ms
         if metrics.total_steps >= self.warmup_steps:
-            self._own_ms = float(np.median(self.updates.run(self.effort.own_updates)))
+            times_ms = self.learning.in_thread(self.updates.run, self.effort.own_updates)
+            self._own_ms = float(np.median(times_ms))
         if metrics.total_steps - metrics.steps >= self.warmup_steps:
-            parts_s = {name: getattr(metrics, f"{name}_s", 0.0) for name in PARTS}
+            parts_s = {name: getattr(metrics, f"{name}_s") for name in PARTS}
             own_ms = 0.5 * (before_ms + self._own_ms)
             self.episodes.append(Episode(metrics.steps, whole_s, parts_s, own_ms))
             self.tick("training")

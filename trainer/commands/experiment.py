@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import time
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from trainer.experiments.store import Store
 from trainer.experiments.summary import BEGIN, write_summary
 from trainer.experiments.units import Unit
 from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task
+from trainer.parallel import cores
 
 EXAMPLE = "example: python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60"
 ALL, STATUS, SUMMARY = "all", "status", "summary"
@@ -138,7 +138,7 @@ def _compute(arguments: argparse.Namespace, store: Store, units: list[Unit]) -> 
     tasks = [Task(unit, store, arguments.device, stop_at_s) for unit in left]
     if arguments.ray:
         return run_on_ray(tasks, arguments.ray)
-    return run_units(tasks, arguments.jobs or len(os.sched_getaffinity(0)))
+    return run_units(tasks, arguments.jobs or cores())
 
 
 def _say_what_is_left(tally: Tally) -> None:

@@ -163,8 +163,10 @@ def _scene(scenario: str, condition: str) -> Any:
 
 def _about(task: Task, run_dir: Path) -> dict[str, Any]:
     rows = read_metrics(run_dir)
-    names = ("environment_s", "acting_s", "waiting_s")
-    seconds = sum(float(row[name]) for row in rows for name in names)
+    names = ["environment_s", "acting_s", "storing_s"]
+    if task.device == "cpu":
+        names.append("waiting_s")  # elsewhere a part of acting
+    seconds = sum(float(row.get(name) or 0.0) for row in rows for name in names)
     return {
         "id": task.store.id(task.unit),
         **deciding(task.unit, task.store.plan, task.store.humans),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from edge_runtime.errors import UserError
-from trainer.ranges import ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
+from trainer.ranges import ABOVE_ZERO, ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ RANGES = {
     "exploration_bound": FROM_ZERO,
     "replay_capacity": FROM_ONE,
     "alpha": SHARE,
-    "priority_offset": FROM_ZERO,
+    "priority_offset": ABOVE_ZERO,
     "advantage_bound": FROM_ZERO,
     "beta": SHARE,
     "cloning_weight": FROM_ZERO,

@@ -17,9 +17,9 @@ from torch.nn.functional import conv2d, linear, max_pool2d, relu
 from trainer.learner import equations
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
+from trainer.learner.minibatch import Losses
 from trainer.learner.networks import Actor, Critic, CriticPair, Picture
 from trainer.learner.replay import Batch
-from trainer.learner.td3 import Losses
 
 
 def picture_features(picture: Picture, frames: Tensor) -> Tensor:

@@ -153,6 +153,8 @@ class ReplayBuffer:
         self._pictures[:pictures] = state["pictures"]
         for name in ("actions", "rewards", "terminals", "human", "priorities"):
             getattr(self, f"_{name}")[:used] = state[name]
+        # What was here before must not be drawn any more.
+        self._trees = [SumTree(self.capacity) for _ in self._trees]
         alive = self._ledger.alive
         if len(alive):
             self._set_weights(alive, self._priorities[alive] ** self.alpha)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,41 +18,11 @@ from torch import Tensor
 from trainer.learner import equations
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
+from trainer.learner.minibatch import Losses, Minibatch, Outcome
 from trainer.learner.networks import Actor, CriticPair
 from trainer.learner.optimiser import load_adam, make_adam
 from trainer.learner.precision import multiplies_bfloat16
 from trainer.learner.replay import Batch
-
-
-class Losses(NamedTuple):
-    """What one update reports; ``priorities`` are the batch's new ones (eq. 21)."""
-
-    critic: float
-    policy: float
-    cloning: float
-    mean_value: float
-    priorities: NDArray[np.float64]
-
-
-class Minibatch(NamedTuple):
-    """A ``Batch`` as tensors on the learner's device; the fields are described there."""
-
-    frames: Tensor
-    actions: Tensor
-    rewards: Tensor
-    next_frames: Tensor
-    terminals: Tensor
-    human: Tensor
-    probabilities: Tensor
-
-
-class Outcome(NamedTuple):
-    """What one update found, on the learner's device."""
-
-    losses: Tensor
-    """Critic, policy and cloning loss and mean value: [4]."""
-    priorities: Tensor
-    """The batch's new priorities (eq. 21), [n]."""
 
 
 class TD3Learner:
@@ -106,8 +76,12 @@ class TD3Learner:
 
     def step(self, batch: Minibatch, beta: Tensor) -> Outcome:
         """The same for a batch that is on the device already, and nothing read back."""
+        return self.change(batch, beta, with_policy=self.count_update())
+
+    def count_update(self) -> bool:
+        """Count an update that begins; whether it is the policy's turn, too (table A5: d)."""
         self.updates += 1
-        return self.change(batch, beta, with_policy=self.updates % self.config.policy_delay == 0)
+        return self.updates % self.config.policy_delay == 0
 
     def change(self, batch: Minibatch, beta: Tensor, with_policy: bool) -> Outcome:
         """One step on all weights, or on the critics' alone: what a CUDA graph captures."""

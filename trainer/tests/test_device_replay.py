@@ -4,7 +4,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trainer.learner.device_replay import DeviceReplay, last_for_all, pick
+from trainer.learner.device_replay import DeviceReplay
+from trainer.learner.drawing import last_for_all, pick
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.staging import ROWS, Staging
 from trainer.learner.sum_tree import SumTree
@@ -111,6 +112,22 @@ def test_a_restored_one_draws_the_same():
     (ours, batch), (theirs, same) = (replay.draw(32, drawing(3)) for replay in (a, b))
     assert torch.equal(ours, theirs)
     assert all(torch.equal(x, y) for x, y in zip(batch, same, strict=True))
+
+
+@pytest.mark.parametrize("kind", [DeviceReplay, ReplayBuffer])
+@pytest.mark.parametrize("separate", [False, True])
+def test_what_a_used_one_held_before_is_not_drawn_any_more(kind, separate):
+    used, other = kind(30, separate=separate), kind(30, separate=separate)
+    for human in (False, True):
+        drive(used, human, 12, human)
+        drive(other, human, 2, human)
+    used.load_state_dict(other.state_dict())
+    if isinstance(used, DeviceReplay):
+        drawn = used.draw(200, drawing())[0].numpy()
+    else:
+        drawn = used.sample(200, np.random.default_rng(0)).indices
+    assert set(drawn) == {0, 1, 2, 3}
+    assert_equal_states(used, other)
 
 
 def test_draws_follow_equation_20_and_are_stratified():

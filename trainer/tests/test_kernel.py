@@ -1,7 +1,3 @@
-import os
-import platform
-import subprocess
-import sys
 from pathlib import Path
 
 import onnx
@@ -12,6 +8,7 @@ from torch import Tensor
 from trainer.learner import kernel
 from trainer.learner.kernel import trunk
 from trainer.learner.kernel.trunk import trunk_features
+from trainer.learner.precision import multiplies_bfloat16
 
 needs_kernel = pytest.mark.skipif(
     kernel.load("trunk") is None, reason="there is no compiler here, or PHIL_KERNEL=0"
@@ -150,6 +147,24 @@ def test_reduced_precision_is_near_and_does_not_depend_on_threads(frames: slice)
 
 
 @needs_kernel
+@pytest.mark.parametrize("frames", [slice(0, 2), slice(2, 3)])
+def test_reduced_precision_is_bfloat16_where_the_processor_has_it(frames: slice) -> None:
+    if not multiplies_bfloat16("cpu"):
+        pytest.skip("the processor has no bfloat16 instructions")
+    library = kernel.load("trunk")
+    assert library is not None
+    if not library.trunk_has_bfloat16():
+        pytest.skip("the kernel was compiled without bfloat16")
+    pictures = _pictures(2)[:, frames]
+    parameters = _parameters(pictures.shape[1])
+    single = trunk_features(pictures, *parameters)
+    with torch.autocast("cpu", torch.bfloat16):
+        reduced = trunk_features(pictures, *parameters)
+    assert reduced.dtype == torch.float32
+    assert not torch.equal(reduced, single)
+
+
+@needs_kernel
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
 def test_in_reduced_precision_ties_stay_ties(level: int) -> None:
     """The first of equal candidates wins, so a flat picture sends each gradient the same way."""
@@ -195,92 +210,3 @@ def test_other_pictures_take_the_torch_path() -> None:
     features = trunk_features(_pictures(2), weight1, bias1, *second)
     right = trunk._torch_features(_pictures(2), weight1, bias1, *second)
     assert torch.equal(features, right)
-
-
-_PROGRAM = """
-import torch
-from trainer.learner import kernel
-from trainer.learner.kernel.trunk import trunk_features
-frames = torch.zeros(2, 1, 45, 80, dtype=torch.uint8)
-features = trunk_features(
-    frames, torch.ones(6, 1, 6, 6), torch.ones(6), torch.ones(16, 6, 6, 6), torch.zeros(16)
-)
-assert (features == 216).all(), features
-trunk_features(
-    frames, torch.ones(6, 1, 6, 6), torch.ones(6), torch.ones(16, 6, 6, 6), torch.zeros(16)
-)
-print("kernel" if kernel.load("trunk") else "torch")
-"""
-
-
-def _start(cache: Path, program: str = _PROGRAM, **environment: str) -> subprocess.Popen[str]:
-    settings = {**os.environ, "XDG_CACHE_HOME": str(cache), "PHIL_KERNEL": "1", **environment}
-    return subprocess.Popen(
-        [sys.executable, "-c", program],
-        env=settings,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def _finish(process: subprocess.Popen[str]) -> tuple[str, str]:
-    output, errors = process.communicate(timeout=200)
-    assert process.returncode == 0, errors
-    return output.strip(), errors
-
-
-@pytest.mark.parametrize("compiler", ["/bin/false", "/no/such/compiler"])
-def test_without_a_compiler_torch_does_the_work(tmp_path: Path, compiler: str) -> None:
-    output, errors = _finish(_start(tmp_path, CXX=compiler))
-    assert output == "torch"
-    assert len(errors.splitlines()) == 1
-    assert "4 times slower" in errors
-    assert list(tmp_path.rglob("*.so")) == []
-
-
-def test_the_kernel_can_be_turned_off(tmp_path: Path) -> None:
-    assert _finish(_start(tmp_path, PHIL_KERNEL="0")) == ("torch", "")
-
-
-def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way of a directory")
-    output, errors = _finish(_start(blocked))
-    assert output == "torch"
-    assert len(errors.splitlines()) == 1
-
-
-_ON_ANOTHER_PROCESSOR = """
-import torch
-from trainer.learner import kernel
-from trainer.learner.kernel.trunk import _torch_features, trunk_features
-frames = torch.randint(0, 256, (5, 2, 45, 80), dtype=torch.uint8)
-layers = torch.nn.Conv2d(2, 6, 6), torch.nn.Conv2d(6, 16, 6)
-parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
-right = _torch_features(frames, *parameters)
-wanted = torch.autograd.grad(right.square().sum(), parameters)
-for reduced in (False, True):
-    with torch.autocast("cpu", torch.bfloat16, enabled=reduced):
-        features = trunk_features(frames, *parameters)
-    torch.testing.assert_close(features, right, rtol=1e-4, atol=1e-5)
-    for gradient, true in zip(torch.autograd.grad(features.square().sum(), parameters), wanted):
-        assert (gradient - true).norm() < 1e-4 * true.norm()
-print("kernel" if kernel.load("trunk") else "torch")
-"""
-
-
-@needs_kernel
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the flags are those of x86-64")
-@pytest.mark.parametrize("flags", ["-mno-avx512f", "-mno-avx512f -mno-avx"])
-def test_processors_with_shorter_vectors_compute_the_same(tmp_path: Path, flags: str) -> None:
-    """Also: without bfloat16 instructions, reduced precision is single precision."""
-    process = _start(tmp_path, _ON_ANOTHER_PROCESSOR, CXX=f"c++ {flags}")
-    assert _finish(process) == ("kernel", "")
-
-
-@needs_kernel
-def test_two_processes_may_build_at_once(tmp_path: Path) -> None:
-    processes = [_start(tmp_path) for _ in range(2)]
-    assert [_finish(process) for process in processes] == [("kernel", "")] * 2
-    assert [path.suffix for path in (tmp_path / "phil-hil").iterdir()] == [".so"]

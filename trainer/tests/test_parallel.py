@@ -15,6 +15,7 @@ from trainer.drivers import load_driver, make_environment
 from trainer.evaluation import drive_episodes
 from trainer.human.model import HumanModel, HumanModelConfig
 from trainer.parallel import WORTH_STARTING, choose_jobs, drive_episodes_in_parallel
+from trainer.parallel import cores as parallel_cores
 
 
 @pytest.fixture
@@ -107,7 +108,7 @@ def test_whatever_ends_the_command_ends_its_workers(sent, status):
 
 
 def test_processes_are_started_only_where_they_pay():
-    cores = len(os.sched_getaffinity(0))
+    cores = parallel_cores()
     assert choose_jobs(WORTH_STARTING - 1) == 1
     assert choose_jobs(10 * WORTH_STARTING) == min(cores, 10 * WORTH_STARTING)
 

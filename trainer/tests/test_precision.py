@@ -1,8 +1,10 @@
 import pytest
+import torch
 
 from trainer.learner import precision
 from trainer.learner.algorithms import PHIL
 from trainer.learner.config import LearnerConfig
+from trainer.learner.networks import Picture
 from trainer.learner.td3 import TD3Learner
 from trainer.tests.test_td3 import make_batch, weights_of
 
@@ -42,13 +44,53 @@ def test_without_a_list_of_flags_there_is_none(processor, monkeypatch, tmp_path)
     assert not precision.multiplies_bfloat16("cpu")
 
 
-def test_a_processor_without_bfloat16_learns_in_float32(processor):
-    processor("flags : fma avx2")
+def updated(precisions: tuple[str, ...]) -> list[dict[str, torch.Tensor]]:
+    """The weights after one update, for each precision."""
     learners = [
         TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
-        for name in ("float32", "bfloat16")
+        for name in precisions
     ]
     for learner in learners:
         learner.update(make_batch())
-    single, reduced = map(weights_of, learners)
+    return [weights_of(learner) for learner in learners]
+
+
+def test_a_processor_without_bfloat16_learns_in_float32(processor):
+    processor("flags : fma avx2")
+    single, reduced = updated(("float32", "bfloat16"))
     assert all((single[name] == reduced[name]).all() for name in single)
+
+
+@pytest.mark.skipif(
+    not precision.multiplies_bfloat16("cpu"), reason="this processor has no bfloat16"
+)
+def test_a_processor_with_bfloat16_learns_in_it():
+    single, reduced = updated(("float32", "bfloat16"))
+    for name in ("actor", "critics"):
+        assert not torch.equal(single[name], reduced[name])
+
+
+@pytest.mark.parametrize("name", ["float32", "bfloat16"])
+def test_every_picture_of_an_update_is_embedded_in_its_precision(processor, monkeypatch, name):
+    """Online and target networks alike, the Q advantage's too; acting is always float32."""
+    processor("flags : avx512_bf16")
+    embed, reduced = Picture.forward, []
+
+    def spy(self, frames):
+        reduced.append((id(self), torch.is_autocast_enabled("cpu")))
+        # Whatever this processor can do.
+        with torch.autocast("cpu", enabled=False):
+            return embed(self, frames)
+
+    monkeypatch.setattr(Picture, "forward", spy)
+    batch = make_batch()
+    learner = TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
+    learner.update(batch)
+    online = [learner.actor, *learner.critics.pair]
+    targets = [learner.target_actor, *learner.target_critics.pair]
+    used = [*online, *targets, learner.target_critics.first]
+    embedded = [id(network.picture) for network in used]
+    assert sorted(reduced) == sorted((network, name == "bfloat16") for network in embedded)
+    reduced.clear()
+    learner.act(batch.frames[0])
+    assert reduced == [(id(learner.actor.picture), False)]

@@ -12,7 +12,7 @@ from trainer.learner.reference import ReferenceLearner
 from trainer.learner.replay import Batch
 from trainer.learner.td3 import TD3Learner
 
-SMALL = LearnerConfig(batch_size=12)
+SMALL = LearnerConfig(batch_size=12, precision="float32")
 
 
 def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:

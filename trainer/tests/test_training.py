@@ -93,7 +93,7 @@ def test_a_run_in_two_parts_ends_with_the_same_weights_and_metrics(trained, tmp_
     resumed = train(TINY, directory, resume=True)
     assert torch.equal(actor_weights(trained), actor_weights(resumed))
     for ours, whole in zip(read_metrics(directory), read_metrics(trained.run_dir), strict=True):
-        timed = {"environment_s", "acting_s", "learning_s", "waiting_s"}
+        timed = {"environment_s", "acting_s", "storing_s", "learning_s", "waiting_s"}
         assert {k: v for k, v in ours.items() if k not in timed} == {
             k: v for k, v in whole.items() if k not in timed
         }

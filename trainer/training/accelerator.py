@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from trainer import seeds
+from trainer.files import as_arrays, as_tensors
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.captured import captured, changed_by_learning
 from trainer.learner.config import LearnerConfig
@@ -23,7 +24,7 @@ from trainer.learner.networks import Actor
 from trainer.learner.replay import FRAME_SHAPE
 from trainer.learner.staging import Staging
 from trainer.learner.td3 import TD3Learner
-from trainer.training.learning import Action, EpisodeLearning, Observation
+from trainer.training.learning import NO_LOSSES, Action, EpisodeLearning, Observation
 from trainer.training.update_clock import UpdateClock
 
 
@@ -81,7 +82,7 @@ class AcceleratorLearning:
         """pi(s), float32 [action size]; waits for the update before it."""
         self._seen.row()["frames"] = observation
         self._seen.send()
-        self._replay_graph("act", self._choose_action)
+        self._run_graph("act", self._choose_action)
         self._read_action.copy_(self._action, non_blocking=True)
         began_s = time.perf_counter()
         if self.device.type == "cuda":
@@ -91,6 +92,8 @@ class AcceleratorLearning:
 
     def start_episode(self, observation: Observation) -> None:
         """Take an episode's first observation."""
+        # Validation between two episodes waits for its actions, too.
+        self._waiting_s = 0.0
         self.replay.start_episode(observation)
 
     def add(
@@ -102,40 +105,38 @@ class AcceleratorLearning:
     def begin(self, beta: float) -> None:
         """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
         self._beta.fill_(beta)
-        self.learner.updates += 1
         self._updates += 1
-        with_policy = self.learner.updates % self.config.policy_delay == 0
+        with_policy = self.learner.count_update()
         update = self._update_all if with_policy else self._update_critics
         graph = self._graph("update" if with_policy else "update critics", update, learning=True)
         with self._clock.timed():
             graph()
 
-    def finish(self) -> None:
+    def finish(self) -> float:
         """Nothing to wait for: what comes next on the device comes after the update."""
+        return 0.0
 
     def end_episode(self) -> EpisodeLearning:
         """What was learned since the last call, read back at once; learning rates decay."""
         self.learner.decay_learning_rates()
         found = torch.cat([self._loss_sums, self.replay.priority_means()]).cpu().numpy()
         self._loss_sums.zero_()
-        mean_losses = found[:4] / self._updates if self._updates else None
-        learning_s, waiting_s = self._clock.take_total_s(), self._waiting_s
-        self._updates, self._waiting_s = 0, 0.0
         if np.isinf(found).any() or np.isnan(found[:4]).any():
             raise ValueError("a loss or a priority is not finite")
-        priorities = float(found[4]), float(found[5])
-        return EpisodeLearning(mean_losses, learning_s, waiting_s, priorities)
+        mean_losses = found[:4] / self._updates if self._updates else NO_LOSSES
+        learned = EpisodeLearning(
+            self._clock.take_total_s(),
+            self._waiting_s,
+            *map(float, [*mean_losses, *found[4:]]),
+        )
+        self._updates, self._waiting_s = 0, 0.0
+        return learned
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on."""
-        replay = self.replay.state_dict()
         return {
             "learner": self.learner.state_dict(),
-            # Tensors: what a checkpoint may hold without arbitrary unpickling.
-            "replay": {
-                name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
-                for name, value in replay.items()
-            },
+            "replay": as_tensors(self.replay.state_dict()),
             "drawing": self._drawing.get_state(),
         }
 
@@ -144,12 +145,7 @@ class AcceleratorLearning:
         # Optimisers change addresses when they load.
         self._graphs.clear()
         self.learner.load_state_dict(state["learner"])
-        self.replay.load_state_dict(
-            {
-                name: value.numpy() if isinstance(value, torch.Tensor) else value
-                for name, value in state["replay"].items()
-            }
-        )
+        self.replay.load_state_dict(as_arrays(state["replay"]))
         self._drawing.set_state(state["drawing"])
 
     def close(self) -> None:
@@ -161,7 +157,7 @@ class AcceleratorLearning:
         self._action.copy_(self.learner.actor(self._seen.fields["frames"])[0])
 
     def _store(self) -> None:
-        self._replay_graph("store", self.replay.store_record)
+        self._run_graph("store", self.replay.store_record)
 
     def _update_all(self) -> None:
         self._update(with_policy=True)
@@ -175,7 +171,7 @@ class AcceleratorLearning:
         self.replay.set_priorities(indices, outcome.priorities)
         self._loss_sums += outcome.losses
 
-    def _replay_graph(self, name: str, function: Callable[[], None]) -> None:
+    def _run_graph(self, name: str, function: Callable[[], None]) -> None:
         self._graph(name, function)()
 
     def _graph(

@@ -7,20 +7,24 @@ finished, and only then the step is stored.
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from trainer import seeds
+from trainer.files import as_arrays, as_tensors
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
+from trainer.learner.minibatch import Losses
 from trainer.learner.networks import Actor
 from trainer.learner.replay import Batch, ReplayBuffer
-from trainer.learner.td3 import Losses, TD3Learner
+from trainer.learner.td3 import TD3Learner
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
@@ -54,8 +58,9 @@ class Learning(Protocol):
     def begin(self, beta: float) -> None:
         """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
 
-    def finish(self) -> None:
-        """Wait until the update that was begun is done, if one was."""
+    def finish(self) -> float:
+        """Wait until the update that was begun is done, if one was; the seconds waited."""
+        ...
 
     def end_episode(self) -> EpisodeLearning:
         """What was learned since the last call; learning rates decay (table A5)."""
@@ -72,28 +77,43 @@ class Learning(Protocol):
         """Let go of threads and memory."""
 
 
+@dataclass(frozen=True)
 class EpisodeLearning:
-    """What the updates of an episode amount to."""
+    """What the updates of an episode amount to; losses are means, nan where there was no update."""
 
-    def __init__(
-        self,
-        mean_losses: NDArray[np.float64] | None,
-        learning_s: float,
-        waiting_s: float,
-        mean_priorities: tuple[float, float],
-    ) -> None:
-        nothing = np.full(4, np.nan)
-        losses = nothing if mean_losses is None else mean_losses
-        self.critic_loss, self.policy_loss, self.cloning_loss, self.value = map(float, losses)
-        self.learning_s, self.waiting_s = learning_s, waiting_s
-        self.policy_priority, self.human_priority = mean_priorities
+    learning_s: float
+    waiting_s: float
+    critic_loss: float
+    policy_loss: float
+    cloning_loss: float
+    value: float
+    policy_priority: float
+    human_priority: float
+
+
+NO_LOSSES = (math.nan,) * 4
+
+
+class LearningDriver:
+    """The policy that is being learned at the wheel, asked where it is learned."""
+
+    def __init__(self, learning: Learning) -> None:
+        self.learning = learning
+
+    def reset(self) -> None:
+        """Networks have no memory."""
+
+    def act(self, observation: Observation) -> Action:
+        """pi(s), float32 [action size]; not while an update is under way."""
+        return self.learning.act(observation)
 
 
 class ProcessorLearning:
     """``Learning`` on the processor: updates run in a thread of their own.
 
-    All of the learner's torch calls come from that thread: a second one would bring a second pool
-    of OpenMP threads, and the two would fight for the same cores.
+    The policy acts in that thread, too, in validation as well: another would bring a second pool
+    of OpenMP threads, and the two would fight for the same cores. Only a human who is a network
+    acts in the loop's thread, beside the update: a batch of one, which takes that thread alone.
 
     Args:
         config: hyper-parameters.
@@ -129,6 +149,10 @@ class ProcessorLearning:
         """pi(s), float32 [action size]; not between ``begin`` and ``finish``."""
         return self._thread.submit(self.learner.act, observation).result()
 
+    def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """What ``work(*arguments)`` returns in the updates' thread, after the update under way."""
+        return self._thread.submit(work, *arguments).result()
+
     def start_episode(self, observation: Observation) -> None:
         """Take an episode's first observation."""
         self.replay.start_episode(observation)
@@ -144,50 +168,47 @@ class ProcessorLearning:
         batch = self.replay.sample(self.config.batch_size, self._random)
         self._begun = batch, self._thread.submit(self._update, batch, beta)
 
-    def finish(self) -> None:
-        """Wait until the update that was begun is done, if one was."""
+    def finish(self) -> float:
+        """Wait until the update that was begun is done, if one was; the seconds waited.
+
+        What the update raised comes out here.
+        """
         if self._begun is None:
-            return
+            return 0.0
         began_s = time.perf_counter()
-        batch, update = self._begun
+        (batch, update), self._begun = self._begun, None
         losses, learning_s = update.result()
-        self._waiting_s += time.perf_counter() - began_s
+        waited_s = time.perf_counter() - began_s
+        self._waiting_s += waited_s
         self._learning_s += learning_s
         self._losses.append(losses[:4])
         self.replay.update_priorities(batch.indices, losses.priorities)
-        self._begun = None
+        return waited_s
 
     def end_episode(self) -> EpisodeLearning:
         """What was learned since the last call; learning rates decay (table A5)."""
         self.learner.decay_learning_rates()
-        mean_losses = np.mean(self._losses, axis=0) if self._losses else None
-        priorities = self.replay.mean_priorities()
-        learned = EpisodeLearning(mean_losses, self._learning_s, self._waiting_s, priorities)
+        mean_losses = np.mean(self._losses, axis=0) if self._losses else NO_LOSSES
+        learned = EpisodeLearning(
+            self._learning_s,
+            self._waiting_s,
+            *map(float, [*mean_losses, *self.replay.mean_priorities()]),
+        )
         self._forget_episode()
         return learned
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on."""
-        replay = self.replay.state_dict()
         return {
             "learner": self.learner.state_dict(),
-            # Tensors: what a checkpoint may hold without arbitrary unpickling.
-            "replay": {
-                name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
-                for name, value in replay.items()
-            },
+            "replay": as_tensors(self.replay.state_dict()),
             "drawing": self._random.bit_generator.state,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""
         self.learner.load_state_dict(state["learner"])
-        self.replay.load_state_dict(
-            {
-                name: value.numpy() if isinstance(value, torch.Tensor) else value
-                for name, value in state["replay"].items()
-            }
-        )
+        self.replay.load_state_dict(as_arrays(state["replay"]))
         self._random.bit_generator.state = state["drawing"]
 
     def close(self) -> None:

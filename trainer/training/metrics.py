@@ -42,10 +42,16 @@ class EpisodeMetrics:
     environment_s: float
     """Time spent in the environment and with the human, while the learner updates."""
     acting_s: float
+    """Time of the policy's actions. On an accelerator they queue behind the update, and the wait
+    for both is a part of this."""
+    storing_s: float
+    """Time of drawing minibatches, storing steps and their new priorities; on an accelerator, of
+    queueing the update that does so."""
     learning_s: float
-    """Time of the updates themselves."""
+    """Time of the updates themselves, beside the parts above."""
     waiting_s: float
-    """How long the loop waited for an update after the environment's step was done."""
+    """How long the loop waited for an update after the environment's step was done; on an
+    accelerator, for the action behind it: counted in ``acting_s``, too."""
     validation_success: float
     """Success rate on the validation seeds (nan where the episode ended without one)."""
     validation_distance_m: float

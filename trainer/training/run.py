@@ -20,7 +20,6 @@ from trainer.drivers import (
     CHECKPOINT_FILE,
     EXPERTS,
     TRIGGERS,
-    NetworkDriver,
     load_driver,
     make_environment,
 )
@@ -28,24 +27,15 @@ from trainer.evaluation import drive_episodes
 from trainer.files import load_torch, save_torch
 from trainer.human.guide import HumanGuide, Intervention
 from trainer.learner import equations
-from trainer.learner.algorithms import ALGORITHMS, Algorithm
+from trainer.learner.algorithms import ALGORITHMS
 from trainer.revision import source_revision
-from trainer.training.accelerator import AcceleratorLearning
 from trainer.training.config import RunConfig
-from trainer.training.learning import Learning, ProcessorLearning
+from trainer.training.learning import LearningDriver
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
+from trainer.training.placement import make_learning
 from trainer.training.tally import Tally
 
 CONFIG_FILE = "config.json"
-
-
-def make_learning(config: RunConfig, algorithm: Algorithm, action_size: int) -> Learning:
-    """Learner and replay on the configured device."""
-    if config.device != "cpu":
-        return AcceleratorLearning(
-            config.learner, algorithm, config.seed, action_size, config.device
-        )
-    return ProcessorLearning(config.learner, algorithm, config.seed, action_size)
 
 
 class TrainingRun:
@@ -77,7 +67,11 @@ class TrainingRun:
         on_episode: Callable[[EpisodeMetrics], None] = lambda metrics: None,
         deadline_s: float | None = None,
     ) -> None:
-        """Train until the configured number of episodes, or ``time.monotonic() > deadline_s``."""
+        """Train until the configured number of episodes, or ``time.monotonic() > deadline_s``.
+
+        Not twice: however it ends, the learner lets go of its thread or graphs. A new run with
+        ``resume`` goes on.
+        """
         about = {**self.config.as_dict(), "source_revision": source_revision()}
         write_json(self.run_dir / CONFIG_FILE, about)
         metrics_writer = MetricsWriter(self.run_dir, self.episode)
@@ -163,9 +157,10 @@ class TrainingRun:
         """One control period: act, let the human take over and the car move; meanwhile, learn."""
         began_s = time.perf_counter()
         policy_action = self._explore(self.learning.act(observation))
+        acted_s = time.perf_counter()
         if self.learning.added >= self.config.learner.warmup_steps:
             self.learning.begin(self._beta())
-        acted_s = time.perf_counter()
+        begun_s = time.perf_counter()
         intervention = None
         if guided and self.guide is not None:
             intervention = self._spoil(self.guide.watch(observation, policy_action))
@@ -173,15 +168,17 @@ class TrainingRun:
         action = equations.masked_action(policy_action, human_action)
         next_observation, reward, terminated, truncated, info = self.env.step(action)
         moved_s = time.perf_counter()
-        self.learning.finish()
+        waited_s = self.learning.finish()
         shaped = self._shape(reward, intervention)
         self.learning.add(action, shaped, next_observation, terminated, intervention is not None)
+        stored_s = time.perf_counter()
         tally.steps += 1
         tally.rewards += reward
         tally.human_steps += intervention is not None
         tally.interventions += intervention is not None and intervention.first
         tally.acting_s += acted_s - began_s
-        tally.environment_s += moved_s - acted_s
+        tally.environment_s += moved_s - begun_s
+        tally.storing_s += begun_s - acted_s + stored_s - moved_s - waited_s
         return next_observation, terminated or truncated, info
 
     def _spoil(self, intervention: Intervention | None) -> Intervention | None:
@@ -229,7 +226,7 @@ class TrainingRun:
             seeds.episode_seed(self.config.seed, seeds.VALIDATION, run)
             for run in range(self.config.evaluation_runs)
         ]
-        results = drive_episodes(self.validation_env, self._driver(), chosen)
+        results = drive_episodes(self.validation_env, LearningDriver(self.learning), chosen)
         success = float(np.mean([result.outcome == GOAL for result in results]))
         distance_m = float(np.mean([result.distance_m for result in results]))
         metrics.validation_success, metrics.validation_distance_m = success, distance_m
@@ -238,9 +235,6 @@ class TrainingRun:
             self.best_validation = (success, reward)
             state = {**self._label(), "actor": self.learning.actor.state_dict()}
             save_torch(self.run_dir / BEST_FILE, state)
-
-    def _driver(self) -> NetworkDriver:
-        return NetworkDriver(self.learning.actor)
 
     def _label(self) -> dict[str, Any]:
         c = self.config

@@ -19,6 +19,7 @@ class Tally:
     steps: int = 0
     environment_s: float = 0.0
     acting_s: float = 0.0
+    storing_s: float = 0.0
 
     def summary(
         self,
@@ -47,6 +48,7 @@ class Tally:
             human_priority=learned.human_priority,
             environment_s=self.environment_s,
             acting_s=self.acting_s,
+            storing_s=self.storing_s,
             learning_s=learned.learning_s,
             waiting_s=learned.waiting_s,
             validation_success=float("nan"),

@@ -43,7 +43,7 @@ def load(name: str) -> ctypes.CDLL | None:
     except (_BuildError, OSError, RuntimeError) as error:
         # RuntimeError: there is no home directory, hence no cache.
         _LOGGER.warning(
-            "no compiled %s kernel (%s): torch does its work, about 4 times slower",
+            "no compiled %s kernel (%s): torch does its work, several times slower",
             name,
             " ".join(str(error).split()),
         )
@@ -53,8 +53,10 @@ def load(name: str) -> ctypes.CDLL | None:
 def _built(source: Path) -> ctypes.CDLL:
     """The library of this source, compiler and processor: from the cache, or built now."""
     compiler = _compiler()
-    code = source.read_bytes()
-    key = "\0".join([*compiler, *_FLAGS, _OPENMP, _processor()]).encode() + code
+    # Every header beside it, included or not: none can be forgotten.
+    code = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")))]
+    settings = "\0".join([*compiler, *_FLAGS, _OPENMP, _processor()]).encode()
+    key = b"\0".join([settings, *code])
     library = _cache() / f"{source.stem}-{hashlib.sha256(key).hexdigest()[:16]}.so"
     if not library.exists():
         _build(compiler, source, library)

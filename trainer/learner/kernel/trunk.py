@@ -30,7 +30,8 @@ def trunk_features(
     Differentiable once with respect to the parameters. The compiled kernel serves the networks of
     this project on the CPU; anything else, and every export, takes the torch operations.
     Under ``torch.autocast`` the kernel's forward pass multiplies in bfloat16, where the processor
-    can; sums, features and gradients stay in single precision.
+    can; its sums, features and gradients stay in single precision. The torch operations follow
+    autocast's own rules, which round features too.
 
     Args:
         frames: uint8 [batch, n, 45, 80] with n = 1 or 2. A slice of a longer stack of frames,
@@ -41,7 +42,8 @@ def trunk_features(
         conv2_bias: [16].
 
     Returns:
-        float32 [batch, 1792], in the order of ``torch.flatten`` over [batch, 16, 7, 16].
+        [batch, 1792], in the order of ``torch.flatten`` over [batch, 16, 7, 16]: float32 from the
+        kernel; from torch the parameters' type, or autocast's.
     """
     parameters = (conv1_weight, conv1_bias, conv2_weight, conv2_bias)
     if not _served(frames, parameters):
