@@ -1,5 +1,10 @@
+import signal
+
 import pytest
 import torch
+
+# A shell's background job ignores ^C, and so would every process that a test starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

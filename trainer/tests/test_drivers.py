@@ -12,7 +12,7 @@ def test_an_actor_is_loaded_with_the_frames_that_it_was_trained_on(tmp_path, fra
     label = {"scenario": "congestion", "algorithm": "phil_td3", "seed": 0, "episode": 3}
     save_torch(tmp_path / BEST_FILE, {**label, "actor": actor.state_dict()})
     loaded, about = load_actor(tmp_path)
-    assert (loaded.frames, about) == (frames, label)
+    assert (loaded.picture.frames, about) == (frames, label)
     driver, policy_id = load_driver(str(tmp_path), make_environment("congestion"))
     assert policy_id.startswith("run:")
     assert driver.act(np.zeros((2, 45, 80), np.uint8)).shape == (1,)
