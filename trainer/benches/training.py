@@ -41,7 +41,7 @@ class Episode(NamedTuple):
         return self.whole_s / (1e-3 * self.own_ms * self.steps)
 
 
-class _Enough(Exception):  # noqa: N818 (it is no error)
+class _EnoughError(Exception):
     """Ends the training."""
 
 
@@ -78,7 +78,7 @@ class _Watch:
             self.episodes.append(Episode(metrics.steps, whole_s, parts_s, own_ms))
             self.tick("training")
             if len(self.episodes) == self.effort.training_episodes:
-                raise _Enough
+                raise _EnoughError
         self._began_s = time.perf_counter()
 
 
@@ -93,7 +93,7 @@ def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as directory:
         run = TrainingRun(config, Path(directory))
         watch = _Watch(run, effort, tick)
-        with contextlib.suppress(_Enough):
+        with contextlib.suppress(_EnoughError):
             run.train(watch)
     return summary(watch.episodes)
 

@@ -68,8 +68,6 @@ def obstacle(unit: Unit, humans: Path) -> str | None:
         return f"there is no algorithm {unit.algorithm} in trainer/learner/algorithms.py"
     if unit.setting not in SETTINGS:
         return f"there is no setting {unit.setting}"
-    if unit.setting == POOR and "poor_guidance_share" not in RunConfig.__dataclass_fields__:
-        return "the setting poor needs the field poor_guidance_share of trainer/training/config.py"
     if unit.needs_human and not human_file(unit.scenario, humans).is_file():
         directory = humans / unit.scenario
         return (
@@ -89,13 +87,10 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
     if reason or not unit.trained:
         raise UserError(f"{unit}: {reason or 'nothing is trained for it'}")
     learner = replace(LearnerConfig(), **plan.learner)
-    extra: dict[str, Any] = {}
     if unit.setting == TOUGH:
         learner = replace(learner, frames=1)
     if unit.setting == REMEDY:
         learner = replace(learner, saturation_weight=REMEDY_WEIGHT)
-    if unit.setting == POOR:
-        extra["poor_guidance_share"] = POOR_SHARE
     return RunConfig(
         scenario=unit.scenario,
         algorithm=unit.algorithm,
@@ -107,8 +102,8 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
         checkpoint_every=plan.checkpoint_every,
         device=device,
         threads=1,
+        poor_guidance_share=POOR_SHARE if unit.setting == POOR else 0.0,
         learner=learner,
-        **extra,
     )
 
 

@@ -146,19 +146,13 @@ def _test(task: Task, policy: str) -> dict[str, list[EpisodeResult]]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)  # as in `trainer evaluate`: the last bits must not depend on it
     for condition in CONDITIONS:
-        env = _scene(task.unit.scenario, condition)
+        env = make_environment(task.unit.scenario, condition)
         driver, _ = load_driver(policy, env)
         results[condition] = drive_episodes(
             env, driver, range(task.store.plan.test_runs), condition
         )
     torch.set_num_threads(before)
     return results
-
-
-def _scene(scenario: str, condition: str) -> Any:
-    """The environment of a condition; noise is on the command, not in the scene."""
-    make: Callable[..., Any] = make_environment
-    return make(scenario) if condition in ("nominal", "noise") else make(scenario, condition)
 
 
 def _about(task: Task, run_dir: Path) -> dict[str, Any]:

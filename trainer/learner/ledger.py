@@ -6,7 +6,7 @@ processor, so that storing never has to ask an accelerator for anything.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,10 @@ FRAMES_PER_TRANSITION = 1.05
 LOST_AT_ONCE = 2
 """Most transitions that one new picture can make forgotten: an episode's first two begin with the
 same picture, any later one with a picture of its own."""
+
+
+AddPicture = Callable[[NDArray[np.uint8]], int]
+"""Stores a picture [45, 80]; gives its running number."""
 
 
 class Ledger:
@@ -55,8 +59,10 @@ class Ledger:
         """Slots of the transitions that are not forgotten, oldest first."""
         return np.arange(self.oldest, self.added, dtype=np.int64) % self.capacity
 
-    def start_episode(self, older: int, newer: int) -> None:
-        """The pictures, by number, that an episode begins with."""
+    def start_episode(self, frames: NDArray[np.uint8], add_picture: AddPicture) -> None:
+        """Take the first observation [2, 45, 80] of an episode; a picture seen twice once only."""
+        older = add_picture(frames[0])
+        newer = older if np.array_equal(frames[0], frames[1]) else add_picture(frames[1])
         self._current = (older, newer)
 
     def check_started(self) -> None:

@@ -85,9 +85,7 @@ class ReplayBuffer:
 
     def start_episode(self, frames: NDArray[np.uint8]) -> None:
         """Take the first observation [2, 45, 80] of an episode."""
-        older = self._add_picture(frames[0])
-        newer = older if np.array_equal(frames[0], frames[1]) else self._add_picture(frames[1])
-        self._ledger.start_episode(older, newer)
+        self._ledger.start_episode(frames, self._add_picture)
 
     def add(
         self,

@@ -117,18 +117,19 @@ def test_training_summary_scales_and_weighs_by_steps():
 
 def test_an_update_draws_learns_and_sets_the_new_priorities():
     class Recorder:
-        seen: list = []  # noqa: RUF012
+        def __init__(self):
+            self.seen = []
 
         def update(self, batch, beta):
             self.seen.append(batch)
             return Losses(0.0, 0.0, 0.0, 0.0, np.full(len(batch.indices), 7.0))
 
-    buffer, experience = ReplayBuffer(50), gather(50)
+    recorder, buffer, experience = Recorder(), ReplayBuffer(50), gather(50)
     fill(buffer, experience)
-    times_ms = Updates(Recorder(), buffer, batch_size=8).run(3)
+    times_ms = Updates(recorder, buffer, batch_size=8).run(3)
     assert len(times_ms) == 3
-    assert [len(batch.indices) for batch in Recorder.seen] == [8, 8, 8]
-    drawn = np.concatenate([batch.indices for batch in Recorder.seen])
+    assert [len(batch.indices) for batch in recorder.seen] == [8, 8, 8]
+    drawn = np.concatenate([batch.indices for batch in recorder.seen])
     assert (buffer._priorities[drawn] == 7.0).all()
     assert 0 < experience.human.sum() < 50
 

@@ -10,16 +10,6 @@ from trainer.scenarios.geometry import corners
 from trainer.tests.test_congestion import CENTRED, STRAIGHT
 
 
-def test_an_observation_is_a_picture_that_moves():
-    env = CongestionEnv()
-    start, _ = env.reset(seed=0)
-    assert len(np.unique(start)) > 4
-    assert np.array_equal(start[0], start[1])
-    moved, *_ = env.step(STRAIGHT)
-    assert np.array_equal(moved[0], start[1])
-    assert not np.array_equal(moved[0], moved[1])
-
-
 def test_the_picture_moves_along_the_road_but_neither_aside_nor_round():
     def picture(offset_m: float, heading_rad: float) -> np.ndarray:
         config = replace(

@@ -147,7 +147,7 @@ class ProcessorLearning:
 
     def act(self, observation: Observation) -> Action:
         """pi(s), float32 [action size]; not between ``begin`` and ``finish``."""
-        return self._thread.submit(self.learner.act, observation).result()
+        return self.in_thread(self.learner.act, observation)
 
     def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
         """What ``work(*arguments)`` returns in the updates' thread, after the update under way."""
