@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from bridge.event_heap import EventHeap
+from edge_runtime.latency.event_heap import EventHeap
 
 Action = Callable[[], None]
 

@@ -25,8 +25,8 @@ from bridge.command_hold import (
     CommandHold,
     Decision,
 )
-from bridge.event_heap import EventHeap
-from bridge.latency import LatencySpec, make_link
+from edge_runtime.latency.event_heap import EventHeap
+from edge_runtime.latency.model import LatencySpec, make_link
 from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Reason, State, encode
 
 

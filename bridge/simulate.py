@@ -14,7 +14,6 @@ from bridge.clock import Clock, Publish
 from bridge.command_check import CommandCheck
 from bridge.environments import CONDITIONS, NOMINAL, SCENARIOS, make_environment, scenario_of
 from bridge.episode import EpisodeRunner
-from bridge.latency import GRAMMAR, LatencySpec, parse_spec
 from bridge.lockstep import LockStepClock
 from bridge.port import SimulatorPort, open_port
 from bridge.progress import EpisodeBar, episode_bar
@@ -23,6 +22,7 @@ from bridge.report import make_report, rejections, summary_line
 from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, write_json_out
 from edge_runtime.files import check_writable
+from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 from edge_runtime.wire import check_vehicle_id
 

@@ -72,7 +72,8 @@ def _settings(direction: DirectionSpec, prefix: str = "") -> list[str]:
 
 def _number(value: float) -> str:
     """The shortest text that reads back as the same number."""
-    return repr(float(value)).removesuffix(".0")
+    text = repr(float(value))
+    return text[:-2] if text.endswith(".0") else text
 
 
 def parse_spec(text: str) -> LatencySpec:
@@ -98,7 +99,7 @@ def _parse_part(part: str, text: str) -> dict[str, float]:
     if short:
         delay, jitter = short.groups()
         settings = {"delay_ms": _duration_ms(delay)}
-        return settings | ({"jitter_ms": _duration_ms(jitter)} if jitter else {})
+        return {**settings, **({"jitter_ms": _duration_ms(jitter)} if jitter else {})}
     name, _, value = part.partition("=")
     if name in ("delay", "jitter") and _DURATION.fullmatch(value):
         return {f"{name}_ms": _duration_ms(value)}

@@ -5,8 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.latency import DirectionSpec, LatencyModel, LatencySpec, make_link, parse_spec
 from edge_runtime.cli import UserError
+from edge_runtime.latency.model import (
+    DirectionSpec,
+    LatencyModel,
+    LatencySpec,
+    make_link,
+    parse_spec,
+)
 
 milliseconds = st.floats(0.0, 10_000.0, allow_nan=False)
 directions = st.builds(DirectionSpec, milliseconds, milliseconds, st.floats(0.0, 100.0))

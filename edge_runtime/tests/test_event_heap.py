@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.event_heap import EventHeap
+from edge_runtime.latency.event_heap import EventHeap
 
 times = st.lists(st.floats(0, 100, allow_nan=False), max_size=30)
 
