@@ -15,7 +15,16 @@ from trainer.experiments.figures.bars import draw_difficulty, draw_guidance, dra
 from trainer.experiments.figures.curves import Line, draw_curves
 from trainer.experiments.figures.spread import draw_boxes, draw_distributions, draw_table
 from trainer.experiments.gathered import Gathered
-from trainer.experiments.plan import HUMAN_MODEL, NORMAL, POOR, REMEDY, SCENARIO_TITLES, TOUGH
+from trainer.experiments.plan import (
+    EXACT_LOSSES,
+    HUMAN_MODEL,
+    IMPORTANCE,
+    NORMAL,
+    POOR,
+    REMEDY,
+    SCENARIO_TITLES,
+    TOUGH,
+)
 from trainer.experiments.units import Unit
 from trainer.experiments.verdict import Claim
 
@@ -141,10 +150,18 @@ EXPERIMENTS: dict[str, Experiment] = {
         learning.judge_remedy,
         by_metric=False,
     ),
+    "switches": _curves(
+        "what the paper leaves open: loss form, importance weights",
+        _lines(("phil_td3",), NORMAL, EXACT_LOSSES, IMPORTANCE),
+        learning.judge_switches,
+        by_metric=False,
+    ),
 }
 """Name on the command line -> experiment; ``time`` is measured and has no units."""
+OURS = ("remedy", "switches")
+"""Experiments that the paper does not have: computed last."""
 TIME = "time"
-NAMES = (*(name for name in EXPERIMENTS if name != "remedy"), TIME, "remedy")
+NAMES = (*(name for name in EXPERIMENTS if name not in OURS), TIME, *OURS)
 
 
 def units_of(names: Iterable[str], seeds: int) -> list[Unit]:
@@ -152,7 +169,7 @@ def units_of(names: Iterable[str], seeds: int) -> list[Unit]:
 
     Of units that equally many need, all seeds of one algorithm come before the next algorithm.
     """
-    papers = [experiment for name, experiment in EXPERIMENTS.items() if name != "remedy"]
+    papers = [experiment for name, experiment in EXPERIMENTS.items() if name not in OURS]
     needed = Counter(unit for experiment in papers for unit in experiment.units(seeds))
     wanted = [u for name in names if name != TIME for u in EXPERIMENTS[name].units(seeds)]
     unique = list(dict.fromkeys(wanted))

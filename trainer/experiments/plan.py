@@ -9,14 +9,23 @@ from typing import Any, NamedTuple
 HUMAN_MODEL = "human_model"
 """Stands in an algorithm's place where the human model itself is tested: nothing is trained."""
 
-NORMAL, TOUGH, POOR, REMEDY = SETTINGS = ("normal", "tough", "poor", "remedy")
+NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE = SETTINGS = (
+    "normal", "tough", "poor", "remedy", "exact_losses", "importance",
+)  # fmt: skip
 """Section VI's definition; one frame instead of two; one third of the demonstrations random; a
-price on the action before tanh, for algorithms whose policy saturates."""
+price on the action before tanh, for algorithms whose policy saturates; losses as eq. 22 and 23 are
+printed; the importance weights that the paper calls optional."""
 
 POOR_SHARE = 1.0 / 3.0
 """Demonstrations replaced by random actions in the poor setting (section VII-E)."""
-REMEDY_WEIGHT = 0.1
-"""``saturation_weight`` of the remedy. Not in the paper; measured on one run of a prototype."""
+LEARNER_OF: Mapping[str, Mapping[str, Any]] = {
+    TOUGH: {"frames": 1},
+    # Not in the paper; measured on one run of a prototype.
+    REMEDY: {"saturation_weight": 0.1},
+    EXACT_LOSSES: {"split_loss": True},
+    IMPORTANCE: {"importance_sampling": True},
+}
+"""Setting -> the hyper-parameters that it changes."""
 
 
 class Scene(NamedTuple):

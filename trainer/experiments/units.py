@@ -14,12 +14,10 @@ from edge_runtime.files import read_bytes
 from trainer.drivers import make_environment
 from trainer.experiments.plan import (
     HUMAN_MODEL,
+    LEARNER_OF,
     POOR,
     POOR_SHARE,
-    REMEDY,
-    REMEDY_WEIGHT,
     SETTINGS,
-    TOUGH,
     Plan,
 )
 from trainer.human.model import MODEL_FILE
@@ -86,11 +84,7 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
     reason = obstacle(unit, humans)
     if reason or not unit.trained:
         raise UserError(f"{unit}: {reason or 'nothing is trained for it'}")
-    learner = replace(LearnerConfig(), **plan.learner)
-    if unit.setting == TOUGH:
-        learner = replace(learner, frames=1)
-    if unit.setting == REMEDY:
-        learner = replace(learner, saturation_weight=REMEDY_WEIGHT)
+    learner = replace(LearnerConfig(), **plan.learner, **LEARNER_OF.get(unit.setting, {}))
     return RunConfig(
         scenario=unit.scenario,
         algorithm=unit.algorithm,

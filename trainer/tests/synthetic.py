@@ -16,7 +16,14 @@ SKILLS = {
     "phil_advantage_100": 0.97, "rd2_td3": 0.7, "rd2_phil": 0.9, "phil_without_cloning": 0.8,
     "phil_without_tdqa": 0.7, "phil_without_shaping": 0.9,
 }  # fmt: skip
-FACTORS = {"normal": 1.0, "tough": 0.85, "poor": 0.97, "remedy": 1.0}
+FACTORS = {
+    "normal": 1.0,
+    "tough": 0.85,
+    "poor": 0.97,
+    "remedy": 1.0,
+    "exact_losses": 0.9,
+    "importance": 0.9,
+}
 
 
 def outcome(unit: Unit, episodes: int = 100, runs: int = 50, conditions=CONDITIONS) -> Outcome:

@@ -8,7 +8,7 @@ import pytest
 
 from edge_runtime.errors import UserError
 from trainer.experiments import units
-from trainer.experiments.plan import HUMAN_MODEL, REMEDY_WEIGHT
+from trainer.experiments.plan import HUMAN_MODEL
 from trainer.experiments.units import Unit, deciding, digest, obstacle, run_config, unit_id
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.tests.experiments import GUIDED, TINY, UNIT, store_in, write_human
@@ -111,9 +111,7 @@ def test_settings_change_one_thing_each(humans):
     tough = run_config(replace(GUIDED, setting="tough"), TINY, humans)
     remedy = run_config(replace(GUIDED, setting="remedy"), TINY, humans)
     assert tough == replace(normal, learner=replace(normal.learner, frames=1))
-    assert remedy == replace(
-        normal, learner=replace(normal.learner, saturation_weight=REMEDY_WEIGHT)
-    )
+    assert remedy == replace(normal, learner=replace(normal.learner, saturation_weight=0.1))
     assert normal.learner.batch_size == TINY.learner["batch_size"]
 
 
