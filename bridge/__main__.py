@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from bridge import record, simulate, view
+from bridge import record, replay, simulate, view
 from bridge.recording import repair
 from edge_runtime.cli import ArgumentParser, run_cli
 
@@ -30,6 +30,11 @@ SUBCOMMANDS = {
     ),
     "repair": Subcommand(
         repair.add_arguments, repair.repair, "give a recording that was cut off its index back"
+    ),
+    "replay": Subcommand(
+        replay.add_arguments,
+        replay.replay,
+        "run recorded states through a policy or runtime, and compare its commands",
     ),
     "view": Subcommand(view.add_arguments, view.view, "show the wire in rerun, live or in a file"),
 }

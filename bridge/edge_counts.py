@@ -28,6 +28,12 @@ class EdgeCounts:
         with self._lock:
             return dict(self._rejected)
 
+    @property
+    def policy_id(self) -> str:
+        """Return the policy of the newest health; empty before the first."""
+        with self._lock:
+            return "" if self._last is None else self._last.policy_id
+
     def observe_message(self, payload: bytes) -> None:
         """Take a health message; one that cannot be read is left out."""
         health = decode_health(payload)
