@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 import zstandard
-from mcap.exceptions import InvalidMagic, McapError
+from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 
 from edge_runtime.errors import UserError
 
@@ -76,12 +76,8 @@ class Recording:
                 parts = breakup_chunk(record, True) if isinstance(record, Chunk) else [record]
             except StopIteration:
                 return
-            except InvalidMagic:
-                if stream.tell() <= len(b"\x89MCAP0\r\n"):
-                    raise UserError(f"{self.path} is no MCAP recording") from None
-                return
             except TORN:
-                if stream.tell() <= len(b"\x89MCAP0\r\n"):
+                if stream.tell() <= MAGIC_SIZE:
                     raise UserError(f"{self.path} is no MCAP recording") from None
                 return
             # The footer comes with the closing magic: only then is the file whole.
