@@ -128,9 +128,7 @@ def open_feed(connect: str, vehicle_id: str, wait_s: float = 0.0) -> Iterator[Fe
         liveliness = session.liveliness()
         for topic in TOKEN_TOPICS:
             token = f"phil/{vehicle_id}/{topic}"
-            declared.append(
-                liveliness.declare_subscriber(token, feed.watch(topic), history=True)
-            )
+            declared.append(liveliness.declare_subscriber(token, feed.watch(topic), history=True))
         try:
             _wait_for_simulator(feed, give_up_s, vehicle_id, connect)
             yield feed

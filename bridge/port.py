@@ -95,7 +95,7 @@ class SimulatorPort:
                 self.edge_counts.observe_status(reply.ok.payload.to_bytes())
 
     def edge_policy_id(self) -> str:
-        """Return the policy that the edge runtime drives, by its own word; empty if it is silent."""
+        """Return the policy that the edge runtime says it drives; empty if it says nothing."""
         self.note_edge_counts()
         return self.edge_counts.policy_id
 

@@ -12,7 +12,6 @@ import numpy as np
 from bridge.safe_stops import SafeStopEvent
 from edge_runtime.episode_report import EpisodeResult, summarise
 
-
 QUANTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 
 
@@ -43,9 +42,9 @@ def make_report(
 ) -> dict[str, Any]:
     """Join the summary of the episodes with what happened on the wire.
 
-    ``settings`` holds scenario, condition, policy_ids, seed, clock and latency_spec; ``counts``
-    holds deadline_misses, tick_overruns, missed_ticks, edge_changes and ``rejections``. The
-    report's policy_id is that of the policy that answered last.
+    ``settings`` holds scenario, condition, policy_ids, seed, clock, latency_spec and wall_s;
+    ``counts`` holds deadline_misses, tick_overruns, missed_ticks, edge_changes and
+    ``rejections``. The report's policy_id is that of the policy that answered last.
     """
     return {
         **summarise(
@@ -62,6 +61,8 @@ def make_report(
         "safe_stops": len(safe_stop_events),
         "clock": settings["clock"],
         "latency_spec": settings["latency_spec"],
+        "wall_s": settings["wall_s"],
+        "times_real_time": sum(result.time_s for result in results) / settings["wall_s"],
         "safe_stop_events": [asdict(event) for event in safe_stop_events],
         "per_episode": [result.as_dict() for result in results],
     }

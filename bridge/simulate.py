@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -186,9 +187,11 @@ def _drive(
     runner = EpisodeRunner(environment, clock, port.session, port.publish_scene, bar.tick)
     results = []
     port.note_edge_counts()
+    started_s = time.monotonic()
     for episode in range(settings.episodes):
         results.append(runner.run(episode, settings.seed + episode))
         bar.done(episode + 1)
+    wall_s = time.monotonic() - started_s
     port.note_edge_counts()
     return make_report(
         results,
@@ -209,5 +212,6 @@ def _drive(
             "seed": settings.seed,
             "clock": settings.clock,
             "latency_spec": str(settings.latency),
+            "wall_s": wall_s,
         },
     )

@@ -12,11 +12,11 @@ from typing import Any
 import rerun as rr
 
 from bridge.arguments import non_negative_seconds
+from bridge.feed import Feed, Heard, open_feed
 from bridge.scene import decode_scene
 from bridge.signals import sigterm_as_interrupt
 from bridge.simulate import DEFAULT_VEHICLE_ID
 from bridge.viewer import sinks
-from bridge.feed import Feed, Heard, open_feed
 from bridge.viewer.wire_log import WireLog
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser

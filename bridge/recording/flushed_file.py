@@ -1,4 +1,4 @@
-"""A file that grows by whole blocks: what has been flushed is whole, also on a disk that is full."""
+"""A file that grows by whole blocks: what has been flushed stays whole on a full disk, too."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
-Field = descriptor_pb2.FieldDescriptorProto
+Field: Any = descriptor_pb2.FieldDescriptorProto
 _SCALARS = {
     str: Field.TYPE_STRING,
     bool: Field.TYPE_BOOL,
@@ -121,7 +121,7 @@ def _add_struct(message: Any, kind: type[msgspec.Struct], path: str = "phil") ->
             message.field.append(field)
 
 
-def _type_field(field: Field, hint: Any, message: Any, path: str) -> bool:
+def _type_field(field: Any, hint: Any, message: Any, path: str) -> bool:
     """Fill in the type; False where the viewers' copy goes without this field."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin is dict:
@@ -162,7 +162,7 @@ def _build(file: descriptor_pb2.FileDescriptorProto, name: str) -> Schema:
     files = [stamp, file] if file.dependency else [file]
     pool = descriptor_pool.DescriptorPool()
     for each in files:
-        pool.Add(each)  # type: ignore[no-untyped-call]
+        pool.Add(each)
     descriptors = descriptor_pb2.FileDescriptorSet(file=files).SerializeToString()
     make = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
     return Schema(name, make, descriptors)

@@ -1,12 +1,12 @@
 """What is heard, written as MCAP: the exact payloads for replay, and copies that viewers can draw.
 
-| topic | encoding | for |
-|---|---|---|
-| ``phil/<id>/state`` and all other keys of the wire | ``msgpack``: the payload as it was | replay |
-| ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true or false} | replay, people |
-| ``view/<id>/frames`` | ``foxglove.RawImage``: frame t-1 above frame t | viewers |
-| ``view/<id>/state``, ``command``, ``feedback``, ``health``, ``scene`` | protobuf ``phil.*`` | viewers |
-| ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages | viewers |
+| topic | encoding |
+|---|---|
+| ``phil/<id>/<topic>``, the keys of the wire | ``msgpack``: the payload as it was |
+| ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true}, or false |
+| ``view/<id>/frames`` | ``foxglove.RawImage``: frame t-1 above frame t |
+| ``view/<id>/<topic>``, of every topic of the wire | protobuf ``phil.State`` and so on |
+| ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages |
 """
 
 from __future__ import annotations
@@ -98,13 +98,18 @@ class RecordingWriter:
             self._event(vehicle_id, heard.arrived_ns, WARNING, f"unreadable {heard.topic}: {why}")
             return
         schema, _ = self._schema(kind.__name__, lambda: protobuf.schema_of(kind))
-        copy = protobuf.fill(schema.make(), message)
+        try:
+            copy = protobuf.fill(schema.make(), message)
+        except ValueError as error:  # The wire carries integers that protobuf's do not hold.
+            text = f"{heard.topic} not drawn: {error}"
+            self._event(vehicle_id, heard.arrived_ns, WARNING, text)
+            return
         self._add_view(f"view/{vehicle_id}/{heard.topic}", schema.name, heard.arrived_ns, copy)
         if isinstance(message, wire.State):
             self._frames(vehicle_id, heard.arrived_ns, message)
 
     def _frames(self, vehicle_id: str, now_ns: int, state: wire.State) -> None:
-        """Both frames lie one after the other in memory: that is one picture of twice the height."""
+        """Both frames lie one after the other: in memory that is one picture, twice as high."""
         schema, _ = self._schema("RawImage", protobuf.raw_image)
         count, height, width = wire.FRAMES_SHAPE
         image = schema.make(

@@ -7,15 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from bridge.replaying.recorded import Answer, Key, RecordedDrive, RecordedState, key_of
+from bridge.replaying.recorded import (
+    JUST_AFTER_S,
+    Answer,
+    Key,
+    RecordedDrive,
+    RecordedState,
+    key_of,
+)
 from edge_runtime.controller import Controller, Order, Received
 from edge_runtime.inference import infer
 from edge_runtime.limiter import LimitRow, limit_rows
 from edge_runtime.policy import Policy
 from edge_runtime.vehicles.registry import make_vehicle
-
-JUST_AFTER_S = 1e-6
-"""A watchdog wakes at its deadline or later, never before."""
 
 Answers = dict[Key, list[Answer]]
 
@@ -43,17 +47,19 @@ class _Replay:
         self._restarts_s: Iterator[float] = iter(drive.runtime_starts_s[1:])
         self._next_restart_s = next(self._restarts_s, float("inf"))
         self._controller = Controller(rows, needs_rearm)
+        self._last_heard_s = 0.0
         self._answers: Answers = {}
 
     def run(self) -> Answers:
         for recorded in self._drive.answered():
             self._restart(recorded.exchange.arrived_s)
             self._answer(recorded)
-        self._pass_time(self._drive.ends_s)
+        self._pass_time(self._last_heard_s)
         return self._answers
 
     def _restart(self, now_s: float) -> None:
         while now_s >= self._next_restart_s:
+            self._pass_time(self._last_heard_s)
             self._controller = Controller(self._rows, self._needs_rearm)
             self._next_restart_s = next(self._restarts_s, float("inf"))
 
@@ -68,6 +74,7 @@ class _Replay:
         output = infer(self._policy, state.frames_array()).output
         self._pass_time(exchange.finished_s)
         self._note(self._controller.finish(output, 1, exchange.finished_s))
+        self._last_heard_s = exchange.last_s
 
     def _pass_time(self, until_s: float) -> None:
         """Be the watchdog up to a moment."""

@@ -41,14 +41,16 @@ class _Live:
     def run(self) -> Answers:
         self._port.on_command(self._inbox.put)
         zero_s: float | None = None
+        last_s = 0.0
         for number, recorded in enumerate(self._drive.answered(), start=1):
             if zero_s is None:
                 zero_s = time.monotonic() - recorded.exchange.arrived_s
             self._listen_until(zero_s + recorded.exchange.arrived_s)
             self._publish(recorded)
             zero_s = max(zero_s, time.monotonic() - recorded.exchange.finished_s)
+            last_s = recorded.exchange.last_s
             self._on_state(number)
-        self._listen_until((zero_s or 0.0) + self._drive.ends_s)
+        self._listen_until((zero_s or 0.0) + last_s)
         return self._answers
 
     def _publish(self, recorded: RecordedState) -> None:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 from bridge.recording.reader import Recording
 from bridge.recording.writer import WIRE_ENCODING
 from edge_runtime.errors import UserError
+from edge_runtime.safety import MAX_INFERENCE_S, Event
 from edge_runtime.wire import (
-    CONTROL_PERIOD_S,
     Command,
     Health,
     Rejection,
@@ -27,6 +27,8 @@ from edge_runtime.wire import (
 
 RUNTIME_ENDED = "runtime_ended"
 """Reason of the farewell of a runtime that is ended; no decision about a state."""
+JUST_AFTER_S = 1e-6
+"""A watchdog wakes at its deadline or later, never before."""
 RESTART_S = 0.5
 """Uptimes that disagree by more than this belong to two runtimes."""
 
@@ -52,6 +54,8 @@ class Exchange:
     """When the policy began with it."""
     finished_s: float
     """When the policy's answer, or the verdict that it took too long, was there."""
+    last_s: float
+    """When the last answer was heard, repetitions included."""
     answers: list[Answer] = field(default_factory=list)
 
 
@@ -72,8 +76,6 @@ class RecordedDrive:
         self.policy_ids: list[str] = []
         self.vehicle = "none"
         self.runtime_starts_s: list[float] = []
-        self.ends_s = 0.0
-        """When the last command was heard."""
         self._zero_ns: int | None = None
         self._seen_ids: set[str] = set()
         self._read_answers(vehicle_id)
@@ -101,9 +103,10 @@ class RecordedDrive:
         for stored in self.recording.messages():
             if self._zero_ns is None:
                 self._zero_ns = stored.message.log_time
-            if stored.channel.message_encoding != WIRE_ENCODING:
-                continue
-            _, id_, topic = stored.channel.topic.split("/")
+            parts = stored.channel.topic.split("/")
+            if stored.channel.message_encoding != WIRE_ENCODING or len(parts) != 3:
+                continue  # A copy for viewers, or nothing of ours.
+            _, id_, topic = parts
             self._seen_ids.add(id_)
             if vehicle_id in (None, id_):
                 heard_s = (stored.message.log_time - self._zero_ns) * 1e-9
@@ -120,12 +123,12 @@ class RecordedDrive:
                 self._take_health(health, heard_s)
 
     def _take_command(self, command: Command, heard_s: float) -> None:
-        self.ends_s = heard_s
         if command.policy_id not in self.policy_ids:
             self.policy_ids.append(command.policy_id)
         key = (command.session, command.episode, command.step)
         if key not in self.exchanges:
             self.exchanges[key] = _first_exchange(command, heard_s)
+        self.exchanges[key].last_s = heard_s
         answers = self.exchanges[key].answers
         answer = Answer(command.mode, command.reason, tuple(command.action))
         if not answers or answers[-1] != answer:
@@ -159,8 +162,11 @@ def key_of(state: State) -> Key:
 def _first_exchange(command: Command, heard_s: float) -> Exchange:
     """Place the state's arrival in the recorder's time by how long the runtime had it."""
     thought_s = max(0.0, (command.sent_ns - command.received_ns) * 1e-9)
-    inference_s = command.inference_ns * 1e-9
     arrived_s = heard_s - thought_s
-    if inference_s == 0.0:  # The watchdog's verdict: the policy is still at it.
-        inference_s = min(thought_s, CONTROL_PERIOD_S)
-    return Exchange(arrived_s, max(arrived_s, heard_s - inference_s), heard_s)
+    begun_s = max(arrived_s, heard_s - command.inference_ns * 1e-9)
+    finished_s = heard_s
+    if command.inference_ns == 0 and command.reason == Event.TOO_LONG.value:
+        # The watchdog's verdict; the policy is still at it.
+        begun_s = arrived_s
+        finished_s = max(heard_s, begun_s + MAX_INFERENCE_S + JUST_AFTER_S)
+    return Exchange(arrived_s, begun_s, finished_s, heard_s)

@@ -11,13 +11,18 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zenoh
 from mcap.reader import NonSeekingReader, make_reader
 
-from bridge.feed import QUEUE_MESSAGES, Feed, Heard
+from bridge.feed import QUEUE_MESSAGES, WIRE_TOPICS, Feed, Heard
 from bridge.recording.reader import Recording
 from bridge.recording.writer import RecordingWriter
+from bridge.replaying.in_process import replay_in_process
+from bridge.replaying.recorded import RecordedDrive
+from bridge.scene import encode_scene
+from bridge.tests.commands import make_command
 from bridge.tests.processes import (
     SLOW_TOY,
     BridgeProcess,
@@ -27,7 +32,9 @@ from bridge.tests.processes import (
     start_edge,
     start_simulate,
 )
+from bridge.tests.test_edge_counts import health
 from edge_runtime.cli import UserError
+from edge_runtime.policy import load_policy
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
 from edge_runtime.transport import free_endpoint, open_session
 from edge_runtime.wire import FRAMES_BYTES, MAX_PAYLOAD_BYTES, State, decode_state, encode
@@ -60,9 +67,7 @@ def heard(topic: str, payload: bytes, arrived_ns: int = 1, key: str = "") -> Hea
 def rerun(*arguments: str) -> str:
     """Run rerun's own reader; what it prints."""
     command = [sys.executable, "-m", "rerun", *arguments]
-    return subprocess.run(
-        command, check=True, capture_output=True, timeout=60, text=True
-    ).stdout
+    return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
 
 
 @pytest.fixture(scope="module")
@@ -70,10 +75,13 @@ def drive(tmp_path_factory):
     """A recorded drive in lock-step, and its report."""
     folder, endpoint = tmp_path_factory.mktemp("drive"), free_endpoint()
     recording, out = folder / "drive.mcap", folder / "r.json"
-    with start_simulate(endpoint, out, SLOW_TOY) as run, start_record(endpoint, recording) as rec:
-        with start_edge(endpoint, make_policy(folder)):
-            assert run.wait() == 0, run.errors
-            assert rec.wait(PATIENCE_S) == 0, rec.errors
+    with (
+        start_simulate(endpoint, out, SLOW_TOY) as run,
+        start_record(endpoint, recording) as recorder,
+        start_edge(endpoint, make_policy(folder)),
+    ):
+        assert run.wait() == 0, run.errors
+        assert recorder.wait(PATIENCE_S) == 0, recorder.errors
     return recording, read(out)
 
 
@@ -199,6 +207,33 @@ def test_what_cannot_be_read_is_kept_and_what_is_too_large_is_not(tmp_path):
     assert b"unreadable" in events[0]
     assert b"65537 bytes" in events[1]
     assert recording.metadata == {"messages": "3", "dropped": "3"}
+
+
+def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
+    """Ints beyond 64 bits signed, and 3,000 mutated messages of every topic."""
+    random = np.random.default_rng(1)
+    good = [
+        encode(make_state(1, episode=2**63)),
+        encode(make_state(1)),
+        encode(make_command(1)),
+        encode(health(1, 2.0, stale=2**63)),
+        encode_scene({"vehicles": []}, 1, 1, 0.1),
+    ]
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    for number in range(3000):
+        payload = bytearray(good[number % len(good)])
+        for _ in range(number // 1000):
+            payload[random.integers(len(payload))] = random.integers(256)
+        topic = WIRE_TOPICS[(number // len(good)) % len(WIRE_TOPICS)]
+        writer.write(heard(topic, bytes(payload), arrived_ns=number))
+    writer.finish(dropped=0)
+    writer.close()
+    raw = [stored for stored in Recording(tmp_path / "a.mcap").messages() if stored.schema is None]
+    assert len(raw) == 3000
+    drive = RecordedDrive(tmp_path / "a.mcap", None)
+    policy = load_policy(make_policy(tmp_path), allow_unsigned=True)
+    assert ("here", 0, 1) in drive.exchanges
+    replay_in_process(drive, policy)
 
 
 def test_a_feed_that_falls_behind_drops_and_counts():
