@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from bridge import simulate, view
+from bridge import router, simulate, view
 from edge_runtime.cli import ArgumentParser, run_cli
 
 
@@ -23,6 +23,11 @@ SUBCOMMANDS = {
         simulate.add_arguments,
         simulate.simulate,
         "serve an environment to an edge runtime over Zenoh, and report",
+    ),
+    "router": Subcommand(
+        router.add_arguments,
+        router.router,
+        "connect several simulators, edge runtimes and viewers with one another",
     ),
     "view": Subcommand(view.add_arguments, view.view, "show the wire in rerun, live or in a file"),
 }

@@ -13,7 +13,9 @@ import zenoh
 from bridge.edge_counts import EdgeCounts
 from bridge.environments import scene_of
 from bridge.scene import encode_scene, scene_key
+from edge_runtime import access
 from edge_runtime.cli import UserError
+from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.wire import key
 
@@ -112,9 +114,16 @@ class SimulatorPort:
 
 
 @contextlib.contextmanager
-def open_port(listen: str, vehicle_id: str) -> Iterator[SimulatorPort]:
-    """Listen at ``listen`` for the edge runtime; UserError if the port is busy."""
-    zenoh_session = open_session(listen=listen, mode="router")
+def open_port(listen: str, vehicle_id: str, tls: TlsFiles | None = None) -> Iterator[SimulatorPort]:
+    """Listen at ``listen`` for the edge runtime; UserError if the port is busy.
+
+    With ``tls``, every other party has the rights of its certificate's name and no more.
+    """
+    rules = None
+    if tls is not None:
+        access.check_name(tls.name, access.common_name(access.SIMULATOR, vehicle_id), access.ROUTER)
+        rules = access.rules_for_listener([vehicle_id])
+    zenoh_session = open_session(listen=listen, mode="router", tls=tls, access=rules)
     try:
         port = SimulatorPort(zenoh_session, vehicle_id)
         try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium
 
-from bridge.arguments import non_negative_int, non_negative_seconds, positive_int
+from bridge.arguments import add_tls, non_negative_int, non_negative_seconds, positive_int
 from bridge.clock import Clock, Publish
 from bridge.command_check import CommandCheck
 from bridge.environments import CONDITIONS, NOMINAL, SCENARIOS, make_environment, scenario_of
@@ -23,6 +23,7 @@ from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
+from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 from edge_runtime.wire import check_vehicle_id
 
@@ -42,6 +43,7 @@ class SimulateSettings:
     episodes: int
     clock: str
     listen: str
+    tls: TlsFiles | None
     vehicle_id: str
     latency: LatencySpec
     seed: int
@@ -76,6 +78,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=DEFAULT_ENDPOINT,
         help="where the edge runtime and viewers connect to",
     )
+    add_tls(parser)
     parser.add_argument(
         "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to simulate"
     )
@@ -119,6 +122,7 @@ def _check(arguments: Any) -> SimulateSettings:
         episodes=arguments.episodes,
         clock=arguments.clock,
         listen=check_endpoint(arguments.listen),
+        tls=tls_for(arguments.tls, arguments.listen),
         vehicle_id=check_vehicle_id(arguments.vehicle_id),
         latency=parse_spec(arguments.latency),
         seed=arguments.seed,
@@ -132,7 +136,7 @@ def _check(arguments: Any) -> SimulateSettings:
 
 def _serve(settings: SimulateSettings, environment: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     action_size = (environment.action_space.shape or (1,))[0]
-    with open_port(settings.listen, settings.vehicle_id) as port:
+    with open_port(settings.listen, settings.vehicle_id, settings.tls) as port:
         check = CommandCheck(port.session, action_size)
         with (
             _running_clock(settings, port.publish_state, check) as clock,

@@ -18,6 +18,7 @@ import zenoh
 from bridge.port import simulator_key
 from bridge.scene import scene_key
 from edge_runtime.cli import UserError
+from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.wire import check_vehicle_id, key
 
@@ -75,11 +76,13 @@ class Feed:
 
 
 @contextlib.contextmanager
-def open_feed(connect: str, vehicle_id: str, wait_s: float = 0.0) -> Iterator[Feed]:
+def open_feed(
+    connect: str, vehicle_id: str, wait_s: float = 0.0, tls: TlsFiles | None = None
+) -> Iterator[Feed]:
     """Listen to one vehicle; UserError if its simulator is not at ``connect`` within ``wait_s``."""
     check_vehicle_id(vehicle_id)
     give_up_s = time.monotonic() + wait_s
-    session = _connect(connect, wait_s)
+    session = _connect(connect, wait_s, tls)
     try:
         feed = Feed()
         keys = {topic: key(vehicle_id, topic) for topic in WIRE_TOPICS}
@@ -106,12 +109,12 @@ def _wait_for_simulator(feed: Feed, give_up_s: float, vehicle_id: str, endpoint:
         )
 
 
-def _connect(endpoint: str, wait_s: float) -> zenoh.Session:
+def _connect(endpoint: str, wait_s: float, tls: TlsFiles | None) -> zenoh.Session:
     """Try again until the simulator listens: it and its viewer are often started together."""
     give_up_s = time.monotonic() + wait_s
     while True:
         try:
-            return open_session(connect=endpoint, mode="client")
+            return open_session(connect=endpoint, mode="client", tls=tls)
         except UserError:
             if time.monotonic() >= give_up_s:
                 raise
