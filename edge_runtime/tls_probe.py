@@ -15,6 +15,7 @@ from edge_runtime.tls import TlsFiles
 _TIMEOUT_S = 1.0
 # A server that refuses a client's certificate says so after the handshake (TLS 1.3).
 _ALERT_S = 0.3
+_AUTHORITY = "both need one authority, and certificates that have not expired"
 
 
 def why_refused(endpoint: str, files: TlsFiles) -> Optional[str]:
@@ -29,27 +30,30 @@ def why_refused(endpoint: str, files: TlsFiles) -> Optional[str]:
     host = host.strip("[]")
     context = ssl.create_default_context(cafile=files.ca)
     context.load_cert_chain(files.certificate, files.key)
-    with contextlib.suppress(OSError):
+    try:
         plain = socket.create_connection((host, int(port)), timeout=_TIMEOUT_S)
-        with contextlib.closing(plain):
-            return _shake_hands(plain, context, host, endpoint, files)
-    return None
+    except OSError:
+        return None
+    with contextlib.closing(plain):
+        return _shake_hands(plain, context, host, endpoint, files)
 
 
 def _shake_hands(
     plain: socket.socket, context: ssl.SSLContext, host: str, endpoint: str, files: TlsFiles
 ) -> Optional[str]:
+    shaken = False
     try:
         with context.wrap_socket(plain, server_hostname=host) as link:
+            shaken = True
             link.settimeout(_ALERT_S)
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
-        return f"{endpoint} is not believed: {error.verify_message}"
+        return f"{endpoint} shows a certificate that is not believed here: {error.verify_message}"
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).lower().replace("_", " ")
         if "alert" in reason:
-            return f"{endpoint} refuses the certificate of {files.name} ({reason})"
+            return f"{endpoint} refuses the certificate of {files.name} ({reason}): {_AUTHORITY}"
         return f"{endpoint} does not speak TLS ({reason})"
-    except socket.timeout:
-        return None
+    except OSError:  # A link that stays open, and silent, has been accepted.
+        return None if shaken else f"{endpoint} answers, but not with TLS"
     return None
