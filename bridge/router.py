@@ -8,12 +8,13 @@ from typing import Any
 
 from bridge.arguments import add_tls
 from bridge.signals import sigterm_as_interrupt
-from bridge.simulate import DEFAULT_VEHICLE_ID
 from edge_runtime import access
 from edge_runtime.cli import ArgumentParser
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, open_session
 from edge_runtime.wire import check_vehicle_id
+
+DEFAULT_VEHICLE_ID = "hunter01"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
