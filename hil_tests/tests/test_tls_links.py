@@ -157,12 +157,14 @@ def start_router(endpoint, parties):
     router = subprocess.Popen(
         [*command, "--tls", str(parties / "router")], stdout=subprocess.PIPE, text=True
     )
+    assert router.stdout is not None
     assert router.stdout.readline() == f"ready listen={endpoint}\n"
     return router
 
 
 def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(parties, policy_flags):
-    place, answered = free_endpoint("tls"), []
+    place = free_endpoint("tls")
+    answered: list[bytes] = []
     flags = ["--connect", place, "--tls", str(parties / "edge-hunter01"), *policy_flags]
     with EdgeProcess(*flags) as edge:
         assert edge.ready_line.startswith("ready")
