@@ -16,6 +16,7 @@ from typing import NamedTuple
 import zenoh
 
 from edge_runtime.cli import UserError
+from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, check_vehicle_id
 
@@ -110,7 +111,9 @@ class Feed:
 
 
 @contextlib.contextmanager
-def open_feed(connect: str, vehicle_id: str, wait_s: float = 0.0) -> Iterator[Feed]:
+def open_feed(
+    connect: str, vehicle_id: str, wait_s: float = 0.0, tls: TlsFiles | None = None
+) -> Iterator[Feed]:
     """Listen to one vehicle, or to ANY_VEHICLE.
 
     UserError if no simulator for it is at ``connect`` within ``wait_s``.
@@ -118,7 +121,7 @@ def open_feed(connect: str, vehicle_id: str, wait_s: float = 0.0) -> Iterator[Fe
     if vehicle_id != ANY_VEHICLE:
         check_vehicle_id(vehicle_id)
     give_up_s = time.monotonic() + wait_s
-    session = connect_client(connect, wait_s)
+    session = connect_client(connect, wait_s, tls)
     try:
         feed = Feed()
         declared = [
@@ -149,12 +152,12 @@ def _wait_for_simulator(feed: Feed, give_up_s: float, vehicle_id: str, endpoint:
         )
 
 
-def connect_client(endpoint: str, wait_s: float) -> zenoh.Session:
+def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:
     """Open a client; try again for ``wait_s``: both ends are often started together."""
     give_up_s = time.monotonic() + wait_s
     while True:
         try:
-            return open_session(connect=endpoint, mode="client")
+            return open_session(connect=endpoint, mode="client", tls=tls)
         except UserError:
             if time.monotonic() >= give_up_s:
                 raise

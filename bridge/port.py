@@ -14,7 +14,9 @@ from bridge.edge_counts import EdgeCounts
 from bridge.environments import scene_of
 from bridge.feed import connect_client
 from bridge.scene import encode_scene, scene_key
+from edge_runtime import access
 from edge_runtime.cli import UserError
+from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.wire import key
 
@@ -119,17 +121,28 @@ class SimulatorPort:
 
 @contextlib.contextmanager
 def open_port(
-    listen: str | None, vehicle_id: str, connect: str | None = None, wait_s: float = 0.0
+    listen: str | None,
+    vehicle_id: str,
+    tls: TlsFiles | None = None,
+    connect: str | None = None,
+    wait_s: float = 0.0,
 ) -> Iterator[SimulatorPort]:
     """Listen at ``listen`` for the edge runtime, or share the router at ``connect`` with others.
 
+    With ``tls``, every other party has the rights of its certificate's name and no more; behind a
+    router it is the router that sees to that.
     UserError if the port is busy, or if no router answers within ``wait_s``.
     """
+    rules = None
+    if tls is not None:
+        able = (access.ROUTER,) if connect is None else ()
+        access.check_name(tls.name, access.common_name(access.SIMULATOR, vehicle_id), *able)
+        rules = access.rules_for_listener([vehicle_id])
     # Behind a router a client: two peers there would not hear one another.
     if connect is not None:
-        zenoh_session = connect_client(connect, wait_s)
+        zenoh_session = connect_client(connect, wait_s, tls)
     else:
-        zenoh_session = open_session(listen=listen, mode="router")
+        zenoh_session = open_session(listen=listen, mode="router", tls=tls, access=rules)
     try:
         port = SimulatorPort(zenoh_session, vehicle_id)
         try:

@@ -8,12 +8,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bridge.arguments import non_negative_seconds
+from bridge.arguments import add_tls, non_negative_seconds
 from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
 from bridge.recording.writer import RecordingWriter
 from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, UserError
 from edge_runtime.files import check_writable
+from edge_runtime.tls import tls_for
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 from edge_runtime.wire import check_vehicle_id
 
@@ -33,8 +34,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--connect",
         metavar="PROTOCOL/HOST:PORT",
         default=DEFAULT_ENDPOINT,
-        help="where the simulator or a router listens",
+        help="where the simulator or the router listens",
     )
+    add_tls(parser)
     parser.add_argument(
         "--vehicle-id", metavar="ID", help="record this vehicle only (otherwise all)"
     )
@@ -62,14 +64,17 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def record(arguments: Any) -> int:
     """Run the command until the simulators go, the time is over, or somebody interrupts."""
-    check_endpoint(arguments.connect)
+    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     vehicle_id = arguments.vehicle_id
     vehicle_id = ANY_VEHICLE if vehicle_id is None else check_vehicle_id(vehicle_id)
     path = Path(arguments.out)
     check_writable(path)
     if path.exists():
         raise UserError(f"{path} exists; choose another name: no recording is lost")
-    with sigterm_as_interrupt(), open_feed(arguments.connect, vehicle_id, arguments.wait_s) as feed:
+    with (
+        sigterm_as_interrupt(),
+        open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,
+    ):
         writer = RecordingWriter(path)
         try:
             print(f"recording {path}", flush=True)

@@ -8,7 +8,7 @@ from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import Any
 
-from bridge.arguments import non_negative_seconds
+from bridge.arguments import add_tls, non_negative_seconds
 from bridge.port import open_port
 from bridge.progress import count_bar
 from bridge.replaying.comparison import compare
@@ -18,6 +18,7 @@ from bridge.replaying.recorded import RecordedDrive, key_of
 from edge_runtime.cli import ArgumentParser, UserError, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.policy import load_policy
+from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
 
@@ -55,6 +56,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="PROTOCOL/HOST:PORT",
         help="replay in real time to an edge runtime behind this router",
     )
+    add_tls(parser)
     parser.add_argument(
         "--public-key", metavar="FILE", help="Ed25519 public key of the policy, PEM"
     )
@@ -113,8 +115,8 @@ def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:
         policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
         return policy.policy_id, replay_in_process(drive, policy)
     endpoint = check_endpoint(arguments.listen or arguments.connect)
-    wait_s = arguments.wait_edge_s
-    with open_port(arguments.listen, drive.vehicle_id, arguments.connect, wait_s) as port:
+    wait_s, tls = arguments.wait_edge_s, tls_for(arguments.tls, endpoint)
+    with open_port(arguments.listen, drive.vehicle_id, tls, arguments.connect, wait_s) as port:
         port.wait_for_edge(wait_s, endpoint)
         with count_bar("states", len(drive.exchanges)) as bar:
             answers = replay_live(drive, port, bar)

@@ -10,7 +10,7 @@ from typing import Any
 
 import gymnasium
 
-from bridge.arguments import non_negative_int, non_negative_seconds, positive_int
+from bridge.arguments import add_tls, non_negative_int, non_negative_seconds, positive_int
 from bridge.clock import Clock, Publish
 from bridge.command_check import CommandCheck
 from bridge.environments import CONDITIONS, NOMINAL, SCENARIOS, make_environment, scenario_of
@@ -24,6 +24,7 @@ from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
+from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 from edge_runtime.wire import check_vehicle_id
 
@@ -44,6 +45,7 @@ class SimulateSettings:
     clock: str
     listen: str | None
     connect: str | None
+    tls: TlsFiles | None
     vehicle_id: str
     latency: LatencySpec
     seed: int
@@ -73,6 +75,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="lockstep waits for each command; realtime waits for nobody",
     )
     add_where(parser)
+    add_tls(parser)
     parser.add_argument(
         "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to simulate"
     )
@@ -140,6 +143,7 @@ def _check(arguments: Any) -> SimulateSettings:
         clock=arguments.clock,
         listen=listen,
         connect=connect,
+        tls=tls_for(arguments.tls, str(listen or connect)),
         vehicle_id=check_vehicle_id(arguments.vehicle_id),
         latency=parse_spec(arguments.latency),
         seed=arguments.seed,
@@ -153,8 +157,8 @@ def _check(arguments: Any) -> SimulateSettings:
 
 def _serve(settings: SimulateSettings, environment: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     action_size = (environment.action_space.shape or (1,))[0]
-    wait_s = settings.wait_edge_s
-    with open_port(settings.listen, settings.vehicle_id, settings.connect, wait_s) as port:
+    wait_s, tls = settings.wait_edge_s, settings.tls
+    with open_port(settings.listen, settings.vehicle_id, tls, settings.connect, wait_s) as port:
         check = CommandCheck(port.session, action_size)
         with (
             _running_clock(settings, port.publish_state, check) as clock,
