@@ -1,7 +1,7 @@
 """A recorded drive: which states the runtime answered, when they reached it, and with what.
 
-The recorder's clock is monotonic, and of the runtime's own stamps only differences are used, so
-that neither a clock that is off nor one that is stepped in the middle changes a replay.
+The runtime's own stamps say when, so that a recorder that was held up changes nothing. Its clock
+need not be right: the recorder's, which is monotonic, says when the runtime's is stepped.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ RUNTIME_ENDED = "runtime_ended"
 """Reason of the farewell of a runtime that is ended; no decision about a state."""
 JUST_AFTER_S = 1e-6
 """A watchdog wakes at its deadline or later, never before."""
+CLOCK_STEP_S = 1.0
+"""Where the two clocks come apart by more than this, the runtime's has been stepped."""
 RESTART_S = 0.5
 """Uptimes that disagree by more than this belong to two runtimes."""
 
@@ -77,6 +79,7 @@ class RecordedDrive:
         self.vehicle = "none"
         self.runtime_starts_s: list[float] = []
         self._zero_ns: int | None = None
+        self._lead_s: tuple[int, float] | None = None
         self._seen_ids: set[str] = set()
         self._read_answers(vehicle_id)
         self.vehicle_id = self._choose(vehicle_id)
@@ -125,14 +128,28 @@ class RecordedDrive:
     def _take_command(self, command: Command, heard_s: float) -> None:
         if command.policy_id not in self.policy_ids:
             self.policy_ids.append(command.policy_id)
+        sent_s = self._sent_s(command, heard_s)
         key = (command.session, command.episode, command.step)
         if key not in self.exchanges:
-            self.exchanges[key] = _first_exchange(command, heard_s)
-        self.exchanges[key].last_s = heard_s
+            self.exchanges[key] = _first_exchange(command, sent_s)
+        self.exchanges[key].last_s = sent_s
         answers = self.exchanges[key].answers
         answer = Answer(command.mode, command.reason, tuple(command.action))
         if not answers or answers[-1] != answer:
             answers.append(answer)
+
+    def _sent_s(self, command: Command, heard_s: float) -> float:
+        """When the command was sent, in the recorder's time.
+
+        The recorder's clock leads the runtime's by as much as at the first command of that
+        runtime, until a step of the latter.
+        """
+        stamp_s = (command.sent_ns - (self._zero_ns or 0)) * 1e-9
+        runtime, lead_s = len(self.runtime_starts_s), heard_s - stamp_s
+        known = self._lead_s
+        if known is None or known[0] != runtime or abs(lead_s - known[1]) > CLOCK_STEP_S:
+            self._lead_s = known = (runtime, lead_s)
+        return stamp_s + known[1]
 
     def _take_health(self, health: Health, heard_s: float) -> None:
         self.vehicle = health.vehicle
@@ -159,14 +176,14 @@ def key_of(state: State) -> Key:
     return state.session, state.episode, state.step
 
 
-def _first_exchange(command: Command, heard_s: float) -> Exchange:
-    """Place the state's arrival in the recorder's time by how long the runtime had it."""
+def _first_exchange(command: Command, sent_s: float) -> Exchange:
+    """The state arrived as long before its answer as the runtime had it."""
     thought_s = max(0.0, (command.sent_ns - command.received_ns) * 1e-9)
-    arrived_s = heard_s - thought_s
-    begun_s = max(arrived_s, heard_s - command.inference_ns * 1e-9)
-    finished_s = heard_s
+    arrived_s = sent_s - thought_s
+    begun_s = max(arrived_s, sent_s - command.inference_ns * 1e-9)
+    finished_s = sent_s
     if command.inference_ns == 0 and command.reason == Event.TOO_LONG.value:
         # The watchdog's verdict; the policy is still at it.
         begun_s = arrived_s
-        finished_s = max(heard_s, begun_s + MAX_INFERENCE_S + JUST_AFTER_S)
-    return Exchange(arrived_s, begun_s, finished_s, heard_s)
+        finished_s = max(sent_s, begun_s + MAX_INFERENCE_S + JUST_AFTER_S)
+    return Exchange(arrived_s, begun_s, finished_s, sent_s)

@@ -155,6 +155,22 @@ def test_a_step_of_the_boards_clock_changes_nothing(hand, path, tmp_path):
     assert replay(path, make_policy(tmp_path, "constant", 0.3))[0] == 0
 
 
+def test_a_recorder_that_was_held_up_changes_nothing(hand, path, tmp_path):
+    hand.drive(0, 3)
+    for step in range(3, 6):  # Heard half a second late, answered in time.
+        hand.state(0.8 + step * 0.01, step)
+        late_s = 0.8 + step * 0.01 - step * 0.1
+        sent_s = step * 0.1 + ANSWER_S
+        stamps = {"received_ns": ns(sent_s - ANSWER_S), "sent_ns": ns(sent_s)}
+        hand.command(sent_s + late_s, step, **stamps)
+    hand.drive(9, 12)
+    hand.close()
+    status, report = replay(path, make_policy(tmp_path, "constant", 0.3))
+    # Between step 5 and 9 the runtime itself heard nothing for 0.4 s.
+    assert status == 1
+    assert [row["step"] for row in report["first_differences"]] == [5, 9, 10, 11]
+
+
 def test_an_inference_that_took_too_long_is_replayed_as_one(hand, path, tmp_path):
     hand.drive(0, 5)
     hand.state(0.5, 5)
