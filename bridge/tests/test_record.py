@@ -79,7 +79,7 @@ def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
             counts[channel.topic] += 1
     assert counts["phil/hunter01/state"] == counts["view/hunter01/frames"] == steps + 1
     assert counts["phil/hunter01/scene"] == counts["view/hunter01/scene"] == steps + 1
-    assert steps <= counts["phil/hunter01/command"] <= steps + 1
+    assert counts["phil/hunter01/command"] >= steps
     assert counts["phil/hunter01/health"] >= 1
     assert counts["phil/hunter01/alive"] >= 1  # It came.
     assert counts["phil/hunter01/simulator"] == 2  # It came, and it went.
@@ -103,7 +103,7 @@ def record_and_kill(folder: Path) -> tuple[Path, float]:
         start_record(endpoint, recording) as run,
         start_edge(endpoint, make_policy(folder)),
     ):
-        wait_until(lambda: recording.exists() and len(states_in(recording)) > 15, "two seconds")
+        wait_until(lambda: recording.exists() and len(states_in(recording)) > 10, "a second")
         run.process.send_signal(signal.SIGKILL)
         killed_ns = time.time_ns()
         run.process.wait()
