@@ -25,7 +25,6 @@ from deploy.certs import (
     party_roles,
     read_authority,
 )
-from edge_runtime.access import ROLES
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
@@ -73,12 +72,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def certs(arguments: argparse.Namespace) -> int:
-    """Make what is missing of the authority, router and viewer, and all of each vehicle.
+    """Make what is missing of the authority and of the parties' folders.
 
-    Raises UserError, with nothing written, where a vehicle has a folder already.
+    Raises UserError, with nothing written, where nothing is missing.
     """
     request = _check(arguments)
-    roles = _wanted(request)
+    roles = _missing(request)
     now = datetime.datetime.now(datetime.UTC)
     ca_folder = request.out / CA_FOLDER
     is_new = not ca_folder.exists()
@@ -114,19 +113,18 @@ def _check(arguments: argparse.Namespace) -> Request:
     return Request(Path(arguments.out), list(dict.fromkeys(vehicle_ids)), hosts, arguments.days)
 
 
-def _wanted(request: Request) -> dict[str, str]:
-    """The role of each party to make, by name; UserError where one of a vehicle is there."""
-    wanted = {}
-    for name, role in party_roles(request.vehicle_ids).items():
-        folder = request.out / name
-        if not folder.exists():
-            wanted[name] = role
-        elif not ROLES[role].all_vehicles:
-            raise UserError(
-                f"{folder} exists and is not overwritten; move it away to make a new one, or"
-                " choose another --vehicle-id or --out"
-            )
-    return wanted
+def _missing(request: Request) -> dict[str, str]:
+    """The role of each party that has no folder yet, by name; UserError where all have one."""
+    roles = party_roles(request.vehicle_ids)
+    missing = {name: role for name, role in roles.items() if not (request.out / name).exists()}
+    if not missing:
+        raise UserError(
+            f"{request.out} has {', '.join(roles)} already and nothing is overwritten; move away"
+            " what is to be made new, or choose another --vehicle-id or --out"
+        )
+    for name in sorted(roles.keys() - missing.keys()):
+        print(f"kept as it is: {request.out / name}")
+    return missing
 
 
 def _check_lifetime(authority: Authority, now: datetime.datetime, days: int) -> None:

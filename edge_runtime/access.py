@@ -33,24 +33,26 @@ class Rights(NamedTuple):
     """Others connect to it: its certificate is a server's, too."""
 
 
-# `scene` and `simulator` are the bridge's: the picture for viewers, and its own token.
+# `scene` and `simulator` are the bridge's: the picture for viewers, and its own token. `alive/**`
+# is `alive` and whatever stands below it.
 ROLES: Dict[str, Rights] = {
     EDGE: Rights(
         publishes=("command", "feedback", "health"),
         reads=("state",),
         answers=("status", "rearm"),
-        shows=("alive",),
+        shows=("alive/**",),
+        watches=("alive/**",),  # Is there another one with this id?
     ),
     SIMULATOR: Rights(
         publishes=("state", "scene"),
         reads=("command", "feedback", "health"),
         asks=("status",),
         shows=("simulator",),
-        watches=("alive",),
+        watches=("alive/**",),
         listens=True,
     ),
     OPERATOR: Rights(asks=("status", "rearm")),
-    VIEWER: Rights(reads=("*",), asks=("status",), watches=("*",), all_vehicles=True),
+    VIEWER: Rights(reads=("*",), asks=("status",), watches=("**",), all_vehicles=True),
     # Only others connect to it; as somebody's peer it has no rights.
     ROUTER: Rights(all_vehicles=True, listens=True),
 }

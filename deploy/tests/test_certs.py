@@ -86,7 +86,7 @@ def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        (["--vehicle-id", "new", "--vehicle-id", "hunter01"], "not overwritten"),
+        (["--vehicle-id", "hunter01"], "nothing is overwritten"),
         (["--vehicle-id", "a/b"], "a/b"),
         (["--vehicle-id", "new", "--host", "tcp/host:1"], "tcp/host:1"),
         (["--vehicle-id", "new", "--days", "0"], "--days 0"),
@@ -99,6 +99,19 @@ def test_bad_input_is_one_line_and_nothing_is_written(made, options, word, capsy
     (line,) = capsys.readouterr().err.splitlines()
     assert word in line
     assert contents(made) == before
+
+
+def test_one_folder_moved_away_is_made_new_and_the_others_are_kept(tmp_path, capsys):
+    folder = tmp_path / "certs"
+    assert make(folder) == 0
+    (folder / "edge-hunter01").rename(tmp_path / "old")
+    before = contents(folder)
+    assert make(folder) == 0
+    assert f"kept as it is: {folder / 'router'}" in capsys.readouterr().out
+    after = contents(folder)
+    assert {path: after[path] for path in before} == before
+    assert {path.parts[0] for path in set(after) - set(before)} == {"edge-hunter01"}
+    assert contents(tmp_path / "old") != contents(folder / "edge-hunter01")
 
 
 def test_an_authority_without_its_key_is_refused(made, tmp_path, capsys):

@@ -43,6 +43,7 @@ def test_each_party_may_send_only_what_is_its_own():
         for message in SENDS:
             assert allowed(config, name, message, "ingress") == set()
     assert allowed(config, "operator-b", "query", "ingress") == {"phil/b/status", "phil/b/rearm"}
+    assert allowed(config, "edge-a", "liveliness_query", "ingress") == {"phil/a/alive/**"}
     assert "phil/a/rearm" not in allowed(config, "simulator-a", "query", "ingress")
     assert allowed(config, "viewer", "query", "ingress") == {"phil/*/status"}
 
@@ -76,7 +77,8 @@ def test_an_edge_takes_states_from_its_simulator_or_a_router_only():
 
 
 def test_the_table_knows_every_topic_of_the_wire():
-    named = {key for rights in ROLES.values() for column in rights[:6] for key in column}
+    columns = [column for rights in ROLES.values() for column in rights[:6]]
+    named = {suffix.split("/")[0] for column in columns for suffix in column}
     assert set(TOPICS) <= named
 
 

@@ -63,6 +63,9 @@ def test_policies_that_may_not_drive(tmp_path, command):
         (["run", "--policy", "p.onnx", "--config", "absent.toml"], ["absent.toml"]),
         (["run", "--policy", "p.onnx", "--log-level", "loud"], ["loud"]),
         (["check", "p.onnx", "--out", "no/such/place.json"], ["no/such"]),
+        (["run", "--policy", "p.onnx", "--tls", "absent"], ["would send plain text", "tls/127"]),
+        (["run", "--policy", "p.onnx", "--connect", "tls/h:1"], ["needs certificates", "--tls"]),
+        (["status", "--connect", "tls/h:1", "--tls", "absent"], ["absent is no directory"]),
         (["status", "--connect", "tcp/127.0.0.1:1"], ["nobody answers"]),
         (["rearm", "--connect", "tcp/127.0.0.1:1"], ["nobody answers"]),
     ],
@@ -117,7 +120,8 @@ def test_a_busy_port_is_named():
 
 
 @pytest.mark.parametrize(
-    "endpoint", ["", "tcp", "tcp/host", "tcp/host:0", "tcp/host:70000", "tls/h:1", "quic/h:1"]
+    "endpoint",
+    ["", "tcp", "tcp/host", "tcp/host:0", "tcp/host:70000", "ws/h:1", "unixsock-stream/h:1"],
 )
 def test_malformed_endpoints(endpoint):
     with pytest.raises(UserError, match="write it as"):

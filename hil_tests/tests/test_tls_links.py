@@ -25,7 +25,7 @@ from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint, open_session
 from hil_tests.tests.tls_parties import listener, make_certificates, session
 
-LIFE_S = 3.0
+LIFE_S = 2.0
 
 
 @pytest.fixture(scope="module")
