@@ -92,13 +92,15 @@ class Controller:
 
     def tick(self, now_s: float) -> Optional[Order]:
         """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
+        if self._newest is None:
+            return None  # before the first state there is nobody to tell
         if self._begun_s is not None and now_s - self._begun_s > rules.MAX_INFERENCE_S:
             return self._give_up(now_s)
         was = self.safety.mode
         if was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
-        if self.safety.mode is not Mode.SAFE_STOP or self._newest is None:
-            return None  # before the first state there is nobody to tell
+        if self.safety.mode is not Mode.SAFE_STOP:
+            return None
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:
             return None
         self._schedule_stop(now_s, on_grid=was is Mode.SAFE_STOP)
