@@ -65,7 +65,11 @@ def _config(listen: Optional[str], connect: Optional[str], mode: str) -> zenoh.C
         "connect/retry": RETRY,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        # Nothing is looked for, so there is nothing to wait for either (0.5 s at each start).
+        "scouting/delay": 0,
         "transport/link/tx/lease": LEASE_MS,
+        # It would map 17 MB for messages of 7 KB, and share them with any local process.
+        "transport/shared_memory/enabled": False,
     }
     config = zenoh.Config()
     for name, value in rows.items():
