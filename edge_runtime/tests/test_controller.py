@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge_runtime.controller import Controller, Received
-from edge_runtime.limiter import limit_rows
+from edge_runtime.limiter import LimitRow, limit_rows
 from edge_runtime.safety import Mode
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import PEDAL, STEERING
@@ -206,6 +206,81 @@ def test_an_answer_later_than_a_period_is_a_deadline_miss():
     controller.begin(Received(make_state(0), 0.0, 0), 0.15)
     controller.finish(GOOD, QUICK_NS, 0.16)
     assert controller.deadline_misses == 1
+
+
+def test_exactly_one_period_is_in_time():
+    controller = make()
+    controller.begin(Received(make_state(0), 0.0, 0), 0.0)
+    assert controller.finish(GOOD, QUICK_NS, 0.1).mode == "drive"
+    assert controller.deadline_misses == 0
+
+
+def test_each_miss_counts_once():
+    controller = make()
+    for step, arrived_s in enumerate((0.0, 0.15, 0.3)):
+        controller.begin(Received(make_state(step), arrived_s, 0), arrived_s + 0.1)
+        controller.finish(GOOD, QUICK_NS, arrived_s + 0.11)
+    assert controller.deadline_misses == 3
+    controller.begin(Received(make_state(3), 0.45, 0), 0.45)
+    for now_s in (0.56, 0.57):
+        controller.tick(now_s)
+    assert controller.deadline_misses == 4
+
+
+def test_an_order_says_how_long_its_own_inference_took():
+    controller = make()
+    controller.begin(Received(make_state(0), 0.0, 7), 0.0)
+    order = controller.finish(GOOD, 12345, 0.01)
+    assert (order.inference_ns, order.answers.arrived_ns) == (12345, 7)
+    assert controller.tick(0.21).inference_ns == 0
+    controller.begin(Received(make_state(1), 0.22, 0), 0.22)
+    assert controller.finish(GOOD, 54321, 0.23).inference_ns == 54321  # in a safe stop, too
+    controller.begin(Received(make_state(2), 0.3, 0), 0.3)
+    assert controller.tick(0.41).inference_ns == 0
+    assert controller.farewell().inference_ns == 0
+
+
+def test_an_answer_without_a_question_is_nothing():
+    controller = make()
+    assert controller.finish(GOOD, QUICK_NS, 0.0) is None
+    answer(controller, 0, 0.0)
+    assert controller.finish(GOOD, QUICK_NS, 0.01) is None
+    assert controller.tick(0.15) is None  # and the one that was given is no longer waited for
+
+
+def test_a_wake_up_late_by_a_whole_period_starts_a_new_grid():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.tick(0.25)
+    late_s = controller.next_deadline_s() + 0.1
+    assert controller.tick(late_s) is not None
+    assert controller.next_deadline_s() == late_s + 0.1
+
+
+def test_an_answer_in_a_safe_stop_puts_off_the_next_repetition():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.tick(0.25)
+    answer(controller, 1, 0.3)
+    assert controller.next_deadline_s() == pytest.approx(0.401)
+    assert controller.tick(0.36) is None
+
+
+def test_a_state_in_hand_is_due_before_the_silence_after_it():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.begin(Received(make_state(1), 0.1, 0), 0.15)
+    assert controller.next_deadline_s() == pytest.approx(0.25)
+
+
+def test_a_rate_limit_counts_from_the_last_order_whatever_its_mode():
+    rows = [LimitRow("pedal", -1.0, 1.0, 0.25)]
+    controller = Controller(rows, needs_rearm=False)
+    assert answer(controller, 0, 0.0).action == [0.25]
+    assert answer(controller, 1, 0.1).action == [0.5]
+    controller.tick(0.4)
+    actions = [answer(controller, step, step * 0.1 + 0.2).action for step in range(2, 8)]
+    assert actions == [[-1.0]] * 4 + [[-0.75], [-0.5]]
 
 
 def stop(controller):
