@@ -5,6 +5,7 @@ Times are monotonic seconds. The caller serialises the calls (loop.py holds one 
 
 from __future__ import annotations
 
+import math
 from typing import List, NamedTuple, Optional, Sequence
 
 import numpy as np
@@ -49,7 +50,7 @@ class Controller:
         self._last_action = neutral_action(rows)
         self._newest: Optional[Received] = None
         self._begun_s: Optional[float] = None
-        self._next_stop_s = 0.0
+        self._next_stop_s = math.inf  # the first safe stop is an answer
         if needs_rearm and not armed_at_start:
             self._apply(Event.NOT_ARMED)
 
@@ -67,8 +68,6 @@ class Controller:
         if event is not None:
             self._apply(event)
         self.safety = rules.note_arrival(self.safety, session, received.arrived_s)
-        if self._newest is None:
-            self._next_stop_s = now_s + CONTROL_PERIOD_S
         self._newest = received
         self._begun_s = now_s
 

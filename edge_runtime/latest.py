@@ -7,6 +7,7 @@ as is one from further ahead than any simulator can have come.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from typing import Dict, NamedTuple, Optional, Tuple
 
@@ -38,7 +39,7 @@ class LatestState:
         self.accepted = 0
         self.rejected: Dict[str, int] = {}
         self._session: Optional[str] = None
-        self._heard_s = 0.0
+        self._heard_s = -math.inf
         # Where each session stood: a delayed message of an earlier one never goes back either.
         self._lasts: OrderedDict[str, _Last] = OrderedDict()
 
@@ -63,7 +64,7 @@ class LatestState:
         if state.session == self._session:
             # Even a stale message shows that this simulator is there.
             self._heard_s = now_s
-        elif self._session is not None and now_s - self._heard_s < TAKEOVER_SILENCE_S:
+        elif now_s - self._heard_s < TAKEOVER_SILENCE_S:
             return Rejection(
                 Reason.FOREIGN_SESSION,
                 f"session {state.session!r} while {self._session!r} is not silent",

@@ -90,6 +90,7 @@ def test_the_limits_are_the_contracts():
         (STANDBY, 10.0, "a", Event.SILENT, Event.SILENT),
         (STANDBY, 10.001, "a", Event.SILENT, Event.PAUSED),
         (STANDBY, 0.1, "b", None, Event.OTHER_SESSION),
+        (STANDBY, 0.1, "0", None, Event.OTHER_SESSION),
         (STANDBY, 60.0, "b", Event.SILENT, Event.OTHER_SESSION),
         (DRIVE, 0.2, "a", None, None),
         (DRIVE, 60.0, "a", Event.SILENT, Event.SILENT),
@@ -193,3 +194,4 @@ def test_no_way_out_of_a_safe_stop_but_recovery(events, needs_rearm):
 def test_the_readme_shows_the_table():
     readme = Path(edge_runtime.__file__).with_name("README.md").read_text()
     assert render_table() in readme
+    assert len(render_table().splitlines()) == 2 + len(Event)

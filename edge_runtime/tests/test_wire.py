@@ -150,6 +150,7 @@ def test_frames_keep_their_order():
     ("changes", "reason"),
     [
         ({"schema": 2}, Reason.SCHEMA),
+        ({"schema": 0}, Reason.SCHEMA),
         ({"frames": bytes(7199)}, Reason.FRAMES_SIZE),
         ({"frames": bytes(7201)}, Reason.FRAMES_SIZE),
         ({"frames": b""}, Reason.FRAMES_SIZE),

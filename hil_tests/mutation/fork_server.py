@@ -58,7 +58,11 @@ def _run(arguments: list[str]) -> None:
     code = 1
     try:
         import pytest
+        from hypothesis import Phase, settings
 
+        # The first counter-example is enough: nobody reads the smallest one.
+        settings.register_profile("mutate", phases=(Phase.explicit, Phase.generate), database=None)
+        settings.load_profile("mutate")
         code = int(pytest.main(arguments))
     finally:
         os._exit(code)
