@@ -188,6 +188,19 @@ def test_an_answer_to_a_state_older_than_two_periods_stops():
     assert (order.mode, order.reason) == ("safe_stop", "inference_too_long")
 
 
+def test_only_a_stopped_vehicle_without_permission_waits_for_the_operator():
+    for needs_rearm in (False, True):
+        controller = make(needs_rearm=needs_rearm)
+        assert not controller.waits_for_rearm
+        answer(controller, 0, 0.0)
+        assert not controller.waits_for_rearm
+        stop(controller)
+        assert controller.waits_for_rearm == needs_rearm
+    answer(controller, 1, 0.35)
+    assert controller.rearm(0.4) == ""
+    assert not controller.waits_for_rearm
+
+
 def test_a_safe_stop_holds_the_last_steering():
     controller = make(actions=(PEDAL, STEERING))
     answer(controller, 0, 0.0, np.array([0.4, -0.25], np.float32))
