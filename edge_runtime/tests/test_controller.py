@@ -225,6 +225,7 @@ def test_exactly_one_period_is_in_time():
     controller = make()
     controller.begin(Received(make_state(0), 0.0, 0), 0.0)
     assert controller.finish(GOOD, QUICK_NS, 0.1).mode == "drive"
+    answer(controller, 1, 0.15)
     assert controller.deadline_misses == 0
 
 

@@ -152,7 +152,11 @@ def _ran(result: dict | None) -> bool:
 
 def _mutant(name: str, item: dict, result: dict | None) -> Mutant:
     (mutation,) = item["mutations"]
-    diff = ((result or {}).get("diff") or "").splitlines()[2:]
+    diff = [
+        line
+        for line in ((result or {}).get("diff") or "").splitlines()
+        if not line.startswith(("--- ", "+++ "))
+    ]
     changed = {sign: [line[1:].strip() for line in diff if line[:1] == sign] for sign in "-+"}
     return Mutant(
         module=name,
