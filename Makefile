@@ -5,10 +5,12 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PEERS := .venv-peers
 PEERS_STAMP := $(PEERS)/.installed
+MUTATION := .venv-mutation
+MUTATION_STAMP := $(MUTATION)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu recording lock clean
+.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -65,10 +67,18 @@ bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
 	$(BIN)/python -m hil_tests.recordings.make
 
+$(MUTATION_STAMP): requirements/mutation.txt
+	$(PYTHON) -m venv $(MUTATION)
+	$(MUTATION)/bin/python -m pip install --quiet --requirement requirements/mutation.txt
+	@touch $@
+
+mutate: $(MUTATION_STAMP)  ## change the safety core in every small way: a test must fail each time
+	$(MUTATION)/bin/python -m hil_tests.mutation --out results/mutation
+
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new
 	echo 'torch==2.13.0' >> requirements/workstation.txt.new
 	mv requirements/workstation.txt.new requirements/workstation.txt
 
 clean:  ## remove caches and the virtual environments; trained runs stay
-	rm -rf $(VENV) $(PEERS) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(PEERS) $(MUTATION) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -100,6 +100,8 @@ def _config(
         # Nobody is scouted for, so there is nothing to wait for: half a second at every start.
         "scouting/delay": 0,
         "transport/link/tx/lease": LEASE_MS,
+        # It would map 17 MB for messages of 7 KB, and share them with any local process.
+        "transport/shared_memory/enabled": False,
     }
     if tls is not None:
         rows["transport/link/tls"] = zenoh_rows(tls)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge_runtime.controller import Controller, Received
-from edge_runtime.limiter import limit_rows
+from edge_runtime.limiter import LimitRow, limit_rows
 from edge_runtime.safety import Mode
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import PEDAL, STEERING
@@ -16,8 +16,8 @@ NAN = np.array([np.nan], np.float32)
 QUICK_NS = 1_000_000
 
 
-def make(needs_rearm=False, actions=(PEDAL,)):
-    return Controller(limit_rows(actions, {}), needs_rearm)
+def make(needs_rearm=False, actions=(PEDAL,), **options):
+    return Controller(limit_rows(actions, {}), needs_rearm, **options)
 
 
 def answer(controller, step, now_s, output=GOOD, **changes):
@@ -131,6 +131,76 @@ def test_a_rearm_with_fresh_states_drives_at_the_next():
     assert answer(controller, 10, 2.0).mode == "drive"
 
 
+def test_a_vehicle_goes_on_between_two_episodes_of_one_drive():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0, final=True)
+    assert answer(controller, 0, 9.9, episode=1).mode == "drive"
+    assert controller.safety.safe_stops == 0
+
+
+@pytest.mark.parametrize(
+    ("now_s", "session", "reason"),
+    [(10.1, "simulator-a", "pause_too_long"), (1.0, "simulator-b", "other_session")],
+)
+def test_a_vehicle_in_standby_moves_only_for_the_drive_it_was_armed_for(now_s, session, reason):
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0, final=True)
+    orders = [
+        answer(controller, step, now_s + step * 0.1, episode=1, session=session)
+        for step in range(8)
+    ]
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", reason)}
+    assert controller.waits_for_rearm
+    assert controller.rearm(now_s + 0.75) == ""
+    assert answer(controller, 8, now_s + 0.8, episode=1, session=session).mode == "drive"
+
+
+def test_without_a_vehicle_a_pause_and_another_simulator_are_no_fault():
+    controller = make()
+    answer(controller, 0, 0.0, final=True)
+    assert answer(controller, 0, 60.0, session="simulator-b").mode == "drive"
+
+
+def test_a_service_with_a_vehicle_waits_for_its_first_permission():
+    controller = make(needs_rearm=True, armed_at_start=False)
+    assert (controller.tick(5.0), controller.next_deadline_s()) == (None, None)
+    assert controller.waits_for_rearm
+    assert "no fresh states" in controller.rearm(5.0)
+    controller.begin(Received(make_state(0), 6.0, 0), 6.0)
+    assert controller.tick(6.0) is None  # the answer comes first
+    order = controller.finish(GOOD, QUICK_NS, 6.001)
+    assert (order.mode, order.reason) == ("safe_stop", "not_armed")
+    for step in range(1, 5):
+        assert answer(controller, step, 6.0 + step * 0.1).mode == "safe_stop"
+    assert controller.rearm(6.45) == ""
+    assert answer(controller, 5, 6.5).mode == "drive"
+
+
+def test_a_service_without_a_vehicle_needs_no_permission():
+    assert answer(make(armed_at_start=False), 0, 0.0).mode == "drive"
+
+
+def test_an_answer_to_a_state_older_than_two_periods_stops():
+    """As after SIGSTOP and SIGCONT, where the state waited and the policy itself was quick."""
+    controller = make()
+    controller.begin(Received(make_state(0), 0.0, 0), 0.9)
+    order = controller.finish(GOOD, QUICK_NS, 0.901)
+    assert (order.mode, order.reason) == ("safe_stop", "inference_too_long")
+
+
+def test_only_a_stopped_vehicle_without_permission_waits_for_the_operator():
+    for needs_rearm in (False, True):
+        controller = make(needs_rearm=needs_rearm)
+        assert not controller.waits_for_rearm
+        answer(controller, 0, 0.0)
+        assert not controller.waits_for_rearm
+        stop(controller)
+        assert controller.waits_for_rearm == needs_rearm
+    answer(controller, 1, 0.35)
+    assert controller.rearm(0.4) == ""
+    assert not controller.waits_for_rearm
+
+
 def test_a_safe_stop_holds_the_last_steering():
     controller = make(actions=(PEDAL, STEERING))
     answer(controller, 0, 0.0, np.array([0.4, -0.25], np.float32))
@@ -149,6 +219,82 @@ def test_an_answer_later_than_a_period_is_a_deadline_miss():
     controller.begin(Received(make_state(0), 0.0, 0), 0.15)
     controller.finish(GOOD, QUICK_NS, 0.16)
     assert controller.deadline_misses == 1
+
+
+def test_exactly_one_period_is_in_time():
+    controller = make()
+    controller.begin(Received(make_state(0), 0.0, 0), 0.0)
+    assert controller.finish(GOOD, QUICK_NS, 0.1).mode == "drive"
+    answer(controller, 1, 0.15)
+    assert controller.deadline_misses == 0
+
+
+def test_each_miss_counts_once():
+    controller = make()
+    for step, arrived_s in enumerate((0.0, 0.15, 0.3)):
+        controller.begin(Received(make_state(step), arrived_s, 0), arrived_s + 0.1)
+        controller.finish(GOOD, QUICK_NS, arrived_s + 0.11)
+    assert controller.deadline_misses == 3
+    controller.begin(Received(make_state(3), 0.45, 0), 0.45)
+    for now_s in (0.56, 0.57):
+        controller.tick(now_s)
+    assert controller.deadline_misses == 4
+
+
+def test_an_order_says_how_long_its_own_inference_took():
+    controller = make()
+    controller.begin(Received(make_state(0), 0.0, 7), 0.0)
+    order = controller.finish(GOOD, 12345, 0.01)
+    assert (order.inference_ns, order.answers.arrived_ns) == (12345, 7)
+    assert controller.tick(0.21).inference_ns == 0
+    controller.begin(Received(make_state(1), 0.22, 0), 0.22)
+    assert controller.finish(GOOD, 54321, 0.23).inference_ns == 54321  # in a safe stop, too
+    controller.begin(Received(make_state(2), 0.3, 0), 0.3)
+    assert controller.tick(0.41).inference_ns == 0
+    assert controller.farewell().inference_ns == 0
+
+
+def test_an_answer_without_a_question_is_nothing():
+    controller = make()
+    assert controller.finish(GOOD, QUICK_NS, 0.0) is None
+    answer(controller, 0, 0.0)
+    assert controller.finish(GOOD, QUICK_NS, 0.01) is None
+    assert controller.tick(0.15) is None  # and the one that was given is no longer waited for
+
+
+def test_a_wake_up_late_by_a_whole_period_starts_a_new_grid():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.tick(0.25)
+    late_s = controller.next_deadline_s() + 0.1
+    assert controller.tick(late_s) is not None
+    assert controller.next_deadline_s() == late_s + 0.1
+
+
+def test_an_answer_in_a_safe_stop_puts_off_the_next_repetition():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.tick(0.25)
+    answer(controller, 1, 0.3)
+    assert controller.next_deadline_s() == pytest.approx(0.401)
+    assert controller.tick(0.36) is None
+
+
+def test_a_state_in_hand_is_due_before_the_silence_after_it():
+    controller = make()
+    answer(controller, 0, 0.0)
+    controller.begin(Received(make_state(1), 0.1, 0), 0.15)
+    assert controller.next_deadline_s() == pytest.approx(0.25)
+
+
+def test_a_rate_limit_counts_from_the_last_order_whatever_its_mode():
+    rows = [LimitRow("pedal", -1.0, 1.0, 0.25)]
+    controller = Controller(rows, needs_rearm=False)
+    assert answer(controller, 0, 0.0).action == [0.25]
+    assert answer(controller, 1, 0.1).action == [0.5]
+    controller.tick(0.4)
+    actions = [answer(controller, step, step * 0.1 + 0.2).action for step in range(2, 8)]
+    assert actions == [[-1.0]] * 4 + [[-0.75], [-0.5]]
 
 
 def stop(controller):

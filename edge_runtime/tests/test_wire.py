@@ -13,6 +13,12 @@ from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import Command, Feedback, Health, Reason, Rejection, State
 
+HEALTH = Health(
+    vehicle_id="hunter01", vehicle="none", mode="standby", reason="", needs_rearm=False,
+    accepted=0, superseded=0, rejected={}, deadline_misses=0, safe_stops=0, policy_id="p",
+    inference_ms={}, uptime_s=0.0, sent_ns=0, command_ms={"p50": 1.5}, temperature_c=40.0,
+    load_1min=0.5, rss_mb=90.0, rivals=1,
+)  # fmt: skip
 DECODERS = {
     State: wire.decode_state,
     Command: wire.decode_command,
@@ -78,6 +84,11 @@ MESSAGES = {
         inference_ms=st.dictionaries(st.sampled_from(["p50", "p99", "max"]), finite),
         uptime_s=finite,
         sent_ns=counts,
+        command_ms=st.dictionaries(st.sampled_from(["p50", "p99", "max"]), finite),
+        temperature_c=st.none() | finite,
+        load_1min=finite,
+        rss_mb=finite,
+        rivals=counts,
     ),
 }
 
@@ -139,7 +150,9 @@ def test_frames_keep_their_order():
     ("changes", "reason"),
     [
         ({"schema": 2}, Reason.SCHEMA),
+        ({"schema": 0}, Reason.SCHEMA),
         ({"frames": bytes(7199)}, Reason.FRAMES_SIZE),
+        ({"frames": bytes(7201)}, Reason.FRAMES_SIZE),
         ({"frames": b""}, Reason.FRAMES_SIZE),
         ({"frames": bytes(70_000)}, Reason.OVERSIZED),
         ({"speed_mps": math.nan}, Reason.NOT_FINITE),
@@ -174,11 +187,7 @@ def test_another_schema_is_named_even_where_its_fields_differ():
 
 @pytest.mark.parametrize("action", [[], [1.01], [-2.0]])
 def test_a_command_outside_the_range_is_rejected(action):
-    command = Command(
-        session="a", episode=0, step=0, mode="drive", action=action, policy_id="p",
-        received_ns=0, inference_ns=0, sent_ns=0,
-    )  # fmt: skip
-    assert isinstance(wire.decode_command(wire.encode(command)), Rejection)
+    assert isinstance(wire.decode_command(wire.encode(command_of(action))), Rejection)
 
 
 @pytest.mark.parametrize(
@@ -186,6 +195,80 @@ def test_a_command_outside_the_range_is_rejected(action):
 )
 def test_hostile_nesting_and_lengths(nested):
     assert isinstance(wire.decode_state(b"\x82\xa6schema\x01\xa1x" + nested), Rejection)
+
+
+def test_the_health_of_an_earlier_version_is_understood_and_so_is_ours_by_it():
+    later = {"command_ms", "temperature_c", "load_1min", "rss_mb", "rivals"}
+    fields = as_map(HEALTH)
+    health = wire.decode_health(
+        msgspec.msgpack.encode({k: v for k, v in fields.items() if k not in later})
+    )
+    assert isinstance(health, Health)
+    assert (health.command_ms, health.temperature_c, health.rivals) == ({}, None, 0)
+    old_kind = msgspec.defstruct("Old", [("vehicle_id", str), ("mode", str), ("sent_ns", int)])
+    old = msgspec.msgpack.decode(wire.encode(HEALTH), type=old_kind)
+    assert old.mode == "standby"  # type: ignore[attr-defined]
+
+
+def padded_to(size: int) -> bytes:
+    """A valid state that is so many bytes long, by a field that nobody knows."""
+    tried = 50_000
+    overhead = len(msgspec.msgpack.encode({**as_map(make_state(0)), "more": bytes(tried)})) - tried
+    return msgspec.msgpack.encode({**as_map(make_state(0)), "more": bytes(size - overhead)})
+
+
+def test_what_is_just_in_bounds_is_accepted_and_one_more_is_not():
+    assert len(padded_to(65_536)) == 65_536
+    assert isinstance(wire.decode_state(padded_to(65_536)), State)
+    rejection = wire.decode_state(padded_to(65_537))
+    assert isinstance(rejection, Rejection)
+    assert rejection == (Reason.OVERSIZED, "65537 bytes, at most 65536 are read")
+    for count in (256, 257):
+        state = wire.decode_state(wire.encode(make_state(0, session="x" * count)))
+        assert isinstance(state, State) == (count == 256)
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
+def test_a_command_at_the_ends_of_its_range_is_accepted(value):
+    assert isinstance(wire.decode_command(wire.encode(command_of([value]))), Command)
+
+
+def test_the_second_action_counts_as_much_as_the_first():
+    assert isinstance(wire.decode_command(wire.encode(command_of([0.0, 1.5]))), Rejection)
+    rejection = wire.decode_command(wire.encode(command_of([0.0, math.nan])))
+    assert isinstance(rejection, Rejection)
+    assert rejection == (Reason.NOT_FINITE, "action[1] is nan")
+
+
+def test_a_mode_that_nobody_knows_is_rejected():
+    rejection = wire.decode_command(wire.encode(command_of([0.0], mode="fly")))
+    assert isinstance(rejection, Rejection)
+    assert rejection.reason is Reason.MALFORMED
+    assert "'fly'" in rejection.detail
+
+
+def test_only_feedback_may_say_that_no_command_came_yet():
+    fields = {
+        "vehicle": "mock", "session": "", "episode": -1, "step": -1, "mode": "standby",
+        "action": [0.0], "speed_mps": 0.0, "self_braking": True, "faults": [], "sent_ns": 0,
+        "schema": 1,
+    }  # fmt: skip
+    assert isinstance(wire.decode_feedback(msgspec.msgpack.encode(fields)), Feedback)
+    for name in ("episode", "step"):
+        bad = wire.decode_feedback(msgspec.msgpack.encode({**fields, name: -2}))
+        assert isinstance(bad, Rejection)
+        assert bad.detail == f"{name} is -2, below the least value"
+    negative = {**as_map(HEALTH), "rejected": {"stale": -1}}
+    rejection = wire.decode_health(msgspec.msgpack.encode(negative))
+    assert isinstance(rejection, Rejection)
+    assert rejection.detail == "rejected.stale is -1, below the least value"
+
+
+def command_of(action, mode="drive"):
+    return Command(
+        session="a", episode=0, step=0, mode=mode, action=action, policy_id="p",
+        received_ns=0, inference_ns=0, sent_ns=0,
+    )  # fmt: skip
 
 
 def test_keys():

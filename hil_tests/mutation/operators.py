@@ -1,0 +1,78 @@
+"""Mutation operators for cosmic-ray that its own do not cover. Loaded by cosmic-ray itself.
+
+`StatementRemover`: a statement that is not there. `TableTarget`: a row of the transition table
+that leads elsewhere. Neither changes an import, a docstring or a definition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from cosmic_ray.operators.operator import Example, Operator
+from parso.python.tree import Keyword, Name
+
+_MODES = ("_S", "_D", "_X")
+
+
+class StatementRemover(Operator):
+    """Replaces an assignment or a call by `pass`."""
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple]:
+        """Each statement inside a function."""
+        if node.type != "simple_stmt" or node.search_ancestor("funcdef") is None:
+            return
+        statement = node.children[0]
+        if statement.type in ("expr_stmt", "atom_expr"):
+            yield statement.start_pos, statement.end_pos
+
+    def mutate(self, node: Any, index: int) -> Any:
+        """The same line with `pass` in the statement's place."""
+        first = node.get_first_leaf()
+        node.children[0] = Keyword("pass", first.start_pos, prefix=first.prefix)
+        return node
+
+    @classmethod
+    def examples(cls) -> tuple:
+        """For cosmic-ray's own tests."""
+        return (Example("def f():\n    g()\n", "def f():\n    pass\n"),)
+
+
+class TableTarget(Operator):
+    """Sends a row of TRANSITIONS, `(_D, Event.X): _S,`, to each of the other two modes."""
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple]:
+        """Twice for each target, because there are two other modes."""
+        if self._is_target(node):
+            yield node.start_pos, node.end_pos
+            yield node.start_pos, node.end_pos
+
+    def mutate(self, node: Any, index: int) -> Any:
+        """The other mode, the first or the second."""
+        others = [mode for mode in _MODES if mode != node.value]
+        return Name(others[index], node.start_pos, prefix=node.prefix)
+
+    @classmethod
+    def examples(cls) -> tuple:
+        """For cosmic-ray's own tests."""
+        return (Example("{(_S, 1): _D}", "{(_S, 1): _S}"),)
+
+    @staticmethod
+    def _is_target(node: Any) -> bool:
+        if node.type != "name" or node.value not in _MODES:
+            return False
+        before = node.get_previous_leaf()
+        return before is not None and before.value == ":"
+
+
+_OPERATORS = {operator.__name__: operator for operator in (StatementRemover, TableTarget)}
+
+
+class Provider:
+    """What the entry point `cosmic_ray.operator_providers` names."""
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_OPERATORS)
+
+    def __getitem__(self, name: str) -> type:
+        return _OPERATORS[name]
