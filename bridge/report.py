@@ -12,13 +12,15 @@ import numpy as np
 from bridge.safe_stops import SafeStopEvent
 from edge_runtime.episode_report import EpisodeResult, summarise
 
+QUANTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 
-def latency_summary(latencies_ms: Sequence[float]) -> dict[str, float | None]:
-    """Return p50, p99 and max of state sent to command received, ms; None if none came."""
-    if not latencies_ms:
-        return {"p50": None, "p99": None, "max": None}
-    p50, p99 = np.percentile(latencies_ms, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(max(latencies_ms))}
+
+def quantiles(values_ms: Sequence[float]) -> dict[str, float | None]:
+    """Return p50, p90, p99 and max of times in ms; None each if there are none."""
+    if not values_ms:
+        return dict.fromkeys(QUANTILES)
+    found = np.percentile(values_ms, list(QUANTILES.values()))
+    return dict(zip(QUANTILES, map(float, found), strict=True))
 
 
 def rejections(by_edge: Mapping[str, int], by_simulator: Mapping[str, int]) -> dict[str, Any]:
@@ -50,7 +52,8 @@ def make_report(
             policy_id=settings["policy_id"],
             seed=settings["seed"],
         ),
-        "latency_ms": latency_summary(latencies_ms),
+        "latency_ms": quantiles(latencies_ms),
+        "answered_states": len(latencies_ms),
         **counts,
         "safe_stops": len(safe_stop_events),
         "clock": settings["clock"],

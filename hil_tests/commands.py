@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 
 from edge_runtime.errors import UserError
 
@@ -34,14 +35,19 @@ class BackgroundCommand:
     Args:
         arguments: module and its arguments.
         ready: text of its output that says it has started; None: no wait.
+        prefix: a program that runs it, as in ``ip netns exec NAME``.
     """
 
-    def __init__(self, *arguments: str, ready: str | None = None) -> None:
+    def __init__(
+        self, *arguments: str, ready: str | None = None, prefix: Sequence[str] = ()
+    ) -> None:
         print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
         self.name = " ".join(arguments[:2])
         self._output = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115 (closed in __exit__)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", *arguments], stdout=self._output, stderr=subprocess.STDOUT
+            [*prefix, sys.executable, "-m", *arguments],
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
         )
         if ready:
             self._wait_for(ready)

@@ -96,7 +96,7 @@ def test_no_state_reaches_the_edge_so_the_simulator_brakes(tmp_path, clock):
     assert (event["reason"], event["resumed_after_s"]) == ("no_command", None)
     assert event["step"] <= 3
     assert event["stopped_after_s"] < 2.0
-    assert report["latency_ms"] == {"p50": None, "p99": None, "max": None}
+    assert report["latency_ms"] == {"p50": None, "p90": None, "p99": None, "max": None}
     assert report["per_episode"][0]["outcome"] == "timeout"
 
 
