@@ -12,10 +12,12 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
+from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
+from hil_tests.commands import end_children
 from hil_tests.network.cells import KERNEL, TRANSPORTS, Cell, Drive, run_cell
 from hil_tests.network.namespaces import why_not
 from hil_tests.network.report import write_report
@@ -58,6 +60,11 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         UserError: the machine has no kernel network, or a process of a cell failed.
     """
+    with sigterm_as_interrupt():
+        return _run(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> int:
     _check(arguments)
     cells = [
         Cell(row, transport, parse_spec(SPECS[row]))
@@ -119,6 +126,7 @@ def _run_cells(
         except BaseException:
             for future in futures:
                 future.cancel()
+            end_children()
             raise
         return [(cell, future.result()) for future, cell in futures.items()]
 
