@@ -15,7 +15,7 @@ NAMES = {
     "virtual": "virtual time",
 }
 HEAD = ("network, each way", "through", "p50", "p90", "p99", "max", "unanswered", "safe stops",
-        "success")  # fmt: skip
+        "success", "failed starts")  # fmt: skip
 
 
 def write_report(result: dict[str, Any], folder: Path) -> None:
@@ -33,14 +33,18 @@ def table(result: dict[str, Any]) -> str:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
+    begin = [f"`{row['latency_spec']}`", NAMES[row["transport"]]]
+    failed = str(len(row["failed_starts"]))
+    if "round_trip_ms" not in row:
+        return [*begin, *["-"] * (len(HEAD) - 3), failed]
     times = row["round_trip_ms"]
     return [
-        f"`{row['latency_spec']}`",
-        NAMES[row["transport"]],
+        *begin,
         *("-" if times[name] is None else f"{times[name]:.0f}" for name in times),
         f"{row['unanswered_percent']:.1f} %",
         str(row["safe_stops"]),
         f"{row['success_rate']:.0%}",
+        failed,
     ]
 
 
@@ -55,7 +59,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     ways = list(dict.fromkeys(row["transport"] for row in result["rows"]))
     figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
     for number, way in enumerate(ways):
-        rows = [row for row in result["rows"] if row["transport"] == way]
+        rows = [row for row in result["rows"] if row["transport"] == way and "round_trip_ms" in row]
         places = [networks.index(row["latency_spec"]) + 0.15 * number for row in rows]
         p50, p90, p99 = (
             [row["round_trip_ms"][name] for row in rows] for name in ("p50", "p90", "p99")

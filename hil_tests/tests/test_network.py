@@ -52,6 +52,7 @@ REPORT = {
     "answered_states": 95,
     "latency_ms": {"p50": 51.2, "p90": 58.0, "p99": 250.0, "max": 301.0},
     "safe_stops": 2,
+    "safe_stop_events": [{"reason": "no_command"}, {"reason": "no_fresh_state"}],
     "success_rate": 0.5,
     "tick_overruns": 1,
     "rejected_by_edge": {"stale": 3},
@@ -68,12 +69,17 @@ def test_the_share_of_unanswered_states_is_of_all_that_were_sent():
 def test_the_table_and_the_picture_show_every_cell(tmp_path):
     rows = [
         {"row": "clean", "latency_spec": "delay=25ms", "transport": name, **summary(REPORT)}
+        | {"failed_starts": ["late"]}
         for name in cells.TRANSPORTS
     ]
+    dead = {"latency_spec": "loss=50%", "transport": "udp", "failed_starts": ["no"] * 3}
+    rows.append({"row": "dead", **dead})
     write_report({"rows": rows}, tmp_path)
     lines = (tmp_path / "table.md").read_text().splitlines()
     assert len(lines) == 2 + len(rows)
-    assert lines[2] == ("| `delay=25ms` | Zenoh on TCP | 51 | 58 | 250 | 301 | 5.0 % | 2 | 50% |")
+    assert lines[2] == (
+        "| `delay=25ms` | Zenoh on TCP | 51 | 58 | 250 | 301 | 5.0 % | 2 | 50% | 1 |"
+    )
     assert (tmp_path / "quantiles.png").read_bytes().startswith(b"\x89PNG")
     assert table({"rows": []}).count("\n") == 2
 
