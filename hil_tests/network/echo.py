@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import struct
 import sys
 import threading
@@ -88,7 +89,7 @@ def ask(session: zenoh.Session, arguments: argparse.Namespace) -> list[float | N
     try:
         _wait_for_listener(publisher)
         begun_s = time.monotonic()
-        padding = bytes(STATE_BYTES - _NUMBER.size)
+        padding = os.urandom(STATE_BYTES - _NUMBER.size)
         for number in range(arguments.messages):
             time.sleep(max(0.0, begun_s + number * CONTROL_PERIOD_S - time.monotonic()))
             sent_s[number] = time.monotonic()

@@ -36,7 +36,9 @@ class Variant(NamedTuple):
     reliability: str = RELIABLE
     mtu: int = MTU
     metadata: str = ""
-    """Zenoh's endpoint metadata, as in ``?rel=0``."""
+    """Zenoh's endpoint metadata. ``rel=0`` is QUIC's datagrams, ``rel=1`` on UDP is QUIC without
+    encryption, ``mixed_rel=1`` sends best effort in datagrams beside a reliable stream (the last
+    two: Zenoh 1.10, not the 1.5.1 of Python 3.8)."""
 
 
 VARIANTS = {
@@ -46,6 +48,8 @@ VARIANTS = {
     "udp": Variant("udp"),
     "udp best effort": Variant("udp", BEST_EFFORT),
     "udp mtu 9000": Variant("udp", mtu=JUMBO_MTU),
+    "udp rel=1": Variant("udp", metadata="?rel=1"),
+    "udp mixed": Variant("udp", BEST_EFFORT, metadata="?rel=1;mixed_rel=1"),
     "quic": Variant("quic"),
     "quic best effort": Variant("quic", BEST_EFFORT),
     "quic rel=0": Variant("quic", BEST_EFFORT, metadata="?rel=0"),
