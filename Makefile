@@ -10,7 +10,7 @@ MUTATION_STAMP := $(MUTATION)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu recording mutate lock clean
+.PHONY: help install demo test test-ray test-network lint format bench bench-quick bench-gpu network recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -33,6 +33,9 @@ test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
 	$(BIN)/python -m pytest -m ray trainer
+
+test-network: $(STAMP)  ## the loop over a kernel network of two namespaces; needs root
+	$(BIN)/python -m pytest -m network hil_tests
 
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
@@ -59,6 +62,11 @@ bench: $(STAMP) $(PEERS_STAMP)  ## speed and memory beside peers: tables, and JS
 
 bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table only
 	$(BIN)/python -m trainer bench --quick --threads 1
+
+network: $(STAMP)  ## TCP, UDP, relay and virtual time on the same network; needs root, some 25 minutes
+	@mkdir -p results/network
+	$(BIN)/python -m hil_tests network --out results/network/network.json --report results/network
+	$(BIN)/python -m hil_tests.network.variants --out results/network/variants.json
 
 bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and eight at once
 	@mkdir -p $(BENCH)

@@ -26,8 +26,11 @@ from bridge.command_hold import (
     Decision,
 )
 from edge_runtime.latency.event_heap import EventHeap
-from edge_runtime.latency.model import LatencySpec, make_link
+from edge_runtime.latency.model import LatencyModel, LatencySpec, make_link
 from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Reason, State, encode
+
+_STAMP = 2**62
+"""A wall clock in nanoseconds, as long on the wire as the real one."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class LockStepClock:
         """Let virtual time run from this tick to the end of its command window."""
         tick_s = state.step * CONTROL_PERIOD_S
         self._check.sent(state.step)
-        self._send(self._link.up.sample(tick_s), state)
+        self._send(self._link.up, tick_s, state)
         window_end_s = tick_s + COMMAND_WINDOW_S
         while due := self._under_way.pop_due(window_end_s + ROUNDING_S):
             arrival_s, message = due
@@ -92,30 +95,33 @@ class LockStepClock:
     def close(self) -> None:
         """Nothing runs in the background."""
 
-    def _send(self, arrival_s: float | None, message: State | _Answer) -> None:
-        if arrival_s is not None:
+    def _send(self, direction: LatencyModel, now_s: float, message: State | _Answer) -> None:
+        for arrival_s in direction.arrivals(now_s, _size_bytes(message)):
             self._under_way.push(arrival_s, message)
 
     def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
+        answered_step = self._hold.newest_step
         if not self._hold.admit(answer.command, now_s, answer.sent_s):
             self._check.reject(Reason.STALE.value)
             return
         self._admitted_s = now_s
-        self.latencies_ms.append((now_s - answer.sent_s + answer.round_trip_s) * 1e3)
+        if answer.command.step > answered_step:
+            self.latencies_ms.append((now_s - answer.sent_s + answer.round_trip_s) * 1e3)
 
     def _arrive_at_edge(self, state: State, now_s: float) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
         payload = encode(msgspec.structs.replace(state, sent_ns=time.time_ns()))
-        overtaken = state.step < self._published_step
+        refused = state.step <= self._published_step
         self._take_unasked()
         published_s = time.monotonic()
         self._publish(payload)
-        if overtaken:
-            return  # The edge runtime rejects it as stale, as it should, and does not answer.
+        if refused:
+            # Overtaken or a duplicate: the edge runtime rejects and counts it, without an answer.
+            return
         self._published_step = state.step
         answer = self._await_answer(state, published_s)
         if answer is not None:
-            self._send(self._link.down.sample(now_s), answer)
+            self._send(self._link.down, now_s, answer)
 
     def _take_unasked(self) -> None:
         """Empty the inbox of what came between two ticks, so that only faults are counted."""
@@ -162,3 +168,11 @@ class LockStepClock:
             if self._answered_at_s is None
             else (time.monotonic() - self._answered_at_s)
         )
+
+
+def _size_bytes(message: State | _Answer) -> int:
+    """Size on the wire with stamps of a fixed size: a real inference time must not change it."""
+    if isinstance(message, State):
+        return len(encode(msgspec.structs.replace(message, sent_ns=_STAMP)))
+    stamps = {"received_ns": _STAMP, "inference_ns": _STAMP, "sent_ns": _STAMP}
+    return len(encode(msgspec.structs.replace(message.command, **stamps)))

@@ -56,6 +56,7 @@ def make_report(
         ),
         "policy_ids": list(settings["policy_ids"]),
         "latency_ms": quantiles(latencies_ms),
+        "answered_states": len(latencies_ms),
         "command_age_ms": quantiles(command_ages_ms),
         **counts,
         "safe_stops": len(safe_stop_events),

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shlex
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from pathlib import Path
 
 from edge_runtime.errors import UserError
 
@@ -26,6 +31,14 @@ def run_command(*arguments: str) -> None:
         raise UserError(f"python -m {arguments[0]} {arguments[1]} ended with status {status}")
 
 
+def end_children() -> None:
+    """Ask every process that this one has started to end, whichever thread waits for it."""
+    for children in Path("/proc/self/task").glob("*/children"):
+        for child in children.read_text().split():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(child), signal.SIGTERM)
+
+
 class BackgroundCommand:
     """``python -m ...`` running beside us for the length of a ``with`` block.
 
@@ -34,14 +47,19 @@ class BackgroundCommand:
     Args:
         arguments: module and its arguments.
         ready: text of its output that says it has started; None: no wait.
+        prefix: a program that runs it, as in ``ip netns exec NAME``.
     """
 
-    def __init__(self, *arguments: str, ready: str | None = None) -> None:
+    def __init__(
+        self, *arguments: str, ready: str | None = None, prefix: Sequence[str] = ()
+    ) -> None:
         print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
         self.name = " ".join(arguments[:2])
         self._output = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115 (closed in __exit__)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", *arguments], stdout=self._output, stderr=subprocess.STDOUT
+            [*prefix, sys.executable, "-m", *arguments],
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
         )
         if ready:
             self._wait_for(ready)

@@ -1,0 +1,1 @@
+"""The loop over a kernel's own TCP and UDP, against the same network in virtual and real time."""
