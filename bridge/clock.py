@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from bridge.command_hold import Decision
+from edge_runtime.latency.command_hold import Decision
 from edge_runtime.wire import State
 
 Publish = Callable[[bytes], None]

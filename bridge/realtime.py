@@ -17,8 +17,8 @@ import msgspec
 
 from bridge.clock import Publish
 from bridge.command_check import CommandCheck
-from bridge.command_hold import COMMAND_WINDOW_S, CommandHold, Decision
 from bridge.delay_line import DelayLine
+from edge_runtime.latency.command_hold import COMMAND_WINDOW_S, CommandHold, Decision
 from edge_runtime.latency.model import LatencyModel, LatencySpec, make_link
 from edge_runtime.wire import CONTROL_PERIOD_S, Reason, State, encode
 

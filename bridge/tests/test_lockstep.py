@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 
 from bridge.command_check import CommandCheck
-from bridge.command_hold import NO_COMMAND
 from bridge.lockstep import LockStepClock
 from bridge.tests.commands import make_command
+from edge_runtime.latency.command_hold import NO_COMMAND
 from edge_runtime.latency.model import parse_spec
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import State, decode_state, encode
