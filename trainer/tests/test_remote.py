@@ -10,8 +10,6 @@ from trainer.remote.vehicle_end import RemoteDriver, VehicleEnd
 from trainer.training.wheel import DirectWheel, Ends, RemoteWheel, make_wheel
 
 TERMINATED, TRUNCATED = Ends(True, False), Ends(False, True)
-    name: Ends(name == "terminated", name == "truncated") for name in ("terminated", "truncated")
-}
 GOES_ON = Ends(False, False)
 
 
