@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from bridge import simulate, view
+from bridge import relay, simulate, view
 from edge_runtime.cli import ArgumentParser, run_cli
 
 
@@ -23,6 +23,11 @@ SUBCOMMANDS = {
         simulate.add_arguments,
         simulate.simulate,
         "serve an environment to an edge runtime over Zenoh, and report",
+    ),
+    "relay": Subcommand(
+        relay.add_arguments,
+        relay.relay,
+        "put an injected network between a simulator and an edge runtime",
     ),
     "view": Subcommand(view.add_arguments, view.view, "show the wire in rerun, live or in a file"),
 }

@@ -19,6 +19,9 @@ class Clock(Protocol):
     """From state sent to command received, injected delays included; one per answered state."""
     tick_overruns: int
     """Ticks that began so late that the simulation slipped behind the wall clock."""
+    wall_clock_stalls: int
+    """States of lock-step that the edge runtime did not answer in wall time, or only with a safe
+    stop because of it: it was gone, or got no processor. Always 0 in real time."""
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode; ``seed`` decides the delays and losses of the link."""

@@ -19,7 +19,11 @@ from bridge.command_check import CommandCheck
 from edge_runtime.latency.command_hold import SILENCE_LIMIT_S, Decision
 from edge_runtime.latency.model import LatencySpec
 from edge_runtime.latency.virtual_link import Arrival, VirtualLink
+from edge_runtime.safety import Event
 from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Reason, State, encode
+
+WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
+"""Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
 
 
 class LockStepClock:
@@ -27,7 +31,7 @@ class LockStepClock:
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
-        self.tick_overruns = 0
+        self.tick_overruns = self.wall_clock_stalls = 0
         self._publish = publish
         self._check = check
         self._spec = spec
@@ -97,10 +101,12 @@ class LockStepClock:
                 continue
             if command.step == step:
                 self._answered_at_s, self._edge_silent = received_s, False
+                self.wall_clock_stalls += command.reason in WALL_CLOCK_REASONS
                 return command, received_s
             if command.mode != SAFE_STOP:  # In safe stop the edge repeats its last answer.
                 self._check.reject(Reason.STALE.value)
         self._edge_silent = True
+        self.wall_clock_stalls += 1
         return None
 
     def _deadline_s(self, published_s: float) -> float:

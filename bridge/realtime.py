@@ -28,7 +28,7 @@ class RealTimeClock:
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
-        self.tick_overruns = 0
+        self.tick_overruns = self.wall_clock_stalls = 0
         self._publish = publish
         self._check = check
         self._spec = spec
@@ -41,13 +41,13 @@ class RealTimeClock:
         with self._arrived:
             self._check.begin(episode)
             self._link = make_link(self._spec, seed)
-            self._start_s = time.monotonic()
+            self._start_s = self._begun_s = time.monotonic()
             self._hold = CommandHold(now_s=self._start_s)
             self._sent_s: dict[int, float] = {}
 
     def receive(self, payload: bytes) -> None:
         """Send one command down the line to the vehicle."""
-        self._send(self._link.down, partial(self._arrive_at_vehicle, payload))
+        self._send(self._link.down, payload, self._arrive_at_vehicle)
 
     def exchange(self, state: State) -> Decision:
         """Wait for the tick, send its state, and decide when its command window closes."""
@@ -56,7 +56,7 @@ class RealTimeClock:
         with self._arrived:
             self._sent_s[state.step] = time.monotonic()
             self._check.sent(state.step)
-        self._send(self._link.up, partial(self._publish, payload))
+        self._send(self._link.up, payload, self._publish)
         return self._decide(state.step, tick_s + COMMAND_WINDOW_S)
 
     def finish(self, state: State) -> None:
@@ -70,10 +70,11 @@ class RealTimeClock:
         """Stop the delay line."""
         self._line.close()
 
-    def _send(self, direction: LatencyModel, action: partial[None]) -> None:
-        release_s = direction.sample(time.monotonic())
-        if release_s is not None:
-            self._line.push(release_s, action)
+    def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
+        # The model's time is the episode's, so that its outages come as in lock-step.
+        sent_s = time.monotonic() - self._begun_s
+        for arrival_s in direction.arrivals(sent_s, len(payload)):
+            self._line.push(self._begun_s + arrival_s, partial(deliver, payload))
 
     def _wait_for_tick(self, step: int) -> float:
         """Sleep until the tick and return its time; a tick missed altogether moves all later ones.

@@ -40,7 +40,7 @@ def make_report(
     """Join the summary of the episodes with what happened on the wire.
 
     ``settings`` holds scenario, condition, policy_id, seed, clock and latency_spec; ``counts``
-    holds deadline_misses, tick_overruns and ``rejections``.
+    holds deadline_misses, tick_overruns, wall_clock_stalls and ``rejections``.
     """
     return {
         **summarise(

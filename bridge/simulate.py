@@ -176,6 +176,7 @@ def _drive(
         counts={
             "deadline_misses": runner.deadline_misses,
             "tick_overruns": clock.tick_overruns,
+            "wall_clock_stalls": clock.wall_clock_stalls,
             **rejections(port.edge_counts.rejected, check.rejected),
         },
         settings={

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from edge_runtime.cli import ArgumentParser, run_cli
 from hil_tests import demo
+from hil_tests.campaign import command as campaign
+
+COMMANDS: dict[str, tuple[Any, str]] = {
+    "demo": (demo, "train, export and drive the left turn, end to end"),
+    "campaign": (campaign, "every fault, every latency row, one report"),
+}
 
 
 def main(argv: list[str]) -> int:
     """Run one command; the exit status."""
     parser = ArgumentParser(prog="python -m hil_tests", description="Proves the loop.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    summary = "train, export and drive the left turn, end to end"
-    demo.add_arguments(commands.add_parser("demo", help=summary, description=summary))
-    return demo.run(parser.parse_args(argv))
+    for name, (module, summary) in COMMANDS.items():
+        module.add_arguments(commands.add_parser(name, help=summary, description=summary))
+    arguments = parser.parse_args(argv)
+    status: int = COMMANDS[arguments.command][0].run(arguments)
+    return status
 
 
 if __name__ == "__main__":

@@ -34,10 +34,12 @@ class BackgroundCommand:
     Args:
         arguments: module and its arguments.
         ready: text of its output that says it has started; None: no wait.
+        quiet: do not print the command.
     """
 
-    def __init__(self, *arguments: str, ready: str | None = None) -> None:
-        print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
+    def __init__(self, *arguments: str, ready: str | None = None, quiet: bool = False) -> None:
+        if not quiet:
+            print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
         self.name = " ".join(arguments[:2])
         self._output = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115 (closed in __exit__)
         self._process = subprocess.Popen(

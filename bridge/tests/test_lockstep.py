@@ -29,10 +29,10 @@ class Rig:
     def publish(self, payload):
         state = decode_state(payload)
         assert isinstance(state, State)
-        # The edge runtime answers no state that is older than one it has seen.
-        overtaken = any(state.step < step for step in self.published)
+        # The edge runtime answers no state that is as old as one it has seen, or older.
+        refused = any(state.step <= step for step in self.published)
         self.published.append(state.step)
-        if not overtaken and self.answer is not None:
+        if not refused and self.answer is not None:
             self.clock.receive(encode(self.answer(state.step)))
 
     def drive(self, steps, seed=0):
@@ -81,6 +81,60 @@ def test_jitter_reorders_and_the_overtaken_state_is_not_waited_for():
     rig.drive(60)
     assert rig.published != sorted(rig.published)
     assert time.monotonic() - started_s < 2.0  # Nothing timed out.
+
+
+def test_duplicates_reach_the_edge_and_the_vehicle_and_nobody_waits_for_an_answer():
+    rig = Rig("10ms,duplicate=100%")
+    started_s = time.monotonic()
+    decisions = rig.drive(20)
+    assert time.monotonic() - started_s < 2.0  # Nothing timed out.
+    assert rig.published == [step for step in range(20) for _ in range(2)]
+    assert used(decisions) == list(range(20))
+    assert dict(rig.check.rejected) == {"stale": 20}
+    assert len(rig.clock.latencies_ms) == 20
+
+
+def test_a_slow_line_carries_no_more_states_than_its_rate():
+    # One state of 7.3 kB takes 146 ms at 400 kbit/s: with a short queue two of three get through.
+    rig = Rig("up.rate=400kbit/s,up.queue=50ms")
+    rig.drive(60)
+    assert 38 <= len(rig.published) <= 42
+
+
+def test_an_outage_brakes_and_ends_with_the_fifth_fresh_state():
+    reasons = [d.brake_reason for d in Rig("outage=0.5s@1s").drive(20)]
+    assert [bool(reason) for reason in reasons] == [11 <= step < 19 for step in range(20)]
+    assert set(reasons[11:15]) == {NO_COMMAND}
+    assert set(reasons[15:19]) == {"no_fresh_state"}
+
+
+def test_one_lost_state_is_no_silence_and_two_are():
+    one, two = (Rig(f"up.outage={length}s@0.95s").drive(20) for length in (0.1, 0.2))
+    assert not any(decision.brake_reason for decision in one)
+    braking = [decision.brake_reason for decision in two if decision.brake_reason]
+    assert braking == [NO_COMMAND, *["no_fresh_state"] * 4]
+
+
+def test_a_machine_that_stalls_is_counted_apart_from_the_network():
+    rig = Rig()
+    rig.drive(3)
+    rig.answer = lambda step: make_command(step, mode="safe_stop", reason="no_fresh_state")
+    rig.clock.exchange(make_state(3, session="here"))
+    assert rig.clock.wall_clock_stalls == 1
+    late = Rig("outage=0.5s@1s")
+    late.drive(20)
+    assert late.clock.wall_clock_stalls == 0
+
+
+def test_every_feature_at_once_repeats_itself():
+    spec = (
+        "60ms+-40ms,tail=pareto,loss=5%,burst=3,reorder=5%,duplicate=5%,rate=2Mbit/s,outage=0.3s/2s"
+    )
+    first, again, other = (Rig(spec) for _ in range(3))
+    runs = [used(rig.drive(100, seed)) for rig, seed in ((first, 3), (again, 3), (other, 4))]
+    assert runs[0] == runs[1] != runs[2]
+    assert first.published == again.published != other.published
+    assert first.check.rejected == again.check.rejected
 
 
 def test_a_dead_link_brakes_after_2_periods_of_virtual_time():

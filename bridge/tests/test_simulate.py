@@ -180,10 +180,11 @@ def test_a_number_that_is_not_finite_is_one_line_and_status_2(tmp_path):
 
 def test_what_the_edge_rejects_is_in_the_report(tmp_path):
     policy, endpoint = make_policy(tmp_path), free_endpoint()
-    options = ["--latency", "up.delay=100ms,up.jitter=80ms"]
+    options = ["--latency", "up.delay=100ms,up.jitter=80ms,up.duplicate=50%"]
     with start_edge(endpoint, policy):
         report = simulate(tmp_path, endpoint, TOY, options)
     assert report["rejected_by_edge"]["stale"] > 0
+    assert report["rejected_by_edge"]["duplicate"] > 0
     assert report["rejected"]["stale"] >= report["rejected_by_edge"]["stale"]
 
 

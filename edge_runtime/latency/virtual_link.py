@@ -4,12 +4,19 @@ Tick n stands at virtual time n T. Its state arrives at the edge runtime after t
 the answer takes no time, and arrives at the vehicle after the downlink's; the tick is decided at
 n T + 25 ms from what has arrived by then. Who answers is the caller's business: a real edge
 runtime that is waited for, or a function.
+
+The edge runtime's rule for silence counts time, and here time is virtual: a real one, which sees
+states come faster than in life, would miss the gaps. So its safety machine runs along, and what it
+would not drive becomes a safe stop. It begins each episode in standby: episodes do not depend on
+each other.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Callable, Generic, Optional, Tuple, TypeVar, Union
+
+import msgspec
 
 from edge_runtime.latency.command_hold import (
     COMMAND_WINDOW_S,
@@ -18,11 +25,20 @@ from edge_runtime.latency.command_hold import (
     Decision,
 )
 from edge_runtime.latency.event_heap import EventHeap
-from edge_runtime.latency.model import LatencyModel, LatencySpec, make_link
-from edge_runtime.wire import CONTROL_PERIOD_S, Command
+from edge_runtime.latency.model import LatencySpec, make_link
+from edge_runtime.safety import (
+    Event,
+    Mode,
+    Safety,
+    advance,
+    classify_fresh,
+    is_silent,
+    note_arrival,
+)
+from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command
 
-STATE_BYTES = 7360
-COMMAND_BYTES = 240
+STATE_BYTES = 7322
+COMMAND_BYTES = 217
 """What the messages take on the wire, for links of limited rate: the same for every message, so
 that a longer session name or another digit does not change a drive."""
 
@@ -72,13 +88,14 @@ class VirtualLink(Generic[Message]):
         self._on_heard, self._on_stale = on_heard, on_stale
         self._under_way: EventHeap[Union[Tuple[int, Message], _Answer]] = EventHeap()
         self._newest_at_edge = -1
+        self._safety = Safety()
         self._window_end_s = COMMAND_WINDOW_S
 
     def send_state(self, step: int, message: Message) -> None:
         """Begin tick ``step``: its state leaves the vehicle."""
         tick_s = step * CONTROL_PERIOD_S
         self._window_end_s = tick_s + COMMAND_WINDOW_S
-        for arrival_s in _arrivals(self._link.up, tick_s, STATE_BYTES):
+        for arrival_s in self._link.up.arrivals(tick_s, STATE_BYTES):
             self._under_way.push(arrival_s, (step, message))
 
     def next_at_edge(self) -> Optional[Arrival[Message]]:
@@ -93,18 +110,30 @@ class VirtualLink(Generic[Message]):
                 continue
             step, content = message
             overtaken = step <= self._newest_at_edge
-            self._newest_at_edge = max(step, self._newest_at_edge)
+            if not overtaken:
+                self._newest_at_edge = step
+                self._note_fresh(now_s)
             return Arrival(step, now_s, content, overtaken)
 
     def answer(self, arrival: Arrival[Message], command: Command, computing_s: float = 0.0) -> None:
-        """Send the answer to a state back; ``computing_s`` is reported, but takes no time."""
+        """Send the answer to the newest state back; ``computing_s`` is reported only."""
+        if self._safety.mode is Mode.SAFE_STOP:
+            command = msgspec.structs.replace(command, mode=SAFE_STOP, reason=self._safety.reason)
         answer = _Answer(command, arrival.step * CONTROL_PERIOD_S, computing_s)
-        for arrival_s in _arrivals(self._link.down, arrival.arrived_s, COMMAND_BYTES):
+        for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
             self._under_way.push(arrival_s, answer)
 
     def decide(self, edge_silence_s: Optional[float] = None) -> Decision:
         """What the vehicle does in this tick; for ``edge_silence_s`` see ``CommandHold.decide``."""
         return self.hold.decide(self._window_end_s, edge_silence_s)
+
+    def _note_fresh(self, now_s: float) -> None:
+        """What the edge runtime's safety machine makes of a fresh state's moment."""
+        if is_silent(self._safety, now_s - ROUNDING_S):
+            self._safety = advance(self._safety, Event.SILENT)
+        self._safety = note_arrival(self._safety, now_s)
+        event = classify_fresh(self._safety, final=False, needs_rearm=False)
+        self._safety = advance(self._safety, event)
 
     def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
         answered_step = self.hold.newest_step
@@ -112,8 +141,3 @@ class VirtualLink(Generic[Message]):
             self._on_stale()
         elif answer.command.step > answered_step:
             self._on_heard(now_s - answer.sent_s + answer.computing_s)
-
-
-def _arrivals(direction: LatencyModel, now_s: float, size_bytes: int) -> Tuple[float, ...]:
-    arrival_s = direction.sample(now_s)
-    return () if arrival_s is None else (arrival_s,)

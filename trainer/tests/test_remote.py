@@ -1,5 +1,7 @@
 """A policy behind a network: what it drives, and what is learned from it."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -27,7 +29,8 @@ class Kept:
     """Stands for ``Learning``: keeps what would be learned, as the replay's chain would."""
 
     def __init__(self):
-        self.rows, self.current = [], None
+        self.rows: list[tuple] = []
+        self.current: Any = None
 
     def start_episode(self, observation):
         self.current = observation
@@ -66,7 +69,7 @@ def answer(observation):
 
 def drive_wheel(spec, ticks, seed=0, ends=GOES_ON, human=()):
     """Drive a wheel over numbered observations; the reward of tick n is n."""
-    kept = Kept()
+    kept: Any = Kept()
     wheel = RemoteWheel(kept, Car(), parse_spec(spec))
     wheel.start(frames(0), seed)
     actions = []
@@ -134,6 +137,6 @@ def test_a_car_that_brakes_by_itself_teaches_nothing_but_how_it_ends():
 
 
 def test_without_a_network_nothing_is_between():
-    kept = Kept()
+    kept: Any = Kept()
     assert isinstance(make_wheel(kept, Car(), LatencySpec()), DirectWheel)
     assert isinstance(make_wheel(kept, Car(), parse_spec("1ms")), RemoteWheel)
