@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, read_bytes, write_atomic
@@ -23,6 +24,8 @@ from trainer.parallel import cores
 from trainer.progress import ProgressBar
 
 PARTS = ("latency", "faults")
+NO_ROWS = "none"
+"""``--rows none``: nothing but what ``--check-realtime`` asks for."""
 EXAMPLE = "python -m hil_tests campaign --only latency --runs 100 --out results/latency/r.json"
 
 
@@ -47,7 +50,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--rows",
         metavar="NAME,...",
-        help=f"only these latency axes ({', '.join(axis.name for axis in AXES)}) and faults",
+        help=f"only these latency axes ({', '.join(axis.name for axis in AXES)}) and faults; "
+        f"{NO_ROWS}: only what --check-realtime asks for",
     )
     parser.add_argument(
         "--runs", type=positive, default=100, help="episodes of each latency row, the same seeds"
@@ -106,7 +110,8 @@ def run(arguments: argparse.Namespace) -> int:
     report: dict[str, Any] = {"command": _command()}
     text = [f"# Campaign: {policy.name}, {arguments.scenario}", "", f"`{_command()}`", ""]
     if axes or arguments.check_realtime:
-        latency = run_latency(arguments, policy, axes, out.with_name(f"{out.stem}_rows"))
+        with sigterm_as_interrupt():  # Whoever ends a campaign ends its processes.
+            latency = run_latency(arguments, policy, axes, out.with_name(f"{out.stem}_rows"))
         figures = write_figures(out, latency, others) if axes else {}
         report["latency"] = {**latency, "figures": figures}
         text += ["## Latency", "", render_latency(latency, figures, others)]
@@ -124,6 +129,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _choose(arguments: argparse.Namespace) -> tuple[list[Axis], list[str] | None]:
     """The latency axes, and the faults by name ([]: all of them; None: no faults)."""
     known = {axis.name: axis for axis in AXES}
+    if arguments.rows == NO_ROWS:
+        return [], None
     named = arguments.rows.split(",") if arguments.rows else []
     axes = [known[name] for name in named if name in known] if named else list(AXES)
     faults = [name for name in named if name not in known]

@@ -17,24 +17,28 @@ def render_latency(
     others: Mapping[str, Mapping[str, Any]],
 ) -> str:
     """Sentences of the budgets, pictures, what real time says, and a table for each axis."""
-    lines = [latency["budget"]["sentence"]] if latency["budget"] else []
-    lines += [part["budget"]["sentence"] for part in others.values()]
-    lines += [
-        "",
-        f"A limit is the largest tested value up to which every tested value's share of successes "
-        f"over {latency['runs']} episodes (the same seeds in every row) is at the target; nothing "
-        f"is interpolated. Lock-step ran {latency['faster_than_real_time']:.0f} times faster than "
-        "real time in each worker, starting the simulator included."
-        if latency["clock"] == "lockstep" and latency["faster_than_real_time"]
-        else "Driven in real time.",
-        "",
-        *(f"![{name}]({path})\n" for name, path in figures.items()),
-    ]
+    lines = _budgets(latency, figures, others) if latency["axes"] else []
     if latency["realtime_check"]:
         lines += [*_realtime(latency["realtime_check"]), ""]
     for axis in latency["axes"]:
         lines += [*_table(axis, latency["rows"]), ""]
     return "\n".join(lines)
+
+
+def _budgets(
+    latency: Mapping[str, Any], figures: Mapping[str, str], others: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    sentences = [part["budget"]["sentence"] for part in (latency, *others.values())]
+    speed = f"{latency['faster_than_real_time']:.1f} times real time in each worker"
+    return [
+        *(f"{sentence}\n" for sentence in sentences),
+        "A limit is the largest tested value up to which, at every tested value, the share of "
+        f"successes over {latency['runs']} episodes (the same seeds in every row) is at the "
+        f"target; nothing is interpolated. Clock: {latency['clock']}, {speed}, the start of each "
+        "simulator included.",
+        "",
+        *(f"![{name}]({path})\n" for name, path in figures.items()),
+    ]
 
 
 def _realtime(check: Mapping[str, Any]) -> list[str]:
