@@ -29,11 +29,9 @@ class Held:
 
     action: Action
     step: int
-    """The tick whose state the command answers; -1 before the first command."""
-    observation: Observation | None
-    """What the policy saw when it gave the command; None before the first command."""
+    """The tick whose state the obeyed command answers; -1 before the first command."""
     braking: bool
-    """The vehicle brakes by itself: no command has come for 2 T."""
+    """The vehicle brakes: no command has come for 2 T, or the command is a safe stop."""
 
 
 class VehicleEnd:
@@ -49,7 +47,6 @@ class VehicleEnd:
         self.env = env
         self._link: VirtualLink[Observation] = VirtualLink(spec, seed)
         self._step = 0
-        self._seen: dict[int, Observation] = {}
 
     def tick(self, observation: Observation, policy: Policy) -> Held:
         """Send the tick's observation, let the policy answer all that arrive, and decide.
@@ -57,7 +54,6 @@ class VehicleEnd:
         The policy is asked for each fresh observation that reaches the edge within the tick: often
         one, but none or several where the network drops, delays or bundles them.
         """
-        self._seen[self._step] = observation
         self._link.send_state(self._step, observation)
         self._step += 1
         while arrival := self._link.next_at_edge():
@@ -69,25 +65,19 @@ class VehicleEnd:
         decision = self._link.decide()
         braking = bool(decision.brake_reason)
         self._press_brake(braking)
-        command = decision.command
-        if command is None:
-            size = self.env.action_space.shape
-            action = self.env.brake_action if braking else np.zeros(size, np.float32)
-            return Held(action, -1, None, braking)
-        action = self.env.brake_action if braking else np.array(command.action, np.float32)
-        self._forget_before(command.step)
-        return Held(action, command.step, self._seen[command.step], braking)
+        if braking:
+            action = self.env.brake_action
+        elif decision.command is None:
+            action = np.zeros(self.env.action_space.shape, np.float32)
+        else:
+            action = np.array(decision.command.action, np.float32)
+        return Held(action, self._link.hold.newest_step, braking)
 
     def _press_brake(self, pressed: bool) -> None:
         """A scenario whose action only steers has a brake beside it."""
         press = getattr(self.env, "press_brake", None)
         if press is not None:
             press(pressed)
-
-    def _forget_before(self, step: int) -> None:
-        """An older command is never obeyed again."""
-        for old in [number for number in self._seen if number < step]:
-            del self._seen[old]
 
 
 class RemoteDriver:

@@ -1,21 +1,28 @@
 """Between policy and vehicle in training: directly, or over the network it will be deployed on.
 
-Over a network, what is stored is what happens at the vehicle, from the policy's point of view: in
-each tick, the observation that the obeyed command answers, the action carried out, the reward of
-that tick, and the observation that the next tick's command answers. So a reward stands beside the
-action that earned it, however long the command was under way, and a human's action beside the
-picture to which the policy would have had to give it. What happened meanwhile is not in the
-picture: the delayed decision process is only partially observed, and the contract fixes the
-observation, so past commands are not added to it.
+Over a network, what is stored is what happens at the vehicle, beside what the policy knows of it:
+in tick n the observation of tick n - d, the action carried out in tick n, its reward, and the
+observation of tick n + 1 - d, where d is how many ticks old a command is that is on time. So a
+reward stands beside the action that earned it, and a human's action beside the picture to which
+the policy would have had to give it. Where the network makes a command late, lost or repeated, the
+action carried out is another than the policy's answer; for a learner off policy that is a sample
+like any other, and so is the brake.
+
+What was carried out in the d ticks between is not in the picture: the delayed decision process is
+only partially observed, and the contract fixes the observation, so past commands are not added.
 """
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from edge_runtime.latency.command_hold import COMMAND_WINDOW_S, ROUNDING_S
 from edge_runtime.latency.model import LatencySpec
-from trainer.remote.vehicle_end import Action, Held, Observation, Policy, VehicleEnd
+from edge_runtime.wire import CONTROL_PERIOD_S
+from trainer.remote.vehicle_end import Action, Observation, Policy, VehicleEnd
 from trainer.training.learning import Learning
 
 
@@ -64,66 +71,43 @@ class DirectWheel:
         self._learning.add(action, reward, observation, ends.terminated, human)
 
 
-@dataclass(frozen=True)
-class _Tick:
-    """A tick that waits for the observation which the next command answers."""
-
-    step: int
-    action: Action
-    reward: float
-    human: bool
-
-
 class RemoteWheel:
-    """The policy behind a network.
-
-    The replay buffer keeps pictures in a chain, so a tick becomes a transition where the next
-    command answers the next state, as nearly all do at a constant delay. Where a command was held
-    or skipped (jitter, loss), and while the car brakes by itself, the chain is begun anew; the end
-    of an episode by goal or failure is always kept.
-    """
+    """The policy behind a network, in virtual time."""
 
     def __init__(self, learning: Learning, env: Any, spec: LatencySpec) -> None:
         self._learning, self._env, self._spec = learning, env, spec
+        self._known: deque[Observation] = deque(maxlen=ticks_late(spec) + 1)
+        """Observations of the ticks n - d to n."""
+        self._storing = False
 
     def start(self, observation: Observation, seed: int) -> None:
         """Begin an episode; the seed decides the network's luck."""
         self._vehicle_end = VehicleEnd(self._env, self._spec, seed)
-        self._held: Held | None = None
-        self._waiting: _Tick | None = None
-        self._chain_step: int | None = None
+        self._known.clear()
+        self._storing = False
 
     def act(self, observation: Observation, policy: Policy) -> Action:
         """What the vehicle does: the newest command, or the brake."""
-        held = self._held = self._vehicle_end.tick(observation, policy)
-        self._settle(held)
-        return held.action
+        self._known.append(observation)
+        if not self._storing and len(self._known) == self._known.maxlen:
+            self._learning.start_episode(self._known[0])
+            self._storing = True
+        return self._vehicle_end.tick(observation, policy).action
 
     def store(
         self, action: Action, reward: float, observation: Observation, ends: Ends, human: bool
     ) -> None:
-        """Keep the tick until it is known what the next one answers."""
-        held = self._held
-        assert held is not None
-        if held.observation is None:
-            return
-        if ends.terminated:
-            self._learning.add(action, reward, observation, True, human)
-        elif human or not held.braking:
-            self._waiting = _Tick(held.step, action, reward, human)
+        """Keep the tick; the first d of an episode answer to nothing the policy could know."""
+        if self._storing:
+            following = [*self._known, observation][1]
+            self._learning.add(action, reward, following, ends.terminated, human)
 
-    def _settle(self, held: Held) -> None:
-        """Store the tick before this one if this one goes on where it was; be ready for this."""
-        waiting, self._waiting = self._waiting, None
-        if held.observation is None:
-            return
-        if waiting is not None and held.step == waiting.step + 1:
-            self._learning.add(
-                waiting.action, waiting.reward, held.observation, False, waiting.human
-            )
-        elif held.step != self._chain_step:
-            self._learning.start_episode(held.observation)
-        self._chain_step = held.step
+
+def ticks_late(spec: LatencySpec) -> int:
+    """How many ticks old the state is that a command answers when it is on time."""
+    round_trip_s = (spec.up.delay_ms + spec.down.delay_ms) * 1e-3
+    beyond_window_s = max(0.0, round_trip_s - COMMAND_WINDOW_S - ROUNDING_S)
+    return math.ceil(beyond_window_s / CONTROL_PERIOD_S)
 
 
 def make_wheel(learning: Learning, env: Any, spec: LatencySpec) -> Wheel:
