@@ -7,10 +7,14 @@ for another row, computes only what is missing.
 from __future__ import annotations
 
 import json
+import statistics
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from edge_runtime.episode_report import GOAL
 from edge_runtime.files import read_bytes, write_json
 from trainer.drivers import make_environment
 from trainer.experiments.units import digest
@@ -43,6 +47,40 @@ class Chunk:
 def chunks_of(spec: str, seed: int, runs: int, size: int) -> list[Chunk]:
     """The chunks of one row."""
     return [Chunk(spec, seed + done, min(size, runs - done)) for done in range(0, runs, size)]
+
+
+def halve(chunk: Chunk) -> tuple[Chunk, Chunk]:
+    """Two chunks with the same episodes."""
+    first = chunk.episodes // 2
+    second_seed = chunk.first_seed + first
+    return (
+        Chunk(chunk.spec, chunk.first_seed, first),
+        Chunk(chunk.spec, second_seed, chunk.episodes - first),
+    )
+
+
+def join_reports(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One report of ``bridge simulate`` for what was driven in parts.
+
+    Latencies: the mean of the parts' p50, and the largest p99.
+    """
+    heard = [part["latency_ms"] for part in reports if part["latency_ms"]["p50"] is not None]
+    rejected: Counter[str] = Counter()
+    for part in reports:
+        rejected.update(part["rejected"])
+    episodes = [episode for part in reports for episode in part["per_episode"]]
+    counts = ("deadline_misses", "tick_overruns", "safe_stops")
+    return {
+        "command": reports[0]["command"],
+        "success_rate": sum(e["outcome"] == GOAL for e in episodes) / len(episodes),
+        "latency_ms": {
+            "p50": statistics.fmean(part["p50"] for part in heard) if heard else None,
+            "p99": max(part["p99"] for part in heard) if heard else None,
+        },
+        **{name: sum(part[name] for part in reports) for name in counts},
+        "rejected": dict(rejected),
+        "per_episode": episodes,
+    }
 
 
 class ChunkStore:
