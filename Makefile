@@ -8,7 +8,7 @@ PEERS_STAMP := $(PEERS)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu lock clean
+.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu recording lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -61,6 +61,9 @@ bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table 
 bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and eight at once
 	@mkdir -p $(BENCH)
 	$(BIN)/python -m trainer.benches.accelerator --runs 8 --out $(BENCH)/gpu.json
+
+recording: $(STAMP)  ## drive and record anew what the next release is replayed against
+	$(BIN)/python -m hil_tests.recordings.make
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new

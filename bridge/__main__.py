@@ -2,45 +2,36 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
-from collections.abc import Callable
-from typing import Any, NamedTuple
 
-from bridge import relay, simulate, view
 from edge_runtime.cli import ArgumentParser, run_cli
 
-
-class Subcommand(NamedTuple):
-    """One row of SUBCOMMANDS."""
-
-    add_arguments: Callable[[ArgumentParser], None]
-    run: Callable[[Any], int]
-    help: str
-
-
 SUBCOMMANDS = {
-    "simulate": Subcommand(
-        simulate.add_arguments,
-        simulate.simulate,
-        "serve an environment to an edge runtime over Zenoh, and report",
-    ),
-    "relay": Subcommand(
-        relay.add_arguments,
-        relay.relay,
-        "put an injected network between a simulator and an edge runtime",
-    ),
-    "view": Subcommand(view.add_arguments, view.view, "show the wire in rerun, live or in a file"),
+    "simulate": "serve an environment to an edge runtime over Zenoh, and report",
+    "relay": "put an injected network between a simulator and an edge runtime",
+    "router": "connect several simulators, edge runtimes and viewers with one another",
+    "record": "write everything on the wire to an MCAP recording",
+    "replay": "run recorded states through a policy or runtime, and compare its commands",
+    "repair": "give a recording that was cut off its index back",
+    "view": "show the wire in rerun, live or in a file",
 }
+"""By the name of its module in here, which has ``add_arguments`` and a function of that name."""
 
 
 def main(argv: list[str]) -> int:
     """Run one subcommand and return its exit status."""
     parser = ArgumentParser(prog="python -m bridge", description=__doc__)
     subparsers = parser.add_subparsers(dest="subcommand", required=True, metavar="COMMAND")
-    for name, row in SUBCOMMANDS.items():
-        row.add_arguments(subparsers.add_parser(name, help=row.help, description=row.help))
+    asked = next((word for word in argv if not word.startswith("-")), None)
+    for name, text in SUBCOMMANDS.items():
+        subparser = subparsers.add_parser(name, help=text, description=text)
+        # Only what is asked for is loaded: a router need not wait for rerun and gymnasium.
+        if name == asked:
+            module = importlib.import_module(f"bridge.{name}")
+            module.add_arguments(subparser)
     arguments = parser.parse_args(argv)
-    return SUBCOMMANDS[arguments.subcommand].run(arguments)
+    return int(getattr(module, arguments.subcommand)(arguments))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from argparse import ArgumentTypeError
+from argparse import ArgumentParser, ArgumentTypeError
 
 
 def positive_int(text: str) -> int:
@@ -25,6 +25,15 @@ def non_negative_seconds(text: str) -> float:
     if not (math.isfinite(seconds) and seconds >= 0):
         raise ArgumentTypeError(f"{text!r} is not a number of seconds, at least 0")
     return seconds
+
+
+def add_tls(parser: ArgumentParser) -> None:
+    """Declare ``--tls``; its value goes through ``edge_runtime.tls.tls_for``."""
+    parser.add_argument(
+        "--tls",
+        metavar="DIR",
+        help="ca.pem, cert.pem, key.pem of this party (python -m deploy certs); endpoint tls/...",
+    )
 
 
 def _int_from(text: str, least: int) -> int:

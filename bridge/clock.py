@@ -19,6 +19,8 @@ class Clock(Protocol):
     """From state sent to command received, injected delays included; one per answered state."""
     tick_overruns: int
     """Ticks that began so late that the simulation slipped behind the wall clock."""
+    missed_ticks: int
+    """Whole ticks of the wall clock that went by without a state because of it."""
     wall_clock_stalls: int
     """States of lock-step that the edge runtime did not answer in wall time, or only with a safe
     stop because of it: it was gone, or got no processor. Always 0 in real time."""

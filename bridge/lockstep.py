@@ -31,7 +31,7 @@ class LockStepClock:
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
-        self.tick_overruns = self.wall_clock_stalls = 0
+        self.tick_overruns = self.missed_ticks = self.wall_clock_stalls = 0
         self._publish = publish
         self._check = check
         self._spec = spec

@@ -11,16 +11,17 @@ from typing import Any
 
 import rerun as rr
 
-from bridge.arguments import non_negative_seconds
+from bridge.arguments import add_tls, non_negative_seconds
+from bridge.feed import Feed, Heard, open_feed
 from bridge.scene import decode_scene
 from bridge.signals import sigterm_as_interrupt
 from bridge.simulate import DEFAULT_VEHICLE_ID
 from bridge.viewer import sinks
-from bridge.viewer.feed import Feed, Heard, open_feed
 from bridge.viewer.wire_log import WireLog
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser
 from edge_runtime.files import check_writable
+from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 
 POLL_S = 0.1
@@ -46,8 +47,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--connect",
         metavar="PROTOCOL/HOST:PORT",
         default=DEFAULT_ENDPOINT,
-        help="where the simulator listens",
+        help="where the simulator or the router listens",
     )
+    add_tls(parser)
     parser.add_argument(
         "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to watch"
     )
@@ -69,9 +71,9 @@ def add_arguments(parser: ArgumentParser) -> None:
 def view(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
     wire.check_vehicle_id(arguments.vehicle_id)
-    check_endpoint(arguments.connect)
+    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     _check_sink(arguments)
-    dropped = _watch(arguments)
+    dropped = _watch(arguments, tls)
     if dropped:
         print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
     if arguments.save is not None:
@@ -79,11 +81,11 @@ def view(arguments: Any) -> int:
     return 0
 
 
-def _watch(arguments: Any) -> int:
+def _watch(arguments: Any, tls: TlsFiles | None) -> int:
     """Draw until there is a reason to stop; return how many messages had to be dropped."""
     with (
         sigterm_as_interrupt(),
-        open_feed(arguments.connect, arguments.vehicle_id, arguments.wait_s) as feed,
+        open_feed(arguments.connect, arguments.vehicle_id, arguments.wait_s, tls) as feed,
         _sink(arguments) as recording,
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         contextlib.suppress(KeyboardInterrupt),
@@ -120,7 +122,10 @@ def _show(feed: Feed, log: WireLog, duration_s: float | None) -> None:
 
 
 def _write(log: WireLog, heard: Heard) -> None:
-    message = DECODERS[heard.topic](heard.payload)
+    decode = DECODERS.get(heard.topic)
+    if decode is None:
+        return  # A token: it shows as silence.
+    message = decode(heard.payload)
     if message is None or isinstance(message, wire.Rejection):
         log.write_unreadable(heard.topic, message.detail if message else "not a scene")
     else:

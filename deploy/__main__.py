@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
+from deploy import certs_command
 from deploy.keys import DEFAULT_DIRECTORY, write_key_pair
 from edge_runtime.cli import ArgumentParser, run_cli
 
@@ -21,7 +23,13 @@ def main(argv: list[str]) -> int:
     keys.add_argument(
         "--out", default=DEFAULT_DIRECTORY, help="directory for policy.key and policy.pub"
     )
+    certs = commands.add_parser("certs", help="make an authority and certificates for TLS")
+    certs_command.add_arguments(certs)
     arguments = parser.parse_args(argv)
+    return certs_command.certs(arguments) if arguments.command == "certs" else _keys(arguments)
+
+
+def _keys(arguments: Any) -> int:
     private, public = write_key_pair(Path(arguments.out))
     print(f"private key (keep it on the workstation): {private}")
     print(f"public key (goes onto the board):         {public}")

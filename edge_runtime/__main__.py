@@ -64,6 +64,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         metavar="PROTOCOL/HOST:PORT",
         help=f"where the simulator listens (default: {_DEFAULTS.connect})",
     )
+    _add_tls(parser)
     parser.add_argument(
         "--vehicle-id",
         metavar="ID",
@@ -99,6 +100,14 @@ def _add_trust(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_tls(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--tls",
+        metavar="DIR",
+        help="ca.pem, cert.pem, key.pem of this party (python -m deploy certs); endpoint tls/...",
+    )
+
+
 def _add_operator(parser: argparse.ArgumentParser, with_out: bool) -> None:
     parser.add_argument(
         "--connect",
@@ -106,6 +115,7 @@ def _add_operator(parser: argparse.ArgumentParser, with_out: bool) -> None:
         default=_DEFAULTS.connect,
         help="where the simulator listens",
     )
+    _add_tls(parser)
     parser.add_argument(
         "--vehicle-id", metavar="ID", default=_DEFAULTS.vehicle_id, help="which vehicle"
     )

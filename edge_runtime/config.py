@@ -12,6 +12,7 @@ import msgspec
 from edge_runtime import log
 from edge_runtime.errors import UserError
 from edge_runtime.files import PathLike, read_bytes
+from edge_runtime.tls import check_fits
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 from edge_runtime.vehicles.registry import NONE, VEHICLE_NAMES
 from edge_runtime.wire import check_vehicle_id
@@ -22,6 +23,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     policy: Optional[str] = None
     connect: str = DEFAULT_ENDPOINT
+    tls: Optional[str] = None
     vehicle_id: str = "hunter01"
     vehicle: str = NONE
     public_key: Optional[str] = None
@@ -52,7 +54,7 @@ def _read(path: PathLike) -> Config:
 def _check(config: Config) -> None:
     if not config.policy:
         raise UserError("no policy to drive: name it with --policy, or as policy in --config")
-    check_endpoint(config.connect)
+    check_fits(check_endpoint(config.connect), config.tls is not None)
     check_vehicle_id(config.vehicle_id)
     if config.vehicle not in VEHICLE_NAMES:
         raise UserError(

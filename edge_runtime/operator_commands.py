@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any, Dict
+from typing import Any, Dict, Optional
 
+from edge_runtime import access
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_json
-from edge_runtime.transport import open_session
+from edge_runtime.tls import TlsFiles, tls_for
+from edge_runtime.transport import check_endpoint, open_session
 from edge_runtime.wire import key
 
 _TIMEOUT_S = 2.0
@@ -18,7 +20,8 @@ def status(arguments: argparse.Namespace) -> int:
     """Print the runtime's status as JSON."""
     if arguments.out is not None:
         check_writable(arguments.out)
-    reply = ask(arguments.connect, arguments.vehicle_id, "status")
+    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+    reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
     print(json.dumps(reply, indent=2))
     if arguments.out is not None:
         write_json(arguments.out, reply)
@@ -27,17 +30,22 @@ def status(arguments: argparse.Namespace) -> int:
 
 def rearm(arguments: argparse.Namespace) -> int:
     """Let the runtime drive again. Raises UserError where it refuses."""
-    reply = ask(arguments.connect, arguments.vehicle_id, "rearm")
+    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+    if tls is not None:
+        access.check_name(tls.name, access.common_name(access.OPERATOR, arguments.vehicle_id))
+    reply = ask(arguments.connect, arguments.vehicle_id, "rearm", tls)
     if not reply["accepted"]:
         raise UserError(f"{arguments.vehicle_id} was not re-armed: {reply['detail']}")
     print(f"{arguments.vehicle_id} is re-armed; it drives after 5 fresh states in a row")
     return 0
 
 
-def ask(connect: str, vehicle_id: str, topic: str) -> Dict[str, Any]:
+def ask(
+    connect: str, vehicle_id: str, topic: str, tls: Optional[TlsFiles] = None
+) -> Dict[str, Any]:
     """The JSON reply of a queryable of wire.TOPICS. Raises UserError where none comes in 2 s."""
     selector = key(vehicle_id, topic)
-    session = open_session(connect=connect, mode="client")
+    session = open_session(connect=connect, mode="client", tls=tls)
     try:
         for reply in session.get(selector, timeout=_TIMEOUT_S):
             if reply.ok is not None:
@@ -46,5 +54,10 @@ def ask(connect: str, vehicle_id: str, topic: str) -> Dict[str, Any]:
         session.close()
     raise UserError(
         f"no edge runtime with vehicle id {vehicle_id} is connected to {connect};"
-        " start one, or name it with --vehicle-id"
+        " start one, or name it with --vehicle-id" + _hint(tls, topic)
     )
+
+
+def _hint(tls: Optional[TlsFiles], topic: str) -> str:
+    """A query without the right to it looks the same from here as a runtime that is not there."""
+    return "" if tls is None else f"; or the certificate of {tls.name} may not ask for its {topic}"

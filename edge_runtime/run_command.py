@@ -9,13 +9,14 @@ import signal
 import sys
 from typing import Any, Callable, Optional
 
-from edge_runtime import log
+from edge_runtime import access, log
 from edge_runtime.config import Config, load_config
 from edge_runtime.controller import Controller
 from edge_runtime.limiter import limit_rows
 from edge_runtime.link import Link
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import Policy, load_policy
+from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.interface import Vehicle
 from edge_runtime.vehicles.registry import make_vehicle
@@ -42,23 +43,33 @@ def run(arguments: argparse.Namespace) -> int:
     config = load_config(arguments.config, flags)
     log.configure(config.log_level)
     stop = StopSignal()
+    tls = _certificate(config)
     vehicle = make_vehicle(config.vehicle)
     policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
     rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
     controller = Controller(rows, needs_rearm=vehicle is not None)
     if stop.came:
         return 0
-    return _serve(config, policy, controller, vehicle, stop)
+    return _serve(config, tls, policy, controller, vehicle, stop)
+
+
+def _certificate(config: Config) -> Optional[TlsFiles]:
+    tls = tls_for(config.tls, config.connect)
+    if tls is not None:
+        access.check_name(tls.name, access.common_name(access.EDGE, config.vehicle_id))
+    return tls
 
 
 def _serve(
     config: Config,
+    tls: Optional[TlsFiles],
     policy: Policy,
     controller: Controller,
     vehicle: Optional[Vehicle],
     stop: StopSignal,
 ) -> int:
-    session = open_session(connect=config.connect, mode="peer")
+    rules = None if tls is None else access.rules_for_edge(config.vehicle_id)
+    session = open_session(connect=config.connect, mode="peer", tls=tls, access=rules)
     try:
         link = Link(session, config.vehicle_id, policy.manifest)
         runner = _attach(vehicle, policy, link)
@@ -74,7 +85,7 @@ def _serve(
         if runner is not None:
             runner.start()
         loop.start()
-        _say_ready(config, policy)
+        _say_ready(config, policy, tls)
         if not stop.came:
             loop.run()
     finally:
@@ -96,9 +107,11 @@ def _attach(vehicle: Optional[Vehicle], policy: Policy, link: Link) -> Optional[
     return VehicleRunner(vehicle, names, lambda feedback: link.send("feedback", feedback))
 
 
-def _say_ready(config: Config, policy: Policy) -> None:
+def _say_ready(config: Config, policy: Policy, tls: Optional[TlsFiles]) -> None:
     if policy.trust != "verified":
         log.event("warning", "policy_not_verified", trust=policy.trust)
+    if tls is not None:
+        log.event("info", "certificate", of=tls.name, expires=f"{tls.expires:%Y-%m-%dT%H:%MZ}")
     print(
         f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
         f" connect={config.connect} policy_id={policy.policy_id}",

@@ -2,6 +2,7 @@
 
 The simulator is a `router` that listens, the edge runtime a `peer` that connects and goes on
 trying, and viewers and operators' commands are `client`s that fail at once with nobody there.
+Behind a router of its own the simulator is a `client`, too: two peers would not hear each other.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ import errno
 import json
 import re
 import socket
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
 from edge_runtime.errors import UserError
+from edge_runtime.tls import TLS_PROTOCOLS, TlsFiles, check_fits, zenoh_rows
+from edge_runtime.tls_probe import why_refused
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 MODES = ("router", "peer", "client")
@@ -23,7 +26,7 @@ MODES = ("router", "peer", "client")
 LEASE_MS = 1000
 RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 
-_ENDPOINT = re.compile(r"(tcp|udp)/(\[[0-9A-Fa-f:.]+\]|[^\s\[\]/:]+):(\d{1,5})")
+_ENDPOINT = re.compile(r"(tcp|udp|tls|quic)/(\[[0-9A-Fa-f:.]+\]|[^\s\[\]/:]+):(\d{1,5})")
 
 
 def check_endpoint(endpoint: str) -> str:
@@ -31,42 +34,79 @@ def check_endpoint(endpoint: str) -> str:
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 1 <= int(match.group(3)) <= 65535:
         raise UserError(
-            f"endpoint {endpoint!r} is not valid: write it as {DEFAULT_ENDPOINT} (tcp or udp)"
+            f"endpoint {endpoint!r} is not valid: write it as {DEFAULT_ENDPOINT}"
+            " (tcp or udp; tls or quic with --tls)"
         )
     return endpoint
 
 
 def open_session(
-    listen: Optional[str] = None, connect: Optional[str] = None, mode: str = "peer"
+    listen: Union[str, Sequence[str], None] = None,
+    connect: Optional[str] = None,
+    mode: str = "peer",
+    tls: Optional[TlsFiles] = None,
+    access: Optional[Dict[str, Any]] = None,
 ) -> zenoh.Session:
     """Open a session that listens, connects, or both. Close it before the process ends.
 
-    Raises UserError for a malformed endpoint, a busy port, and, in client mode, nobody there.
+    `tls` is what `tls_for` gave; `access` is Zenoh's `access_control`, of access.py, and whoever
+    listens with TLS must have it.
+    Raises UserError for a malformed endpoint, one that does not go with `tls`, a busy port, a
+    link that either end refuses, and, in client mode, nobody there.
     """
     if mode not in MODES:
         raise ValueError(f"mode {mode!r} is none of {MODES}")
-    for endpoint in (listen, connect):
-        if endpoint is not None:
-            check_endpoint(endpoint)
-    if listen is not None:
-        _check_port_is_free(listen)
+    listens = [listen] if isinstance(listen, str) else list(listen or [])
+    if listens and tls is not None and access is None:
+        raise ValueError(
+            "who listens with TLS needs access control: every certificate could say all"
+        )
+    for endpoint in [*listens, *_listed(connect)]:
+        check_fits(check_endpoint(endpoint), tls is not None)
+    for endpoint in listens:
+        _check_port_is_free(endpoint)
     try:
-        return zenoh.open(_config(listen, connect, mode))
+        session = zenoh.open(_config(listens, connect, mode, tls, access))
     except zenoh.ZError as error:
-        raise UserError(_explain(str(error), listen, connect)) from None
+        raise UserError(_explain(str(error), listens, connect, tls)) from None
+    if connect is not None and tls is not None and not session.info.routers_zid():
+        _check_refusal(session, connect, tls)
+    return session
 
 
-def _config(listen: Optional[str], connect: Optional[str], mode: str) -> zenoh.Config:
+def _check_refusal(session: zenoh.Session, connect: str, tls: TlsFiles) -> None:
+    """A peer goes on trying for ever, also where it will never be let in: say so now."""
+    refusal = why_refused(connect, tls)
+    if refusal is not None and not session.info.routers_zid():
+        session.close()
+        raise UserError(refusal)
+
+
+def _config(
+    listens: List[str],
+    connect: Optional[str],
+    mode: str,
+    tls: Optional[TlsFiles],
+    access: Optional[Dict[str, Any]],
+) -> zenoh.Config:
     rows: Dict[str, Any] = {
         "mode": mode,
         # Explicitly none: a peer would otherwise listen on every interface.
-        "listen/endpoints": _listed(listen),
+        "listen/endpoints": listens,
         "connect/endpoints": _listed(connect),
         "connect/retry": RETRY,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        # Nobody is scouted for, so there is nothing to wait for: half a second at every start.
+        "scouting/delay": 0,
         "transport/link/tx/lease": LEASE_MS,
     }
+    if tls is not None:
+        rows["transport/link/tls"] = zenoh_rows(tls)
+        # A port that speaks TLS only, whatever an endpoint's metadata may ask for.
+        rows["transport/link/protocols"] = list(TLS_PROTOCOLS)
+    if access is not None:
+        rows["access_control"] = access
     config = zenoh.Config()
     for name, value in rows.items():
         config.insert_json5(name, json.dumps(value))
@@ -81,7 +121,7 @@ def _check_port_is_free(endpoint: str) -> None:
     """Zenoh's own message for a busy port names neither the port nor the cause."""
     protocol, address = endpoint.split("/", 1)
     host, port = address.rsplit(":", 1)
-    kind = socket.SOCK_STREAM if protocol == "tcp" else socket.SOCK_DGRAM
+    kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
     try:
         family, _, _, _, target = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
     except OSError:
@@ -103,17 +143,26 @@ def _explain_bind(error: OSError, host: str, port: str) -> str:
     return f"cannot listen on port {port} of {host}: {error.strerror}"
 
 
-def _explain(text: str, listen: Optional[str], connect: Optional[str]) -> str:
-    if connect is not None and listen is None:
-        return (
-            f"nobody answers at {connect}; start the simulator first, or name its address with"
-            " --connect"
-        )
-    return f"Zenoh cannot open {listen or connect}: {text}"
+def _explain(text: str, listens: List[str], connect: Optional[str], tls: Optional[TlsFiles]) -> str:
+    if connect is None or listens:
+        return f"Zenoh cannot open {', '.join(listens) or connect}: {text}"
+    refusal = None if tls is None else why_refused(connect, tls)
+    return refusal or (
+        f"nobody answers at {connect}; start the simulator first, or name its address with"
+        " --connect" + ("" if connect.startswith("tls/") else _hint(connect))
+    )
 
 
-def free_endpoint() -> str:
+def _hint(connect: str) -> str:
+    """What else it may be: these links do not say why they fail."""
+    if connect.startswith("quic/"):
+        return "; or one end does not believe the other's certificate"
+    return "; or it listens with TLS and wants --tls"
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
     """A Zenoh endpoint on loopback that nobody listens on, for demos and tests."""
-    with socket.socket() as probe:
+    kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
+    with socket.socket(type=kind) as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"

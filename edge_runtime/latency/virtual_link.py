@@ -89,12 +89,13 @@ class VirtualLink(Generic[Message]):
         self._under_way: EventHeap[Union[Tuple[int, Message], _Answer]] = EventHeap()
         self._newest_at_edge = -1
         self._safety = Safety()
-        self._window_end_s = COMMAND_WINDOW_S
+        self._step, self._window_end_s = 0, COMMAND_WINDOW_S
+        self._admitted_s = 0.0
 
     def send_state(self, step: int, message: Message) -> None:
         """Begin tick ``step``: its state leaves the vehicle."""
         tick_s = step * CONTROL_PERIOD_S
-        self._window_end_s = tick_s + COMMAND_WINDOW_S
+        self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW_S
         for arrival_s in self._link.up.arrivals(tick_s, STATE_BYTES):
             self._under_way.push(arrival_s, (step, message))
 
@@ -125,7 +126,10 @@ class VirtualLink(Generic[Message]):
 
     def decide(self, edge_silence_s: Optional[float] = None) -> Decision:
         """What the vehicle does in this tick; for ``edge_silence_s`` see ``CommandHold.decide``."""
-        return self.hold.decide(self._window_end_s, edge_silence_s)
+        # Answered already, the vehicle acts at once: nothing newer can come in this tick.
+        answered = self.hold.newest_step >= self._step
+        acts_s = self._admitted_s if answered else self._window_end_s
+        return self.hold.decide(acts_s, edge_silence_s)
 
     def _note_fresh(self, now_s: float) -> None:
         """What the edge runtime's safety machine makes of a fresh state's moment."""
@@ -137,7 +141,9 @@ class VirtualLink(Generic[Message]):
 
     def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
         answered_step = self.hold.newest_step
-        if not self.hold.admit(answer.command, now_s):
+        if not self.hold.admit(answer.command, now_s, answer.sent_s):
             self._on_stale()
-        elif answer.command.step > answered_step:
+            return
+        self._admitted_s = now_s
+        if answer.command.step > answered_step:
             self._on_heard(now_s - answer.sent_s + answer.computing_s)

@@ -73,6 +73,10 @@ class _Worker:
     def __init__(self, task: Task, directory: Path) -> None:
         self._task = task
         self._report = directory / "report.json"
+        self._start_edge()
+
+    def _start_edge(self) -> None:
+        task = self._task
         self._endpoint = free_endpoint()
         self._edge = BackgroundCommand(
             "edge_runtime", "run", "--policy", str(task.policy), "--allow-unsigned",
@@ -81,7 +85,15 @@ class _Worker:
 
     def drive(self, chunk: Chunk) -> tuple[dict[str, Any], float]:
         """Drive a chunk undisturbed by the machine; its report, and the wall time of that (s)."""
-        return self._undisturbed(chunk, ATTEMPTS)
+        try:
+            return self._undisturbed(chunk, ATTEMPTS)
+        except UserError as error:
+            if "is in use" not in str(error):
+                raise
+            # Nobody listens between two chunks: any process of the machine may take the port.
+            self.close()
+            self._start_edge()
+            return self._undisturbed(chunk, ATTEMPTS)
 
     def _undisturbed(self, chunk: Chunk, attempts: int) -> tuple[dict[str, Any], float]:
         """Drive a chunk, and a disturbed one again in halves: the good half is done then."""

@@ -1,0 +1,160 @@
+"""``python -m deploy certs``: a folder for each party, holding what that party needs."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+from deploy.certs import (
+    CA_KEY_FILE,
+    LOOPBACK_HOSTS,
+    Authority,
+    issue,
+    make_authority,
+    party_roles,
+    read_authority,
+)
+from edge_runtime.access import ROLES
+from edge_runtime.errors import UserError
+from edge_runtime.files import write_atomic
+from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
+from edge_runtime.topics import check_vehicle_id
+
+CA_FOLDER = "ca"
+DEFAULT_OUT = "certs"
+DEFAULT_VEHICLE_ID = "hunter01"
+DEFAULT_DAYS = 365
+_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9])?|::1?")
+
+
+class Request(NamedTuple):
+    """What the command line asks for, checked."""
+
+    out: Path
+    vehicle_ids: list[str]
+    hosts: list[str]
+    days: int
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out", metavar="DIR", default=DEFAULT_OUT, help="directory of all folders"
+    )
+    parser.add_argument(
+        "--vehicle-id",
+        metavar="ID",
+        action="append",
+        help="a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
+        f" (default: {DEFAULT_VEHICLE_ID})",
+    )
+    parser.add_argument(
+        "--host",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="a name or address at which simulator or router are reached; may be repeated"
+        f" (always: {', '.join(LOOPBACK_HOSTS)})",
+    )
+    parser.add_argument(
+        "--days", metavar="N", type=int, default=DEFAULT_DAYS, help="how long they are valid, days"
+    )
+
+
+def certs(arguments: argparse.Namespace) -> int:
+    """Make what is missing of the authority, router and viewer, and all of each vehicle.
+
+    Raises UserError, with nothing written, where a vehicle has a folder already.
+    """
+    request = _check(arguments)
+    roles = _wanted(request)
+    now = datetime.datetime.now(datetime.UTC)
+    ca_folder = request.out / CA_FOLDER
+    is_new = not ca_folder.exists()
+    authority = make_authority(now) if is_new else read_authority(ca_folder)
+    _check_lifetime(authority, now, request.days)
+    if is_new:
+        with _new_folder(ca_folder) as draft:
+            write_atomic(draft / CA_FILE, _pem(authority.certificate))
+            _write_key(draft / CA_KEY_FILE, authority.key)
+    for name, role in roles.items():
+        issued = issue(authority, name, role, request.hosts, now, request.days)
+        with _new_folder(request.out / name) as draft:
+            write_atomic(draft / CA_FILE, _pem(authority.certificate))
+            write_atomic(draft / CERTIFICATE_FILE, _pem(issued.certificate))
+            _write_key(draft / KEY_FILE, issued.key)
+    print(f"authority (keep {ca_folder / CA_KEY_FILE} off every board): {ca_folder}")
+    for name in roles:
+        print(f"--tls {request.out / name}")
+    print(f"valid until {now + datetime.timedelta(days=request.days):%Y-%m-%d}")
+    return 0
+
+
+def _check(arguments: argparse.Namespace) -> Request:
+    vehicle_ids = arguments.vehicle_id or [DEFAULT_VEHICLE_ID]
+    for vehicle_id in vehicle_ids:
+        check_vehicle_id(vehicle_id)
+    for host in arguments.host:
+        if not _HOST.fullmatch(host):
+            raise UserError(f"host {host!r} is not valid: write a name or an address, without port")
+    if arguments.days < 1:
+        raise UserError(f"--days {arguments.days} is too short: at least 1")
+    hosts = [*LOOPBACK_HOSTS, *arguments.host]
+    return Request(Path(arguments.out), list(dict.fromkeys(vehicle_ids)), hosts, arguments.days)
+
+
+def _wanted(request: Request) -> dict[str, str]:
+    """The role of each party to make, by name; UserError where one of a vehicle is there."""
+    wanted = {}
+    for name, role in party_roles(request.vehicle_ids).items():
+        folder = request.out / name
+        if not folder.exists():
+            wanted[name] = role
+        elif not ROLES[role].all_vehicles:
+            raise UserError(
+                f"{folder} exists and is not overwritten; move it away to make a new one, or"
+                " choose another --vehicle-id or --out"
+            )
+    return wanted
+
+
+def _check_lifetime(authority: Authority, now: datetime.datetime, days: int) -> None:
+    left = authority.certificate.not_valid_after_utc - now
+    if left < datetime.timedelta(days=days):
+        raise UserError(f"--days {days} is longer than the authority's own {left.days} days")
+
+
+@contextlib.contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """Fill a draft beside it and move it there, so that the folder is whole or absent."""
+    draft = folder.with_name(f".{folder.name}.{os.getpid()}")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        draft.mkdir(mode=0o700)
+        yield draft
+        draft.rename(folder)  # Fails where somebody has filled it meanwhile.
+    except OSError as error:
+        raise UserError(f"cannot create {folder}: {error.strerror}") from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """PKCS8 PEM, mode 0600. The folder is the owner's alone, so it never was open to others."""
+    write_atomic(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    path.chmod(0o600)
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(Encoding.PEM)

@@ -1,0 +1,180 @@
+"""The authority and its certificates as files; on the wire: hil_tests/tests/test_tls*.py."""
+
+import datetime
+import shutil
+import stat
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from deploy.__main__ import main
+from deploy.certs import issue, read_authority
+from edge_runtime.cli import run_cli
+from edge_runtime.errors import UserError
+from edge_runtime.tls import load_tls, tls_for
+
+PARTIES = {"router", "viewer", "edge-hunter01", "simulator-hunter01", "operator-hunter01"}
+
+
+def make(folder, *options):
+    return run_cli(main, ["certs", "--out", str(folder), *options])
+
+
+def contents(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "certs"
+    assert make(folder) == 0
+    return folder
+
+
+@pytest.fixture
+def party(made, tmp_path):
+    """A copy of one party's folder, to spoil."""
+    shutil.copytree(made / "edge-hunter01", tmp_path / "party")
+    return tmp_path / "party"
+
+
+def test_each_party_has_what_it_needs_and_no_more(made):
+    assert {p.name for p in made.iterdir()} == {*PARTIES, "ca"}
+    for name in PARTIES:
+        assert {p.name for p in (made / name).iterdir()} == {"ca.pem", "cert.pem", "key.pem"}
+        assert load_tls(made / name).name == name
+    for key in [*made.glob("*/key.pem"), made / "ca/ca.key.pem"]:
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+        assert stat.S_IMODE(key.parent.stat().st_mode) == 0o700
+
+
+def test_only_listeners_have_a_servers_certificate(made):
+    for name in PARTIES:
+        certificate = x509.load_pem_x509_certificate((made / name / "cert.pem").read_bytes())
+        usage = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+        assert ExtendedKeyUsageOID.CLIENT_AUTH in usage
+        is_server = name in ("router", "simulator-hunter01")
+        assert (ExtendedKeyUsageOID.SERVER_AUTH in usage) is is_server
+
+
+def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
+    folder = tmp_path / "certs"
+    assert make(folder, "--vehicle-id", "one") == 0
+    before = contents(folder)
+    assert make(folder, "--vehicle-id", "two", "--host", "bench.local", "--host", "10.0.0.7") == 0
+    after = contents(folder)
+    assert {path: after[path] for path in before} == before
+    assert {p.parts[0] for p in set(after) - set(before)} == {
+        "edge-two",
+        "simulator-two",
+        "operator-two",
+    }
+    certificate = x509.load_pem_x509_certificate(
+        after[next(p for p in after if p.parts == ("simulator-two", "cert.pem"))]
+    )
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert set(names.get_values_for_type(x509.DNSName)) == {"localhost", "bench.local"}
+    assert {str(a) for a in names.get_values_for_type(x509.IPAddress)} == {
+        "127.0.0.1",
+        "::1",
+        "10.0.0.7",
+    }
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--vehicle-id", "new", "--vehicle-id", "hunter01"], "not overwritten"),
+        (["--vehicle-id", "a/b"], "a/b"),
+        (["--vehicle-id", "new", "--host", "tcp/host:1"], "tcp/host:1"),
+        (["--vehicle-id", "new", "--days", "0"], "--days 0"),
+        (["--vehicle-id", "new", "--days", "99999"], "authority's own"),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(made, options, word, capsys):
+    before = contents(made)
+    assert make(made, *options) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert word in line
+    assert contents(made) == before
+
+
+def test_an_authority_without_its_key_is_refused(made, tmp_path, capsys):
+    shutil.copytree(made, tmp_path / "certs")
+    (tmp_path / "certs/ca/ca.key.pem").unlink()
+    assert make(tmp_path / "certs", "--vehicle-id", "new") == 2
+    assert "ca.key.pem" in capsys.readouterr().err
+
+
+def test_a_missing_file_is_named(party):
+    for name in ("ca.pem", "cert.pem", "key.pem"):
+        data = (party / name).read_bytes()
+        (party / name).unlink()
+        with pytest.raises(UserError, match=f"{name} does not exist"):
+            load_tls(party)
+        (party / name).write_bytes(data)
+        (party / name).chmod(0o600)
+    assert load_tls(party).name == "edge-hunter01"
+    with pytest.raises(UserError, match="no directory"):
+        load_tls(party / "nowhere")
+
+
+def test_what_is_no_pem_is_named(party):
+    for name in ("ca.pem", "cert.pem", "key.pem"):
+        data = (party / name).read_bytes()
+        (party / name).write_bytes(b"nonsense")
+        with pytest.raises(UserError, match=f"{name} is not a"):
+            load_tls(party)
+        (party / name).write_bytes(data)
+
+
+def test_files_of_different_parties_do_not_mix(party, made, tmp_path):
+    other = tmp_path / "other"
+    assert make(other) == 0
+    for source, match in (
+        (made / "viewer/key.pem", "does not fit"),
+        (other / "ca/ca.pem", "not issued by"),
+        (other / "edge-hunter01/cert.pem", "does not fit"),
+    ):
+        target = party / source.name
+        data = target.read_bytes()
+        target.write_bytes(source.read_bytes())
+        with pytest.raises(UserError, match=match):
+            load_tls(party)
+        target.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("mode", "is_fine"), [(0o600, True), (0o440, True), (0o644, False), (0o660, False)]
+)
+def test_a_key_that_others_can_read_is_refused(party, mode, is_fine):
+    (party / "key.pem").chmod(mode)
+    if is_fine:
+        load_tls(party)
+    else:
+        with pytest.raises(UserError, match="chmod 600"):
+            load_tls(party)
+
+
+@pytest.mark.parametrize(("shift_days", "match"), [(-30, "expired at"), (30, "is the clock set")])
+def test_a_certificate_outside_its_time_says_so(party, made, shift_days, match):
+    authority = read_authority(made / "ca")
+    then = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=shift_days)
+    issued = issue(authority, "edge-hunter01", "edge", [], then, days=5)
+    (party / "cert.pem").write_bytes(issued.certificate.public_bytes(Encoding.PEM))
+    (party / "key.pem").write_bytes(
+        issued.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    )
+    with pytest.raises(UserError, match=match):
+        load_tls(party)
+
+
+def test_plain_endpoints_and_certificates_do_not_go_together(made):
+    assert tls_for(None, "tcp/127.0.0.1:7447", None) is None
+    assert tls_for(made / "viewer", "tls/127.0.0.1:7447") is not None
+    with pytest.raises(UserError, match="plain text despite --tls: write tls/127"):
+        tls_for(made / "viewer", "tcp/127.0.0.1:7447")
+    with pytest.raises(UserError, match="needs certificates"):
+        tls_for(None, "tls/127.0.0.1:7447")
