@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from bridge.command_hold import Decision
+from edge_runtime.latency.command_hold import Decision
 from edge_runtime.wire import State
 
 Publish = Callable[[bytes], None]
@@ -21,6 +21,9 @@ class Clock(Protocol):
     """Ticks that began so late that the simulation slipped behind the wall clock."""
     missed_ticks: int
     """Whole ticks of the wall clock that went by without a state because of it."""
+    wall_clock_stalls: int
+    """States of lock-step that the edge runtime did not answer in wall time, or only with a safe
+    stop because of it: it was gone, or got no processor. Always 0 in real time."""
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode; ``seed`` decides the delays and losses of the link."""

@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 
 from bridge.clock import Clock
-from bridge.command_hold import Decision
 from bridge.environments import brake_action, press_brake
 from bridge.safe_stops import SafeStopLog
 from edge_runtime.cli import UserError
 from edge_runtime.episode_report import EpisodeResult
+from edge_runtime.latency.command_hold import Decision
 from edge_runtime.wire import CONTROL_PERIOD_S, State
 
 PublishScene = Callable[[Any, int, int, float, float | None], None]

@@ -1,9 +1,8 @@
 """Lock-step: the simulation waits for each answer, and latency passes in virtual time.
 
-Tick n stands at virtual time n T. Its state arrives at the edge runtime after the uplink delay;
-states are really published in their order of arrival, each real answer is awaited and scheduled
-to arrive after the downlink delay, and the tick is decided at n T + 25 ms from what has arrived.
-Computing takes no virtual time, so the same seed gives the same run on a fast and a slow machine.
+The network is `edge_runtime/latency/virtual_link.py`: states are really published in their virtual
+order of arrival, and each real answer is awaited before it goes its virtual way back. Computing
+takes no virtual time, so the same seed gives the same run on a fast and a slow machine.
 
 One thread runs all this; Zenoh's thread only fills the inbox.
 """
@@ -12,34 +11,19 @@ from __future__ import annotations
 
 import queue
 import time
-from dataclasses import dataclass
 
 import msgspec
 
 from bridge.clock import Publish
 from bridge.command_check import CommandCheck
-from bridge.command_hold import (
-    COMMAND_WINDOW_S,
-    ROUNDING_S,
-    SILENCE_LIMIT_S,
-    CommandHold,
-    Decision,
-)
-from edge_runtime.latency.event_heap import EventHeap
-from edge_runtime.latency.model import LatencyModel, LatencySpec, make_link
+from edge_runtime.latency.command_hold import SILENCE_LIMIT_S, Decision
+from edge_runtime.latency.model import LatencySpec
+from edge_runtime.latency.virtual_link import Arrival, VirtualLink
+from edge_runtime.safety import Event
 from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Reason, State, encode
 
-_STAMP = 2**62
-"""A wall clock in nanoseconds, as long on the wire as the real one."""
-
-
-@dataclass(frozen=True)
-class _Answer:
-    command: Command
-    sent_s: float
-    """Virtual time of the state's tick."""
-    round_trip_s: float
-    """Real time from publishing the state to receiving the command."""
+WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
+"""Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
 
 
 class LockStepClock:
@@ -47,8 +31,7 @@ class LockStepClock:
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
-        self.tick_overruns = 0
-        self.missed_ticks = 0
+        self.tick_overruns = self.missed_ticks = self.wall_clock_stalls = 0
         self._publish = publish
         self._check = check
         self._spec = spec
@@ -58,11 +41,12 @@ class LockStepClock:
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode at virtual time 0."""
         self._check.begin(episode)
-        self._link = make_link(self._spec, seed)
-        self._hold = CommandHold(now_s=0.0)
-        self._under_way: EventHeap[State | _Answer] = EventHeap()
-        self._published_step = -1
-        self._admitted_s = 0.0
+        self._link: VirtualLink[State] = VirtualLink(
+            self._spec,
+            seed,
+            on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
+            on_stale=lambda: self._check.reject(Reason.STALE.value),
+        )
         self._answered_at_s: float | None = None
         self._edge_silent = False
 
@@ -72,64 +56,40 @@ class LockStepClock:
 
     def exchange(self, state: State) -> Decision:
         """Let virtual time run from this tick to the end of its command window."""
-        tick_s = state.step * CONTROL_PERIOD_S
         self._check.sent(state.step)
-        self._send(self._link.up, tick_s, state)
-        window_end_s = tick_s + COMMAND_WINDOW_S
-        while due := self._under_way.pop_due(window_end_s + ROUNDING_S):
-            arrival_s, message = due
-            if isinstance(message, _Answer):
-                self._arrive_at_vehicle(message, arrival_s)
-            else:
-                self._arrive_at_edge(message, arrival_s)
-        # Answered already, the vehicle acts at once: nothing newer can come in this tick.
-        answered = self._hold.newest_step >= state.step
-        acts_s = self._admitted_s if answered else window_end_s
-        return self._hold.decide(acts_s, self._wall_silence_s())
+        self._link.send_state(state.step, state)
+        while arrival := self._link.next_at_edge():
+            self._arrive_at_edge(arrival)
+        return self._link.decide(self._wall_silence_s())
 
     def finish(self, state: State) -> None:
         """Publish the final state at once; nobody waits for an answer to it."""
-        self._check.end(state.step, self._hold.newest_step)
+        self._check.end(state.step, self._link.hold.newest_step)
         self._publish(encode(msgspec.structs.replace(state, sent_ns=time.time_ns())))
 
     def close(self) -> None:
         """Nothing runs in the background."""
 
-    def _send(self, direction: LatencyModel, now_s: float, message: State | _Answer) -> None:
-        for arrival_s in direction.arrivals(now_s, _size_bytes(message)):
-            self._under_way.push(arrival_s, message)
-
-    def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
-        answered_step = self._hold.newest_step
-        if not self._hold.admit(answer.command, now_s, answer.sent_s):
-            self._check.reject(Reason.STALE.value)
-            return
-        self._admitted_s = now_s
-        if answer.command.step > answered_step:
-            self.latencies_ms.append((now_s - answer.sent_s + answer.round_trip_s) * 1e3)
-
-    def _arrive_at_edge(self, state: State, now_s: float) -> None:
+    def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
-        payload = encode(msgspec.structs.replace(state, sent_ns=time.time_ns()))
-        refused = state.step <= self._published_step
+        payload = encode(msgspec.structs.replace(arrival.message, sent_ns=time.time_ns()))
         self._take_unasked()
         published_s = time.monotonic()
         self._publish(payload)
-        if refused:
-            # Overtaken or a duplicate: the edge runtime rejects and counts it, without an answer.
-            return
-        self._published_step = state.step
-        answer = self._await_answer(state, published_s)
+        if arrival.overtaken:
+            return  # The edge runtime rejects it as stale, as it should, and does not answer.
+        answer = self._await_answer(arrival.step, published_s)
         if answer is not None:
-            self._send(self._link.down, now_s, answer)
+            command, received_s = answer
+            self._link.answer(arrival, command, computing_s=received_s - published_s)
 
     def _take_unasked(self) -> None:
         """Empty the inbox of what came between two ticks, so that only faults are counted."""
         while not self._inbox.empty():
             self._check.read(self._inbox.get()[0])
 
-    def _await_answer(self, state: State, published_s: float) -> _Answer | None:
-        """Wait in wall time for the answer to exactly this state."""
+    def _await_answer(self, step: int, published_s: float) -> tuple[Command, float] | None:
+        """Wait in wall time for the answer to exactly this state, and say when it came."""
         deadline_s = self._deadline_s(published_s)
         while (wait_s := deadline_s - time.monotonic()) > 0:
             try:
@@ -139,13 +99,14 @@ class LockStepClock:
             command = self._check.read(payload)
             if command is None:
                 continue
-            if command.step == state.step:
+            if command.step == step:
                 self._answered_at_s, self._edge_silent = received_s, False
-                sent_s = state.step * CONTROL_PERIOD_S
-                return _Answer(command, sent_s, received_s - published_s)
+                self.wall_clock_stalls += command.reason in WALL_CLOCK_REASONS
+                return command, received_s
             if command.mode != SAFE_STOP:  # In safe stop the edge repeats its last answer.
                 self._check.reject(Reason.STALE.value)
         self._edge_silent = True
+        self.wall_clock_stalls += 1
         return None
 
     def _deadline_s(self, published_s: float) -> float:
@@ -168,11 +129,3 @@ class LockStepClock:
             if self._answered_at_s is None
             else (time.monotonic() - self._answered_at_s)
         )
-
-
-def _size_bytes(message: State | _Answer) -> int:
-    """Size on the wire with stamps of a fixed size: a real inference time must not change it."""
-    if isinstance(message, State):
-        return len(encode(msgspec.structs.replace(message, sent_ns=_STAMP)))
-    stamps = {"received_ns": _STAMP, "inference_ns": _STAMP, "sent_ns": _STAMP}
-    return len(encode(msgspec.structs.replace(message.command, **stamps)))

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from bridge.command_hold import Decision
+from edge_runtime.latency.command_hold import Decision
 
 
 class EpisodeBar:

@@ -17,8 +17,8 @@ import msgspec
 
 from bridge.clock import Publish
 from bridge.command_check import CommandCheck
-from bridge.command_hold import COMMAND_WINDOW_S, CommandHold, Decision
 from bridge.delay_line import DelayLine
+from edge_runtime.latency.command_hold import COMMAND_WINDOW_S, CommandHold, Decision
 from edge_runtime.latency.model import LatencyModel, LatencySpec, make_link
 from edge_runtime.wire import CONTROL_PERIOD_S, Reason, State, encode
 
@@ -28,8 +28,7 @@ class RealTimeClock:
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
-        self.tick_overruns = 0
-        self.missed_ticks = 0
+        self.tick_overruns = self.missed_ticks = self.wall_clock_stalls = 0
         self._publish = publish
         self._check = check
         self._spec = spec

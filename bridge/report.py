@@ -43,8 +43,9 @@ def make_report(
     """Join the summary of the episodes with what happened on the wire.
 
     ``settings`` holds scenario, condition, policy_ids, seed, clock, latency_spec and wall_s;
-    ``counts`` holds deadline_misses, tick_overruns, missed_ticks, edge_changes and
-    ``rejections``. The report's policy_id is that of the policy that answered last.
+    ``counts`` holds deadline_misses, tick_overruns, missed_ticks, edge_changes,
+    wall_clock_stalls and ``rejections``. The report's policy_id is that of the policy that
+    answered last.
     """
     return {
         **summarise(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bridge.command_hold import Decision
+from edge_runtime.latency.command_hold import Decision
 
 STANDSTILL_MPS = 0.05
 

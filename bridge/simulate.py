@@ -206,6 +206,7 @@ def _drive(
             "deadline_misses": runner.deadline_misses,
             "tick_overruns": clock.tick_overruns,
             "missed_ticks": clock.missed_ticks,
+            "wall_clock_stalls": clock.wall_clock_stalls,
             "edge_changes": port.edge_counts.changes,
             **rejections(port.edge_counts.rejected, check.rejected),
         },

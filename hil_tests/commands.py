@@ -48,12 +48,18 @@ class BackgroundCommand:
         arguments: module and its arguments.
         ready: text of its output that says it has started; None: no wait.
         prefix: a program that runs it, as in ``ip netns exec NAME``.
+        quiet: do not print the command.
     """
 
     def __init__(
-        self, *arguments: str, ready: str | None = None, prefix: Sequence[str] = ()
+        self,
+        *arguments: str,
+        ready: str | None = None,
+        prefix: Sequence[str] = (),
+        quiet: bool = False,
     ) -> None:
-        print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
+        if not quiet:
+            print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
         self.name = " ".join(arguments[:2])
         self._output = tempfile.TemporaryFile(mode="w+")  # noqa: SIM115 (closed in __exit__)
         self._process = subprocess.Popen(

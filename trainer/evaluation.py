@@ -8,14 +8,23 @@ from typing import Any
 import numpy as np
 
 from edge_runtime.episode_report import EpisodeResult
+from edge_runtime.latency.model import LatencySpec
 from trainer.human.guide import Driver
+from trainer.remote.vehicle_end import RemoteDriver
 
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
 CONDITIONS = ("nominal", "noise", "variant")
+NO_NETWORK = LatencySpec()
 
 
-def drive_episode(env: Any, driver: Driver, seed: int, noise_std: float = 0.0) -> EpisodeResult:
+def drive_episode(
+    env: Any,
+    driver: Driver,
+    seed: int,
+    noise_std: float = 0.0,
+    latency: LatencySpec = NO_NETWORK,
+) -> EpisodeResult:
     """Drive one episode.
 
     Args:
@@ -23,9 +32,12 @@ def drive_episode(env: Any, driver: Driver, seed: int, noise_std: float = 0.0) -
         driver: who drives.
         seed: of the episode, and of the noise.
         noise_std: standard deviation of Gaussian noise on the command.
+        latency: the network between driver and vehicle, in virtual time.
     """
     noise = np.random.default_rng([seed, 1])
     observation, info = env.reset(seed=seed)
+    if latency != NO_NETWORK:
+        driver = RemoteDriver(driver, env, latency, seed)
     driver.reset()
     actions, rewards, lateral, longitudinal = [], [], [], []
     ended = False
@@ -59,6 +71,7 @@ def drive_episodes(
     seeds: Iterable[int],
     condition: str = "nominal",
     on_episode: Callable[[EpisodeResult], None] = lambda result: None,
+    latency: LatencySpec = NO_NETWORK,
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition.
 
@@ -67,6 +80,6 @@ def drive_episodes(
     noise_std = COMMAND_NOISE if condition == "noise" else 0.0
     results = []
     for seed in seeds:
-        results.append(drive_episode(env, driver, seed, noise_std))
+        results.append(drive_episode(env, driver, seed, noise_std, latency))
         on_episode(results[-1])
     return results

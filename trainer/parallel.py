@@ -18,8 +18,9 @@ import torch
 
 from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.errors import UserError
+from edge_runtime.latency.model import LatencySpec
 from trainer.drivers import load_driver, make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluation import NO_NETWORK, drive_episodes
 from trainer.human.guide import Driver
 
 WORTH_STARTING = 200
@@ -46,6 +47,7 @@ def drive_episodes_in_parallel(
     jobs: int,
     condition: str = "nominal",
     on_episode: Callable[[EpisodeResult], None] = lambda result: None,
+    latency: LatencySpec = NO_NETWORK,
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition, in ``jobs`` worker processes.
 
@@ -56,6 +58,7 @@ def drive_episodes_in_parallel(
         jobs: number of processes.
         condition: one of `trainer.evaluation.CONDITIONS`.
         on_episode: called with each result, in the order of the seeds.
+        latency: the network between driver and vehicle, in virtual time.
 
     Returns:
         The results in the order of the seeds; to the bit what `drive_episodes` gives on one torch
@@ -70,7 +73,7 @@ def drive_episodes_in_parallel(
     try:
         with interrupts_blocked():
             futures: list[Future[EpisodeResult]] = [
-                pool.submit(_drive, policy, scenario, seed, condition) for seed in seeds
+                pool.submit(_drive, policy, scenario, seed, condition, latency) for seed in seeds
             ]
         for future in futures:
             results.append(future.result())
@@ -118,6 +121,8 @@ def _cockpit(policy: str, scenario: str, condition: str) -> tuple[Any, Driver]:
     return env, load_driver(policy, env)[0]
 
 
-def _drive(policy: str, scenario: str, seed: int, condition: str) -> EpisodeResult:
+def _drive(
+    policy: str, scenario: str, seed: int, condition: str, latency: LatencySpec
+) -> EpisodeResult:
     env, driver = _cockpit(policy, scenario, condition)
-    return drive_episodes(env, driver, [seed], condition)[0]
+    return drive_episodes(env, driver, [seed], condition, latency=latency)[0]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from bridge.command_check import CommandCheck
-from bridge.command_hold import NO_COMMAND, CommandHold
 from bridge.safe_stops import SafeStopLog
 from bridge.tests.commands import make_command
+from edge_runtime.latency.command_hold import NO_COMMAND, CommandHold
 from edge_runtime.wire import encode
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 
 from bridge.command_check import CommandCheck
-from bridge.command_hold import NO_COMMAND
 from bridge.lockstep import LockStepClock
 from bridge.tests.commands import make_command
+from edge_runtime.latency.command_hold import NO_COMMAND
 from edge_runtime.latency.model import parse_spec
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import State, decode_state, encode
@@ -101,9 +101,29 @@ def test_a_slow_line_carries_no_more_states_than_its_rate():
     assert 38 <= len(rig.published) <= 42
 
 
-def test_an_outage_brakes_and_ends():
+def test_an_outage_brakes_and_ends_with_the_fifth_fresh_state():
     reasons = [d.brake_reason for d in Rig("outage=0.5s@1s").drive(20)]
-    assert [bool(reason) for reason in reasons] == [11 <= step < 15 for step in range(20)]
+    assert [bool(reason) for reason in reasons] == [11 <= step < 19 for step in range(20)]
+    assert set(reasons[11:15]) == {NO_COMMAND}
+    assert set(reasons[15:19]) == {"no_fresh_state"}
+
+
+def test_one_lost_state_is_no_silence_and_two_are():
+    one, two = (Rig(f"up.outage={length}s@0.95s").drive(20) for length in (0.1, 0.2))
+    assert not any(decision.brake_reason for decision in one)
+    braking = [decision.brake_reason for decision in two if decision.brake_reason]
+    assert braking == [NO_COMMAND, *["no_fresh_state"] * 4]
+
+
+def test_a_machine_that_stalls_is_counted_apart_from_the_network():
+    rig = Rig()
+    rig.drive(3)
+    rig.answer = lambda step: make_command(step, mode="safe_stop", reason="no_fresh_state")
+    rig.clock.exchange(make_state(3, session="here"))
+    assert rig.clock.wall_clock_stalls == 1
+    late = Rig("outage=0.5s@1s")
+    late.drive(20)
+    assert late.clock.wall_clock_stalls == 0
 
 
 def test_every_feature_at_once_repeats_itself():

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from bridge.command_hold import NO_COMMAND, Decision
 from bridge.environments import make_environment
 from bridge.episode import EpisodeRunner
 from bridge.tests.commands import make_command
+from edge_runtime.latency.command_hold import NO_COMMAND, Decision
 
 
 class ScriptedClock:

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import rerun as rr
 
-from bridge.command_hold import SILENCE_LIMIT_S
 from bridge.scene import Scene
 from bridge.viewer.blueprint import make_blueprint
 from bridge.viewer.road import EGO, draw_cars, draw_ground
 from bridge.viewer.timeline import Moment, Timeline
+from edge_runtime.latency.command_hold import SILENCE_LIMIT_S
 from edge_runtime.wire import Command, Feedback, Health, State
 
 SILENT = "no command"

@@ -8,7 +8,14 @@ import json
 from edge_runtime.cli import write_json_out
 from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
 from edge_runtime.files import check_writable
-from trainer.commands.options import add_scenario, not_negative, positive, set_threads
+from edge_runtime.latency.model import parse_spec
+from trainer.commands.options import (
+    add_latency,
+    add_scenario,
+    not_negative,
+    positive,
+    set_threads,
+)
 from trainer.drivers import load_driver, make_environment
 from trainer.evaluation import CONDITIONS, drive_episodes
 from trainer.parallel import WORTH_STARTING, choose_jobs, drive_episodes_in_parallel
@@ -28,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="nominal; Gaussian noise of 5 %% of the control domain on the command; or the variant "
         "scene with more vehicles and other types of them",
     )
+    add_latency(parser, "network between policy and vehicle")
     parser.add_argument("--runs", type=positive, default=50, help="episodes")
     parser.add_argument(
         "--seed", type=not_negative, default=0, help="of the first episode; the next has one more"
@@ -51,6 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print the report; returns the exit status."""
     if arguments.out:
         check_writable(arguments.out)
+    latency = parse_spec(arguments.latency)
     env = make_environment(arguments.scenario, arguments.condition)
     driver, policy_id = load_driver(arguments.policy, env)
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
@@ -65,12 +74,19 @@ def run(arguments: argparse.Namespace) -> int:
 
         if jobs == 1:
             set_threads(1)  # As each worker: the last bits must not depend on how many drive.
-            results = drive_episodes(env, driver, seeds, arguments.condition, on_episode)
+            results = drive_episodes(env, driver, seeds, arguments.condition, on_episode, latency)
         else:
             results = drive_episodes_in_parallel(
-                arguments.policy, arguments.scenario, seeds, jobs, arguments.condition, on_episode
+                arguments.policy,
+                arguments.scenario,
+                seeds,
+                jobs,
+                arguments.condition,
+                on_episode,
+                latency,
             )
     report = summarise(results, arguments.scenario, arguments.condition, policy_id, arguments.seed)
+    report["latency_spec"] = str(latency)
     if not arguments.out:
         print(json.dumps(report, indent=2))
         return 0

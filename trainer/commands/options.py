@@ -12,6 +12,7 @@ import torch
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
+from edge_runtime.latency.model import GRAMMAR
 from trainer.scenarios import SCENARIOS
 
 
@@ -30,6 +31,16 @@ def add_threads(parser: argparse.ArgumentParser) -> None:
         default=0,
         metavar="N",
         help="processor threads of the learner; 0: all cores",
+    )
+
+
+def add_latency(parser: argparse.ArgumentParser, what: str) -> None:
+    """``--latency``, read as a ``LatencySpec``."""
+    parser.add_argument(
+        "--latency",
+        metavar="SPEC",
+        default="none",
+        help=f"{what}, in virtual time: {GRAMMAR}".replace("%", "%%"),
     )
 
 

@@ -13,7 +13,9 @@ import torch
 
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
+from edge_runtime.latency.model import parse_spec
 from trainer.commands.options import (
+    add_latency,
     add_scenario,
     add_threads,
     not_negative,
@@ -58,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learner's device")
+    add_latency(parser, "network between policy and vehicle, also in validation")
     parser.add_argument(
         "--max-minutes",
         type=positive_float,
@@ -123,6 +126,7 @@ def _config(arguments: argparse.Namespace) -> RunConfig:
         seed=arguments.seed,
         episodes=arguments.episodes,
         human=arguments.human,
+        latency=str(parse_spec(arguments.latency)),
         device=arguments.device,
         threads=arguments.threads,
     )
@@ -161,7 +165,8 @@ def _check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
     if resume and not started:
         raise UserError(f"{run_dir} holds no checkpoint to resume from")
     if resume:
-        saved = read_json(run_dir / CONFIG_FILE, "run config")
+        # A config of before the network has no field for it.
+        saved = {"latency": DEFAULTS.latency, **read_json(run_dir / CONFIG_FILE, "run config")}
         wanted = config.as_dict()
         changed = [key for key in wanted if key != "episodes" and saved.get(key) != wanted[key]]
         if changed:

@@ -30,7 +30,7 @@ ID_LENGTH = 12
 NOT_DECIDING = ("device", "threads", "checkpoint_every")
 """Fields of a run that change where and how fast it is computed. A unit always learns on one
 thread; a GPU sums in another order, as another processor does, and is written beside the result."""
-NEUTRAL: dict[str, Any] = {"poor_guidance_share": 0.0}
+NEUTRAL: dict[str, Any] = {"poor_guidance_share": 0.0, "latency": "none"}
 """Fields that came after the first results, with the value that means what was before them: left
 out of the id while they hold it, so that no result is lost. Add a row with each new field."""
 

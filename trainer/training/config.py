@@ -47,6 +47,9 @@ class RunConfig:
     """Episodes of such an evaluation."""
     checkpoint_every: int = 10
     """Episodes between two checkpoints."""
+    latency: str = "none"
+    """The network between policy and vehicle, in training and validation alike, in the words of
+    ``bridge simulate --latency``."""
     device: str = "cpu"
     threads: int = 0
     """Processor threads of the learner; 0: as many as torch takes. Another number sums in another
@@ -63,5 +66,7 @@ class RunConfig:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> RunConfig:
         """The inverse of ``as_dict``."""
+        # A config of before the network has no field for it.
+        values = {"latency": RunConfig.latency, **values}
         known = {name: values[name] for name in RunConfig.__dataclass_fields__}
         return RunConfig(**{**known, "learner": LearnerConfig(**values["learner"])})

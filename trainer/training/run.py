@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_json
+from edge_runtime.latency.model import parse_spec
 from trainer import seeds
 from trainer.drivers import (
     BEST_FILE,
@@ -34,6 +35,7 @@ from trainer.training.learning import LearningDriver
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 from trainer.training.placement import make_learning
 from trainer.training.tally import Tally
+from trainer.training.wheel import Ends, make_wheel
 
 CONFIG_FILE = "config.json"
 
@@ -54,6 +56,8 @@ class TrainingRun:
         self.validation_env = make_environment(config.scenario)
         action_size = self.env.action_space.shape[0]
         self.learning = make_learning(config, self.algorithm, action_size)
+        self.network = parse_spec(config.latency)
+        self.wheel = make_wheel(self.learning, self.env, self.network)
         self.guide = self._make_guide()
         self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
         self.guidance = seeds.stream(config.seed, seeds.GUIDANCE)
@@ -136,7 +140,7 @@ class TrainingRun:
         config, tally = self.config, Tally()
         seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
-        self.learning.start_episode(observation)
+        self.wheel.start(observation, seed)
         guided = self.guide is not None and self.episode % config.guided_share == 0
         if self.guide is not None:
             self.guide.reset()
@@ -156,7 +160,7 @@ class TrainingRun:
     ) -> tuple[NDArray[np.uint8], bool, dict[str, Any]]:
         """One control period: act, let the human take over and the car move; meanwhile, learn."""
         began_s = time.perf_counter()
-        policy_action = self._explore(self.learning.act(observation))
+        policy_action = self.wheel.act(observation, self._explore)
         acted_s = time.perf_counter()
         if self.learning.added >= self.config.learner.warmup_steps:
             self.learning.begin(self._beta())
@@ -170,7 +174,8 @@ class TrainingRun:
         moved_s = time.perf_counter()
         waited_s = self.learning.finish()
         shaped = self._shape(reward, intervention)
-        self.learning.add(action, shaped, next_observation, terminated, intervention is not None)
+        ends = Ends(terminated, truncated)
+        self.wheel.store(action, shaped, next_observation, ends, intervention is not None)
         stored_s = time.perf_counter()
         tally.steps += 1
         tally.rewards += reward
@@ -189,7 +194,8 @@ class TrainingRun:
         random = self.guidance.uniform(-1.0, 1.0, intervention.action.shape)
         return replace(intervention, action=random.astype(np.float32))
 
-    def _explore(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _explore(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
+        action = self.learning.act(observation)
         noise = equations.exploration_noise(
             self._exploration_std(),
             self.config.learner.exploration_bound,
@@ -226,7 +232,8 @@ class TrainingRun:
             seeds.episode_seed(self.config.seed, seeds.VALIDATION, run)
             for run in range(self.config.evaluation_runs)
         ]
-        results = drive_episodes(self.validation_env, LearningDriver(self.learning), chosen)
+        driver = LearningDriver(self.learning)
+        results = drive_episodes(self.validation_env, driver, chosen, latency=self.network)
         success = float(np.mean([result.outcome == GOAL for result in results]))
         distance_m = float(np.mean([result.distance_m for result in results]))
         metrics.validation_success, metrics.validation_distance_m = success, distance_m

@@ -1,0 +1,1 @@
+"""How much network a policy bears, and how the loop takes every fault: one report."""

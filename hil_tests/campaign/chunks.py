@@ -1,0 +1,129 @@
+"""The unit of work: some episodes of one specification through a real edge runtime, kept on disk.
+
+A chunk's file is named by a hash of all that decides it, so a campaign that was killed, or is asked
+for another row, computes only what is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from edge_runtime.episode_report import GOAL
+from edge_runtime.files import read_bytes, write_json
+from trainer.drivers import make_environment
+from trainer.experiments.units import digest
+
+CHUNK_EPISODES = 50
+FORMAT = 1
+"""Raise it where the same specification begins to mean another drive: kept chunks become void."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What every chunk of a campaign has in common."""
+
+    policy: Path
+    policy_id: str
+    scenario: str
+    condition: str
+    clock: str
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Episodes with the seeds ``first_seed``, ``first_seed + 1``, ...: the same for every row."""
+
+    spec: str
+    first_seed: int
+    episodes: int
+
+
+def chunks_of(spec: str, seed: int, runs: int, size: int) -> list[Chunk]:
+    """The chunks of one row."""
+    return [Chunk(spec, seed + done, min(size, runs - done)) for done in range(0, runs, size)]
+
+
+def halve(chunk: Chunk) -> tuple[Chunk, Chunk]:
+    """Two chunks with the same episodes."""
+    first = chunk.episodes // 2
+    second_seed = chunk.first_seed + first
+    return (
+        Chunk(chunk.spec, chunk.first_seed, first),
+        Chunk(chunk.spec, second_seed, chunk.episodes - first),
+    )
+
+
+def join_reports(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One report of ``bridge simulate`` for what was driven in parts.
+
+    Latencies: the mean of the parts' p50, and the largest p99.
+    """
+    heard = [part["latency_ms"] for part in reports if part["latency_ms"]["p50"] is not None]
+    rejected: Counter[str] = Counter()
+    for part in reports:
+        rejected.update(part["rejected"])
+    episodes = [episode for part in reports for episode in part["per_episode"]]
+    counts = ("deadline_misses", "tick_overruns", "safe_stops")
+    return {
+        "command": reports[0]["command"],
+        "success_rate": sum(e["outcome"] == GOAL for e in episodes) / len(episodes),
+        "latency_ms": {
+            "p50": statistics.fmean(part["p50"] for part in heard) if heard else None,
+            "p99": max(part["p99"] for part in heard) if heard else None,
+        },
+        **{name: sum(part[name] for part in reports) for name in counts},
+        "rejected": dict(rejected),
+        "per_episode": episodes,
+    }
+
+
+class ChunkStore:
+    """Reports of ``bridge simulate``, one file for each chunk."""
+
+    def __init__(self, directory: Path, task: Task) -> None:
+        self.directory = directory
+        config = make_environment(task.scenario, task.condition).config
+        self._deciding = {
+            "format": FORMAT,
+            "policy": task.policy_id,
+            "scenario": task.scenario,
+            "condition": task.condition,
+            "clock": task.clock,
+            "environment": asdict(config),
+        }
+
+    def path(self, chunk: Chunk) -> Path:
+        """Where a chunk's report is or will be."""
+        return self.directory / f"{digest({**self._deciding, **asdict(chunk)})}.json"
+
+    def load(self, chunk: Chunk) -> dict[str, Any] | None:
+        """The kept report; None where there is none."""
+        path = self.path(chunk)
+        if not path.is_file():
+            return None
+        report: dict[str, Any] = json.loads(read_bytes(path, "kept row"))
+        return report
+
+    def save(self, chunk: Chunk, report: dict[str, Any], wall_s: float) -> dict[str, Any]:
+        """Keep what the campaign needs of a report of ``bridge simulate``."""
+        episodes = [
+            {name: row[name] for name in ("seed", "outcome", "distance_m", "time_s", "steps")}
+            for row in report["per_episode"]
+        ]
+        names = ("latency_ms", "deadline_misses", "tick_overruns", "rejected", "safe_stops")
+        kept = {
+            "spec": chunk.spec,
+            "command": report["command"],
+            "wall_s": round(wall_s, 3),
+            **{name: report[name] for name in names},
+            "episodes": episodes,
+        }
+        self.directory.mkdir(parents=True, exist_ok=True)
+        write_json(self.path(chunk), kept)
+        return kept

@@ -1,0 +1,147 @@
+"""The latency campaign: what it says of its rows, and that it drives each of them once."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from edge_runtime.cli import UserError, run_cli
+from hil_tests.__main__ import main
+from hil_tests.campaign import command, latency
+from hil_tests.campaign.axes import AXES, Axis
+from hil_tests.campaign.budget import budget, limit_of
+from hil_tests.campaign.chunks import Chunk, chunks_of
+from hil_tests.campaign.latency import agree
+from hil_tests.campaign.rows import make_row
+
+DELAY = Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms", "none", "{} of delay")
+LOSS = Axis("loss", "loss", "%", (0, 10), "loss={}%", "none", "{} of loss")
+
+
+def rows_of(axis, *success):
+    return {
+        axis.spec(value): {"success": {"value": share}}
+        for value, share in zip(axis.values, success, strict=True)
+    }
+
+
+@pytest.mark.parametrize(
+    ("success", "limit"),
+    [
+        ((1.0, 0.99, 0.98, 0.97), 100),
+        ((1.0, 0.97, 1.0, 1.0), 0),  # What holds further out does not count: one may land between.
+        ((0.97, 1.0, 1.0, 1.0), None),
+        ((1.0, 1.0, 1.0, 1.0), 150),
+    ],
+)
+def test_the_limit_is_the_largest_value_up_to_which_all_hold(success, limit):
+    assert limit_of(DELAY, rows_of(DELAY, *success), 0.98) == limit
+
+
+def test_the_sentence_says_what_was_only_the_end_of_the_table():
+    rows = {**rows_of(DELAY, 1.0, 1.0, 0.9, 0.9), **rows_of(LOSS, 1.0, 1.0)}
+    found = budget([DELAY, LOSS], rows, 0.98, "a policy")
+    assert found["sentence"] == (
+        "a policy holds at least 98% success up to 50 ms of delay and "
+        "10 % of loss (the most that was tested), one at a time."
+    )
+    assert found["up_to_the_largest_tested"] == {"delay": False, "loss": True}
+
+
+def test_a_policy_that_fails_without_any_network_has_no_budget():
+    found = budget([DELAY], rows_of(DELAY, 0.9, 1.0, 1.0, 1.0), 0.98, "a policy")
+    assert found["sentence"] == "a policy is below 98% success even on a perfect network."
+
+
+def test_every_axis_can_be_read_and_begins_without_trouble():
+    for axis in AXES:
+        assert axis.values[0] == 0
+        assert list(axis.values) == sorted(axis.values)
+        specs = [axis.spec(value) for value in axis.values]
+        assert len(set(specs)) == len(specs)
+    delays = next(axis.values for axis in AXES if axis.name == "delay")
+    assert {0, 25, 250} <= set(delays)  # 0 to 500 ms there and back
+
+
+def test_chunks_cover_each_seed_once():
+    chunks = chunks_of("none", seed=7, runs=60, size=25)
+    assert [(chunk.first_seed, chunk.episodes) for chunk in chunks] == [(7, 25), (32, 25), (57, 10)]
+
+
+def chunk_report(outcomes, p99):
+    episodes = [
+        {"seed": n, "outcome": outcome, "distance_m": 20.0 + n, "time_s": 2.0, "steps": 20}
+        for n, outcome in enumerate(outcomes)
+    ]
+    return {
+        "episodes": episodes,
+        "latency_ms": {"p50": 100.0, "p99": p99},
+        "rejected": {"stale": 2},
+        "safe_stops": 3,
+        "deadline_misses": 10,
+        "wall_s": 0.5,
+        "command": "c",
+    }
+
+
+def test_a_row_joins_its_chunks():
+    chunks = [chunk_report(["goal"] * 8, 110.0), chunk_report(["collision"] * 2, 130.0)]
+    row = make_row("s", chunks)
+    # Wilson's 95 % interval of 8 in 10.
+    assert row["success"] == pytest.approx(
+        {"value": 0.8, "low": 0.49016, "high": 0.94331}, abs=1e-5
+    )
+    assert row["collision_rate"] == 0.2
+    assert row["safe_stops_per_episode"] == 0.6
+    assert row["ticks_without_new_command"] == 0.1
+    assert row["latency_ms"] == {"p50": 100.0, "p99": 130.0}
+    assert row["rejected"] == {"stale": 4}
+
+
+def test_intervals_that_do_not_meet_do_not_agree():
+    assert agree({"low": 0.8, "high": 0.9}, {"low": 0.9, "high": 1.0})
+    assert not agree({"low": 0.8, "high": 0.9}, {"low": 0.91, "high": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--check-realtime", "delay=5"], "is not understood"),
+        (["--rows", "lag", "--only", "latency"], "no latency axis 'lag'"),
+        (["--against", "r.json"], "write NAME=R.json"),
+        (["--policy", "nowhere.onnx", "--only", "latency"], "nowhere.onnx"),
+    ],
+)
+def test_a_mistake_is_one_line(options, said, tmp_path, capsys):
+    assert run_cli(main, ["campaign", "--out", str(tmp_path / "r.json"), *options]) == 2
+    errors = capsys.readouterr().err.strip()
+    assert said in errors
+    assert "\n" not in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
+    few = Axis("delay", "delay", "ms", (0, 100), "delay={}ms", "none", "{} of delay")
+    monkeypatch.setattr(command, "AXES", (few,))
+    out = tmp_path / "r.json"
+    arguments = ["campaign", "--only", "latency", "--runs", "2", "--jobs", "2", "--out", str(out)]
+    assert run_cli(main, arguments) == 0
+    first = json.loads(out.read_text())["latency"]
+    assert set(first["rows"]) == {"none", "delay=100ms"}
+    assert first["rows"]["delay=100ms"]["latency_ms"]["p50"] > 200
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in first["figures"].values())
+    assert first["budget"]["sentence"] in capsys.readouterr().out
+    assert first["budget"]["sentence"] in out.with_suffix(".md").read_text()
+
+    driven: list[Chunk] = []
+
+    def note(task, chunks, *_):
+        driven.extend(chunks)
+        raise UserError("drives nothing")
+
+    monkeypatch.setattr(latency, "drive_chunks", note)
+    assert run_cli(main, arguments) == 0
+    assert json.loads(out.read_text())["latency"]["rows"] == first["rows"]
+    Path(next((tmp_path / "r_rows").iterdir())).unlink()
+    assert run_cli(main, arguments) == 2
+    assert len(driven) == 1

@@ -1,0 +1,151 @@
+"""A policy behind a network: what it drives, and what is learned from it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_runtime.latency.model import LatencySpec, parse_spec
+from trainer.drivers import make_environment
+from trainer.evaluation import drive_episode
+from trainer.remote.vehicle_end import RemoteDriver, VehicleEnd
+from trainer.training.wheel import DirectWheel, Ends, RemoteWheel, make_wheel, ticks_late
+
+TERMINATED, TRUNCATED = Ends(True, False), Ends(False, True)
+GOES_ON = Ends(False, False)
+
+
+class Brightness:
+    """A policy whose action says which picture it saw."""
+
+    def reset(self):
+        pass
+
+    def act(self, observation):
+        return np.array([observation[1].mean() / 128.0 - 1.0], np.float32)
+
+
+class Kept:
+    """Stands for ``Learning``: keeps what would be learned, as the replay's chain would."""
+
+    def __init__(self):
+        self.rows: list[tuple] = []
+        self.current: Any = None
+
+    def start_episode(self, observation):
+        self.current = observation
+
+    def add(self, action, reward, observation, terminal, human):
+        self.rows.append(
+            (number(self.current), float(action[0]), reward, number(observation), terminal, human)
+        )
+        self.current = np.stack([self.current[1], observation[1]])
+
+
+class Car:
+    """A vehicle that only counts; its brake action cannot be mistaken for an answer."""
+
+    brake_action = np.array([-1.0], np.float32)
+
+    class action_space:  # noqa: N801
+        shape = (1,)
+
+
+def frames(step):
+    """The observation of a tick: its number and the one before as pictures."""
+    pictures = [np.full((45, 80), max(n, 0), np.uint8) for n in (step - 1, step)]
+    return np.stack(pictures)
+
+
+def number(observation):
+    """The tick of an observation whose two pictures follow each other."""
+    assert observation[1, 0, 0] - observation[0, 0, 0] in (0, 1)
+    return int(observation[1, 0, 0])
+
+
+def answer(observation):
+    return np.array([number(observation) / 100.0], np.float32)
+
+
+def drive_wheel(spec, ticks, seed=0, ends=GOES_ON, human=()):
+    """Drive a wheel over numbered observations; the reward of tick n is n."""
+    kept: Any = Kept()
+    wheel = RemoteWheel(kept, Car(), parse_spec(spec))
+    wheel.start(frames(0), seed)
+    actions = []
+    for tick in range(ticks):
+        actions.append(float(wheel.act(frames(tick), answer)[0]))
+        end = ends if tick == ticks - 1 else GOES_ON
+        action = np.array([0.9 if tick in human else actions[-1]], np.float32)
+        wheel.store(action, float(tick), frames(tick + 1), end, tick in human)
+    return kept.rows, actions
+
+
+@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
+def test_a_perfect_network_is_none_to_the_bit(scenario):
+    env = make_environment(scenario)
+    policy = Brightness()
+    for seed in (0, 1):
+        bare = drive_episode(env, policy, seed)
+        remote = RemoteDriver(policy, env, LatencySpec(), seed)
+        assert drive_episode(env, remote, seed) == bare
+
+
+def test_a_delayed_driver_is_another_and_the_same_each_time():
+    env = make_environment("left_turn")
+    spec = parse_spec("100ms+-40ms,loss=5%")
+    first, again = (drive_episode(env, Brightness(), 3, latency=spec) for _ in range(2))
+    assert first == again
+    assert first.actions != drive_episode(env, Brightness(), 3).actions
+
+
+def test_a_reward_stands_beside_the_action_that_earned_it():
+    rows, actions = drive_wheel("100ms", 8, ends=TERMINATED)
+    # Round trip 2 ticks: hands off in ticks 0 and 1; tick n obeys the answer to n - 2.
+    assert actions == pytest.approx([0, 0, 0, 0.01, 0.02, 0.03, 0.04, 0.05])
+    wanted = [(n, pytest.approx(n / 100), n + 2.0, n + 1, n == 5, False) for n in range(6)]
+    assert rows == wanted
+
+
+def test_a_humans_action_stands_beside_what_the_policy_would_have_had_to_answer():
+    rows, _ = drive_wheel("100ms", 8, human=(4,))
+    (row,) = [row for row in rows if row[5]]
+    assert row == (2, pytest.approx(0.9), 4.0, 3, False, True)
+
+
+def test_a_timeout_is_no_end_of_the_road():
+    rows, _ = drive_wheel("100ms", 8, ends=TRUNCATED)
+    assert not any(row[4] for row in rows)
+
+
+@pytest.mark.parametrize("spec", ["up.loss=30%", "60ms+-50ms", "down.loss=20%,delay=120ms"])
+def test_every_tick_is_stored_with_what_was_carried_out(spec):
+    rows, actions = drive_wheel(spec, 60, seed=1)
+    late = ticks_late(parse_spec(spec))
+    assert [row[0] for row in rows] == list(range(60 - late))
+    assert all(row[3] == row[0] + 1 for row in rows)
+    assert [row[1] for row in rows] == pytest.approx(actions[late:])
+    answers = np.arange(60 - late) / 100.0
+    assert not np.allclose(actions[late:], answers)  # The network really spoils some of them.
+
+
+def test_a_car_that_hears_nothing_brakes_by_itself():
+    end = VehicleEnd(Car(), parse_spec("up.loss=100%"), seed=0)
+    assert [end.tick(frames(tick), answer).braking for tick in range(4)] == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("spec", "ticks"),
+    [("none", 0), ("12ms", 0), ("12.5ms", 0), ("13ms", 1), ("100ms", 2), ("up.delay=0.3s", 3)],
+)
+def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
+    assert ticks_late(parse_spec(spec)) == ticks
+    end = VehicleEnd(Car(), parse_spec(spec), seed=0)
+    held = [end.tick(frames(tick), answer).step for tick in range(8)]
+    assert held[-1] == 7 - ticks
+
+
+def test_without_a_network_nothing_is_between():
+    kept: Any = Kept()
+    assert isinstance(make_wheel(kept, Car(), LatencySpec()), DirectWheel)
+    assert isinstance(make_wheel(kept, Car(), parse_spec("1ms")), RemoteWheel)
