@@ -42,6 +42,7 @@ class Controller:
     def __init__(self, rows: Sequence[LimitRow], needs_rearm: bool) -> None:
         self.safety = Safety()
         self.deadline_misses = 0
+        self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
         self._rows = rows
         self._needs_rearm = needs_rearm
         self._last_action = neutral_action(rows)
@@ -87,6 +88,8 @@ class Controller:
         was = self.safety.mode
         if was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
+        elif was is Mode.DRIVE and self.vehicle_fault:
+            self._apply(Event.VEHICLE)
         if self.safety.mode is not Mode.SAFE_STOP:
             return None
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:
@@ -111,6 +114,8 @@ class Controller:
             return f"nothing to re-arm: the mode is {self.safety.mode.value}"
         if not self._needs_rearm:
             return "no vehicle is attached: it drives again by itself after fresh states"
+        if self.vehicle_fault:
+            return f"the vehicle is at fault: {self.vehicle_fault}"
         if rules.is_silent(self.safety, now_s):
             # Kept for later, the permission would move the vehicle when the link returns.
             return "no fresh states arrive; re-arm when the link is back"
@@ -126,6 +131,8 @@ class Controller:
     def _event_of(self, output: np.ndarray) -> Event:
         if not np.all(np.isfinite(output)):
             return Event.NOT_FINITE
+        if self.vehicle_fault:
+            return Event.VEHICLE
         assert self._newest is not None
         return rules.classify_fresh(self.safety, self._newest.state.final, self._needs_rearm)
 

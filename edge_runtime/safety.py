@@ -32,6 +32,7 @@ class Event(str, Enum):
     SILENT = "no_fresh_state"  # for more than 2 T
     NOT_FINITE = "output_not_finite"
     TOO_LONG = "inference_too_long"  # longer than T
+    VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
     REARM = "rearm"  # an operator allows driving again
 
 
@@ -44,6 +45,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_S, Event.SILENT): _S,  # between two episodes nothing is due
     (_S, Event.NOT_FINITE): _X,
     (_S, Event.TOO_LONG): _X,
+    (_S, Event.VEHICLE): _X,
     (_S, Event.REARM): _S,
     (_D, Event.FRESH): _D,
     (_D, Event.RECOVERED): _D,
@@ -51,6 +53,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_D, Event.SILENT): _X,
     (_D, Event.NOT_FINITE): _X,
     (_D, Event.TOO_LONG): _X,
+    (_D, Event.VEHICLE): _X,
     (_D, Event.REARM): _D,
     (_X, Event.FRESH): _X,
     (_X, Event.RECOVERED): _D,
@@ -58,9 +61,10 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_X, Event.SILENT): _X,
     (_X, Event.NOT_FINITE): _X,
     (_X, Event.TOO_LONG): _X,
+    (_X, Event.VEHICLE): _X,
     (_X, Event.REARM): _X,  # a fresh state must follow
 }
-FAULTS = (Event.SILENT, Event.NOT_FINITE, Event.TOO_LONG)
+FAULTS = (Event.SILENT, Event.NOT_FINITE, Event.TOO_LONG, Event.VEHICLE)
 FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
 
 

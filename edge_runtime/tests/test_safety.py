@@ -31,6 +31,7 @@ EXPECTED = {
     Event.SILENT: (STANDBY, STOP, STOP),
     Event.NOT_FINITE: (STOP, STOP, STOP),
     Event.TOO_LONG: (STOP, STOP, STOP),
+    Event.VEHICLE: (STOP, STOP, STOP),
     Event.REARM: (STANDBY, DRIVE, STOP),
 }
 
