@@ -5,11 +5,13 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import socket
 import time
 
 import numpy as np
 
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP
+from hil_tests.faults.link import address
 from hil_tests.faults.processes import wait_until
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
@@ -74,6 +76,7 @@ def link_cut(rig: Rig, number: int) -> Try:
     at_any_phase(number)
     begin_s, drive_s = rig.mark(), last_drive_s(rig.timeline)
     rig.link.cut()
+    last_s = rig.link.last_state_s
     reaction_s, reason = logged_stop(rig, begin_s)
     brake_s = own_brake_s(rig, begin_s) - max(drive_s, last_drive_s(rig.timeline))
     time.sleep(max(0.0, begin_s + CUT_S - time.monotonic()))
@@ -81,7 +84,7 @@ def link_cut(rig: Rig, number: int) -> Try:
     rig.link.restore()
     recovery_s = drive_after_s(rig, ended_s) - ended_s
     figures = {"simulator brakes, ms": brake_s * 1e3}
-    return Try(reaction_s - rig.link.last_state_s, recovery_s, reason, figures=figures)
+    return Try(reaction_s - last_s, recovery_s, reason, figures=figures)
 
 
 def link_stalled(rig: Rig, number: int) -> Try:
@@ -108,7 +111,7 @@ def router_restarted(rig: Rig, number: int) -> Try:
     rig.router.kill()
     reaction_s, reason = logged_stop(rig, begin_s)
     rig.router = rig.start_router()
-    ended_s = rig.mark()
+    ended_s = wait_until(lambda: listens_s(rig.router_endpoint), "the new router")
     recovery_s = drive_after_s(rig, ended_s) - ended_s
     return Try(reaction_s - last_state_s(rig, before_s=begin_s), recovery_s, reason)
 
@@ -157,6 +160,15 @@ def cpu_starved(rig: Rig, number: int) -> Try:
     gap_s = longest_gap_s((c.seen_s for c in rig.timeline.commands), begin_s, ended_s)
     stops = sum(begin_s < m.seen_s < ended_s and m.mode == SAFE_STOP for m in rig.timeline.modes)
     return Try(gap_s, recovery_s, figures={"safe stops": stops})
+
+
+def listens_s(endpoint: str) -> float | None:
+    """Now, if somebody listens there."""
+    try:
+        socket.create_connection(address(endpoint), timeout=0.1).close()
+    except OSError:
+        return None
+    return time.monotonic()
 
 
 def spin() -> None:

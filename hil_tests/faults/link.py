@@ -10,8 +10,9 @@ import time
 from edge_runtime.transport import free_endpoint
 
 _CHUNK = 65536
-_STATE_BYTES = 2000
-"""More than any keep-alive and less than a state: what tells one in a stream of bytes."""
+_STATE_BYTES = 20
+"""More than a keep-alive and less than a state. Zenoh hands large payloads to processes of the
+same machine through shared memory: the link then carries no more than 47 bytes for each."""
 
 
 def address(endpoint: str) -> tuple[str, int]:

@@ -37,7 +37,12 @@ class Probe:
             )
             for topic in ("state", "command", "feedback", "health")
         }
-        handlers = {"state": self._on_state, "command": self._on_command, "health": self._on_health}
+        handlers = {
+            "state": self._on_state,
+            "command": self._on_command,
+            "health": self._on_health,
+            "feedback": self._on_feedback,
+        }
         self._declared: list[Any] = [
             self._session.declare_subscriber(wire.key(vehicle_id, topic), handler)
             for topic, handler in handlers.items()
@@ -83,6 +88,9 @@ class Probe:
                 command.reason,
             )
         )
+
+    def _on_feedback(self, sample: zenoh.Sample) -> None:
+        self.timeline.feedback_s.append(time.monotonic())
 
     def _on_health(self, sample: zenoh.Sample) -> None:
         health = wire.decode_health(bytes(sample.payload))

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from edge_runtime.operator_commands import ask
 from edge_runtime.transport import free_endpoint
 from hil_tests.faults.endless import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
 from hil_tests.faults.link import Link
@@ -68,10 +69,8 @@ class Rig:
         return self._start("simulator", "hil_tests.faults.launch", *arguments)
 
     def start_router(self) -> Process:
-        """The router process between edge and probe, ready."""
-        router = self._start("router", "hil_tests.faults.router", self.router_endpoint, self._hub)
-        router.wait_for_line("ready")
-        return router
+        """The router process between edge and probe, not waited for."""
+        return self._start("router", "hil_tests.faults.router", self.router_endpoint, self._hub)
 
     def wait_until_driving(self, timeout_s: float = 30.0) -> None:
         """Until drive commands come steadily and the simulated vehicle's brake is off."""
@@ -95,6 +94,12 @@ class Rig:
         temporary = path.with_suffix(".new")
         temporary.write_text(word)
         temporary.replace(path)
+
+    def rearm(self) -> None:
+        """As an operator does, once the runtime takes it."""
+        wait_until(
+            lambda: ask(self._hub, VEHICLE_ID, "rearm")["accepted"], "the vehicle to be re-armed"
+        )
 
     def bright(self, on: bool) -> None:
         """Turn the frames white, or back."""

@@ -59,6 +59,7 @@ class Timeline:
     commands: list[CommandSeen] = field(default_factory=list)
     modes: list[ModeSeen] = field(default_factory=list)
     brakes: list[BrakeSeen] = field(default_factory=list)
+    feedback_s: list[float] = field(default_factory=list)
     unreadable: int = 0
     """Commands that no receiver would take: outside their limits, or no commands at all."""
 
