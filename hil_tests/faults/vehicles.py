@@ -11,6 +11,8 @@ from hil_tests.faults.timeline import DRIVE
 
 SWITCH = "vehicle"
 FAULT_S = 1.0
+SETTLED_S = 0.5
+"""So long the drive is steady first: a vehicle may lag behind what it was asked before."""
 
 
 def silent(rig: Rig, number: int) -> Try:
@@ -30,6 +32,7 @@ def lying(rig: Rig, number: int) -> Try:
 
 def _at_fault(rig: Rig, number: int, word: str) -> Try:
     """Stops for it, stays stopped when it is over, and drives again once re-armed."""
+    time.sleep(SETTLED_S)
     at_any_phase(number)
     begin_s = rig.mark()
     rig.switch(SWITCH, word)
