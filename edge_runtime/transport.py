@@ -67,6 +67,9 @@ def _config(listen: Optional[str], connect: Optional[str], mode: str) -> zenoh.C
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
+        # Only for processes of one machine, and 16 MB of memory: a board gains nothing by it, and
+        # tests on one machine would not send over the link what a real one sends.
+        "transport/shared_memory/enabled": False,
     }
     config = zenoh.Config()
     for name, value in rows.items():

@@ -93,7 +93,7 @@ def _weights_sha256(graph: onnx.GraphProto) -> str:
 
 
 def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphProto:
-    weights = {
+    weights: Dict[str, np.ndarray] = {
         "value": np.array([value], np.float32),
         "zero": np.array([0.0], np.float32),
         "half_range": np.array([127.5], np.float32),

@@ -108,9 +108,7 @@ class VehicleRunner:
         self._watch.report(report, time.monotonic())
         return report
 
-    def _feedback(
-        self, report: VehicleReport, last: Optional[Command], fault: str
-    ) -> Feedback:
+    def _feedback(self, report: VehicleReport, last: Optional[Command], fault: str) -> Feedback:
         return Feedback(
             vehicle=self._vehicle.name,
             session=last.session if last else "",

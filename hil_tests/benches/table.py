@@ -83,7 +83,9 @@ def _process(process: Mapping[str, Any]) -> Iterator[Line]:
         bar=_bar(f"< {FLAT_BAR_MB:g}", grown_mb < FLAT_BAR_MB),
     )
     idle = process["idle_load"]
-    yield Line("idle, part of a core", f"{idle:.2%}", bar=_bar(f"< {IDLE_BAR:.0%}", idle < IDLE_BAR))
+    yield Line(
+        "idle, part of a core", f"{idle:.2%}", bar=_bar(f"< {IDLE_BAR:.0%}", idle < IDLE_BAR)
+    )
     start_s = process["first_command_s"]["median"]
     yield Line(
         f"process start to first command, s (median of {process['first_command_s']['starts']})",

@@ -134,9 +134,7 @@ class _Campaign:
 
 def _judge(row: Row, rig: Rig, outcome: Outcome) -> None:
     timeline = rig.timeline
-    outcome.unsafe += unsafe_commands(
-        timeline.commands, timeline.states, by_arrival=row.by_arrival
-    )
+    outcome.unsafe += unsafe_commands(timeline.commands, timeline.states, by_arrival=row.by_arrival)
     if timeline.unreadable:
         outcome.unsafe.append(f"{timeline.unreadable} commands that nobody would take")
 

@@ -69,5 +69,8 @@ class EndlessEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 if "PhilEndless-v0" not in gymnasium.registry:
     gymnasium.register(
-        "PhilEndless-v0", entry_point=EndlessEnv, disable_env_checker=True, order_enforce=False
+        "PhilEndless-v0",
+        entry_point=f"{__name__}:EndlessEnv",
+        disable_env_checker=True,
+        order_enforce=False,
     )

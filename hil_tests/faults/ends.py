@@ -188,9 +188,7 @@ def own_brake_s(rig: Rig, since_s: float) -> float:
 def stop_command(rig: Rig, since_s: float) -> CommandSeen:
     """The first safe_stop command after ``since_s``."""
     return wait_until(
-        lambda: first(
-            rig.timeline.commands, lambda c: c.seen_s > since_s and c.mode == SAFE_STOP
-        ),
+        lambda: first(rig.timeline.commands, lambda c: c.seen_s > since_s and c.mode == SAFE_STOP),
         "a safe_stop command",
     )
 
@@ -209,7 +207,8 @@ def drive_after_s(rig: Rig, since_s: float) -> float:
     return wait_until(
         lambda: first(
             # By its sending: what a link held up was driven before.
-            rig.timeline.commands, lambda c: c.sent_s > since_s and c.mode == DRIVE
+            rig.timeline.commands,
+            lambda c: c.sent_s > since_s and c.mode == DRIVE,
         ),
         "a drive command",
     ).seen_s
@@ -222,9 +221,7 @@ def last_state_s(rig: Rig, before_s: float) -> float:
 
 def last_answered_s(rig: Rig, before_s: float) -> float:
     """When the probe saw the newest state that a drive command answered before ``before_s``."""
-    answered = (
-        c.place for c in rig.timeline.commands if c.mode == DRIVE and c.seen_s < before_s
-    )
+    answered = (c.place for c in rig.timeline.commands if c.mode == DRIVE and c.seen_s < before_s)
     return max(rig.timeline.states[place] for place in answered if place in rig.timeline.states)
 
 

@@ -1,4 +1,4 @@
-"""A TCP link between two ends that can be cut, stalled and restored: a thread for each direction."""
+"""A TCP link between two ends that can be cut, stalled and restored; threads do it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from edge_runtime.transport import free_endpoint
 
 _CHUNK = 65536
 _STATE_BYTES = 20
-"""More than a keep-alive and less than a state. Zenoh hands large payloads to processes of the
-same machine through shared memory: the link then carries no more than 47 bytes for each."""
+"""More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
+(then 47 bytes for each are on the link)."""
 
 
 def address(endpoint: str) -> tuple[str, int]:

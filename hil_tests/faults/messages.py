@@ -8,7 +8,16 @@ from collections import Counter
 from collections.abc import Iterable
 
 from edge_runtime import wire
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command, Feedback, Health, Rejection, State, encode
+from edge_runtime.wire import (
+    CONTROL_PERIOD_S,
+    DRIVE,
+    Command,
+    Feedback,
+    Health,
+    Rejection,
+    State,
+    encode,
+)
 from hil_tests.faults.ends import at_any_phase, drive_after_s
 from hil_tests.faults.payloads import mutated, with_fields, without
 from hil_tests.faults.processes import wait_until

@@ -70,7 +70,7 @@ def _missing_field(valid: bytes, generator: np.random.Generator) -> bytes:
 
 
 _ABSURD: tuple[object, ...] = (
-    None, True, -1, 2**63, -(2**63), float("nan"), float("inf"), -float("inf"), 1e308, "", "x" * 300,
+    None, True, -1, 2**63, -(2**63), float("nan"), float("inf"), 1e308, "", "x" * 300,
     b"", b"\xff" * 70_000, [], [float("nan")], [2.0], [[[[]]]], {}, {"a": {"b": {}}}, "drive",
 )  # fmt: skip
 _MUTATORS: tuple[Callable[[bytes, np.random.Generator], bytes], ...] = (

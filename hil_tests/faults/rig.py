@@ -141,9 +141,7 @@ class Rig:
 
     def _start(self, name: str, *arguments: str) -> Process:
         on_line = self._on_edge_line if name == "edge" else lambda seen_s, line: None
-        process = Process(
-            *arguments, environment={DIRECTORY: str(self.directory)}, on_line=on_line
-        )
+        process = Process(*arguments, environment={DIRECTORY: str(self.directory)}, on_line=on_line)
         self._processes.append((name, process))
         return process
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -107,7 +108,7 @@ def unsafe_commands(
 def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> float:
     """The longest stretch within [begin, end] without an event."""
     inside = [begin_s, *sorted(t for t in times_s if begin_s < t < end_s), end_s]
-    return max(after - before for before, after in zip(inside, inside[1:], strict=False))
+    return max(after - before for before, after in pairwise(inside))
 
 
 def spread_ms(values_s: Iterable[float]) -> dict[str, float] | None:
