@@ -8,7 +8,7 @@ PEERS_STAMP := $(PEERS)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu lock clean
+.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu bench-loop lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -61,6 +61,10 @@ bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table 
 bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and eight at once
 	@mkdir -p $(BENCH)
 	$(BIN)/python -m trainer.benches.accelerator --runs 8 --out $(BENCH)/gpu.json
+
+bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
+	@mkdir -p $(BENCH)
+	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new
