@@ -44,7 +44,7 @@ def build_parser() -> ArgumentParser:
     _add_check(commands.add_parser("check", help="may this policy drive, and how fast is it here"))
     _add_run(commands.add_parser("run", help="answer states with commands until SIGTERM or ^C"))
     for name, text in (
-        ("status", "print the state of a running edge runtime as JSON"),
+        ("status", "print how a running edge runtime is"),
         ("rearm", "let a vehicle drive again after a safe stop"),
     ):
         _add_operator(commands.add_parser(name, help=text), with_out=name == "status")
@@ -82,6 +82,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         metavar="|".join(log.LEVELS),
         help=f"least level that goes to stderr (default: {_DEFAULTS.log_level})",
     )
+    parser.add_argument(
+        "--log-format",
+        metavar="|".join(log.FORMATS),
+        help=f"a line of words, or a JSON object a line (default: {_DEFAULTS.log_format})",
+    )
     _add_trust(parser)
 
 
@@ -110,7 +115,8 @@ def _add_operator(parser: argparse.ArgumentParser, with_out: bool) -> None:
         "--vehicle-id", metavar="ID", default=_DEFAULTS.vehicle_id, help="which vehicle"
     )
     if with_out:
-        parser.add_argument("--out", metavar="FILE.json", help="write the status here, too")
+        parser.add_argument("--out", metavar="FILE.json", help="write all of it here, as JSON")
+        parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, Optional
+from typing import Any, Dict, List, Optional, Sequence
 
 import msgspec
 
@@ -15,6 +15,8 @@ from edge_runtime.files import PathLike, read_bytes
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 from edge_runtime.vehicles.registry import NONE, VEHICLE_NAMES
 from edge_runtime.wire import check_vehicle_id
+
+MAX_PRIORITY = 99  # of SCHED_FIFO
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -26,18 +28,33 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     vehicle: str = NONE
     public_key: Optional[str] = None
     allow_unsigned: bool = False
+    armed_at_start: bool = True
     log_level: str = "info"
+    log_format: str = "text"
+    realtime_priority: int = 0
+    cpus: List[int] = msgspec.field(default_factory=list)
+    lock_memory: bool = False
 
 
 def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     """The file's settings with the given flags (those that are not None) in their place.
 
-    Raises UserError for a file that is no TOML, an unknown key, and a value out of range.
+    Raises UserError for a file that is no TOML, an unknown key, and a value out of range; where
+    the value stands in the file, the error names it.
     """
-    config = Config() if path is None else _read(path)
     given = {name: value for name, value in flags.items() if value is not None}
-    config = msgspec.structs.replace(config, **given)
-    _check(config)
+    if path is None:
+        config = msgspec.structs.replace(Config(), **given)
+        _check(config)
+        return config
+    from_file = _read(path)
+    config = msgspec.structs.replace(from_file, **given)
+    try:
+        _check(config)
+    except UserError as error:
+        if not _is_wrong(from_file):
+            raise  # the flag is wrong, not the file
+        raise UserError(f"config file {path}: {error}") from None
     return config
 
 
@@ -45,8 +62,26 @@ def _read(path: PathLike) -> Config:
     data = read_bytes(path, "config file")
     try:
         return msgspec.toml.decode(data, type=Config)
+    except msgspec.ValidationError as error:
+        raise UserError(f"config file {path}: {_explain(str(error))}") from None
     except (msgspec.MsgspecError, ValueError) as error:
-        raise UserError(f"config file {path}: {error}") from None
+        raise UserError(f"config file {path} is no TOML: {error}") from None
+
+
+def _explain(text: str) -> str:
+    """The sentence of msgspec with the key in front, and for an unknown key the known ones."""
+    if "unknown field" in text:
+        return f"{text}; known are {', '.join(Config.__struct_fields__)}"
+    sentence, _, place = text.partition(" - at ")
+    return f"{place.strip('`').replace('$.', '')}: {sentence}" if place else text
+
+
+def _is_wrong(config: Config) -> bool:
+    try:
+        _check(msgspec.structs.replace(config, policy=config.policy or "any"))
+    except UserError:
+        return True
+    return False
 
 
 def _check(config: Config) -> None:
@@ -54,11 +89,18 @@ def _check(config: Config) -> None:
         raise UserError("no policy to drive: name it with --policy, or as policy in --config")
     check_endpoint(config.connect)
     check_vehicle_id(config.vehicle_id)
-    if config.vehicle not in VEHICLE_NAMES:
+    _check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
+    _check_choice("log_level", config.log_level, log.LEVELS)
+    _check_choice("log_format", config.log_format, log.FORMATS)
+    if not 0 <= config.realtime_priority <= MAX_PRIORITY:
         raise UserError(
-            f"vehicle {config.vehicle!r} is not known; choose from {', '.join(VEHICLE_NAMES)}"
+            f"realtime_priority {config.realtime_priority} is not valid:"
+            f" use 1 to {MAX_PRIORITY}, or 0 for none"
         )
-    if config.log_level not in log.LEVELS:
-        raise UserError(
-            f"log_level {config.log_level!r} is not known; choose from {', '.join(log.LEVELS)}"
-        )
+    if any(cpu < 0 for cpu in config.cpus) or len(set(config.cpus)) < len(config.cpus):
+        raise UserError(f"cpus {config.cpus} is not valid: list each processor once, like [2, 3]")
+
+
+def _check_choice(key: str, value: str, known: Sequence[str]) -> None:
+    if value not in known:
+        raise UserError(f"{key} {value!r} is not known; choose from {', '.join(known)}")

@@ -39,7 +39,9 @@ class Controller:
     `tick` is called at `next_deadline_s` and gives the orders that time alone causes.
     """
 
-    def __init__(self, rows: Sequence[LimitRow], needs_rearm: bool) -> None:
+    def __init__(
+        self, rows: Sequence[LimitRow], needs_rearm: bool, armed_at_start: bool = True
+    ) -> None:
         self.safety = Safety()
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
@@ -49,6 +51,8 @@ class Controller:
         self._newest: Optional[Received] = None
         self._begun_s: Optional[float] = None
         self._next_stop_s = 0.0
+        if needs_rearm and not armed_at_start:
+            self._apply(Event.NOT_ARMED)
 
     @property
     def waits_for_rearm(self) -> bool:
@@ -58,10 +62,14 @@ class Controller:
 
     def begin(self, received: Received, now_s: float) -> None:
         """The policy starts on the newest state."""
-        if rules.is_silent(self.safety, received.arrived_s):
-            # The gap counts even where the watchdog did not get to run within it.
-            self._apply(Event.SILENT)
-        self.safety = rules.note_arrival(self.safety, received.arrived_s)
+        session = received.state.session
+        # The gap counts even where the watchdog did not get to run within it.
+        event = rules.classify_arrival(self.safety, session, received.arrived_s, self._needs_rearm)
+        if event is not None:
+            self._apply(event)
+        self.safety = rules.note_arrival(self.safety, session, received.arrived_s)
+        if self._newest is None:
+            self._next_stop_s = now_s + CONTROL_PERIOD_S
         self._newest = received
         self._begun_s = now_s
 
@@ -69,7 +77,9 @@ class Controller:
         """The policy's answer (float [n]) to the state of `begin`; None where it came too late."""
         if self._begun_s is None or self._newest is None:
             return None
-        if now_s - self._begun_s > rules.MAX_INFERENCE_S:
+        overdue = now_s - self._begun_s > rules.MAX_INFERENCE_S
+        # A process that was stopped in between would drive on what the road was then.
+        if overdue or rules.is_silent(self.safety, now_s):
             return self._give_up(now_s)
         self._begun_s = None
         if now_s - self._newest.arrived_s > CONTROL_PERIOD_S:
@@ -83,6 +93,8 @@ class Controller:
 
     def tick(self, now_s: float) -> Optional[Order]:
         """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
+        if self._newest is None:
+            return None  # before the first state there is nobody to tell
         if self._begun_s is not None and now_s - self._begun_s > rules.MAX_INFERENCE_S:
             return self._give_up(now_s)
         was = self.safety.mode
@@ -102,7 +114,7 @@ class Controller:
         due = []
         if self._begun_s is not None:
             due.append(self._begun_s + rules.MAX_INFERENCE_S)
-        if self.safety.mode is Mode.SAFE_STOP:
+        if self.safety.mode is Mode.SAFE_STOP and self._newest is not None:
             due.append(self._next_stop_s)
         elif self.safety.mode is Mode.DRIVE and self.safety.last_fresh_s is not None:
             due.append(self.safety.last_fresh_s + rules.SILENCE_S)
@@ -150,7 +162,7 @@ class Controller:
         self._next_stop_s = grid_s if on_grid and grid_s > now_s else now_s + CONTROL_PERIOD_S
 
     def _stop_order(self, inference_ns: int) -> Order:
-        assert self._newest is not None  # every way into safe_stop begins with a state
+        assert self._newest is not None  # a safe stop is an answer to a state
         self._last_action = stop_action(self._last_action, self._rows)
         return Order(self._newest, SAFE_STOP, self._last_action, self.safety.reason, inference_ns)
 

@@ -1,20 +1,34 @@
 """Which state is the newest of the right simulator, and why the others are not.
 
 Pure: time is passed in. Contract, section 3: a new session is taken over only when the current
-one has been silent for 2 T, and a state that is not newer than the last accepted one is rejected.
+one has been silent for 2 T, and a state that is not newer than the last accepted one is rejected,
+as is one from further ahead than any simulator can have come.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Dict, Optional, Tuple
+from typing import Dict, NamedTuple, Optional, Tuple
 
 from edge_runtime.wire import CONTROL_PERIOD_S, Reason, Rejection, State
 
 TAKEOVER_SILENCE_S = 2 * CONTROL_PERIOD_S
 _REMEMBERED_SESSIONS = 16
+# One message from far ahead would make all that follow it old. So much may be lost on the way,
+# and besides as many as a quick simulator counts while nothing arrives.
+MAX_SKIPPED_EPISODES = 10
+MAX_SKIPPED_STEPS = 10_000
+SKIPPED_EPISODES_PER_S = 1.0
+SKIPPED_STEPS_PER_S = 100.0
 
 Position = Tuple[int, int]  # (episode, step): what "newer" compares within a session
+
+
+class _Last(NamedTuple):
+    """The newest accepted state of a session."""
+
+    position: Position
+    accepted_s: float
 
 
 class LatestState:
@@ -26,7 +40,7 @@ class LatestState:
         self._session: Optional[str] = None
         self._heard_s = 0.0
         # Where each session stood: a delayed message of an earlier one never goes back either.
-        self._positions: OrderedDict[str, Position] = OrderedDict()
+        self._lasts: OrderedDict[str, _Last] = OrderedDict()
 
     def offer(self, state: State, now_s: float) -> Optional[Rejection]:
         """Accept the state (None) or say why not. `now_s`: monotonic time of arrival."""
@@ -35,7 +49,7 @@ class LatestState:
             return self.reject(rejection)
         self._session = state.session
         self._heard_s = now_s
-        self._remember(state)
+        self._remember(state, now_s)
         self.accepted += 1
         return None
 
@@ -54,19 +68,41 @@ class LatestState:
                 Reason.FOREIGN_SESSION,
                 f"session {state.session!r} while {self._session!r} is not silent",
             )
-        return self._judge_order(state)
+        return self._judge_order(state, now_s)
 
-    def _judge_order(self, state: State) -> Optional[Rejection]:
-        last = self._positions.get(state.session)
-        if last is None or (state.episode, state.step) > last:
+    def _judge_order(self, state: State, now_s: float) -> Optional[Rejection]:
+        last = self._lasts.get(state.session)
+        if last is None:
             return None
-        reason = Reason.DUPLICATE if (state.episode, state.step) == last else Reason.STALE
-        return Rejection(
-            reason, f"episode {state.episode} step {state.step} after {last[0]} step {last[1]}"
-        )
+        position = (state.episode, state.step)
+        if position > last.position:
+            return _judge_skip(position, last, now_s)
+        reason = Reason.DUPLICATE if position == last.position else Reason.STALE
+        return _rejection(reason, position, last)
 
-    def _remember(self, state: State) -> None:
-        self._positions[state.session] = (state.episode, state.step)
-        self._positions.move_to_end(state.session)
-        while len(self._positions) > _REMEMBERED_SESSIONS:
-            self._positions.popitem(last=False)
+    def _remember(self, state: State, now_s: float) -> None:
+        self._lasts[state.session] = _Last((state.episode, state.step), now_s)
+        self._lasts.move_to_end(state.session)
+        while len(self._lasts) > _REMEMBERED_SESSIONS:
+            self._lasts.popitem(last=False)
+
+
+def _judge_skip(position: Position, last: _Last, now_s: float) -> Optional[Rejection]:
+    """Reject what no simulator can have reached since its last accepted state."""
+    elapsed_s = now_s - last.accepted_s
+    episodes = position[0] - last.position[0]
+    steps = position[1] - (last.position[1] if episodes == 0 else 0)
+    if (
+        episodes > MAX_SKIPPED_EPISODES + SKIPPED_EPISODES_PER_S * elapsed_s
+        or steps > MAX_SKIPPED_STEPS + SKIPPED_STEPS_PER_S * elapsed_s
+    ):
+        return _rejection(Reason.FUTURE, position, last)
+    return None
+
+
+def _rejection(reason: Reason, position: Position, last: _Last) -> Rejection:
+    return Rejection(
+        reason,
+        f"episode {position[0]} step {position[1]}"
+        f" after episode {last.position[0]} step {last.position[1]}",
+    )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import Any, Callable, Dict, List
+from typing import Any, Callable, Dict, List, Optional
 
 import msgspec
 import zenoh
 
 from edge_runtime import __version__, log
 from edge_runtime.manifest import Manifest
-from edge_runtime.presence import Presence
+from edge_runtime.presence import OpenClient, Presence
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
 _PUBLISHED = ("command", "feedback", "health")
@@ -25,6 +25,8 @@ class Link:
         self._manifest = manifest
         self._declared: List[Any] = []
         self._publishers: Dict[str, Any] = {}
+        self._presence: Optional[Presence] = None
+        self._muted = False
         for topic in _PUBLISHED:
             # DROP: a full queue must never hold the control loop, and the next message is better.
             self._publishers[topic] = session.declare_publisher(
@@ -40,7 +42,7 @@ class Link:
         health: Callable[[], Health],
         rearm: Callable[[], str],
     ) -> None:
-        """Listen to states, answer queries, and show that it is alive: in this order."""
+        """Listen to states and answer queries. Call `appear` next, when it can answer."""
 
         def state_came(sample: zenoh.Sample) -> None:
             # One byte too many is enough to be rejected; a huge message is not copied.
@@ -61,12 +63,27 @@ class Link:
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
             session.declare_queryable(key(self.vehicle_id, "rearm"), rearm_asked),
         ]
-        presence = Presence(session, key(self.vehicle_id, "alive"))
-        self._declared.append(presence)
-        presence.start()
+
+    def appear(self, open_client: OpenClient, give_way: Callable[[], None]) -> None:
+        """Show that it is alive, and look for others with this vehicle id (presence.py)."""
+        alive = key(self.vehicle_id, "alive")
+        self._presence = Presence(self._session, alive, open_client, give_way)
+        self._declared.append(self._presence)
+        self._presence.start()
+
+    @property
+    def rivals(self) -> int:
+        """How many other runtimes were seen under this vehicle id."""
+        return self._presence.rivals if self._presence else 0
+
+    def mute(self) -> None:
+        """Send nothing more: another runtime speaks for this vehicle."""
+        self._muted = True
 
     def send(self, topic: str, message: Message) -> None:
         """Publish a message. A failure is logged: the receiver's own watchdog handles it."""
+        if self._muted:
+            return
         try:
             self._publishers[topic].put(encode(message))
         except zenoh.ZError as error:

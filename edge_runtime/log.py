@@ -1,33 +1,100 @@
-"""One line on stderr for each thing worth knowing: time, level, event, then key=value pairs."""
+"""One line on stderr for each thing worth knowing: time, level, event, then its fields.
+
+As text (`time LEVEL event key=value`) or as JSON, one object a line. A thread of its own writes
+the lines: a reader of stderr that stands still must not hold the thread that drives.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
+import queue
+import threading
 import time
-from typing import Any
+from typing import Any, Dict, Optional
 
 LEVELS = ("debug", "info", "warning", "error")
+FORMATS = ("text", "json")
 _LOGGER = logging.getLogger("edge_runtime")
+_WAITING_LINES = 1000
+_FLUSH_S = 0.5
 
 
-def configure(level: str) -> None:
+def configure(level: str, log_format: str = "text") -> None:
     """Send lines of at least `level` to stderr."""
-    formatter = logging.Formatter("%(asctime)s.%(msecs)03dZ %(levelname)s %(message)s")
-    formatter.default_time_format = "%Y-%m-%dT%H:%M:%S"
-    formatter.datefmt = "%Y-%m-%dT%H:%M:%S"
-    formatter.converter = time.gmtime  # boards and workstations sit in one time zone: UTC
-    handler = logging.StreamHandler()
-    handler.setFormatter(formatter)
-    _LOGGER.handlers = [handler]
+    stream = logging.StreamHandler()
+    stream.setFormatter(_JsonFormatter() if log_format == "json" else _TextFormatter())
+    close()
+    _LOGGER.handlers = [_Background(stream)]
     _LOGGER.propagate = False
     _LOGGER.setLevel(level.upper())
     logging.raiseExceptions = False  # a closed stderr must not stop the vehicle's controller
 
 
-def event(level: str, name: str, **fields: Any) -> None:
-    """Log `name key=value ...`; a value with spaces is quoted."""
-    pairs = "".join(f" {label}={_quoted(value)}" for label, value in fields.items())
-    _LOGGER.log(logging.getLevelName(level.upper()), "%s%s", name, pairs)
+def event(level: str, name: str, /, **fields: Any) -> None:
+    """Log an event with its fields."""
+    _LOGGER.log(logging.getLevelName(level.upper()), name, extra={"fields": fields})
+
+
+def close() -> None:
+    """Write what still waits, for half a second at most. Call it before the process ends."""
+    for handler in _LOGGER.handlers:
+        handler.close()
+
+
+class _Background(logging.Handler):
+    """Hands the lines to a thread; drops those for which nobody makes room."""
+
+    def __init__(self, target: logging.Handler) -> None:
+        super().__init__()
+        self._target = target
+        self._lines: queue.Queue[Optional[logging.LogRecord]] = queue.Queue(_WAITING_LINES)
+        self._thread = threading.Thread(target=self._run, name="log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(record)
+
+    def close(self) -> None:
+        try:
+            self._lines.put(None, timeout=_FLUSH_S)
+        except queue.Full:
+            return
+        self._thread.join(_FLUSH_S)
+        super().close()
+
+    def _run(self) -> None:
+        for record in iter(self._lines.get, None):
+            self._target.handle(record)
+
+
+class _TextFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        pairs = "".join(f" {label}={_quoted(value)}" for label, value in _fields(record).items())
+        return f"{_time(record)} {record.levelname} {record.getMessage()}{pairs}"
+
+
+class _JsonFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line = {
+            "time": _time(record),
+            "level": record.levelname.lower(),
+            "event": record.getMessage(),
+        }
+        # Twice, so that the line begins with them and no field can take their place.
+        return json.dumps({**line, **_fields(record), **line}, default=str)
+
+
+def _fields(record: logging.LogRecord) -> Dict[str, Any]:
+    return getattr(record, "fields", {})
+
+
+def _time(record: logging.LogRecord) -> str:
+    # Boards and workstations sit in one time zone: UTC.
+    seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
+    return f"{seconds}.{int(record.msecs):03d}Z"
 
 
 def _quoted(value: Any) -> str:

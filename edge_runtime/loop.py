@@ -3,43 +3,61 @@
 Three kinds of threads meet here, under one lock:
 - Zenoh's call `_on_state`, which judges a message and leaves the newest state in a slot;
 - the policy's thread takes the slot, infers outside the lock, and sends the answer;
-- the main thread is the watchdog: it wakes at absolute deadlines, sends safe stops and health.
+- the main thread is the watchdog: it wakes at absolute deadlines, sends safe stops and health,
+  and tells systemd that all of this works.
 A command is sent under the lock, so that no late answer can follow a safe stop.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from typing import Optional
 
 from edge_runtime import log
+from edge_runtime.board import BoardWatch
 from edge_runtime.controller import Controller, Order, Received
+from edge_runtime.flood import Flood
 from edge_runtime.inference import infer
 from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
 from edge_runtime.policy import Policy
 from edge_runtime.safety import Mode, Safety
+from edge_runtime.sd_notify import Notifier
 from edge_runtime.vehicles.runner import VehicleRunner
 from edge_runtime.wire import TOPICS, Command, Health, Rejection, decode_state
 
 _HEALTH_PERIOD_S = 1.0 / TOPICS["health"].rate_hz
 _JOIN_S = 0.5
+_RETRY_S = 0.1
+# A policy that computes so long will not end: only a new process helps.
+_HUNG_S = 2.0
 
 
 class ControlLoop:
     """Answers states with commands until it is stopped."""
 
     def __init__(
-        self, policy: Policy, controller: Controller, link: Link, vehicle: Optional[VehicleRunner]
+        self,
+        policy: Policy,
+        controller: Controller,
+        link: Link,
+        vehicle: Optional[VehicleRunner],
+        notifier: Notifier,
     ) -> None:
         self._policy = policy
         self._controller = controller
         self._link = link
         self._vehicle = vehicle
+        self._notifier = notifier
+        self._board = BoardWatch()
         self._latest = LatestState()
-        self._latency = LatencyWindow()
+        self._inference_window = LatencyWindow()
+        self._command_window = LatencyWindow()
+        self._flood = Flood()
+        self._busy_since_s: Optional[float] = None
         self._slot: Optional[Received] = None
         self._superseded = 0
         self._stopping = False
@@ -62,6 +80,8 @@ class ControlLoop:
     def run(self) -> None:
         """Be the watchdog until `stop` is called."""
         next_health_s = time.monotonic()
+        alive_period_s = self._notifier.watchdog_period_s
+        next_alive_s = next_health_s if alive_period_s else math.inf
         with self._lock:
             while not self._stopping:
                 now_s = time.monotonic()
@@ -70,7 +90,10 @@ class ControlLoop:
                 if now_s >= next_health_s:
                     self._link.send("health", self.health())
                     next_health_s = max(next_health_s + _HEALTH_PERIOD_S, now_s)
-                self._sleep(next_health_s)
+                if alive_period_s and now_s >= next_alive_s and not self._is_hung(now_s):
+                    self._notifier.watchdog()
+                    next_alive_s = now_s + alive_period_s
+                self._sleep(min(next_health_s, max(next_alive_s, now_s + _RETRY_S)))
 
     def stop(self) -> None:
         """Ask `run` to return. May be called from a signal handler."""
@@ -82,6 +105,7 @@ class ControlLoop:
     def close(self) -> bool:
         """Send a last safe stop and end the policy's thread; False where that thread hangs."""
         self.stop()
+        self._board.close()
         if self._worker.is_alive():
             self._worker.join(_JOIN_S)
         with self._lock:
@@ -104,9 +128,12 @@ class ControlLoop:
                 deadline_misses=self._controller.deadline_misses,
                 safe_stops=safety.safe_stops,
                 policy_id=self._policy.policy_id,
-                inference_ms=self._latency.summary_ms(),
+                inference_ms=self._inference_window.summary_ms(),
+                command_ms=self._command_window.summary_ms(),
                 uptime_s=time.monotonic() - self._started_s,
                 sent_ns=time.time_ns(),
+                rivals=self._link.rivals,
+                **self._board.last._asdict(),
             )
 
     def _on_state(self, payload: bytes) -> None:
@@ -114,11 +141,11 @@ class ControlLoop:
         state = decode_state(payload)
         with self._lock:
             if isinstance(state, Rejection):
-                self._log_rejection(self._latest.reject(state))
+                self._log_rejection(self._latest.reject(state), arrived_s)
                 return
             rejection = self._latest.offer(state, arrived_s)
             if rejection is not None:
-                self._log_rejection(rejection)
+                self._log_rejection(rejection, arrived_s)
                 return
             self._superseded += int(self._slot is not None)
             self._slot = Received(state, arrived_s, arrived_ns)
@@ -131,16 +158,24 @@ class ControlLoop:
                 if self._stopping or self._slot is None:
                     return
                 received, self._slot = self._slot, None
-                self._controller.begin(received, time.monotonic())
+                self._busy_since_s = time.monotonic()
+                self._controller.begin(received, self._busy_since_s)
                 self._wake_watchdog()
             inference = infer(self._policy, received.state.frames_array())
             with self._lock:
-                self._latency.add(inference.duration_ns)
+                self._busy_since_s = None
+                self._inference_window.add(inference.duration_ns)
                 self._look_at_vehicle(time.monotonic())
                 order = self._controller.finish(
                     inference.output, inference.duration_ns, time.monotonic()
                 )
                 self._send(order)
+                if order is not None:
+                    took_s = time.monotonic() - received.arrived_s
+                    self._command_window.add(int(took_s * 1e9))
+
+    def _is_hung(self, now_s: float) -> bool:
+        return self._busy_since_s is not None and now_s - self._busy_since_s > _HUNG_S
 
     def _look_at_vehicle(self, now_s: float) -> None:
         if self._vehicle is None:
@@ -211,8 +246,11 @@ class ControlLoop:
                 reason=safety.reason,
             )
             self._logged = safety
+            self._notifier.status(f"{safety.mode.value} {safety.reason}".rstrip())
 
-    def _log_rejection(self, rejection: Rejection) -> None:
-        """Only the first of each reason: the rest are counted in the health message."""
-        if self._latest.rejected[rejection.reason.value] == 1:
-            log.event("warning", "rejected", reason=rejection.reason.value, detail=rejection.detail)
+    def _log_rejection(self, rejection: Rejection, now_s: float) -> None:
+        """The first of each reason, then one a second: all are counted in the health message."""
+        reason = rejection.reason.value
+        unsaid = self._flood.admit(reason, now_s)
+        if unsaid is not None:
+            log.event("warning", "rejected", reason=reason, detail=rejection.detail, unsaid=unsaid)

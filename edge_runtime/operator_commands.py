@@ -8,6 +8,7 @@ from typing import Any, Dict
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_json
+from edge_runtime.status_table import render_status
 from edge_runtime.transport import open_session
 from edge_runtime.wire import key
 
@@ -15,11 +16,11 @@ _TIMEOUT_S = 2.0
 
 
 def status(arguments: argparse.Namespace) -> int:
-    """Print the runtime's status as JSON."""
+    """Print the runtime's status as a table, or as JSON."""
     if arguments.out is not None:
         check_writable(arguments.out)
     reply = ask(arguments.connect, arguments.vehicle_id, "status")
-    print(json.dumps(reply, indent=2))
+    print(json.dumps(reply, indent=2) if arguments.json else render_status(reply))
     if arguments.out is not None:
         write_json(arguments.out, reply)
     return 0

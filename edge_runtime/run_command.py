@@ -9,17 +9,19 @@ import signal
 import sys
 from typing import Any, Callable, Optional
 
-from edge_runtime import log
+from edge_runtime import log, presence, realtime
 from edge_runtime.config import Config, load_config
 from edge_runtime.controller import Controller
 from edge_runtime.limiter import limit_rows
 from edge_runtime.link import Link
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import Policy, load_policy
+from edge_runtime.sd_notify import Notifier
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.interface import Vehicle
 from edge_runtime.vehicles.registry import make_vehicle
 from edge_runtime.vehicles.runner import VehicleRunner
+from edge_runtime.wire import key
 
 
 class StopSignal:
@@ -38,14 +40,22 @@ class StopSignal:
 
 def run(arguments: argparse.Namespace) -> int:
     """Verify, connect, drive until a signal comes. Raises UserError before the network opens."""
-    flags = {name: getattr(arguments, name) for name in Config.__struct_fields__}
+    flags = {name: getattr(arguments, name, None) for name in Config.__struct_fields__}
     config = load_config(arguments.config, flags)
-    log.configure(config.log_level)
+    log.configure(config.log_level, config.log_format)
+    try:
+        return _run(config)
+    finally:
+        log.close()
+
+
+def _run(config: Config) -> int:
     stop = StopSignal()
+    realtime.configure(config.realtime_priority, config.cpus, config.lock_memory)
     vehicle = make_vehicle(config.vehicle)
     policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
     rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
-    controller = Controller(rows, needs_rearm=vehicle is not None)
+    controller = Controller(rows, vehicle is not None, config.armed_at_start)
     if stop.came:
         return 0
     return _serve(config, policy, controller, vehicle, stop)
@@ -58,14 +68,27 @@ def _serve(
     vehicle: Optional[Vehicle],
     stop: StopSignal,
 ) -> int:
+    def open_client() -> Any:
+        return open_session(connect=config.connect, mode="client")
+
+    alive = key(config.vehicle_id, "alive")
+    router_is_there = presence.require_free(open_client, alive, config.vehicle_id)
+    notifier = Notifier()
     session = open_session(connect=config.connect, mode="peer")
     try:
         link = Link(session, config.vehicle_id, policy.manifest)
         runner = _attach(vehicle, policy, link)
-        loop = ControlLoop(policy, controller, link, runner)
+        loop = ControlLoop(policy, controller, link, runner, notifier)
     except BaseException:
         session.close()  # An open session would hang the process at its exit.
         raise
+    taken = []
+
+    def give_way() -> None:
+        taken.append(presence.taken(config.vehicle_id))
+        link.mute()
+        loop.stop()
+
     stop.on_stop = loop.stop
     # What is loaded stays: the collector need not look at it again in the middle of a drive.
     gc.collect()
@@ -74,17 +97,25 @@ def _serve(
         if runner is not None:
             runner.start()
         loop.start()
+        if router_is_there:
+            presence.wait_for_router(session)
+        link.appear(open_client, give_way)
         _say_ready(config, policy)
+        notifier.ready(controller.safety.mode.value)
         if not stop.came:
             loop.run()
     finally:
+        notifier.stopping()
         ended = loop.close()
         if runner is not None:
             runner.close()
         link.close()
         log.event("info", "ended", **_totals(loop))
+    if taken:
+        raise taken[0]
     if not ended:
         # The policy's thread hangs in native code, and would hold the interpreter's exit.
+        log.close()
         os._exit(0)
     return 0
 

@@ -13,6 +13,9 @@ from edge_runtime.wire import CONTROL_PERIOD_S
 SILENCE_S = 2 * CONTROL_PERIOD_S
 MAX_INFERENCE_S = CONTROL_PERIOD_S
 FRESH_STATES_TO_RECOVER = 5
+# Between two episodes of one drive a simulator resets in seconds. After a longer pause nobody
+# may still be beside the vehicle.
+MAX_PAUSE_S = 10.0
 
 
 class Mode(str, Enum):
@@ -31,7 +34,10 @@ class Event(str, Enum):
     FINAL = "final_state"  # the episode ends with it
     SILENT = "no_fresh_state"  # for more than 2 T
     NOT_FINITE = "output_not_finite"
-    TOO_LONG = "inference_too_long"  # longer than T
+    TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than 2 T
+    PAUSED = "pause_too_long"  # a vehicle stood by for more than MAX_PAUSE_S
+    OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
+    NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
     VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
     REARM = "rearm"  # an operator allows driving again
 
@@ -45,6 +51,9 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_S, Event.SILENT): _S,  # between two episodes nothing is due
     (_S, Event.NOT_FINITE): _X,
     (_S, Event.TOO_LONG): _X,
+    (_S, Event.PAUSED): _X,
+    (_S, Event.OTHER_SESSION): _X,
+    (_S, Event.NOT_ARMED): _X,
     (_S, Event.VEHICLE): _X,
     (_S, Event.REARM): _S,
     (_D, Event.FRESH): _D,
@@ -53,6 +62,9 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_D, Event.SILENT): _X,
     (_D, Event.NOT_FINITE): _X,
     (_D, Event.TOO_LONG): _X,
+    (_D, Event.PAUSED): _X,
+    (_D, Event.OTHER_SESSION): _X,
+    (_D, Event.NOT_ARMED): _X,
     (_D, Event.VEHICLE): _X,
     (_D, Event.REARM): _D,
     (_X, Event.FRESH): _X,
@@ -61,17 +73,29 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_X, Event.SILENT): _X,
     (_X, Event.NOT_FINITE): _X,
     (_X, Event.TOO_LONG): _X,
+    (_X, Event.PAUSED): _X,
+    (_X, Event.OTHER_SESSION): _X,
+    (_X, Event.NOT_ARMED): _X,
     (_X, Event.VEHICLE): _X,
     (_X, Event.REARM): _X,  # a fresh state must follow
 }
-FAULTS = (Event.SILENT, Event.NOT_FINITE, Event.TOO_LONG, Event.VEHICLE)
+FAULTS = (
+    Event.SILENT,
+    Event.NOT_FINITE,
+    Event.TOO_LONG,
+    Event.PAUSED,
+    Event.OTHER_SESSION,
+    Event.NOT_ARMED,
+    Event.VEHICLE,
+)
 FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
 
 
 class Safety(NamedTuple):
     """Where the machine stands. `reason` is the fault that stopped it, empty elsewhere.
 
-    `last_fresh_s` is the monotonic arrival of the newest state, None before the first one.
+    `last_fresh_s` and `session` are the monotonic arrival of the newest state and the simulator
+    that sent it, None before the first one.
     """
 
     mode: Mode = Mode.STANDBY
@@ -79,12 +103,27 @@ class Safety(NamedTuple):
     fresh_in_a_row: int = 0
     rearmed: bool = False
     last_fresh_s: Optional[float] = None
+    session: Optional[str] = None
     safe_stops: int = 0
 
 
 def is_silent(safety: Safety, now_s: float) -> bool:
     """Whether the newest state is older than 2 T (or there was none)."""
     return safety.last_fresh_s is None or now_s - safety.last_fresh_s > SILENCE_S
+
+
+def classify_arrival(
+    safety: Safety, session: str, arrived_s: float, needs_rearm: bool
+) -> Optional[Event]:
+    """Which event the time before a state and its sender are; None where it follows in time."""
+    if safety.last_fresh_s is None:
+        return None
+    if needs_rearm and session != safety.session:
+        return Event.OTHER_SESSION
+    pause_s = arrived_s - safety.last_fresh_s
+    if needs_rearm and safety.mode is Mode.STANDBY and pause_s > MAX_PAUSE_S:
+        return Event.PAUSED
+    return Event.SILENT if is_silent(safety, arrived_s) else None
 
 
 def classify_fresh(safety: Safety, final: bool, needs_rearm: bool) -> Event:
@@ -117,9 +156,9 @@ def advance(safety: Safety, event: Event) -> Safety:
     )
 
 
-def note_arrival(safety: Safety, arrived_s: float) -> Safety:
-    """Remember when the newest state arrived, before anyone knows what the policy makes of it."""
-    return safety._replace(last_fresh_s=arrived_s)
+def note_arrival(safety: Safety, session: str, arrived_s: float) -> Safety:
+    """Remember whose newest state arrived when, before anyone knows what the policy makes of it."""
+    return safety._replace(last_fresh_s=arrived_s, session=session)
 
 
 def _count_fresh(safety: Safety, event: Event) -> int:

@@ -66,9 +66,10 @@ def _config(listen: Optional[str], connect: Optional[str], mode: str) -> zenoh.C
         "connect/retry": RETRY,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        # Nothing is looked for, so there is nothing to wait for either (0.5 s at each start).
+        "scouting/delay": 0,
         "transport/link/tx/lease": LEASE_MS,
-        # Only for processes of one machine, and 16 MB of memory: a board gains nothing by it, and
-        # tests on one machine would not send over the link what a real one sends.
+        # It would map 17 MB for messages of 7 KB, and share them with any local process.
         "transport/shared_memory/enabled": False,
     }
     config = zenoh.Config()

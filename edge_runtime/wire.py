@@ -1,25 +1,42 @@
 """The messages on the wire: MessagePack maps, validated on arrival. Contract, section 3.
 
 Pure: no clock and no socket. A decoder never raises: it returns the message, or a Rejection
-that says why it never reaches the policy. The keys stand in topics.py and are re-exported here.
+that says why it never reaches the policy. The keys stand in topics.py, the messages in
+messages.py; both are re-exported here.
 """
 
 from __future__ import annotations
 
 import math
-from enum import Enum
-from typing import Any, Dict, List, NamedTuple, Tuple, Type, TypeVar, Union
+from typing import Any, Dict, List, Tuple, Type, TypeVar, Union
 
 import msgspec
-import numpy as np
 
+from edge_runtime.messages import (
+    COMMAND_MODES,
+    DRIVE,
+    FRAMES_BYTES,
+    FRAMES_SHAPE,
+    SAFE_STOP,
+    SCHEMA,
+    Command,
+    Feedback,
+    Health,
+    Message,
+    Reason,
+    Rejection,
+    State,
+)
 from edge_runtime.topics import CONTROL_PERIOD_S, TOPICS, Topic, check_vehicle_id, key
 
 __all__ = [
+    "COMMAND_MODES",
     "CONTROL_PERIOD_S",
+    "DRIVE",
     "FRAMES_BYTES",
     "FRAMES_SHAPE",
     "MAX_PAYLOAD_BYTES",
+    "SAFE_STOP",
     "SCHEMA",
     "TOPICS",
     "Command",
@@ -39,122 +56,14 @@ __all__ = [
     "key",
 ]
 
-SCHEMA = 1
 MAX_PAYLOAD_BYTES = 64 * 1024
 MAX_TEXT_CHARS = 256
-FRAMES_SHAPE = (2, 45, 80)
-FRAMES_BYTES = 2 * 45 * 80
-
-DRIVE = "drive"
-SAFE_STOP = "safe_stop"
-COMMAND_MODES = (DRIVE, SAFE_STOP)
-
-
-class Reason(str, Enum):
-    """Why a message was rejected. The newest-state logic (latest.py) adds the last three."""
-
-    OVERSIZED = "oversized"
-    MALFORMED = "malformed"
-    SCHEMA = "schema"
-    FRAMES_SIZE = "frames_size"
-    NOT_FINITE = "not_finite"
-    STALE = "stale"
-    DUPLICATE = "duplicate"
-    FOREIGN_SESSION = "foreign_session"
-
-
-class Rejection(NamedTuple):
-    """A message that was not accepted: the reason that is counted, and a sentence for the log."""
-
-    reason: Reason
-    detail: str
-
-
-class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the simulator sees at one step. `frames`: 2x45x80 uint8 in C order, [t-1, t]."""
-
-    session: str
-    episode: int
-    step: int
-    sim_time_s: float
-    sent_ns: int
-    frames: bytes
-    speed_mps: float
-    final: bool
-    schema: int = SCHEMA
-
-    def frames_array(self) -> np.ndarray:
-        """The frames as a read-only uint8 array of shape [2, 45, 80], not copied."""
-        return np.frombuffer(self.frames, dtype=np.uint8).reshape(FRAMES_SHAPE)
-
-
-class Command(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to the state (session, episode, step); it is its own heartbeat.
-
-    `received_ns` and `sent_ns` are the edge's wall clock, `inference_ns` is a duration.
-    """
-
-    session: str
-    episode: int
-    step: int
-    mode: str
-    action: List[float]
-    policy_id: str
-    received_ns: int
-    inference_ns: int
-    sent_ns: int
-    reason: str = ""
-    schema: int = SCHEMA
-
-
-class Feedback(msgspec.Struct, frozen=True, kw_only=True):
-    """What the vehicle does. `action` is what the actuators have reached, not what was asked.
-
-    `episode` and `step` are those of the last command taken (-1 before the first one).
-    """
-
-    vehicle: str
-    session: str
-    episode: int
-    step: int
-    mode: str
-    action: List[float]
-    speed_mps: float
-    self_braking: bool
-    faults: List[str]
-    sent_ns: int
-    schema: int = SCHEMA
-
-
-class Health(msgspec.Struct, frozen=True, kw_only=True):
-    """How the edge runtime is, twice a second.
-
-    `inference_ms` holds p50, p99 and max over the last 1,024 inferences (0 before the first).
-    `superseded` counts accepted states that a newer one replaced before the policy took them.
-    """
-
-    vehicle_id: str
-    vehicle: str
-    mode: str
-    reason: str
-    needs_rearm: bool
-    accepted: int
-    superseded: int
-    rejected: Dict[str, int]
-    deadline_misses: int
-    safe_stops: int
-    policy_id: str
-    inference_ms: Dict[str, float]
-    uptime_s: float
-    sent_ns: int
-    schema: int = SCHEMA
 
 
 class _Envelope(msgspec.Struct):
     schema: int
 
 
-Message = Union[State, Command, Feedback, Health]
 _M = TypeVar("_M", State, Command, Feedback, Health)
 _ENVELOPE = msgspec.msgpack.Decoder(_Envelope)
 _DECODERS: Dict[Any, Any] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import queue
 import subprocess
 import sys
@@ -57,6 +58,7 @@ class EdgeProcess:
         cwd: Optional[Path] = None,
         python_flags: Sequence[str] = (),
         stderr: Any = subprocess.PIPE,
+        environment: Optional[Dict[str, str]] = None,
     ) -> None:
         self.process = subprocess.Popen(
             [python, *python_flags, "-m", "edge_runtime", "run", *arguments],
@@ -64,6 +66,7 @@ class EdgeProcess:
             stderr=stderr,
             text=True,
             cwd=cwd,
+            env={**os.environ, **(environment or {})},
         )
         assert self.process.stdout is not None
         self.ready_line = self.process.stdout.readline().strip()

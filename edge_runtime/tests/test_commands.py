@@ -80,18 +80,37 @@ def test_status_with_a_simulator_but_no_edge():
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("policy = 'p.onnx'\nspeed = 3", "speed"),
-        ("policy = 3", "policy"),
-        ("policy = ", "config file"),
-        ("policy = 'p.onnx'\nvehicle = 'tank'", "tank"),
-        ("", "no policy"),
+        ("speed = 3", "speed.*known are policy, connect"),
+        ("policy = 3", "policy: Expected `str"),
+        ("policy = ", "is no TOML"),
+        ("vehicle = 'tank'", "tank.*none, mock, hunter"),
+        ("log_level = 'loud'", "log_level.*debug, info"),
+        ("log_format = 'xml'", "log_format.*text, json"),
+        ("realtime_priority = 100", "realtime_priority 100.*1 to 99"),
+        ("realtime_priority = -1", "realtime_priority -1.*1 to 99"),
+        ("realtime_priority = 1.5", "realtime_priority: Expected `int"),
+        ("cpus = [1, -1]", "cpus.*each processor once"),
+        ("cpus = [1, 1]", "cpus.*each processor once"),
+        ("cpus = 'all'", "cpus: Expected `array"),
+        ("connect = 'localhost'", "localhost.*write it as"),
+        ("vehicle_id = 'a/b'", "a/b"),
     ],
 )
 def test_wrong_config_files(tmp_path, text, match):
     path = tmp_path / "edge.toml"
     path.write_text(text)
-    with pytest.raises(UserError, match=match):
-        load_config(path, {})
+    with pytest.raises(UserError, match=match) as caught:
+        load_config(path, {"policy": "p.onnx"})
+    assert str(path) in str(caught.value)
+
+
+def test_a_wrong_flag_is_not_blamed_on_the_file(tmp_path):
+    path = tmp_path / "edge.toml"
+    path.write_text("log_level = 'debug'")
+    for flags in ({"log_level": "loud", "policy": "p.onnx"}, {}):
+        with pytest.raises(UserError) as caught:
+            load_config(path, flags)
+        assert str(path) not in str(caught.value)
 
 
 def test_flags_win_over_the_file(tmp_path):

@@ -16,8 +16,8 @@ NAN = np.array([np.nan], np.float32)
 QUICK_NS = 1_000_000
 
 
-def make(needs_rearm=False, actions=(PEDAL,)):
-    return Controller(limit_rows(actions, {}), needs_rearm)
+def make(needs_rearm=False, actions=(PEDAL,), **options):
+    return Controller(limit_rows(actions, {}), needs_rearm, **options)
 
 
 def answer(controller, step, now_s, output=GOOD, **changes):
@@ -129,6 +129,63 @@ def test_a_rearm_with_fresh_states_drives_at_the_next():
     assert set(modes) == {"safe_stop"}
     assert controller.rearm(1.95) == ""
     assert answer(controller, 10, 2.0).mode == "drive"
+
+
+def test_a_vehicle_goes_on_between_two_episodes_of_one_drive():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0, final=True)
+    assert answer(controller, 0, 9.9, episode=1).mode == "drive"
+    assert controller.safety.safe_stops == 0
+
+
+@pytest.mark.parametrize(
+    ("now_s", "session", "reason"),
+    [(10.1, "simulator-a", "pause_too_long"), (1.0, "simulator-b", "other_session")],
+)
+def test_a_vehicle_in_standby_moves_only_for_the_drive_it_was_armed_for(now_s, session, reason):
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0, final=True)
+    orders = [
+        answer(controller, step, now_s + step * 0.1, episode=1, session=session)
+        for step in range(8)
+    ]
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", reason)}
+    assert controller.waits_for_rearm
+    assert controller.rearm(now_s + 0.75) == ""
+    assert answer(controller, 8, now_s + 0.8, episode=1, session=session).mode == "drive"
+
+
+def test_without_a_vehicle_a_pause_and_another_simulator_are_no_fault():
+    controller = make()
+    answer(controller, 0, 0.0, final=True)
+    assert answer(controller, 0, 60.0, session="simulator-b").mode == "drive"
+
+
+def test_a_service_with_a_vehicle_waits_for_its_first_permission():
+    controller = make(needs_rearm=True, armed_at_start=False)
+    assert (controller.tick(5.0), controller.next_deadline_s()) == (None, None)
+    assert controller.waits_for_rearm
+    assert "no fresh states" in controller.rearm(5.0)
+    controller.begin(Received(make_state(0), 6.0, 0), 6.0)
+    assert controller.tick(6.0) is None  # the answer comes first
+    order = controller.finish(GOOD, QUICK_NS, 6.001)
+    assert (order.mode, order.reason) == ("safe_stop", "not_armed")
+    for step in range(1, 5):
+        assert answer(controller, step, 6.0 + step * 0.1).mode == "safe_stop"
+    assert controller.rearm(6.45) == ""
+    assert answer(controller, 5, 6.5).mode == "drive"
+
+
+def test_a_service_without_a_vehicle_needs_no_permission():
+    assert answer(make(armed_at_start=False), 0, 0.0).mode == "drive"
+
+
+def test_an_answer_to_a_state_older_than_two_periods_stops():
+    """As after SIGSTOP and SIGCONT, where the state waited and the policy itself was quick."""
+    controller = make()
+    controller.begin(Received(make_state(0), 0.0, 0), 0.9)
+    order = controller.finish(GOOD, QUICK_NS, 0.901)
+    assert (order.mode, order.reason) == ("safe_stop", "inference_too_long")
 
 
 def test_a_safe_stop_holds_the_last_steering():

@@ -63,6 +63,56 @@ def test_a_delayed_message_of_an_earlier_simulator_does_not_go_back():
     assert reason_of(latest, make_state(8), 2.0) is None
 
 
+def test_no_state_from_further_ahead_than_a_simulator_can_be():
+    latest = LatestState()
+    latest.offer(make_state(5, episode=2), 10.0)
+    for state in (make_state(10_006, episode=2), make_state(10_001, episode=3)):
+        assert reason_of(latest, state, 10.0) is Reason.FUTURE
+    assert reason_of(latest, make_state(0, episode=13), 10.0) is Reason.FUTURE
+    assert reason_of(latest, make_state(6, episode=2), 10.0) is None  # and none of them counts
+    assert reason_of(latest, make_state(10_006, episode=2), 10.0) is None
+    assert reason_of(latest, make_state(10_000, episode=12), 10.0) is None
+
+
+def test_after_an_outage_a_simulator_may_be_far_ahead():
+    latest = LatestState()
+    latest.offer(make_state(0), 0.0)
+    assert reason_of(latest, make_state(20_001), 100.0) is Reason.FUTURE
+    assert reason_of(latest, make_state(20_000), 100.0) is None
+    assert reason_of(latest, make_state(0, episode=31), 120.0) is Reason.FUTURE
+    assert reason_of(latest, make_state(0, episode=30), 120.0) is None
+
+
+def test_the_first_state_of_a_session_may_stand_anywhere():
+    assert LatestState().offer(make_state(10**12, episode=10**9), 0.0) is None
+
+
+def test_a_rejection_says_both_places():
+    latest = LatestState()
+    latest.offer(make_state(7, episode=1), 0.0)
+    rejection = latest.offer(make_state(3, episode=1), 0.1)
+    assert rejection is not None
+    assert rejection.detail == "episode 1 step 3 after episode 1 step 7"
+
+
+def test_only_sixteen_sessions_are_remembered():
+    latest = LatestState()
+    for number in range(17):
+        assert latest.offer(make_state(0, session=f"s{number}"), number * 1.0) is None
+    assert reason_of(latest, make_state(0, session="s1"), 20.0) is Reason.DUPLICATE
+    assert reason_of(latest, make_state(0, session="s0"), 21.0) is None  # forgotten
+
+
+def test_a_session_that_is_heard_again_is_remembered_longest():
+    latest = LatestState()
+    for number in range(16):
+        latest.offer(make_state(0, session=f"s{number}"), number * 1.0)
+    latest.offer(make_state(1, session="s0"), 16.0)
+    latest.offer(make_state(0, session="new"), 17.0)
+    assert reason_of(latest, make_state(1, session="s0"), 18.0) is Reason.DUPLICATE
+    assert reason_of(latest, make_state(0, session="s1"), 19.0) is None
+
+
 messages = st.tuples(
     st.sampled_from(["a", "b", "c"]), st.integers(0, 3), st.integers(0, 5), st.floats(0, 0.3)
 )

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import time
 
 import pytest
 
-from edge_runtime.tests.harness import BLACK, WHITE, EdgeProcess, Simulator, make_state, wait_until
+from edge_runtime.tests.harness import (
+    BLACK,
+    WHITE,
+    EdgeProcess,
+    Simulator,
+    make_state,
+    run_command,
+    wait_until,
+)
 from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
 
@@ -175,6 +184,14 @@ def test_status_and_rearm_without_a_vehicle(edge_and_simulator):
     simulator.ask(make_state(0))
     status = simulator.query("status")
     assert status["accepted"] == 1
+    assert 0 < status["inference_ms"]["max"] <= status["command_ms"]["max"]
+    assert 10 < status["rss_mb"] < 500
+    assert status["load_1min"] >= 0
+    table = run_command("status", "--connect", simulator.endpoint).stdout
+    assert "1 accepted" in table
+    assert f"{status['policy_id'][:12]} (left_turn)" in table
+    whole = run_command("status", "--connect", simulator.endpoint, "--json").stdout
+    assert set(json.loads(whole)) == set(status)
     assert status["manifest"]["scenario"] == "left_turn"
     assert {"mode", "reason", "rejected", "deadline_misses", "policy_id"} <= set(status)
     assert not simulator.query("rearm")["accepted"]
@@ -204,6 +221,35 @@ def rearm_while_driving(simulator, step):
         if simulator.query("rearm")["accepted"]:
             return attempt + 1
     raise AssertionError("no re-arm was taken")
+
+
+def test_a_second_runtime_with_the_same_vehicle_id_does_not_start(edge_and_simulator, make_policy):
+    edge, simulator = edge_and_simulator()
+    flags = [*make_policy().flags, "--connect", simulator.endpoint]
+    second = run_command("run", *flags)
+    assert (second.returncode, second.stdout) == (2, "")
+    assert second.stderr.count("\n") == 1
+    assert "another edge runtime" in second.stderr
+    assert "hunter01" in second.stderr
+    assert simulator.ask(make_state(0, final=True)).mode == "drive"
+    assert edge.end() == 0
+
+
+def test_of_two_runtimes_that_meet_later_the_younger_gives_way(make_policy):
+    """Both started before the simulator, so that neither could know of the other."""
+    endpoint, flags = free_endpoint(), make_policy().flags
+    edges = [EdgeProcess(*flags, "--connect", endpoint) for _ in range(2)]
+    with edges[0], edges[1], Simulator(endpoint) as simulator:
+        ended = wait_until(
+            lambda: [edge for edge in edges if edge.process.poll() is not None], "one of them ends"
+        )
+        assert [edge.process.returncode for edge in ended] == [2]
+        last_line = ended[0].process.stderr.read().splitlines()[-1]
+        assert last_line.startswith("error: another edge runtime")
+        assert simulator.ask(make_state(0, final=True)).mode == "drive"
+        assert last_health(simulator, lambda h: h.rivals == 1)
+        (left,) = set(edges) - set(ended)
+        assert left.end() == 0
 
 
 def test_it_waits_for_a_simulator_and_ends_without_one(make_policy):

@@ -10,11 +10,15 @@ import edge_runtime
 from edge_runtime.safety import (
     FAULTS,
     FRESH_STATES_TO_RECOVER,
+    MAX_INFERENCE_S,
+    MAX_PAUSE_S,
+    SILENCE_S,
     TRANSITIONS,
     Event,
     Mode,
     Safety,
     advance,
+    classify_arrival,
     classify_fresh,
     is_silent,
     note_arrival,
@@ -31,22 +35,79 @@ EXPECTED = {
     Event.SILENT: (STANDBY, STOP, STOP),
     Event.NOT_FINITE: (STOP, STOP, STOP),
     Event.TOO_LONG: (STOP, STOP, STOP),
+    Event.PAUSED: (STOP, STOP, STOP),
+    Event.OTHER_SESSION: (STOP, STOP, STOP),
+    Event.NOT_ARMED: (STOP, STOP, STOP),
     Event.VEHICLE: (STOP, STOP, STOP),
     Event.REARM: (STANDBY, DRIVE, STOP),
 }
 
 
+GOOD = {"fresh_state", "recovered", "final_state"}
+# The words that health and commands say: a reader on the other end compares with them.
+BAD = {
+    "no_fresh_state", "output_not_finite", "inference_too_long",
+    "pause_too_long", "other_session", "not_armed",
+}  # fmt: skip
+
+
+def test_the_events_are_the_good_the_bad_and_the_permission():
+    assert {event.value for event in Event} == GOOD | BAD | {"rearm"}
+    assert {event.value for event in FAULTS} == BAD
+
+
+@pytest.mark.parametrize("rearmed", [False, True])
 @pytest.mark.parametrize("mode", Mode)
 @pytest.mark.parametrize("event", Event)
-def test_every_pair(mode, event):
+def test_every_pair(mode, event, rearmed):
+    """Of the whole record: where it goes, why, and what it remembers."""
     expected = EXPECTED[event][list(Mode).index(mode)]
-    after = advance(Safety(mode=mode, reason="before" if mode is STOP else ""), event)
+    stopped = mode is STOP
+    before = Safety(mode, "before" if stopped else "", 3, rearmed, 7.5, "s", 9)
+    after = advance(before, event)
     assert after.mode is expected
-    assert after.safe_stops == int(mode is not STOP and expected is STOP)
+    assert after.safe_stops == 9 + int(not stopped and expected is STOP)
     if expected is not STOP:
         assert after.reason == ""
     else:
-        assert after.reason == (event.value if event in FAULTS else "before")
+        assert after.reason == (event.value if event.value in BAD else "before")
+    assert after.fresh_in_a_row == (0 if event.value in BAD else 3 + int(event.value in GOOD))
+    kept = rearmed or event is Event.REARM
+    assert after.rearmed == (kept and expected is STOP and event.value not in BAD)
+    assert (after.last_fresh_s, after.session) == (7.5, "s")
+
+
+def test_the_limits_are_the_contracts():
+    assert (SILENCE_S, MAX_INFERENCE_S, FRESH_STATES_TO_RECOVER) == (0.2, 0.1, 5)
+    assert MAX_PAUSE_S == 10.0
+    assert Safety() == (STANDBY, "", 0, False, None, None, 0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "gap_s", "session", "without", "with_vehicle"),
+    [
+        (STANDBY, 0.2, "a", None, None),
+        (STANDBY, 0.3, "a", Event.SILENT, Event.SILENT),
+        (STANDBY, 10.0, "a", Event.SILENT, Event.SILENT),
+        (STANDBY, 10.001, "a", Event.SILENT, Event.PAUSED),
+        (STANDBY, 0.1, "b", None, Event.OTHER_SESSION),
+        (STANDBY, 60.0, "b", Event.SILENT, Event.OTHER_SESSION),
+        (DRIVE, 0.2, "a", None, None),
+        (DRIVE, 60.0, "a", Event.SILENT, Event.SILENT),
+        (DRIVE, 0.2, "b", None, Event.OTHER_SESSION),
+        (STOP, 60.0, "a", Event.SILENT, Event.SILENT),
+        (STOP, 0.2, "b", None, Event.OTHER_SESSION),
+    ],
+)
+def test_what_the_time_before_a_state_means(mode, gap_s, session, without, with_vehicle):
+    safety = note_arrival(Safety(mode), "a", 0.0)
+    assert classify_arrival(safety, session, gap_s, needs_rearm=False) is without
+    assert classify_arrival(safety, session, gap_s, needs_rearm=True) is with_vehicle
+
+
+@pytest.mark.parametrize("needs_rearm", [False, True])
+def test_before_the_first_state_of_all_nothing_was_due(needs_rearm):
+    assert classify_arrival(Safety(), "a", 50.0, needs_rearm) is None
 
 
 def test_the_table_holds_every_pair_and_no_other():
@@ -109,7 +170,7 @@ def test_an_episode_end_does_not_end_a_safe_stop():
 
 
 def test_silence_begins_after_two_periods():
-    safety = note_arrival(Safety(), 10.0)
+    safety = note_arrival(Safety(), "a", 10.0)
     assert is_silent(Safety(), 0.0)
     assert not is_silent(safety, 10.2)
     assert is_silent(safety, 10.201)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.tests.harness import wait_until
@@ -94,6 +94,7 @@ def test_a_leap_is_a_lie_until_that_speed_could_be_real():
     assert watch.fault(now_s + 0.3) == ""
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=1, max_size=30))
 def test_the_mock_is_never_accused(pedals):
     """Whatever a policy asks at the control rate, reported at the feedback's."""

@@ -13,6 +13,12 @@ from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import Command, Feedback, Health, Reason, Rejection, State
 
+HEALTH = Health(
+    vehicle_id="hunter01", vehicle="none", mode="standby", reason="", needs_rearm=False,
+    accepted=0, superseded=0, rejected={}, deadline_misses=0, safe_stops=0, policy_id="p",
+    inference_ms={}, uptime_s=0.0, sent_ns=0, command_ms={"p50": 1.5}, temperature_c=40.0,
+    load_1min=0.5, rss_mb=90.0, rivals=1,
+)  # fmt: skip
 DECODERS = {
     State: wire.decode_state,
     Command: wire.decode_command,
@@ -78,6 +84,11 @@ MESSAGES = {
         inference_ms=st.dictionaries(st.sampled_from(["p50", "p99", "max"]), finite),
         uptime_s=finite,
         sent_ns=counts,
+        command_ms=st.dictionaries(st.sampled_from(["p50", "p99", "max"]), finite),
+        temperature_c=st.none() | finite,
+        load_1min=finite,
+        rss_mb=finite,
+        rivals=counts,
     ),
 }
 
@@ -186,6 +197,19 @@ def test_a_command_outside_the_range_is_rejected(action):
 )
 def test_hostile_nesting_and_lengths(nested):
     assert isinstance(wire.decode_state(b"\x82\xa6schema\x01\xa1x" + nested), Rejection)
+
+
+def test_the_health_of_an_earlier_version_is_understood_and_so_is_ours_by_it():
+    later = {"command_ms", "temperature_c", "load_1min", "rss_mb", "rivals"}
+    fields = as_map(HEALTH)
+    health = wire.decode_health(
+        msgspec.msgpack.encode({k: v for k, v in fields.items() if k not in later})
+    )
+    assert isinstance(health, Health)
+    assert (health.command_ms, health.temperature_c, health.rivals) == ({}, None, 0)
+    old_kind = msgspec.defstruct("Old", [("vehicle_id", str), ("mode", str), ("sent_ns", int)])
+    old = msgspec.msgpack.decode(wire.encode(HEALTH), type=old_kind)
+    assert old.mode == "standby"  # type: ignore[attr-defined]
 
 
 def test_keys():

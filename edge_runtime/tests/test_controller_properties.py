@@ -1,0 +1,185 @@
+"""Any history of states, silences, answers and permissions against what the contract forbids.
+
+The test keeps its own few facts (the last fault, the states since, the last permission) and never
+looks at the table: a command to drive is held against the facts alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import List, Optional
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
+
+from edge_runtime.controller import Controller, Order, Received
+from edge_runtime.limiter import LimitRow, limit_rows
+from edge_runtime.tests.harness import make_state
+from edge_runtime.tests.policies import PEDAL, STEERING
+from edge_runtime.vehicles.interface import ActionLimit
+
+T = 0.1
+LONGEST_PAUSE_S = 10.0
+JUST_AFTER_S = 1e-6
+SLOW = {"pedal": ActionLimit(-1.0, 0.5, 2.0), "steering": ActionLimit(-0.4, 0.4, 1.0)}
+
+gaps = st.sampled_from([0.001, 0.05, T, T, T, 0.19, 0.2, 0.21, 1.0, 9.0, 11.0])
+durations = st.sampled_from([0.001, 0.001, 0.001, 0.06, 0.099, 0.101, 0.5])
+waits = st.sampled_from([0.0, 0.0, 0.0, 0.05, 0.3])
+numbers = st.one_of(st.floats(-3, 3), st.sampled_from([0.0, 0.0, math.nan, math.inf, -math.inf]))
+
+
+class AnyHistory(RuleBasedStateMachine):
+    vehicle = False
+    armed_at_start = True
+
+    @initialize()
+    def start(self) -> None:
+        self.rows: List[LimitRow] = limit_rows([PEDAL, STEERING], SLOW if self.vehicle else {})
+        self.controller = Controller(self.rows, self.vehicle, self.armed_at_start)
+        self.now_s = 100.0
+        self.step = 0
+        self.session = 0
+        self.arrived_s: Optional[float] = None
+        self.good_in_a_row = 0
+        self.permitted = self.armed_at_start
+        self.last: Optional[Order] = None
+        self.stop_s: Optional[float] = None  # the last safe stop, while the watchdog is on time
+
+    @rule(count=st.integers(1, 7), gap_s=gaps, final=st.booleans(), late=st.booleans())
+    def good_states(self, count, gap_s, final, late):
+        for left in reversed(range(count)):
+            self._state([0.5, 0.1], gap_s, late=late, final=final and left == 0)
+
+    @rule(
+        output=st.lists(numbers, min_size=2, max_size=2), gap_s=gaps, wait_s=waits,
+        duration_s=durations, final=st.booleans(), late=st.booleans(),
+    )  # fmt: skip
+    def any_state(self, output, **how):
+        self._state(output, **how)
+
+    @rule(gap_s=gaps)
+    def another_simulator(self, gap_s):
+        self.session += 1
+        self._fault()
+        self.permitted = self.permitted and self.arrived_s is None
+        self._state([0.5, 0.1], max(gap_s, 2 * T))
+
+    @rule(duration_s=st.sampled_from([0.05, 0.25, 2.0, 12.0]))
+    def nothing_comes(self, duration_s):
+        self._pass(duration_s, late=False)
+
+    @rule()
+    def the_operator_permits(self):
+        if self.controller.rearm(self.now_s) == "":
+            assert self.vehicle
+            assert self.arrived_s is not None
+            assert self.now_s - self.arrived_s <= 2 * T
+            self.permitted = True
+
+    def _state(self, output, gap_s, wait_s=0.0, duration_s=0.001, final=False, late=False):
+        """A state comes after `gap_s`, waits for the policy, and is answered."""
+        self._pass(gap_s, late)
+        pause_s = 0.0 if self.arrived_s is None else self.now_s - self.arrived_s
+        if pause_s > 2 * T:
+            self._fault()
+        if pause_s > LONGEST_PAUSE_S:
+            self.permitted = False
+        self.arrived_s = self.now_s
+        self.step += 1
+        state = make_state(self.step, session=f"s{self.session}", final=final)
+        received = Received(state, self.now_s, 0)
+        self._pass(wait_s, late)
+        self.controller.begin(received, self.now_s)
+        self._pass(duration_s, late)
+        in_time = duration_s <= T and self.now_s - received.arrived_s <= 2 * T
+        if in_time and np.all(np.isfinite(output)):
+            self.good_in_a_row += 1
+        else:
+            self._fault()
+        answer = np.array(output, np.float32)
+        order = self.controller.finish(answer, int(duration_s * 1e9), self.now_s)
+        if order is not None:
+            self._note(order)
+
+    def _fault(self) -> None:
+        """What happened starts the count again, and takes back a permission not yet used."""
+        self.good_in_a_row = 0
+        if self._is_stopped():
+            self.permitted = False
+
+    def _is_stopped(self) -> bool:
+        return self.last is not None and self.last.mode == "safe_stop"
+
+    def _pass(self, duration_s: float, late: bool) -> None:
+        """Let time go by with a watchdog on time, or one that gets no processor."""
+        end_s = self.now_s + duration_s
+        if late:
+            self.stop_s = None
+            self.now_s = end_s
+            return
+        while True:
+            due_s = self.controller.next_deadline_s()
+            if due_s is None or due_s + JUST_AFTER_S > end_s:
+                break
+            self.now_s = max(self.now_s, due_s + JUST_AFTER_S)
+            order = self.controller.tick(self.now_s)
+            if order is not None:
+                self._check_tick(order)
+                self._note(order)
+        self.now_s = end_s
+        if self.last is not None and self.last.mode == "drive" and not self.last_is_final:
+            assert self.arrived_s is not None
+            assert self.now_s - self.arrived_s <= 2 * T + 2 * JUST_AFTER_S
+
+    def _check_tick(self, order: Order) -> None:
+        assert order.mode == "safe_stop"
+        if self.stop_s is not None and order.reason != "inference_too_long":
+            assert self.now_s - self.stop_s == pytest.approx(T, abs=1e-4)
+
+    def _note(self, order: Order) -> None:
+        if order.mode == "drive":
+            self._check_drive(order)
+        else:
+            assert order.mode == "safe_stop"
+            assert order.reason
+            assert order.action[0] == self.rows[0].low
+            if self.stop_s is not None:
+                assert self.now_s - self.stop_s <= T + 1e-4
+            self.permitted = self.permitted and self._is_stopped()
+        for value, row in zip(order.action, self.rows):
+            assert row.low <= value <= row.high
+        self.last = order
+        self.last_is_final = order.answers.state.final
+        self.stop_s = self.now_s if self._is_stopped() else None
+
+    def _check_drive(self, order: Order) -> None:
+        assert self.good_in_a_row >= (5 if self._is_stopped() else 1)
+        assert self.permitted or not self.vehicle
+        assert order.reason == ""
+        assert self.now_s - order.answers.arrived_s <= 2 * T
+        before = self.last.action if self.last else [0.0, 0.0]
+        for value, last, row in zip(order.action, before, self.rows):
+            assert math.isfinite(value)
+            assert abs(value - last) <= row.max_step + 1e-9
+
+
+class AnyHistoryWithVehicle(AnyHistory):
+    vehicle = True
+
+
+class AnyHistoryOfAService(AnyHistory):
+    vehicle = True
+    armed_at_start = False
+
+
+_SETTINGS = settings(max_examples=60, stateful_step_count=30, deadline=None, derandomize=True)
+TestAnyHistory = AnyHistory.TestCase
+TestAnyHistoryWithVehicle = AnyHistoryWithVehicle.TestCase
+TestAnyHistoryOfAService = AnyHistoryOfAService.TestCase
+TestAnyHistory.settings = _SETTINGS
+TestAnyHistoryWithVehicle.settings = _SETTINGS
+TestAnyHistoryOfAService.settings = _SETTINGS
