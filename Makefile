@@ -8,7 +8,7 @@ PEERS_STAMP := $(PEERS)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu bench-loop lock clean
+.PHONY: help install demo test test-ray lint format bench bench-quick bench-gpu bench-loop recording lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -65,6 +65,9 @@ bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
 	@mkdir -p $(BENCH)
 	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
+
+recording: $(STAMP)  ## drive and record anew what the next release is replayed against
+	$(BIN)/python -m hil_tests.recordings.make
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new

@@ -6,7 +6,8 @@ import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from bridge import simulate, view
+from bridge import record, replay, simulate, view
+from bridge.recording import repair
 from edge_runtime.cli import ArgumentParser, run_cli
 
 
@@ -23,6 +24,17 @@ SUBCOMMANDS = {
         simulate.add_arguments,
         simulate.simulate,
         "serve an environment to an edge runtime over Zenoh, and report",
+    ),
+    "record": Subcommand(
+        record.add_arguments, record.record, "write everything on the wire to an MCAP recording"
+    ),
+    "repair": Subcommand(
+        repair.add_arguments, repair.repair, "give a recording that was cut off its index back"
+    ),
+    "replay": Subcommand(
+        replay.add_arguments,
+        replay.replay,
+        "run recorded states through a policy or runtime, and compare its commands",
     ),
     "view": Subcommand(view.add_arguments, view.view, "show the wire in rerun, live or in a file"),
 }

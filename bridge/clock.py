@@ -19,6 +19,8 @@ class Clock(Protocol):
     """From state sent to command received, injected delays included; one per answered state."""
     tick_overruns: int
     """Ticks that began so late that the simulation slipped behind the wall clock."""
+    missed_ticks: int
+    """Whole ticks of the wall clock that went by without a state because of it."""
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode; ``seed`` decides the delays and losses of the link."""

@@ -15,12 +15,13 @@ UNKNOWN_STEP = "unknown_step"
 class CommandCheck:
     """Reads commands for one simulator session and keeps the counts of the whole run.
 
+    ``policy_ids`` holds the policies that answered, each once, in order of appearance.
     One thread at a time: the clock that owns it.
     """
 
     def __init__(self, session: str, action_size: int) -> None:
         self.rejected: Counter[str] = Counter()
-        self.policy_id = ""
+        self.policy_ids: list[str] = []
         self._session = session
         self._action_size = action_size
         self._episode = 0
@@ -58,7 +59,8 @@ class CommandCheck:
             return None
         if self._overtaken(command):
             return None
-        self.policy_id = command.policy_id
+        if command.policy_id not in self.policy_ids:
+            self.policy_ids.append(command.policy_id)
         return command
 
     def reject(self, reason: str) -> None:

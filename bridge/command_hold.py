@@ -35,6 +35,8 @@ class Decision:
     """Why the vehicle brakes; empty while it obeys the command."""
     undriven_s: float
     """Time since the newest ``drive`` command arrived (since the episode began, if none has)."""
+    command_age_s: float | None = None
+    """From the sending of the state that the obeyed command answers; None where none is obeyed."""
 
 
 class CommandHold:
@@ -44,6 +46,7 @@ class CommandHold:
         self.newest: Command | None = None
         self._heard_s = now_s
         self._driven_s = now_s
+        self._sent_s = now_s
         self._fresh = False
 
     @property
@@ -51,8 +54,10 @@ class CommandHold:
         """Return the step of the newest command; -1 before the first."""
         return -1 if self.newest is None else self.newest.step
 
-    def admit(self, command: Command, now_s: float) -> bool:
+    def admit(self, command: Command, now_s: float, sent_s: float) -> bool:
         """Take the command if it is newer than the newest one; return whether it was taken.
+
+        ``sent_s`` is when the state was sent that the command answers.
 
         An edge runtime in safe stop repeats its answer to the last state it heard at rate 1/T;
         such a repetition is as good a heartbeat as a new answer. A repeated ``drive`` is not: it
@@ -61,7 +66,7 @@ class CommandHold:
         if self.newest is not None and not _supersedes(command, self.newest):
             return False
         self.newest = command
-        self._heard_s = now_s
+        self._heard_s, self._sent_s = now_s, sent_s
         if command.mode == "drive":
             self._driven_s = now_s
         self._fresh = True
@@ -73,11 +78,14 @@ class CommandHold:
         ``edge_silence_s`` is given when lock-step has waited in vain: virtual time stood still
         meanwhile, so the wall time without an answer (s) counts in its place.
         """
+        brake_reason = self._brake_reason(now_s, edge_silence_s)
+        obeys = self.newest is not None and not brake_reason
         decision = Decision(
             command=self.newest,
             fresh=self._fresh,
-            brake_reason=self._brake_reason(now_s, edge_silence_s),
+            brake_reason=brake_reason,
             undriven_s=now_s - self._driven_s if edge_silence_s is None else edge_silence_s,
+            command_age_s=now_s - self._sent_s if obeys else None,
         )
         self._fresh = False
         return decision

@@ -20,6 +20,7 @@ class EdgeCounts:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._rejected: Counter[str] = Counter()
+        self._changes = 0
         self._last: Health | None = None
 
     @property
@@ -27,6 +28,18 @@ class EdgeCounts:
         """Return the states rejected by reason, without zeros."""
         with self._lock:
             return dict(self._rejected)
+
+    @property
+    def changes(self) -> int:
+        """Return how often another edge runtime took over, or the same was started again."""
+        with self._lock:
+            return self._changes
+
+    @property
+    def policy_id(self) -> str:
+        """Return the policy of the newest health; empty before the first."""
+        with self._lock:
+            return "" if self._last is None else self._last.policy_id
 
     def observe_message(self, payload: bytes) -> None:
         """Take a health message; one that cannot be read is left out."""
@@ -50,8 +63,10 @@ class EdgeCounts:
             self._last = health
             if last is None:
                 return
-            # A restarted edge runtime has a younger clock, and counts from zero.
-            before = last.rejected if health.uptime_s >= last.uptime_s else {}
+            # A restarted edge runtime has a younger clock; it and another one count for themselves.
+            another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id
+            self._changes += another
+            before = {} if another else last.rejected
             grown = Counter(health.rejected)
             grown.subtract(before)
             self._rejected += grown

@@ -6,11 +6,14 @@ trainer itself.
 
 from __future__ import annotations
 
+import contextlib
+import importlib.metadata
 import re
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import namespace
 from gymnasium.spaces import Box
 
 from edge_runtime.cli import UserError
@@ -22,6 +25,8 @@ _REGISTERED_BY = {"phil": "trainer.scenarios"}
 """Namespace of a gymnasium id -> the module that registers it."""
 NOMINAL, VARIANT = CONDITIONS = ("nominal", "variant")
 """Scenes that can be served: the one that was trained in, and one with other traffic."""
+
+PLUGIN_GROUP, ROOT = "gymnasium.envs", "__root__"
 
 HINT = f"use {', '.join(SCENARIOS)}, a gymnasium id, or module:id"
 _NAME = re.compile(r"(?:\w+(?:\.\w+)*:)?[^:\s]+")
@@ -39,6 +44,7 @@ def make_environment(name: str, condition: str = NOMINAL) -> gymnasium.Env[Any, 
     if not _NAME.fullmatch(environment_id):
         raise UserError(f"{name!r} names no environment; {HINT}")
     try:
+        load_plugin(environment_id)
         options: dict[str, Any] = {} if condition == NOMINAL else {"scene": condition}
         environment = gymnasium.make(environment_id, **options)
     except (Exception, SystemExit) as error:  # A module may raise anything when it is imported.
@@ -64,6 +70,25 @@ def _qualified_id(name: str) -> str:
     environment_id = SCENARIOS.get(name, name)
     module = _REGISTERED_BY.get(environment_id.partition("/")[0])
     return environment_id if module is None else f"{module}:{environment_id}"
+
+
+def load_plugin(environment_id: str) -> None:
+    """Let an installed package register the id, as Gymnasium did by itself before 1.0.
+
+    Such a package declares an entry point of the group ``gymnasium.envs``: its name is the
+    namespace of its ids (ROOT: none), its value a function that registers them. Only what the id
+    needs is imported.
+    """
+    if ":" in environment_id or environment_id in gymnasium.registry:
+        return
+    wanted = environment_id.rpartition("/")[0]
+    for plugin in importlib.metadata.entry_points(group=PLUGIN_GROUP):
+        space = "" if plugin.name == ROOT else plugin.name
+        if space == wanted:
+            register = plugin.load()
+            with namespace(space) if space else contextlib.nullcontext():
+                if callable(register):  # A module has registered them by being imported.
+                    register()
 
 
 def _check_spaces(environment: gymnasium.Env[Any, Any], name: str) -> None:

@@ -37,6 +37,8 @@ class EpisodeRunner:
     ) -> None:
         self.safe_stops = SafeStopLog(CONTROL_PERIOD_S)
         self.deadline_misses = 0
+        self.command_ages_ms: list[float] = []
+        """Of the command that the vehicle obeyed, for each tick in which it obeyed one."""
         self._under_way: State | None = None
         self._environment = environment
         self._clock = clock
@@ -121,6 +123,8 @@ class EpisodeRunner:
 
     def _note(self, state: State, decision: Decision, speed_mps: float) -> None:
         self.deadline_misses += not decision.fresh
+        if decision.command_age_s is not None:
+            self.command_ages_ms.append(decision.command_age_s * 1e3)
         self.safe_stops.observe(state.episode, state.step, decision, speed_mps)
         self._on_tick(state.episode, state.step, decision)
 

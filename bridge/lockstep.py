@@ -45,6 +45,7 @@ class LockStepClock:
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
         self.tick_overruns = 0
+        self.missed_ticks = 0
         self._publish = publish
         self._check = check
         self._spec = spec
@@ -58,6 +59,7 @@ class LockStepClock:
         self._hold = CommandHold(now_s=0.0)
         self._under_way: EventHeap[State | _Answer] = EventHeap()
         self._published_step = -1
+        self._admitted_s = 0.0
         self._answered_at_s: float | None = None
         self._edge_silent = False
 
@@ -77,7 +79,10 @@ class LockStepClock:
                 self._arrive_at_vehicle(message, arrival_s)
             else:
                 self._arrive_at_edge(message, arrival_s)
-        return self._hold.decide(window_end_s, self._wall_silence_s())
+        # Answered already, the vehicle acts at once: nothing newer can come in this tick.
+        answered = self._hold.newest_step >= state.step
+        acts_s = self._admitted_s if answered else window_end_s
+        return self._hold.decide(acts_s, self._wall_silence_s())
 
     def finish(self, state: State) -> None:
         """Publish the final state at once; nobody waits for an answer to it."""
@@ -92,9 +97,10 @@ class LockStepClock:
             self._under_way.push(arrival_s, message)
 
     def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
-        if not self._hold.admit(answer.command, now_s):
+        if not self._hold.admit(answer.command, now_s, answer.sent_s):
             self._check.reject(Reason.STALE.value)
             return
+        self._admitted_s = now_s
         self.latencies_ms.append((now_s - answer.sent_s + answer.round_trip_s) * 1e3)
 
     def _arrive_at_edge(self, state: State, now_s: float) -> None:

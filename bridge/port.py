@@ -12,6 +12,7 @@ import zenoh
 
 from bridge.edge_counts import EdgeCounts
 from bridge.environments import scene_of
+from bridge.feed import connect_client
 from bridge.scene import encode_scene, scene_key
 from edge_runtime.cli import UserError
 from edge_runtime.transport import open_session
@@ -93,6 +94,11 @@ class SimulatorPort:
             if reply.ok is not None:
                 self.edge_counts.observe_status(reply.ok.payload.to_bytes())
 
+    def edge_policy_id(self) -> str:
+        """Return the policy that the edge runtime says it drives; empty if it says nothing."""
+        self.note_edge_counts()
+        return self.edge_counts.policy_id
+
     def _edge_is_there(self) -> bool:
         """Its token is seen, or it answers: the board's Zenoh can lose the token for a while."""
         alive = key(self._vehicle_id, "alive")
@@ -112,9 +118,18 @@ class SimulatorPort:
 
 
 @contextlib.contextmanager
-def open_port(listen: str, vehicle_id: str) -> Iterator[SimulatorPort]:
-    """Listen at ``listen`` for the edge runtime; UserError if the port is busy."""
-    zenoh_session = open_session(listen=listen, mode="router")
+def open_port(
+    listen: str | None, vehicle_id: str, connect: str | None = None, wait_s: float = 0.0
+) -> Iterator[SimulatorPort]:
+    """Listen at ``listen`` for the edge runtime, or share the router at ``connect`` with others.
+
+    UserError if the port is busy, or if no router answers within ``wait_s``.
+    """
+    # Behind a router a client: two peers there would not hear one another.
+    if connect is not None:
+        zenoh_session = connect_client(connect, wait_s)
+    else:
+        zenoh_session = open_session(listen=listen, mode="router")
     try:
         port = SimulatorPort(zenoh_session, vehicle_id)
         try:

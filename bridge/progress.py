@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -34,13 +34,24 @@ class EpisodeBar:
 @contextlib.contextmanager
 def episode_bar(episodes: int) -> Iterator[EpisodeBar]:
     """Show a bar on stderr while the block runs; nothing if stderr is no terminal."""
+    with _progress("episodes") as progress:
+        yield EpisodeBar(progress, episodes)
+
+
+@contextlib.contextmanager
+def count_bar(unit: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show a bar like ``episode_bar``; call what it yields with how many are done."""
+    with _progress(unit) as progress:
+        task = progress.add_task("replaying", total=total)
+        yield lambda done: progress.update(task, completed=done)
+
+
+def _progress(unit: str) -> Progress:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("episodes"),
+        TextColumn(unit),
         TimeElapsedColumn(),
     )
-    disable = not sys.stderr.isatty()
-    with Progress(*columns, console=Console(stderr=True), disable=disable) as progress:
-        yield EpisodeBar(progress, episodes)
+    return Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty())

@@ -29,6 +29,7 @@ class RealTimeClock:
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
         self.tick_overruns = 0
+        self.missed_ticks = 0
         self._publish = publish
         self._check = check
         self._spec = spec
@@ -84,6 +85,7 @@ class RealTimeClock:
         late_s = time.monotonic() - tick_s
         if late_s > COMMAND_WINDOW_S:
             self.tick_overruns += 1
+            self.missed_ticks += int(late_s / CONTROL_PERIOD_S)
             self._start_s += late_s
             return tick_s + late_s
         time.sleep(max(0.0, -late_s))
@@ -105,7 +107,7 @@ class RealTimeClock:
             if command is None:
                 return
             answered_step = self._hold.newest_step
-            if not self._hold.admit(command, now_s):
+            if not self._hold.admit(command, now_s, self._sent_s[command.step]):
                 self._check.reject(Reason.STALE.value)
                 return
             if command.step > answered_step:

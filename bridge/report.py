@@ -12,13 +12,15 @@ import numpy as np
 from bridge.safe_stops import SafeStopEvent
 from edge_runtime.episode_report import EpisodeResult, summarise
 
+QUANTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 
-def latency_summary(latencies_ms: Sequence[float]) -> dict[str, float | None]:
-    """Return p50, p99 and max of state sent to command received, ms; None if none came."""
-    if not latencies_ms:
-        return {"p50": None, "p99": None, "max": None}
-    p50, p99 = np.percentile(latencies_ms, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "max": float(max(latencies_ms))}
+
+def quantiles(values_ms: Sequence[float]) -> dict[str, float | None]:
+    """Return p50, p90, p99 and max of times in ms; None each if there are none."""
+    if not values_ms:
+        return dict.fromkeys(QUANTILES)
+    found = np.percentile(values_ms, list(QUANTILES.values()))
+    return dict(zip(QUANTILES, map(float, found), strict=True))
 
 
 def rejections(by_edge: Mapping[str, int], by_simulator: Mapping[str, int]) -> dict[str, Any]:
@@ -34,27 +36,33 @@ def make_report(
     results: Sequence[EpisodeResult],
     safe_stop_events: Sequence[SafeStopEvent],
     latencies_ms: Sequence[float],
+    command_ages_ms: Sequence[float],
     counts: Mapping[str, Any],
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Join the summary of the episodes with what happened on the wire.
 
-    ``settings`` holds scenario, condition, policy_id, seed, clock and latency_spec; ``counts``
-    holds deadline_misses, tick_overruns and ``rejections``.
+    ``settings`` holds scenario, condition, policy_ids, seed, clock, latency_spec and wall_s;
+    ``counts`` holds deadline_misses, tick_overruns, missed_ticks, edge_changes and
+    ``rejections``. The report's policy_id is that of the policy that answered last.
     """
     return {
         **summarise(
             results,
             scenario=settings["scenario"],
             condition=settings["condition"],
-            policy_id=settings["policy_id"],
+            policy_id=settings["policy_ids"][-1] if settings["policy_ids"] else "",
             seed=settings["seed"],
         ),
-        "latency_ms": latency_summary(latencies_ms),
+        "policy_ids": list(settings["policy_ids"]),
+        "latency_ms": quantiles(latencies_ms),
+        "command_age_ms": quantiles(command_ages_ms),
         **counts,
         "safe_stops": len(safe_stop_events),
         "clock": settings["clock"],
         "latency_spec": settings["latency_spec"],
+        "wall_s": settings["wall_s"],
+        "times_real_time": sum(result.time_s for result in results) / settings["wall_s"],
         "safe_stop_events": [asdict(event) for event in safe_stop_events],
         "per_episode": [result.as_dict() for result in results],
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -41,7 +42,8 @@ class SimulateSettings:
     condition: str
     episodes: int
     clock: str
-    listen: str
+    listen: str | None
+    connect: str | None
     vehicle_id: str
     latency: LatencySpec
     seed: int
@@ -70,12 +72,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         default="lockstep",
         help="lockstep waits for each command; realtime waits for nobody",
     )
-    parser.add_argument(
-        "--listen",
-        metavar="PROTOCOL/HOST:PORT",
-        default=DEFAULT_ENDPOINT,
-        help="where the edge runtime and viewers connect to",
-    )
+    add_where(parser)
     parser.add_argument(
         "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to simulate"
     )
@@ -98,6 +95,28 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
 
 
+def add_where(parser: ArgumentParser) -> None:
+    """Declare --listen and --connect, of which one is taken (``check_where``)."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--listen",
+        metavar="PROTOCOL/HOST:PORT",
+        help=f"where the edge runtime and viewers connect to (default: {DEFAULT_ENDPOINT})",
+    )
+    where.add_argument(
+        "--connect",
+        metavar="PROTOCOL/HOST:PORT",
+        help="share a router with other vehicles instead of listening",
+    )
+
+
+def check_where(arguments: Any) -> tuple[str | None, str | None]:
+    """Return listen and connect, of which one is an endpoint and the other None."""
+    if arguments.connect is not None:
+        return None, check_endpoint(arguments.connect)
+    return check_endpoint(arguments.listen or DEFAULT_ENDPOINT), None
+
+
 def simulate(arguments: Any) -> int:
     """Run the command; UserError for anything the caller can put right."""
     settings = _check(arguments)
@@ -113,12 +132,14 @@ def simulate(arguments: Any) -> int:
 
 
 def _check(arguments: Any) -> SimulateSettings:
+    listen, connect = check_where(arguments)
     settings = SimulateSettings(
         env=arguments.env,
         condition=arguments.condition,
         episodes=arguments.episodes,
         clock=arguments.clock,
-        listen=check_endpoint(arguments.listen),
+        listen=listen,
+        connect=connect,
         vehicle_id=check_vehicle_id(arguments.vehicle_id),
         latency=parse_spec(arguments.latency),
         seed=arguments.seed,
@@ -132,14 +153,15 @@ def _check(arguments: Any) -> SimulateSettings:
 
 def _serve(settings: SimulateSettings, environment: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     action_size = (environment.action_space.shape or (1,))[0]
-    with open_port(settings.listen, settings.vehicle_id) as port:
+    wait_s = settings.wait_edge_s
+    with open_port(settings.listen, settings.vehicle_id, settings.connect, wait_s) as port:
         check = CommandCheck(port.session, action_size)
         with (
             _running_clock(settings, port.publish_state, check) as clock,
             episode_bar(settings.episodes) as bar,
         ):
             port.on_command(clock.receive)
-            port.wait_for_edge(settings.wait_edge_s, settings.listen)
+            port.wait_for_edge(wait_s, str(settings.connect or settings.listen))
             return _drive(settings, environment, port, clock, check, bar)
 
 
@@ -165,25 +187,31 @@ def _drive(
     runner = EpisodeRunner(environment, clock, port.session, port.publish_scene, bar.tick)
     results = []
     port.note_edge_counts()
+    started_s = time.monotonic()
     for episode in range(settings.episodes):
         results.append(runner.run(episode, settings.seed + episode))
         bar.done(episode + 1)
+    wall_s = time.monotonic() - started_s
     port.note_edge_counts()
     return make_report(
         results,
         runner.safe_stops.events,
         clock.latencies_ms,
+        runner.command_ages_ms,
         counts={
             "deadline_misses": runner.deadline_misses,
             "tick_overruns": clock.tick_overruns,
+            "missed_ticks": clock.missed_ticks,
+            "edge_changes": port.edge_counts.changes,
             **rejections(port.edge_counts.rejected, check.rejected),
         },
         settings={
             "scenario": scenario_of(settings.env),
             "condition": settings.condition,
-            "policy_id": check.policy_id,
+            "policy_ids": check.policy_ids,
             "seed": settings.seed,
             "clock": settings.clock,
             "latency_spec": str(settings.latency),
+            "wall_s": wall_s,
         },
     )

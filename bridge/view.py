@@ -12,11 +12,11 @@ from typing import Any
 import rerun as rr
 
 from bridge.arguments import non_negative_seconds
+from bridge.feed import Feed, Heard, open_feed
 from bridge.scene import decode_scene
 from bridge.signals import sigterm_as_interrupt
 from bridge.simulate import DEFAULT_VEHICLE_ID
 from bridge.viewer import sinks
-from bridge.viewer.feed import Feed, Heard, open_feed
 from bridge.viewer.wire_log import WireLog
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser
@@ -120,7 +120,10 @@ def _show(feed: Feed, log: WireLog, duration_s: float | None) -> None:
 
 
 def _write(log: WireLog, heard: Heard) -> None:
-    message = DECODERS[heard.topic](heard.payload)
+    decode = DECODERS.get(heard.topic)
+    if decode is None:
+        return  # A token: it shows as silence.
+    message = decode(heard.payload)
     if message is None or isinstance(message, wire.Rejection):
         log.write_unreadable(heard.topic, message.detail if message else "not a scene")
     else:

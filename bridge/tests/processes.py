@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -10,8 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+import numpy as np
+
 from bridge.__main__ import main
 from edge_runtime.cli import run_cli
+from edge_runtime.policy import load_policy
 from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, wait_until
 from edge_runtime.tests.policies import write_policy
 
@@ -23,12 +28,13 @@ SLOW_TOY = "bridge.tests.toy:BridgeToySlow-v0"
 class BridgeProcess:
     """``python -m bridge`` with a subcommand; killed at the end of the block if need be."""
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, *arguments: str, environment: dict[str, str] | None = None) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "bridge", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            env={**os.environ, **(environment or {})},
         )
         self.output, self.errors = "", ""
 
@@ -46,9 +52,10 @@ class BridgeProcess:
             self.process.communicate()
 
 
-def start_edge(endpoint: str, policy: Path) -> EdgeProcess:
+def start_edge(endpoint: str, policy: Path, *options: str) -> EdgeProcess:
     """Start ``python -m edge_runtime run`` with an unsigned test policy and wait until ready."""
-    return EdgeProcess("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
+    fixed = ("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
+    return EdgeProcess(*fixed, *options)
 
 
 def refuse(arguments: list[str]) -> int:
@@ -68,7 +75,7 @@ def wait_until_driving(edge: EdgeProcess) -> None:
 
 def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
     """Write a test policy file."""
-    path = folder / f"{kind}.onnx"
+    path = folder / f"{kind}{value:g}.onnx"
     write_policy(path, kind, value)
     return path
 
@@ -100,6 +107,19 @@ def simulate_undisturbed(
         if all(event["reason"] == "no_command" for event in report["safe_stop_events"]):
             return report
     raise AssertionError(f"disturbed {attempts} times: {report['safe_stop_events']}")
+
+
+def drive_in_process(policy_path: Path, seed: int) -> tuple[str, np.ndarray]:
+    """Drive one episode of TOY without any wire; return its outcome and actions."""
+    policy = load_policy(str(policy_path), allow_unsigned=True)
+    environment = gymnasium.make(TOY)
+    frames, info = environment.reset(seed=seed)
+    actions, ended = [], False
+    while not ended:
+        actions.append(policy.act(frames))
+        frames, _, terminated, truncated, info = environment.step(actions[-1])
+        ended = terminated or truncated
+    return info["outcome"], np.array(actions)
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -42,7 +42,7 @@ def test_a_good_command_passes_and_names_the_policy():
     check = checking()
     command = make_command(5, policy_id="abc")
     assert check.read(encode(command)) == command
-    assert (check.policy_id, dict(check.rejected)) == ("abc", {})
+    assert (check.policy_ids, dict(check.rejected)) == (["abc"], {})
 
 
 def test_an_earlier_episode_is_stale_but_an_overtaken_answer_is_no_fault():
@@ -58,13 +58,22 @@ def test_an_earlier_episode_is_stale_but_an_overtaken_answer_is_no_fault():
 
 def test_the_newest_command_is_held_for_2_periods_and_no_longer():
     hold = CommandHold(now_s=0.0)
-    assert hold.admit(make_command(0), now_s=0.01)
+    assert hold.admit(make_command(0), now_s=0.01, sent_s=0.01)
     assert hold.decide(0.025).brake_reason == ""
     held = hold.decide(0.2)
     assert (held.brake_reason, held.fresh, held.command) == ("", False, make_command(0))
     braking = hold.decide(0.22)
     assert braking.brake_reason == NO_COMMAND
     assert braking.undriven_s == pytest.approx(0.21)
+    assert braking.command_age_s is None  # It obeys none.
+
+
+def test_a_command_is_as_old_as_the_state_that_it_answers():
+    hold = CommandHold(now_s=0.0)
+    assert hold.decide(0.025).command_age_s is None
+    hold.admit(make_command(0), now_s=0.06, sent_s=0.0)
+    assert hold.decide(0.125).command_age_s == pytest.approx(0.125)
+    assert hold.decide(0.225).command_age_s == pytest.approx(0.225)
 
 
 def test_without_any_command_it_brakes_after_2_periods():
@@ -75,18 +84,18 @@ def test_without_any_command_it_brakes_after_2_periods():
 
 def test_a_repeated_drive_command_is_no_heartbeat_but_a_repeated_safe_stop_is():
     hold = CommandHold(now_s=0.0)
-    assert hold.admit(make_command(3), now_s=0.0)
-    assert not hold.admit(make_command(3), now_s=0.1)
-    assert not hold.admit(make_command(2), now_s=0.1)
+    assert hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
+    assert not hold.admit(make_command(3), now_s=0.1, sent_s=0.1)
+    assert not hold.admit(make_command(2), now_s=0.1, sent_s=0.1)
     stop = make_command(3, mode="safe_stop", reason="no_fresh_state")
-    assert hold.admit(stop, now_s=0.15)
-    assert hold.admit(stop, now_s=0.25)
+    assert hold.admit(stop, now_s=0.15, sent_s=0.15)
+    assert hold.admit(stop, now_s=0.25, sent_s=0.25)
     assert hold.decide(0.4).brake_reason == "no_fresh_state"
 
 
 def test_lock_step_brakes_at_once_when_the_edge_is_silent():
     hold = CommandHold(now_s=0.0)
-    hold.admit(make_command(0), now_s=0.0)
+    hold.admit(make_command(0), now_s=0.0, sent_s=0.0)
     decision = hold.decide(0.025, edge_silence_s=0.21)
     assert (decision.brake_reason, decision.undriven_s) == (NO_COMMAND, 0.21)
 

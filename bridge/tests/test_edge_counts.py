@@ -10,10 +10,10 @@ from bridge.report import rejections
 from edge_runtime.wire import Health, encode
 
 
-def health(sent_ns, uptime_s, **rejected):
+def health(sent_ns, uptime_s, vehicle="none", needs_rearm=False, **rejected):
     return Health(
-        vehicle_id="v", vehicle="none", mode="drive", reason="", needs_rearm=False, accepted=1,
-        superseded=0, rejected=rejected, deadline_misses=0, safe_stops=0, policy_id="p",
+        vehicle_id="v", vehicle=vehicle, mode="drive", reason="", needs_rearm=needs_rearm,
+        accepted=1, superseded=0, rejected=rejected, deadline_misses=0, safe_stops=0, policy_id="p",
         inference_ms={}, uptime_s=uptime_s, sent_ns=sent_ns,
     )  # fmt: skip
 

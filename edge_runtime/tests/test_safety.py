@@ -47,7 +47,7 @@ GOOD = {"fresh_state", "recovered", "final_state"}
 # The words that health and commands say: a reader on the other end compares with them.
 BAD = {
     "no_fresh_state", "output_not_finite", "inference_too_long",
-    "pause_too_long", "other_session", "not_armed",
+    "pause_too_long", "other_session", "not_armed", "vehicle_fault",
 }  # fmt: skip
 
 

@@ -1,0 +1,111 @@
+"""``python -m bridge record``: a listener of its own that writes the wire to an MCAP file."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from bridge.arguments import non_negative_seconds
+from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
+from bridge.recording.writer import RecordingWriter
+from bridge.signals import sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, UserError
+from edge_runtime.files import check_writable
+from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+from edge_runtime.wire import check_vehicle_id
+
+POLL_S = 0.1
+FLUSH_S = 0.5
+"""A kill loses at most this much, and what waits in the queue."""
+NOT_WRITTEN = 1
+"""Exit status where the disk did not take the recording to its end."""
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out", metavar="F.mcap", required=True, help="the recording; it must not exist yet"
+    )
+    parser.add_argument(
+        "--connect",
+        metavar="PROTOCOL/HOST:PORT",
+        default=DEFAULT_ENDPOINT,
+        help="where the simulator or a router listens",
+    )
+    parser.add_argument(
+        "--vehicle-id", metavar="ID", help="record this vehicle only (otherwise all)"
+    )
+    parser.add_argument(
+        "--wait-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        default=10.0,
+        help="how long to wait for a simulator, in seconds",
+    )
+    parser.add_argument(
+        "--duration-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        help="stop after this many seconds (otherwise when the simulators have gone)",
+    )
+    parser.add_argument(
+        "--linger-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        default=2.0,
+        help="how long to go on without any simulator: it may come back, in seconds",
+    )
+
+
+def record(arguments: Any) -> int:
+    """Run the command until the simulators go, the time is over, or somebody interrupts."""
+    check_endpoint(arguments.connect)
+    vehicle_id = arguments.vehicle_id
+    vehicle_id = ANY_VEHICLE if vehicle_id is None else check_vehicle_id(vehicle_id)
+    path = Path(arguments.out)
+    check_writable(path)
+    if path.exists():
+        raise UserError(f"{path} exists; choose another name: no recording is lost")
+    with sigterm_as_interrupt(), open_feed(arguments.connect, vehicle_id, arguments.wait_s) as feed:
+        writer = RecordingWriter(path)
+        try:
+            print(f"recording {path}", flush=True)
+            # Being interrupted is the ordinary way to end a recording.
+            with contextlib.suppress(KeyboardInterrupt):
+                _listen(feed, writer, arguments)
+            writer.finish(feed.dropped)
+        except OSError as error:
+            print(
+                f"error: recording {path} stopped: {error.strerror}; it holds what was written"
+                f" before: python -m bridge repair {path}",
+                file=sys.stderr,
+            )
+            return NOT_WRITTEN
+        finally:
+            writer.close()
+    if feed.dropped:
+        print(f"{feed.dropped} messages came faster than they could be written", file=sys.stderr)
+    print(f"wrote {path}: {writer.messages} messages")
+    return 0
+
+
+def _listen(feed: Feed, writer: RecordingWriter, arguments: Any) -> None:
+    now_s = time.monotonic()
+    end_s = None if arguments.duration_s is None else now_s + arguments.duration_s
+    flush_s, seen_s = now_s + FLUSH_S, now_s
+    while end_s is None or now_s < end_s:
+        heard = feed.next(POLL_S)
+        if heard is not None:
+            # Under a flood the copies for viewers are the first to go.
+            writer.write(heard, with_view=feed.waiting < QUEUE_MESSAGES // 2)
+        now_s = time.monotonic()
+        if now_s >= flush_s:
+            writer.flush()
+            flush_s = now_s + FLUSH_S
+        if heard is not None or not feed.simulator_gone.is_set():
+            seen_s = now_s
+        elif now_s - seen_s >= arguments.linger_s:
+            return

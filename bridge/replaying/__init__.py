@@ -1,0 +1,1 @@
+"""Recorded states through another policy or runtime, and what differs."""

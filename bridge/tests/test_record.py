@@ -1,0 +1,211 @@
+"""``python -m bridge record`` beside real drives: killed, out of disk, repaired, flooded."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+from mcap.reader import NonSeekingReader, make_reader
+
+from bridge.feed import QUEUE_MESSAGES, Feed
+from bridge.recording.reader import Recording
+from bridge.tests.processes import (
+    SLOW_TOY,
+    BridgeProcess,
+    make_policy,
+    read,
+    refuse,
+    start_edge,
+    start_simulate,
+)
+from edge_runtime.tests.harness import PATIENCE_S, wait_until
+from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.wire import State, decode_state
+
+SECOND_NS = 10**9
+
+
+def start_record(endpoint: str, path: Path, *options: str) -> BridgeProcess:
+    """Start ``record`` and wait until it writes."""
+    run = BridgeProcess("record", "--out", str(path), "--connect", endpoint, *options)
+    wait_until(path.exists, "the recording to begin")
+    return run
+
+
+def states_in(path: Path) -> list[tuple[int, State]]:
+    """Return the states of a recording with the times of their arrival (ns)."""
+    found = []
+    for stored in Recording(path).messages():
+        if stored.channel.topic.endswith("/state") and stored.channel.message_encoding == "msgpack":
+            state = decode_state(stored.message.data)
+            assert isinstance(state, State)
+            found.append((stored.message.log_time, state))
+    return found
+
+
+def rerun(*arguments: str) -> str:
+    """Run rerun's own reader; what it prints."""
+    command = [sys.executable, "-m", "rerun", *arguments]
+    return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A recorded drive in lock-step, and its report."""
+    folder, endpoint = tmp_path_factory.mktemp("drive"), free_endpoint()
+    recording, out = folder / "drive.mcap", folder / "r.json"
+    with (
+        start_simulate(endpoint, out, SLOW_TOY) as run,
+        start_record(endpoint, recording) as recorder,
+        start_edge(endpoint, make_policy(folder)),
+    ):
+        assert run.wait() == 0, run.errors
+        assert recorder.wait(PATIENCE_S) == 0, recorder.errors
+    return recording, read(out)
+
+
+def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
+    recording, report = drive
+    steps = report["per_episode"][0]["steps"]
+    counts: collections.Counter[str] = collections.Counter()
+    with recording.open("rb") as stream:
+        for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
+            counts[channel.topic] += 1
+    assert counts["phil/hunter01/state"] == counts["view/hunter01/frames"] == steps + 1
+    assert counts["phil/hunter01/scene"] == counts["view/hunter01/scene"] == steps + 1
+    assert steps <= counts["phil/hunter01/command"] <= steps + 1
+    assert counts["phil/hunter01/health"] >= 1
+    assert counts["phil/hunter01/alive"] >= 1  # It came.
+    assert counts["phil/hunter01/simulator"] == 2  # It came, and it went.
+    assert [state.step for _, state in states_in(recording)] == list(range(steps + 1))
+
+
+def test_rerun_draws_frames_texts_and_values(drive, tmp_path):
+    recording, _ = drive
+    drawn = tmp_path / "drive.rrd"
+    rerun("mcap", "convert", str(recording), "-o", str(drawn))
+    found = rerun("rrd", "stats", str(drawn))
+    parts = ("/view/hunter01/frames", "Image:buffer", "TextLog:text", "phil.Command:message")
+    assert [part for part in parts if part not in found] == []
+
+
+def test_a_kill_loses_at_most_the_last_second_and_repair_gives_the_index_back(tmp_path, capsys):
+    endpoint, recording = free_endpoint(), tmp_path / "cut.mcap"
+    with (
+        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY, "--clock", "realtime"),
+        start_record(endpoint, recording) as run,
+        start_edge(endpoint, make_policy(tmp_path)),
+    ):
+        wait_until(lambda: recording.exists() and len(states_in(recording)) > 15, "two seconds")
+        run.process.send_signal(signal.SIGKILL)
+        killed_ns = time.time_ns()
+        run.process.wait()
+    states = states_in(recording)
+    assert killed_ns - states[-1][0] < SECOND_NS
+    assert [state.step for _, state in states] == list(range(len(states)))
+    # The library's own reader for streams gets as far, and then finds the end missing.
+    with recording.open("rb") as stream, contextlib.suppress(Exception):
+        count = 0
+        for _ in NonSeekingReader(stream).iter_messages(
+            "phil/hunter01/state", log_time_order=False
+        ):
+            count += 1
+    assert count == len(states)
+    assert refuse(["repair", str(recording)]) == 0
+    with recording.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert len(states_in(recording)) == len(states)
+    assert refuse(["repair", str(recording)]) == 0
+    assert "is whole" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("keep", [0.2, 0.5, 0.9, 0.999])
+def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
+    recording, _ = drive
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(recording.read_bytes()[: int(recording.stat().st_size * keep)])
+    whole, part = states_in(recording), states_in(torn)
+    assert part == whole[: len(part)]
+    read_again = Recording(torn)
+    collections.deque(read_again.messages(), maxlen=0)
+    assert read_again.cut_off
+
+
+def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
+    """A limit on the file's size stands in for the disk: the same error path of write(2)."""
+    endpoint, recording = free_endpoint(), tmp_path / "full.mcap"
+    out = tmp_path / "r.json"
+    with (
+        start_simulate(endpoint, out, SLOW_TOY) as run,
+        start_record(endpoint, recording) as recorder,
+        start_edge(endpoint, make_policy(tmp_path)),
+    ):
+        resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (12_000, 12_000))
+        assert recorder.wait() == 1, recorder.errors
+        assert run.wait() == 0, run.errors
+    (line,) = recorder.errors.splitlines()
+    assert "File too large" in line
+    assert "repair" in line
+    assert 5 < len(states_in(recording)) < 60
+    # The loop has not noticed.
+    assert [event["reason"] for event in read(out)["safe_stop_events"]] in ([], ["no_fresh_state"])
+
+
+def test_a_feed_that_falls_behind_drops_and_counts():
+    feed, endpoint = Feed(), free_endpoint()
+    session = open_session(listen=endpoint, mode="router")
+    try:
+        subscriber = session.declare_subscriber("phil/v/state", feed.hearer("state"))
+        for _ in range(QUEUE_MESSAGES + 5):
+            session.put("phil/v/state", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_until(lambda: feed.dropped == 5, "the queue to be full")
+        subscriber.undeclare()
+    finally:
+        session.close()
+    assert feed.waiting == QUEUE_MESSAGES
+
+
+def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
+    endpoint, recording = free_endpoint(), tmp_path / "both.mcap"
+    policy = make_policy(tmp_path, "constant")
+    with start_edge(endpoint, policy):
+        with start_simulate(endpoint, tmp_path / "1.json", SLOW_TOY) as first:
+            recorder = start_record(endpoint, recording, "--linger-s", "10")
+            wait_until(lambda: len(states_in(recording)) > 5, "the first drive")
+            first.process.kill()
+        with recorder, start_simulate(endpoint, tmp_path / "2.json", SLOW_TOY) as second:
+            assert second.wait() == 0, second.errors
+            recorder.process.send_signal(signal.SIGTERM)
+            assert recorder.wait(PATIENCE_S) == 0, recorder.errors
+    sessions = {state.session for _, state in states_in(recording)}
+    assert len(sessions) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (["record", "--out", "there.mcap"], "exists"),
+        (["record", "--out", "/no/such/folder/a.mcap"], "does not exist"),
+        (["record", "--out", "a.mcap", "--vehicle-id", "a/b"], "vehicle id"),
+        (["record", "--out", "a.mcap", "--connect", "here"], "endpoint"),
+        (["record", "--out", "a.mcap", "--connect", free_endpoint(), "--wait-s", "0"], "nobody"),
+        (["repair", "none.mcap"], "No such file"),
+        (["repair", "there.mcap"], "no MCAP recording"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(options, part, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.mcap").write_bytes(b"mine")
+    assert refuse(options) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert part in line
+    assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]

@@ -1,0 +1,253 @@
+"""``python -m bridge replay``: recordings written by hand, whose right answers are known."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from bridge.feed import Heard
+from bridge.recording.writer import RecordingWriter
+from bridge.tests.commands import make_command
+from bridge.tests.processes import BridgeProcess, make_policy, refuse, start_edge
+from bridge.tests.test_edge_counts import health
+from edge_runtime.tests.harness import BLACK, WHITE, make_state
+from edge_runtime.transport import free_endpoint
+from edge_runtime.wire import FRAMES_BYTES, encode
+
+EPOCH_NS = 1_700_000_000 * 10**9
+ANSWER_S, INFERENCE_S = 0.002, 0.001
+SAFE_STOP = {"mode": "safe_stop", "reason": "no_fresh_state", "action": [-1.0]}
+
+
+class Hand:
+    """Writes a recording message by message; times in seconds since its beginning."""
+
+    def __init__(self, path, edge_clock_s=0.0):
+        self.writer = RecordingWriter(path)
+        self.edge_clock_s = edge_clock_s
+
+    def hear(self, at_s, topic, message, vehicle_id="v"):
+        payload = encode(message)
+        key = f"phil/{vehicle_id}/{topic}"
+        self.writer.write(Heard(key, topic, payload, ns(at_s), len(payload)))
+
+    def state(self, at_s, step, **changes):
+        self.hear(at_s, "state", make_state(step, session="here", **changes))
+
+    def command(self, at_s, step, answer_s=ANSWER_S, **changes):
+        stamps = {
+            "received_ns": ns(at_s - answer_s + self.edge_clock_s),
+            "sent_ns": ns(at_s + self.edge_clock_s),
+            "inference_ns": round(INFERENCE_S * 1e9),
+            "action": [0.3],
+        }
+        self.hear(at_s, "command", make_command(step, **{**stamps, **changes}))
+
+    def drive(self, first, last, start_s=0.0, **changes):
+        """States at every T, each answered with ``drive``."""
+        for step in range(first, last):
+            at_s = start_s + step * 0.1
+            self.state(at_s, step)
+            self.command(at_s + ANSWER_S, step, **changes)
+
+    def close(self):
+        self.writer.finish(dropped=0)
+        self.writer.close()
+
+
+def ns(seconds):
+    return EPOCH_NS + round(seconds * 1e9)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "by_hand.mcap"
+
+
+@pytest.fixture
+def hand(path):
+    return Hand(path)
+
+
+def replay(path, policy, *options):
+    """Replay in process; the exit status and the report."""
+    out = path.with_suffix(".json")
+    trust = ["--policy", str(policy), "--allow-unsigned"]
+    status = refuse(["replay", str(path), *trust, "--out", str(out), *options])
+    return status, json.loads(out.read_text()) if out.exists() else {}
+
+
+def test_the_same_policy_is_equal_and_the_report_says_of_what(hand, path, tmp_path):
+    hand.drive(0, 20)
+    hand.state(2.0, 20)  # Nobody answered it.
+    hand.close()
+    status, report = replay(path, make_policy(tmp_path, "constant", 0.3))
+    assert status == 0
+    assert (report["states"], report["compared"], report["unanswered"]) == (21, 20, 1)
+    assert (report["equal"], report["different"]) == (20, 0)
+    assert 0 < report["largest_difference"] < 1e-7  # 0.3 as float32
+    assert report["by_recorded"] == {"drive": {"compared": 20, "different": 0}}
+
+
+def test_another_policy_differs_and_the_tolerance_decides(hand, path, tmp_path, capsys):
+    hand.drive(0, 15)
+    hand.close()
+    policy = make_policy(tmp_path, "constant", 0.31)
+    status, report = replay(path, policy)
+    assert (status, report["different"]) == (1, 15)
+    assert report["largest_difference"] == pytest.approx(0.01, abs=1e-6)
+    assert len(report["first_differences"]) == 10
+    first = report["first_differences"][0]
+    assert (first["session"], first["episode"], first["step"]) == ("here", 0, 0)
+    assert first["recorded"] == [{"mode": "drive", "reason": "", "action": [0.3]}]
+    assert (
+        "episode 0 step 0: recorded drive [0.3]; replayed drive [0.31]" in capsys.readouterr().out
+    )
+    assert replay(path, policy, "--tolerance", "0.02")[0] == 0
+
+
+def test_a_gap_is_braked_for_as_it_was_and_five_states_later_it_drives(hand, path, tmp_path):
+    hand.drive(0, 5)
+    # 0.6 s of silence: the watchdog speaks 2 T after the last state, and repeats itself.
+    for repetition in range(4):
+        at_s = 0.4 + 0.2001 + repetition * 0.1
+        hand.command(at_s, 4, answer_s=at_s - 0.4, inference_ns=0, **SAFE_STOP)
+    for step in range(5, 9):
+        hand.state(0.5 + step * 0.1, step)
+        hand.command(0.5 + step * 0.1 + ANSWER_S, step, **SAFE_STOP)
+    hand.drive(9, 12, start_s=0.5)
+    hand.close()
+    policy = make_policy(tmp_path, "constant", 0.3)
+    status, report = replay(path, policy)
+    assert status == 0, report["first_differences"]
+    assert report["by_recorded"]["safe_stop: no_fresh_state"] == {"compared": 5, "different": 0}
+
+
+def test_a_runtime_that_drives_too_early_is_found_out(hand, path, tmp_path):
+    hand.drive(0, 5)
+    hand.drive(8, 12)  # Nobody braked over the gap.
+    hand.close()
+    status, report = replay(path, make_policy(tmp_path, "constant", 0.3))
+    assert status == 1
+    assert [row["step"] for row in report["first_differences"]] == [4, 8, 9, 10, 11]
+    assert report["first_differences"][0]["replayed"][1]["mode"] == "safe_stop"
+
+
+def test_a_runtime_that_was_started_anew_drives_at_once(hand, path, tmp_path):
+    hand.hear(0.0, "health", health(ns(0.0), 5.0))
+    hand.drive(0, 5)
+    for repetition in range(2):
+        at_s = 0.4 + 0.2001 + repetition * 0.1
+        hand.command(at_s, 4, answer_s=at_s - 0.4, inference_ns=0, **SAFE_STOP)
+    hand.hear(2.9, "health", health(ns(2.9), 0.5))
+    hand.drive(30, 33)
+    hand.close()
+    assert replay(path, make_policy(tmp_path, "constant", 0.3))[0] == 0
+
+
+def test_a_step_of_the_boards_clock_changes_nothing(hand, path, tmp_path):
+    hand.drive(0, 5)
+    hand.edge_clock_s = 3600.0
+    hand.drive(5, 10)
+    hand.close()
+    assert replay(path, make_policy(tmp_path, "constant", 0.3))[0] == 0
+
+
+def test_an_inference_that_took_too_long_is_replayed_as_one(hand, path, tmp_path):
+    hand.drive(0, 5)
+    hand.state(0.5, 5)
+    slow = {"mode": "safe_stop", "reason": "inference_too_long", "action": [-1.0]}
+    hand.command(0.6005, 5, answer_s=0.1005, inference_ns=0, **slow)
+    hand.close()
+    status, report = replay(path, make_policy(tmp_path, "constant", 0.3))
+    assert status == 0, report["first_differences"]
+
+
+def test_a_policy_that_answers_nan_brakes_where_the_recorded_one_drove(hand, path, tmp_path):
+    hand.drive(0, 2)
+    hand.state(0.2, 2, frames=bytes([WHITE]) * FRAMES_BYTES)
+    hand.command(0.2 + ANSWER_S, 2)
+    hand.close()
+    status, report = replay(path, make_policy(tmp_path, "nan", 0.3))
+    assert (status, report["different"]) == (1, 1)
+    (answer,) = report["first_differences"][0]["replayed"]
+    assert (answer["mode"], answer["reason"]) == ("safe_stop", "output_not_finite")
+
+
+def test_an_attached_vehicle_and_its_operator_are_the_recordings(hand, path, tmp_path):
+    attached = {"vehicle": "mock", "needs_rearm": False}
+    hand.hear(0.0, "health", health(ns(0.0), 5.0, **attached))
+    hand.drive(0, 3)
+    at_s = 0.2 + 0.2001
+    hand.command(at_s, 2, answer_s=at_s - 0.2, inference_ns=0, **SAFE_STOP)
+    for step in range(10, 20):  # Nobody has re-armed it yet.
+        hand.state(step * 0.1, step)
+        hand.command(step * 0.1 + ANSWER_S, step, **SAFE_STOP)
+    hand.drive(20, 23)
+    hand.close()
+    status, report = replay(path, make_policy(tmp_path, "constant", 0.3))
+    assert status == 0, report["first_differences"]
+
+
+def test_of_several_vehicles_one_is_named(hand, path, tmp_path, capsys):
+    hand.drive(0, 3)
+    hand.hear(1.0, "state", make_state(0), vehicle_id="w")
+    hand.close()
+    policy = make_policy(tmp_path, "constant", 0.3)
+    assert replay(path, policy)[0] == 2
+    assert "vehicles v, w; name one" in capsys.readouterr().err
+    assert replay(path, policy, "--vehicle-id", "v")[0] == 0
+    assert replay(path, policy, "--vehicle-id", "w")[0] == 2
+    assert "no answered state" in capsys.readouterr().err
+
+
+def test_through_a_running_edge_runtime(hand, path, tmp_path):
+    hand.drive(0, 10)
+    for step in range(10, 12):
+        hand.state(step * 0.1, step, frames=bytes([BLACK]) * FRAMES_BYTES, final=step == 11)
+        hand.command(step * 0.1 + ANSWER_S, step)
+    hand.close()
+    endpoint, out = free_endpoint(), tmp_path / "live.json"
+    policy = make_policy(tmp_path, "constant", 0.3)
+    with start_edge(endpoint, policy, "--vehicle-id", "v"):
+        for _ in range(3):  # A busy machine may stand still for over 2 T.
+            arguments = ["replay", str(path), "--listen", endpoint, "--out", str(out)]
+            with BridgeProcess(*arguments) as run:
+                status = run.wait()
+            if status == 0:
+                break
+    assert status == 0, run.output + run.errors
+    report = json.loads(out.read_text())
+    assert (report["compared"], report["equal"]) == (12, 12)
+    assert len(report["policy_id"]) == 64
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (["--policy", "none.onnx"], "does not exist"),
+        ([], "--policy"),
+        (["--policy", "a.onnx", "--connect", free_endpoint()], "not allowed"),
+        (["--listen", "here"], "endpoint"),
+        (["--listen", free_endpoint(), "--wait-edge-s", "0"], "python -m edge_runtime run"),
+        (["--policy", "a.onnx", "--tolerance", "-1"], "tolerance"),
+        (["--policy", "a.onnx", "--out", "/no/such/folder/r.json"], "does not exist"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(options, part, hand, path, capsys):
+    hand.drive(0, 2)
+    hand.close()
+    assert refuse(["replay", str(path), *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert part in line
+
+
+@pytest.mark.parametrize("name", ["missing.mcap", "junk.mcap", "empty.mcap"])
+def test_what_is_no_recording_is_one_line_and_status_2(name, hand, tmp_path, capsys):
+    (tmp_path / "junk.mcap").write_bytes(b"\x89MCAP1\r\n" + bytes(100))
+    hand.close()
+    shutil.move(tmp_path / "by_hand.mcap", tmp_path / "empty.mcap")
+    assert refuse(["replay", str(tmp_path / name), "--policy", "p.onnx"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
