@@ -27,7 +27,7 @@ class FaultyMockVehicle(MockVehicle):
             raise TimeoutError("the vehicle says nothing")
         if word == "stuck":
             action = dict.fromkeys(report.action, _STUCK_AT)
-            report = report._replace(action=action, speed_mps=0.0)
+            report = report._replace(action=action)
         if word == "lying":
             report = report._replace(speed_mps=report.speed_mps + _LEAP_MPS)
         return report

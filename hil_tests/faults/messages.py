@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable
 
 from edge_runtime import wire
+from edge_runtime.cli import BAD_INPUT
 from edge_runtime.wire import (
     CONTROL_PERIOD_S,
     DRIVE,
@@ -147,19 +148,20 @@ def second_simulator(rig: Rig, number: int) -> Try:
 
 
 def second_edge(rig: Rig, number: int) -> Try:
-    """A second edge runtime with the same id: the first answer to a state counts."""
+    """A second edge runtime with the same id gives way; the first answer to a state counts."""
     at_any_phase(number)
     second = rig.start_edge()
-    second.wait_for_line("ready")
     begin_s = rig.mark()
-    time.sleep(SECOND_S)
+    status = second.wait()
     end_s = rig.mark()
-    second.end()
     rig.end_drive()
     # By drives alone: its last safe stop is obeyed beside the other's drive, which is safe.
     answers = Counter(c.place for c in rig.timeline.commands if c.mode == DRIVE)
     wanted = Counter(stale=sum(count - 1 for count in answers.values()))
-    return _drove_on(rig, begin_s, end_s, wanted, _simulator_counts(rig))
+    outcome = _drove_on(rig, begin_s, end_s, wanted, _simulator_counts(rig))
+    if status != BAD_INPUT:
+        outcome.wrong.append(f"the second one ended with status {status}: {second.lines[-1:]}")
+    return outcome
 
 
 def _bad_of(step: int) -> Iterable[tuple[str, bytes]]:
@@ -273,6 +275,6 @@ ROWS = (
         "answers the newest, or stops", _GAP, flood, rig={"sender": True}, alone=True),
     Row("second_simulator", "a second simulator with the same id", _ON, _GAP, second_simulator,
         recovery_limit_s=None),
-    Row("second_edge", "a second edge runtime with the same id", _ON, _GAP, second_edge,
-        recovery_limit_s=None, new_rig_each_try=True),
+    Row("second_edge", "a second edge runtime with the same id", "second one refuses; drives on",
+        _GAP, second_edge, recovery_limit_s=None, new_rig_each_try=True),
 )  # fmt: skip

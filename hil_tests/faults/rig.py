@@ -7,11 +7,13 @@ The simulator may also be the rig's own sender, where a row sends states of its 
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
 from pathlib import Path
 from typing import Any
 
+from edge_runtime.errors import UserError
 from edge_runtime.operator_commands import ask
 from edge_runtime.transport import free_endpoint
 from hil_tests.faults.endless import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
@@ -24,6 +26,7 @@ from hil_tests.faults.timeline import BrakeSeen, ModeSeen, Timeline, last_drive_
 VEHICLE_ID = "faults"
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
+_REARM_EVERY_S = 2.0
 
 
 class Rig:
@@ -68,13 +71,28 @@ class Rig:
         arguments += ["--out", str(self.directory / "report.json")]
         return self._start("simulator", "hil_tests.faults.launch", *arguments)
 
+    def start_recorder(self, path: Path) -> Process:
+        """`bridge record` of this drive, not waited for."""
+        arguments = ["bridge", "record", "--out", str(path), "--connect", self._hub]
+        return self._start("recorder", *arguments, "--vehicle-id", VEHICLE_ID)
+
     def start_router(self) -> Process:
         """The router process between edge and probe, not waited for."""
         return self._start("router", "hil_tests.faults.router", self.router_endpoint, self._hub)
 
     def wait_until_driving(self, timeout_s: float = 30.0) -> None:
         """Until drive commands come steadily and the simulated vehicle's brake is off."""
-        wait_until(self._is_driving, "a steady drive", timeout_s)
+        rearmed_s = time.monotonic()
+
+        def driving() -> bool:
+            nonlocal rearmed_s
+            if self._vehicle != "none" and time.monotonic() - rearmed_s > _REARM_EVERY_S:
+                # A busy machine may have stopped it once more: the operator stays beside it.
+                self._ask_to_rearm()
+                rearmed_s = time.monotonic()
+            return self._is_driving()
+
+        wait_until(driving, "a steady drive", timeout_s)
 
     def mark(self) -> float:
         """Now, the moment before a fault."""
@@ -97,9 +115,7 @@ class Rig:
 
     def rearm(self) -> None:
         """As an operator does, once the runtime takes it."""
-        wait_until(
-            lambda: ask(self._hub, VEHICLE_ID, "rearm")["accepted"], "the vehicle to be re-armed"
-        )
+        wait_until(self._ask_to_rearm, "the vehicle to be re-armed")
 
     def bright(self, on: bool) -> None:
         """Turn the frames white, or back."""
@@ -130,6 +146,11 @@ class Rig:
 
     def __exit__(self, *_: Any) -> None:
         self.close()
+
+    def _ask_to_rearm(self) -> bool:
+        with contextlib.suppress(UserError):  # on a starved machine an answer may take too long
+            return bool(ask(self._hub, VEHICLE_ID, "rearm")["accepted"])
+        return False
 
     def _is_driving(self) -> bool:
         now_s = time.monotonic()

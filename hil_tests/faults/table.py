@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hil_tests.faults import ends, messages, vehicles
+from hil_tests.faults import ends, messages, recordings, vehicles
 from hil_tests.faults.row import Row
 
-ROWS: tuple[Row, ...] = (*ends.ROWS, *messages.ROWS, *vehicles.ROWS)
+ROWS: tuple[Row, ...] = (*ends.ROWS, *messages.ROWS, *vehicles.ROWS, *recordings.ROWS)

@@ -47,6 +47,7 @@ def _at_fault(rig: Rig, number: int, word: str) -> Try:
     wrong += [] if said else [f"the log does not say vehicle_{word}"]
     rig.rearm()
     rearmed_s = rig.mark()
+    rig.wait_until_driving()
     recovery_s = drive_after_s(rig, rearmed_s) - rearmed_s
     return Try(stop.seen_s - last_s, recovery_s, stop.reason, wrong=wrong)
 
