@@ -14,7 +14,7 @@ from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.transport import free_endpoint, open_session
-from hil_tests.benches.contenders import Floor, Ours, answer, start_floor, start_ours
+from hil_tests.benches.contenders import Floor, Ours, answer, rouse, start_floor, start_ours
 from hil_tests.benches.footprint import first_command_s, idle_load, memory_mb
 from hil_tests.benches.latency import alternate
 from hil_tests.benches.lockstep import lockstep
@@ -71,6 +71,7 @@ def _measure(arguments: Any) -> dict[str, Any]:
         bare_process.wait_for_line("ready")
         floor = Floor(session, len(ours.prepare()[1]))
         for contender in (ours, floor):
+            rouse(contender)
             for _ in range(WARM_UP):
                 answer(contender, 5.0)
         ours.end_block()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import zenoh
@@ -12,10 +10,11 @@ import zenoh
 from edge_runtime import wire
 from edge_runtime.wire import FRAMES_BYTES, FRAMES_SHAPE
 from hil_tests.benches.floor import STEP_BYTES
-from hil_tests.faults.processes import Process
+from hil_tests.faults.processes import Process, wait_until
 
 OURS, FLOOR = "bench-ours", "bench-floor"
 PICTURES = 64
+_ROUSE_EVERY_S = 0.02
 
 
 def pictures(seed: int = 0) -> list[bytes]:
@@ -134,11 +133,22 @@ def start_floor(policy: str, endpoint: str, reply_bytes: int) -> Process:
     return Process("hil_tests.benches.floor", policy, endpoint, FLOOR, str(reply_bytes))
 
 
-def answer(contender: Contender, timeout_s: float, sent: Callable[[], Any] = lambda: None) -> float:
+def rouse(contender: Contender) -> None:
+    """Send states until the first answer: a process that is ready may not be known here yet."""
+    contender.begin_block()
+
+    def is_answered() -> bool:
+        contender.put(contender.prepare()[1])
+        time.sleep(_ROUSE_EVERY_S)
+        return bool(contender.arrivals)
+
+    wait_until(is_answered, f"{contender.vehicle_id} answers")
+
+
+def answer(contender: Contender, timeout_s: float) -> float:
     """Send one state and wait for its answer: when it came (perf_counter); TimeoutError."""
     step, payload = contender.prepare()
     contender.put(payload)
-    sent()
     end_s = time.perf_counter() + timeout_s
     while step not in contender.arrivals:
         if time.perf_counter() > end_s:

@@ -68,6 +68,7 @@ class Probe:
         if isinstance(state, wire.State):
             place = (state.session, state.episode, state.step)
             self.timeline.states.setdefault(place, seen_s)
+            self.timeline.flow_s.append(seen_s)
 
     def _on_state(self, sample: zenoh.Sample) -> None:
         self.note_state(bytes(sample.payload), time.monotonic())

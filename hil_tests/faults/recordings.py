@@ -91,8 +91,8 @@ _GAP = "longest gap between commands"
 ROWS = (
     Row("disk_full", "disk full while recording",
         "recorder says so and ends; the recording is readable; drives on", _GAP, disk_full,
-        recovery_limit_s=None),
+        recovery_limit_s=None, flows=True),
     Row("recorder_killed", "SIGKILL to the recorder",
         "at most 1 s of the recording is lost; drives on", _GAP, recorder_killed,
-        recovery_limit_s=None),
+        recovery_limit_s=None, flows=True),
 )  # fmt: skip

@@ -15,7 +15,7 @@ def render_faults(report: Mapping[str, Any]) -> str:
         cells = (
             row["done"],
             row["expected"],
-            str(row["tries"]),
+            str(row["tries"]) + (f" (+{row['disturbed']} again)" if row["disturbed"] else ""),
             _spread(row["reaction_ms"]),
             _limit(row["reaction_limit_ms"]),
             _spread(row["recovery_ms"]),

@@ -45,6 +45,9 @@ class Row:
     """Options of the Rig."""
     policy: str = "given"
     """``given``, or ``slow``: one that is slow on bright frames, ``steady``: always full pedal."""
+    flows: bool = False
+    """Whether the simulator's states go on through the fault: where they do not, the machine stood
+    still, and the try is done again (and counted as disturbed)."""
     alone: bool = False
     """Whether it needs the machine for itself."""
     most_tries: int | None = None

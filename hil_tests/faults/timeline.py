@@ -57,6 +57,8 @@ class Timeline:
 
     states: dict[Place, float] = field(default_factory=dict)
     """When the probe saw each acceptable state."""
+    flow_s: list[float] = field(default_factory=list)
+    """When the states of the drive itself came: gaps in it are the machine's, or the fault's."""
     commands: list[CommandSeen] = field(default_factory=list)
     modes: list[ModeSeen] = field(default_factory=list)
     brakes: list[BrakeSeen] = field(default_factory=list)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 
+from edge_runtime.wire import DRIVE
 from hil_tests.faults.ends import at_any_phase, drive_after_s, stop_command
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
-from hil_tests.faults.timeline import DRIVE
 
 SWITCH = "vehicle"
 FAULT_S = 1.0
@@ -57,7 +57,16 @@ _TO_STOP = "last good feedback at the probe to safe_stop on the wire"
 _RIG = {"vehicle": "mock"}
 
 ROWS = tuple(
-    Row(f"vehicle_{run.__name__}", done, _EXPECT, _TO_STOP, run, rig=_RIG, policy="steady")
+    Row(
+        f"vehicle_{run.__name__}",
+        done,
+        _EXPECT,
+        _TO_STOP,
+        run,
+        rig=_RIG,
+        policy="steady",
+        flows=True,
+    )
     for run, done in (
         (silent, "vehicle silent"),
         (stuck, "vehicle's pedal stuck"),
