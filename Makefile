@@ -10,7 +10,8 @@ MUTATION_STAMP := $(MUTATION)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray test-network lint format bench bench-quick bench-gpu network recording mutate lock clean
+.PHONY: help install demo test test-ray test-network lint format bench bench-quick bench-gpu bench-loop \
+	network recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -71,6 +72,10 @@ network: $(STAMP)  ## TCP, UDP, relay and virtual time on the same network; need
 bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and eight at once
 	@mkdir -p $(BENCH)
 	$(BIN)/python -m trainer.benches.accelerator --runs 8 --out $(BENCH)/gpu.json
+
+bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
+	@mkdir -p $(BENCH)
+	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
 	$(BIN)/python -m hil_tests.recordings.make

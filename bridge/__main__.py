@@ -9,7 +9,6 @@ from edge_runtime.cli import ArgumentParser, run_cli
 
 SUBCOMMANDS = {
     "simulate": "serve an environment to an edge runtime over Zenoh, and report",
-    "relay": "put an injected network between a simulator and an edge runtime",
     "router": "connect several simulators, edge runtimes and viewers with one another",
     "relay": "put an injected network between a simulator and an edge runtime",
     "record": "write everything on the wire to an MCAP recording",

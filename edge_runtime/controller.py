@@ -45,6 +45,7 @@ class Controller:
     ) -> None:
         self.safety = Safety()
         self.deadline_misses = 0
+        self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
         self._rows = rows
         self._needs_rearm = needs_rearm
         self._last_action = neutral_action(rows)
@@ -82,11 +83,12 @@ class Controller:
         self._begun_s = None
         if now_s - self._newest.arrived_s > CONTROL_PERIOD_S:
             self.deadline_misses += 1
-        self._apply(self._event_of(output))
+        wanted: List[float] = output.tolist()
+        self._apply(self._event_of(wanted))
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + CONTROL_PERIOD_S
             return self._stop_order(inference_ns)
-        self._last_action = limit_action(output.tolist(), self._last_action, self._rows)
+        self._last_action = limit_action(wanted, self._last_action, self._rows)
         return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
 
     def tick(self, now_s: float) -> Optional[Order]:
@@ -98,6 +100,8 @@ class Controller:
         was = self.safety.mode
         if was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
+        elif was is Mode.DRIVE and self.vehicle_fault:
+            self._apply(Event.VEHICLE)
         if self.safety.mode is not Mode.SAFE_STOP:
             return None
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:
@@ -122,6 +126,8 @@ class Controller:
             return f"nothing to re-arm: the mode is {self.safety.mode.value}"
         if not self._needs_rearm:
             return "no vehicle is attached: it drives again by itself after fresh states"
+        if self.vehicle_fault:
+            return f"the vehicle is at fault: {self.vehicle_fault}"
         if rules.is_silent(self.safety, now_s):
             # Kept for later, the permission would move the vehicle when the link returns.
             return "no fresh states arrive; re-arm when the link is back"
@@ -134,9 +140,12 @@ class Controller:
             return None
         return self._stop_order(0)._replace(reason="runtime_ended")
 
-    def _event_of(self, output: np.ndarray) -> Event:
-        if not np.all(np.isfinite(output)):
+    def _event_of(self, wanted: List[float]) -> Event:
+        # One or two numbers: numpy would take ten times as long for them.
+        if not all(map(math.isfinite, wanted)):
             return Event.NOT_FINITE
+        if self.vehicle_fault:
+            return Event.VEHICLE
         assert self._newest is not None
         return rules.classify_fresh(self.safety, self._newest.state.final, self._needs_rearm)
 

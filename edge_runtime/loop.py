@@ -73,6 +73,8 @@ class ControlLoop:
     def start(self) -> None:
         """Begin to listen. Call `run` next."""
         self._worker.start()
+        if self._vehicle is not None:
+            self._vehicle.on_fault = self._vehicle_failed
         self._link.declare(self._on_state, self.health, self._rearm)
 
     def run(self) -> None:
@@ -83,6 +85,7 @@ class ControlLoop:
         with self._lock:
             while not self._stopping:
                 now_s = time.monotonic()
+                self._look_at_vehicle(now_s)
                 self._send(self._controller.tick(now_s))
                 if now_s >= next_health_s:
                     self._link.send("health", self.health())
@@ -162,6 +165,7 @@ class ControlLoop:
             with self._lock:
                 self._busy_since_s = None
                 self._inference_window.add(inference.duration_ns)
+                self._look_at_vehicle(time.monotonic())
                 order = self._controller.finish(
                     inference.output, inference.duration_ns, time.monotonic()
                 )
@@ -173,8 +177,23 @@ class ControlLoop:
     def _is_hung(self, now_s: float) -> bool:
         return self._busy_since_s is not None and now_s - self._busy_since_s > _HUNG_S
 
+    def _look_at_vehicle(self, now_s: float) -> None:
+        if self._vehicle is None:
+            return
+        fault = self._vehicle.fault(now_s)
+        if fault != self._controller.vehicle_fault:
+            log.event("warning" if fault else "info", "vehicle", fault=fault)
+            self._controller.vehicle_fault = fault
+
+    def _vehicle_failed(self) -> None:
+        """The vehicle's thread has seen a fault: the watchdog need not wait for its deadline."""
+        with self._lock:
+            self._wakes_s = 0.0
+            self._timer.notify()
+
     def _rearm(self) -> str:
         with self._lock:
+            self._look_at_vehicle(time.monotonic())
             refusal = self._controller.rearm(time.monotonic())
             log.event("info", "rearm", accepted=not refusal, detail=refusal)
             return refusal
@@ -183,6 +202,8 @@ class ControlLoop:
         """Wait for the next deadline; holds the lock before and after."""
         due_s = self._controller.next_deadline_s()
         self._wakes_s = until_s if due_s is None else min(until_s, due_s)
+        if self._vehicle is not None and not self._controller.vehicle_fault:
+            self._wakes_s = min(self._wakes_s, self._vehicle.silent_at_s)
         pause_s = self._wakes_s - time.monotonic()
         if pause_s > 0:
             self._timer.wait(pause_s)

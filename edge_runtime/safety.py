@@ -38,6 +38,7 @@ class Event(str, Enum):
     PAUSED = "pause_too_long"  # a vehicle stood by for more than MAX_PAUSE_S
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
     NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
+    VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
     REARM = "rearm"  # an operator allows driving again
 
 
@@ -53,6 +54,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_S, Event.PAUSED): _X,
     (_S, Event.OTHER_SESSION): _X,
     (_S, Event.NOT_ARMED): _X,
+    (_S, Event.VEHICLE): _X,
     (_S, Event.REARM): _S,
     (_D, Event.FRESH): _D,
     (_D, Event.RECOVERED): _D,
@@ -63,6 +65,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_D, Event.PAUSED): _X,
     (_D, Event.OTHER_SESSION): _X,
     (_D, Event.NOT_ARMED): _X,
+    (_D, Event.VEHICLE): _X,
     (_D, Event.REARM): _D,
     (_X, Event.FRESH): _X,
     (_X, Event.RECOVERED): _D,
@@ -73,6 +76,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_X, Event.PAUSED): _X,
     (_X, Event.OTHER_SESSION): _X,
     (_X, Event.NOT_ARMED): _X,
+    (_X, Event.VEHICLE): _X,
     (_X, Event.REARM): _X,  # a fresh state must follow
 }
 FAULTS = (
@@ -82,6 +86,7 @@ FAULTS = (
     Event.PAUSED,
     Event.OTHER_SESSION,
     Event.NOT_ARMED,
+    Event.VEHICLE,
 )
 FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
 

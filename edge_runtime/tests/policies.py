@@ -17,7 +17,7 @@ from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Observation, e
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.
 FAULT_BRIGHTNESS = 200.0
-_SLOW_LOOPS = 1500
+SLOW_LOOPS = 1500
 _SLOW_SIZE = 256
 
 PEDAL = Action(
@@ -41,15 +41,17 @@ def write_policy(
     manifest_changes: Optional[Dict[str, Any]] = None,
     opset: int = 17,
     ir_version: int = 8,
+    loops: int = SLOW_LOOPS,
 ) -> str:
     """Write a policy file and return its policy_id; sign it as `path`.sig where a key is given.
 
     kind: "constant" always answers `value`; "mean" answers the mean brightness scaled to
     [-1, 1], a different number for different frames; "nan" is "constant" until the frames are
-    brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then takes about a second.
+    brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then takes about a second at
+    SLOW_LOOPS `loops`, and in proportion at others.
     `manifest_changes` replaces fields of the manifest, to write files that must be refused.
     """
-    graph = _graph(kind, value, len(actions))
+    graph = _graph(kind, value, len(actions), loops)
     policy_id = _weights_sha256(graph)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
@@ -90,14 +92,15 @@ def _weights_sha256(graph: onnx.GraphProto) -> str:
     return digest.hexdigest()
 
 
-def _graph(kind: str, value: float, n_actions: int) -> onnx.GraphProto:
-    weights = {
+def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphProto:
+    weights: Dict[str, np.ndarray] = {
         "value": np.array([value], np.float32),
         "zero": np.array([0.0], np.float32),
         "half_range": np.array([127.5], np.float32),
         "fault_brightness": np.array([FAULT_BRIGHTNESS], np.float32),
         # The name is part of the digest: every kind has a policy_id of its own.
         f"{kind}_ones": np.ones((1, n_actions), np.float32),
+        "loops": np.array([loops], np.int64),
     }
     nodes = [
         helper.make_node("Cast", ["frames"], ["pixels"], to=TensorProto.FLOAT),
@@ -141,8 +144,7 @@ def _nan(weights: Dict[str, np.ndarray]) -> List[onnx.NodeProto]:
 
 
 def _slow(weights: Dict[str, np.ndarray]) -> List[onnx.NodeProto]:
-    """Multiplies matrices in a loop, _SLOW_LOOPS times for bright frames and never for others."""
-    weights["loops"] = np.array([_SLOW_LOOPS], np.int64)
+    """Multiplies matrices in a loop, `loops` times for bright frames and never for others."""
     weights["always"] = np.array(True)
     weights["matrix"] = np.eye(_SLOW_SIZE, dtype=np.float32)
     body = helper.make_graph(

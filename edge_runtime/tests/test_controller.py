@@ -301,3 +301,27 @@ def stop(controller):
     answer(controller, 0, 0.0)
     controller.tick(0.3)
     return controller
+
+
+def test_a_vehicle_at_fault_stops_at_the_next_tick_and_is_not_rearmed():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0)
+    controller.vehicle_fault = "vehicle_silent"
+    order = controller.tick(0.01)
+    assert (order.mode, order.reason) == ("safe_stop", "vehicle_fault")
+    assert "vehicle_silent" in controller.rearm(0.02)
+    for step in range(1, 10):
+        assert answer(controller, step, step * 0.1).mode == "safe_stop"
+    controller.vehicle_fault = ""
+    assert answer(controller, 10, 1.0).mode == "safe_stop"  # nobody has allowed it
+    assert controller.rearm(1.01) == ""
+    modes = [answer(controller, step, step * 0.1).mode for step in range(11, 16)]
+    assert modes[-1] == "drive"
+
+
+def test_a_vehicle_at_fault_never_begins_to_drive():
+    controller = make(needs_rearm=True)
+    controller.vehicle_fault = "vehicle_lying"
+    assert controller.tick(0.0) is None
+    order = answer(controller, 0, 0.0)
+    assert (order.mode, order.reason) == ("safe_stop", "vehicle_fault")

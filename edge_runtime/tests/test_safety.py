@@ -38,6 +38,7 @@ EXPECTED = {
     Event.PAUSED: (STOP, STOP, STOP),
     Event.OTHER_SESSION: (STOP, STOP, STOP),
     Event.NOT_ARMED: (STOP, STOP, STOP),
+    Event.VEHICLE: (STOP, STOP, STOP),
     Event.REARM: (STANDBY, DRIVE, STOP),
 }
 
@@ -46,7 +47,7 @@ GOOD = {"fresh_state", "recovered", "final_state"}
 # The words that health and commands say: a reader on the other end compares with them.
 BAD = {
     "no_fresh_state", "output_not_finite", "inference_too_long",
-    "pause_too_long", "other_session", "not_armed",
+    "pause_too_long", "other_session", "not_armed", "vehicle_fault",
 }  # fmt: skip
 
 

@@ -9,7 +9,9 @@ import threading
 import time
 from typing import Callable, Optional, Sequence
 
+from edge_runtime import log
 from edge_runtime.vehicles.interface import Vehicle, VehicleReport
+from edge_runtime.vehicles.watch import VehicleWatch
 from edge_runtime.wire import SAFE_STOP, TOPICS, Command, Feedback
 
 _PERIOD_S = 1.0 / TOPICS["feedback"].rate_hz
@@ -28,6 +30,9 @@ class VehicleRunner:
         self._vehicle = vehicle
         self._action_names = action_names
         self._publish = publish
+        self.on_fault: Callable[[], None] = lambda: None
+        self._watch = VehicleWatch()
+        self._failing = False
         self._lock = threading.Lock()
         self._last: Optional[Command] = None
         self._stopping = threading.Event()
@@ -38,10 +43,21 @@ class VehicleRunner:
         """The vehicle's, as `--vehicle` knows it."""
         return self._vehicle.name
 
+    @property
+    def silent_at_s(self) -> float:
+        """When the vehicle counts as silent if nothing more is heard of it (monotonic)."""
+        return self._watch.silent_at_s
+
+    def fault(self, now_s: float) -> str:
+        """What is wrong with the vehicle, empty if nothing. Takes no lock: a driver may hang."""
+        return self._watch.fault(now_s)
+
     def start(self) -> None:
         """Enable the vehicle and start its feedback."""
         with self._lock:
-            self._vehicle.enable(time.monotonic())
+            now_s = time.monotonic()
+            self._vehicle.enable(now_s)
+            self._watch.begin(now_s)
         self._thread.start()
 
     def command(self, command: Command) -> None:
@@ -49,10 +65,12 @@ class VehicleRunner:
         with self._lock:
             self._last = command
             now_s = time.monotonic()
+            action = dict(zip(self._action_names, command.action))
+            self._watch.command(action, now_s)
             if command.mode == SAFE_STOP:
                 self._vehicle.brake(now_s)
             else:
-                self._vehicle.command(dict(zip(self._action_names, command.action)), now_s)
+                self._vehicle.command(action, now_s)
 
     def close(self) -> None:
         """Brake, end the feedback, close the driver."""
@@ -69,11 +87,28 @@ class VehicleRunner:
             # Absolute deadlines; after a long pause one report, not one for each missed period.
             next_s = max(next_s + _PERIOD_S, time.monotonic())
             with self._lock:
-                report = self._vehicle.feedback(time.monotonic())
+                report = self._ask()
                 last = self._last
-            self._publish(self._feedback(report, last))
+            fault = self._watch.fault(time.monotonic())
+            if fault:
+                self.on_fault()
+            if report is not None:
+                self._publish(self._feedback(report, last, fault))
 
-    def _feedback(self, report: VehicleReport, last: Optional[Command]) -> Feedback:
+    def _ask(self) -> Optional[VehicleReport]:
+        """The vehicle's report; None where the driver fails, which is silence like any other."""
+        try:
+            report = self._vehicle.feedback(time.monotonic())
+        except Exception as error:  # a driver may raise anything; its thread must live on
+            if not self._failing:
+                log.event("error", "no_feedback", detail=error)
+            self._failing = True
+            return None
+        self._failing = False
+        self._watch.report(report, time.monotonic())
+        return report
+
+    def _feedback(self, report: VehicleReport, last: Optional[Command], fault: str) -> Feedback:
         return Feedback(
             vehicle=self._vehicle.name,
             session=last.session if last else "",
@@ -83,6 +118,6 @@ class VehicleRunner:
             action=[report.action.get(name, 0.0) for name in self._action_names],
             speed_mps=report.speed_mps,
             self_braking=report.self_braking,
-            faults=report.faults,
+            faults=[*report.faults, fault] if fault else report.faults,
             sent_ns=time.time_ns(),
         )

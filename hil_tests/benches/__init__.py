@@ -1,0 +1,1 @@
+"""What ``make bench-loop`` measures, a module for each idea."""

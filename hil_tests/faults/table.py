@@ -1,0 +1,8 @@
+"""All rows of the fault table."""
+
+from __future__ import annotations
+
+from hil_tests.faults import ends, messages, recordings, vehicles
+from hil_tests.faults.row import Row
+
+ROWS: tuple[Row, ...] = (*ends.ROWS, *messages.ROWS, *vehicles.ROWS, *recordings.ROWS)

@@ -1,0 +1,128 @@
+"""What the campaign's verdicts rest on, without a process."""
+
+import numpy as np
+import pytest
+
+from edge_runtime import wire
+from edge_runtime.errors import UserError
+from hil_tests.faults import render_faults, run_faults
+from hil_tests.faults.campaign import Outcome, _report_row
+from hil_tests.faults.payloads import mutated, with_fields, without
+from hil_tests.faults.row import Row, Try
+from hil_tests.faults.sender import make_state
+from hil_tests.faults.table import ROWS
+from hil_tests.faults.timeline import (
+    REACTION_LIMIT_S,
+    CommandSeen,
+    longest_gap_s,
+    spread_ms,
+    unsafe_commands,
+)
+
+PLACE = ("session", 0, 7)
+STATES = {PLACE: 10.0}
+ROW = Row("name", "done", "expected", "measured", lambda rig, number: Try())
+
+
+def command(**changes):
+    fields = {"seen_s": 10.002, "sent_s": 10.001, "place": PLACE, "mode": "drive", "action": [0.5]}
+    return CommandSeen(**{**fields, "reason": "", **changes})
+
+
+def test_an_answer_in_time_to_a_known_state_is_safe():
+    assert unsafe_commands([command()], STATES) == []
+    assert unsafe_commands([command(sent_s=10.0 + REACTION_LIMIT_S)], STATES) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"action": [0.5, 1.01]}, "action"),
+        ({"action": [float("nan")]}, "action"),
+        ({"place": ("session", 0, 8)}, "no acceptable state"),
+        ({"sent_s": 10.001 + REACTION_LIMIT_S}, "old"),
+    ],
+)
+def test_each_way_to_be_unsafe_is_found(changes, why):
+    (found,) = unsafe_commands([command(**changes)], STATES)
+    assert why in found
+    assert unsafe_commands([command(mode="safe_stop", **changes)], STATES) == []
+
+
+def test_a_stepped_clock_is_judged_by_arrival():
+    stepped = [command(sent_s=3610.0)]
+    assert unsafe_commands(stepped, STATES, by_arrival=True) == []
+    assert unsafe_commands(stepped, STATES) != []
+
+
+def test_gaps_count_the_edges_of_the_window():
+    assert longest_gap_s([1.0, 1.1, 1.5, 9.0], 0.9, 1.6) == pytest.approx(0.4)
+    assert longest_gap_s([], 2.0, 5.0) == pytest.approx(3.0)
+
+
+def test_a_spread_is_in_milliseconds():
+    assert spread_ms([0.2, 0.1, 0.4]) == {"min": 100.0, "median": 200.0, "max": 400.0}
+    assert spread_ms([]) is None
+
+
+def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
+    valid = wire.encode(make_state(3))
+    payloads = list(mutated(valid, 3000, seed=1))
+    assert payloads == list(mutated(valid, 3000, seed=1))
+    assert payloads != list(mutated(valid, 3000, seed=2))
+    read = [wire.decode_state(payload) for payload in payloads]
+    reasons = {one.reason for one in read if isinstance(one, wire.Rejection)}
+    assert {"malformed", "oversized", "not_finite"} <= {reason.value for reason in reasons}
+    assert any(isinstance(one, wire.State) for one in read)  # a flipped bit in a picture is legal
+
+
+def reason(payload):
+    rejection = wire.decode_state(payload)
+    return rejection.reason if isinstance(rejection, wire.Rejection) else None
+
+
+def test_fields_are_replaced_and_left_out():
+    valid = wire.encode(make_state(3))
+    assert reason(with_fields(valid, schema=2)) is wire.Reason.SCHEMA
+    assert reason(without(valid, "frames")) is wire.Reason.MALFORMED
+
+
+def test_the_senders_pictures_never_trip_a_faulty_policy():
+    assert np.frombuffer(make_state(1).frames, np.uint8).max() < 200
+
+
+def judged(*tries, **outcome):
+    return _report_row(ROW, Outcome(tries=list(tries), **outcome))
+
+
+def test_a_row_passes_only_within_its_limits():
+    assert judged(Try(0.25, 1.0))["passed"]
+    assert judged(Try(0.251, 0.5))["reactions_late"] == 1
+    assert judged(Try(0.2, 1.001))["recoveries_late"] == 1
+    for bad in (
+        judged(Try(0.251, 0.5)),
+        judged(Try(0.2, 1.001)),
+        judged(Try(0.2, 0.5, wrong=["drove on"])),
+        judged(Try(0.2, 0.5), unsafe=["late"]),
+        judged(Try(0.2, 0.5), crashes=["edge"]),
+        judged(failures=["try 0: nothing"]),
+    ):
+        assert not bad["passed"]
+
+
+def test_the_table_says_what_was_missed():
+    rows = [
+        judged(Try(0.2, 0.5, rejected={"stale": 1200}), Try(0.21, 0.6)),
+        judged(Try(0.3, 0.5), unsafe=["late"]),
+    ]
+    table = render_faults({"rows": rows, "crashes": 0, "unsafe_commands": 1})
+    assert "| 200 / 205 / 210 | 250 | 500 / 550 / 600 | 1000 | met, 1,200 rejected" in table
+    assert "MISSED: 1 reactions late, 1 unsafe" in table
+    assert "0 crashes and 1 unsafe commands" in table
+
+
+def test_every_row_has_a_name_of_its_own_and_others_are_refused():
+    names = [row.name for row in ROWS]
+    assert len(set(names)) == len(names)
+    with pytest.raises(UserError, match="no fault 'meteor'; choose from edge_killed"):
+        run_faults(1, ["meteor"])
