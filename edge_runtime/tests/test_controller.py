@@ -214,6 +214,13 @@ def test_the_farewell_brakes():
     assert (order.mode, order.action, order.reason) == ("safe_stop", [-1.0], "runtime_ended")
 
 
+def test_between_episodes_and_before_the_first_there_is_no_farewell():
+    controller = make()
+    answer(controller, 0, 0.0, final=True)
+    assert controller.farewell() is None
+    assert make(needs_rearm=True, armed_at_start=False).farewell() is None
+
+
 def test_an_answer_later_than_a_period_is_a_deadline_miss():
     controller = make()
     controller.begin(Received(make_state(0), 0.0, 0), 0.15)

@@ -196,3 +196,9 @@ def test_the_readme_shows_the_table():
     readme = Path(edge_runtime.__file__).with_name("README.md").read_text()
     assert render_table() in readme
     assert len(render_table().splitlines()) == 2 + len(Event)
+
+
+def test_a_pause_is_a_difference_whatever_the_clock_says():
+    safety = note_arrival(Safety(STANDBY), "a", 1000.0)
+    assert classify_arrival(safety, "a", 1001.0, needs_rearm=True) is Event.SILENT
+    assert classify_arrival(safety, "a", 1011.0, needs_rearm=True) is Event.PAUSED

@@ -58,10 +58,17 @@ def _run(arguments: list[str]) -> None:
     code = 1
     try:
         import pytest
-        from hypothesis import Phase, settings
+        from hypothesis import HealthCheck, Phase, settings
 
-        # The first counter-example is enough: nobody reads the smallest one.
-        settings.register_profile("mutate", phases=(Phase.explicit, Phase.generate), database=None)
+        # The first counter-example is enough: nobody reads the smallest one. And a busy machine
+        # must not look like a mutant that was found.
+        settings.register_profile(
+            "mutate",
+            phases=(Phase.explicit, Phase.generate),
+            database=None,
+            deadline=None,
+            suppress_health_check=list(HealthCheck),
+        )
         settings.load_profile("mutate")
         code = int(pytest.main(arguments))
     finally:
