@@ -72,7 +72,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
     axes.annotate("2 T: safe stop", (0, 200), textcoords="offset points", xytext=(0, 3))
     axes.set_yscale("log")
     axes.set_ylabel("state sent to command received, ms\n(circle p50, dash p90, triangle p99)")
-    axes.set_xticks([place + 0.3 for place in range(len(networks))], networks, fontsize=8)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
+    names = [name.replace(",", "\n") for name in networks]
+    axes.set_xticks([place + 0.3 for place in range(len(networks))], names, fontsize=8)
     axes.legend(fontsize=8)
     temporary = path.with_name(f".{path.name}")
     figure.savefig(temporary, format="png", dpi=120)
