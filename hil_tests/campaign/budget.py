@@ -7,6 +7,8 @@ from typing import Any
 
 from hil_tests.campaign.axes import Axis
 
+NO_NETWORK = "none"
+
 
 def limit_of(axis: Axis, rows: Mapping[str, Mapping[str, Any]], target: float) -> float | None:
     """The largest tested value up to which success is at the target at every tested value.
@@ -43,12 +45,18 @@ def _sentence(
     target: float,
     name: str,
 ) -> str:
-    parts = []
+    parts, missed = [], []
     for axis in axes:
         limit = limits[axis.name]
-        if limit is None:
+        if limit is None and axis.base == NO_NETWORK:
             return f"{name} is below {target:.0%} success even on a perfect network."
+        if limit is None:
+            missed.append(f"on {axis.base} alone it is below that, so no {axis.name} has a budget")
+            continue
         shown = axis.limit.format(f"{limit:g} {axis.unit}" if limit else "none")
         parts.append(f"{shown} (the most that was tested)" if open_ended[axis.name] else shown)
+    if not parts:
+        return f"{name}: " + "; ".join(missed) + "."
     listed = ", ".join(parts[:-1]) + (" and " if parts[:-1] else "") + parts[-1]
-    return f"{name} holds at least {target:.0%} success up to {listed}, one at a time."
+    held = f"{name} holds at least {target:.0%} success up to {listed}, one at a time"
+    return "; ".join([held, *missed]) + "."

@@ -53,7 +53,7 @@ def _draw(
     rows = math.ceil(len(axes) / COLUMNS)
     columns = min(COLUMNS, len(axes))
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten().tolist()
     for panel, axis in zip(panels, axes, strict=False):
         for number, (name, part) in enumerate(parts.items()):
             _curve(panel, axis, part["rows"], field, name, f"C{number}")
@@ -61,7 +61,7 @@ def _draw(
         panel.grid(alpha=0.3)
         if field == "success":
             _mark_target(panel, latency["budget"]["target_success"])
-    for panel in list(panels)[len(axes) :]:
+    for panel in panels[len(axes) :]:
         panel.set_visible(False)
     figure.supylabel(label)
     title = (

@@ -53,6 +53,15 @@ def test_a_policy_that_fails_without_any_network_has_no_budget():
     assert found["sentence"] == "a policy is below 98% success even on a perfect network."
 
 
+def test_an_axis_whose_own_base_fails_has_no_limit_and_takes_nothing_from_the_others():
+    jitter = Axis("jitter", "jitter", "ms", (0, 9), "delay=1ms,jitter={}ms", "delay=1ms", "{}")
+    rows = {**rows_of(LOSS, 1.0, 0.9), **rows_of(jitter, 0.9, 1.0)}
+    assert budget([LOSS, jitter], rows, 0.98, "a policy")["sentence"] == (
+        "a policy holds at least 98% success up to none of loss, one at a time; "
+        "on delay=1ms alone it is below that, so no jitter has a budget."
+    )
+
+
 def test_every_axis_can_be_read_and_begins_without_trouble():
     for axis in AXES:
         assert axis.values[0] == 0
