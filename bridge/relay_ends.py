@@ -15,7 +15,6 @@ import zenoh
 from bridge.port import simulator_key
 from bridge.relay_traffic import DOWN, RelayTraffic
 from edge_runtime.latency.model import LatencySpec
-from edge_runtime.presence import Presence
 from edge_runtime.topics import key
 from edge_runtime.transport import open_session
 
@@ -38,7 +37,7 @@ class Relay:
         self.queries = dict.fromkeys(QUERIES, 0)
         self._edge, self._simulator, self._vehicle_id = to_edge, to_simulator, vehicle_id
         self._lock = threading.Lock()
-        self._presence: dict[str, Any] = {}
+        self._mirrored: dict[str, Any] = {}
         publishers = {"state": self._publisher(to_edge, "state", express=False)}
         for topic in DOWN:
             publishers[topic] = self._publisher(to_simulator, topic, express=True)
@@ -53,8 +52,8 @@ class Relay:
         for declared in reversed(self._declared):
             declared.undeclare()
         # Nobody changes these any more: their listeners went first.
-        for presence in self._presence.values():
-            presence.undeclare()
+        for token in self._mirrored.values():
+            token.undeclare()
         self.traffic.close()
 
     def _publisher(self, session: zenoh.Session, topic: str, express: bool) -> Any:
@@ -102,12 +101,11 @@ class Relay:
 
         def changed(sample: zenoh.Sample) -> None:
             with self._lock:
-                token = self._presence.pop(token_key, None)
+                token = self._mirrored.pop(token_key, None)
                 if token is not None:
                     token.undeclare()
                 if sample.kind == zenoh.SampleKind.PUT:
-                    self._presence[token_key] = presence = Presence(shown_to, token_key)
-                    presence.start()
+                    self._mirrored[token_key] = shown_to.liveliness().declare_token(token_key)
 
         self._declared.append(
             seen_by.liveliness().declare_subscriber(token_key, changed, history=True)

@@ -135,7 +135,7 @@ class VirtualLink(Generic[Message]):
         """What the edge runtime's safety machine makes of a fresh state's moment."""
         if is_silent(self._safety, now_s - ROUNDING_S):
             self._safety = advance(self._safety, Event.SILENT)
-        self._safety = note_arrival(self._safety, now_s)
+        self._safety = note_arrival(self._safety, "", now_s)
         event = classify_fresh(self._safety, final=False, needs_rearm=False)
         self._safety = advance(self._safety, event)
 
