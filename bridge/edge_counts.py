@@ -20,6 +20,7 @@ class EdgeCounts:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._rejected: Counter[str] = Counter()
+        self._unreadable: Counter[str] = Counter()
         self._changes = 0
         self._last: Health | None = None
 
@@ -28,6 +29,12 @@ class EdgeCounts:
         """Return the states rejected by reason, without zeros."""
         with self._lock:
             return dict(self._rejected)
+
+    @property
+    def unreadable(self) -> dict[str, int]:
+        """Return the health messages that could not be read, by reason."""
+        with self._lock:
+            return dict(self._unreadable)
 
     @property
     def changes(self) -> int:
@@ -42,10 +49,13 @@ class EdgeCounts:
             return "" if self._last is None else self._last.policy_id
 
     def observe_message(self, payload: bytes) -> None:
-        """Take a health message; one that cannot be read is left out."""
+        """Take a health message; one that cannot be read is counted, as ``health_REASON``."""
         health = decode_health(payload)
         if isinstance(health, Health):
             self.observe(health)
+            return
+        with self._lock:
+            self._unreadable[f"health_{health.reason.value}"] += 1
 
     def observe_status(self, payload: bytes) -> None:
         """Take the JSON answer to the status query, which holds the fields of a health message."""

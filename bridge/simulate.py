@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -208,7 +209,9 @@ def _drive(
             "missed_ticks": clock.missed_ticks,
             "wall_clock_stalls": clock.wall_clock_stalls,
             "edge_changes": port.edge_counts.changes,
-            **rejections(port.edge_counts.rejected, check.rejected),
+            **rejections(
+                port.edge_counts.rejected, check.rejected + Counter(port.edge_counts.unreadable)
+            ),
         },
         settings={
             "scenario": scenario_of(settings.env),

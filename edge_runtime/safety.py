@@ -10,7 +10,10 @@ from typing import Dict, NamedTuple, Optional, Tuple
 
 from edge_runtime.wire import CONTROL_PERIOD_S
 
-SILENCE_S = 2 * CONTROL_PERIOD_S
+# One lost state leaves a gap of exactly 2 T. Without a little patience the jitter of the sender's
+# clock would decide whether it costs one step or a stop; 2 T + 50 ms is the promise.
+GRACE_S = 0.02
+SILENCE_S = 2 * CONTROL_PERIOD_S + GRACE_S
 MAX_INFERENCE_S = CONTROL_PERIOD_S
 FRESH_STATES_TO_RECOVER = 5
 # Between two episodes of one drive a simulator resets in seconds. After a longer pause nobody

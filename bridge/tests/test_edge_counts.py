@@ -52,3 +52,11 @@ def test_the_report_joins_both_sides():
     assert report["rejected"] == {"stale": 3, "schema": 3}
     assert report["rejected_by_edge"] == {"stale": 2}
     assert report["rejected_by_simulator"] == {"stale": 1, "schema": 3}
+
+
+def test_health_that_cannot_be_read_is_counted_by_reason():
+    counts = EdgeCounts()
+    for payload in (b"junk", bytes(70_000), encode(health(1, 1.0))):
+        counts.observe_message(payload)
+    assert counts.unreadable == {"health_malformed": 1, "health_oversized": 1}
+    assert counts.rejected == {}

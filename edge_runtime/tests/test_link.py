@@ -154,7 +154,7 @@ def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
 
     monkeypatch.setattr(run_command, "open_session", lambda **_: session)
     monkeypatch.setattr(run_command, "Link", fail)
-    arguments: List[Any] = [Config(), unused, None, None, None]
+    arguments: List[Any] = [Config(), None, unused, None, None, None]
     with pytest.raises(OSError, match="no link"):
         run_command._serve(*arguments)
     assert session.events == ["close"] * 2  # the one that asked for other runtimes, and its own
