@@ -19,7 +19,7 @@ class LeftTurnExpert:
     """
 
     HORIZON_S = 6.0
-    START_MARGIN_M = 1.5
+    START_MARGIN_M = 2.5
     KEEP_MARGIN_M = 0.3
     POINT_OF_NO_RETURN_M = 8.0
     """Path length at which the nose comes within 0.5 m of the cars of the near lane."""

@@ -41,8 +41,8 @@ class CongestionConfig:
     """... what each lane's first car is faster. Lanes that drifted apart at 2 m/s would leave the
     ego car alone before half of the way."""
     side_cars: int = 3
-    """In each neighbouring lane; with the one ahead these are the seven within 20 m."""
-    cars_behind: int = 0
+    """In each neighbouring lane; with those ahead and behind these are the eight within 20 m."""
+    cars_behind: int = 1
     """In the ego car's lane. They follow it as one of them: traffic keeps lanes, so a car
     elsewhere has nothing to react to."""
     traffic_mix: Mix = CARS_ONLY
@@ -78,4 +78,4 @@ class CongestionConfig:
         """The numbers of a scene; the variant has more vehicles, and not only cars."""
         if scene == "nominal":
             return CongestionConfig()
-        return CongestionConfig(side_cars=4, cars_behind=1, traffic_mix=MIXED)
+        return CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=MIXED)

@@ -26,11 +26,11 @@ def drive(env: CongestionEnv, action: np.ndarray, seed: int = 0) -> tuple[list[f
             return rewards, info
 
 
-def test_seven_cars_within_20_m_and_the_ego_car_between_them():
+def test_eight_cars_within_20_m_and_the_ego_car_between_them():
     env = CongestionEnv()
     for seed in range(30):
         env.reset(seed=seed)
-        assert len(env.traffic) == 7
+        assert len(env.traffic) == 8
         x, y = np.array([car.position for car in env.traffic]).T
         assert np.abs(x).max() < 20.0
         assert (y < -2.0).sum() == (y > 2.0).sum() == 3
@@ -56,8 +56,9 @@ def test_straight_from_mid_lane_reaches_the_goal_behind_the_car_ahead():
     assert info["distance_m"] == pytest.approx(80.0, abs=0.61)
     assert rewards[:-1] == [0.0] * (len(rewards) - 1)
     assert rewards[-1] == 10.0
-    (leader,) = [car for car in env.traffic if car.lane_index[2] == 1]
-    gap_m = leader.position[0] - env.ego.position[0] - 5.0
+    leader, follower = (car for car in env.traffic if car.lane_index[2] == 1)
+    assert follower.position[0] < env.ego.position[0]
+    gap_m = leader.position[0] - env.ego.position[0] - 2.5 - 0.5 * leader.LENGTH
     assert 2.0 < gap_m < 12.0
     assert env.ego.speed == pytest.approx(leader.speed, abs=0.3)
 
@@ -132,8 +133,9 @@ def test_time_runs_out_without_a_terminal():
 def test_the_ego_car_follows_whoever_is_in_its_corridor():
     env = CongestionEnv(CENTRED)
     env.reset(seed=0)
-    (ahead,) = [car for car in env.traffic if car.lane_index[2] == 1]
+    ahead, behind = (car for car in env.traffic if car.lane_index[2] == 1)
     assert env._leader() is ahead
+    assert behind.leader is env.ego
     env.ego.position[1] = 2.0
     beside = env._leader()
     assert beside is not None
