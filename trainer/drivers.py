@@ -122,9 +122,8 @@ def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:
 def _read_actor(path: Path) -> tuple[Actor, dict[str, Any]]:
     state = load_torch(path)
     try:
-        weights = (
-            state["actor"] if path.name == BEST_FILE else state["learning"]["learner"]["actor"]
-        )
+        networks = state if path.name == BEST_FILE else state["learning"]["learner"]
+        weights = networks[state.get("kept_actor", "actor")]
         frames = weights["picture.trunk.conv1.weight"].shape[1]
         actor = Actor(len(weights["head.output.bias"]), frames)
         actor.load_state_dict(weights)

@@ -47,6 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the person drives the whole of one episode in N; 0: interventions only, as the paper",
     )
     parser.add_argument(
+        "--label-every-step",
+        action="store_true",
+        help="the person also says what they would do while the model drives, as an expert can",
+    )
+    parser.add_argument(
         "--refining-updates",
         type=not_negative,
         default=DEFAULTS.refining_updates,
@@ -63,6 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         episodes=arguments.episodes,
         updates_per_episode=arguments.updates_per_episode,
         demonstrated_share=arguments.demonstrated_share,
+        label_every_step=arguments.label_every_step,
         refining_updates=arguments.refining_updates,
     )
     directory = Path(arguments.out)

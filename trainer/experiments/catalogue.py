@@ -19,6 +19,7 @@ from trainer.experiments.plan import (
     EXACT_LOSSES,
     HUMAN_MODEL,
     IMPORTANCE,
+    LAST_ACTOR,
     NORMAL,
     POOR,
     REMEDY,
@@ -151,8 +152,8 @@ EXPERIMENTS: dict[str, Experiment] = {
         by_metric=False,
     ),
     "switches": _curves(
-        "what the paper leaves open: loss form, importance weights",
-        _lines(("phil_td3",), NORMAL, EXACT_LOSSES, IMPORTANCE),
+        "what the paper leaves open: loss form, importance weights, which actor is judged",
+        _lines(("phil_td3",), NORMAL, EXACT_LOSSES, IMPORTANCE, LAST_ACTOR),
         learning.judge_switches,
         by_metric=False,
     ),

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 HUMAN_MODEL = "human_model"
 """Stands in an algorithm's place where the human model itself is tested: nothing is trained."""
 
-NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE = SETTINGS = (
-    "normal", "tough", "poor", "remedy", "exact_losses", "importance",
+NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE, LAST_ACTOR = SETTINGS = (
+    "normal", "tough", "poor", "remedy", "exact_losses", "importance", "last_actor",
 )  # fmt: skip
 """Section VI's definition; one frame instead of two; one third of the demonstrations random; a
 price on the action before tanh, for algorithms whose policy saturates; losses as eq. 22 and 23 are
-printed; the importance weights that the paper calls optional."""
+printed; the importance weights that the paper calls optional; the actor as it stands judged, not
+its average."""
 
 POOR_SHARE = 1.0 / 3.0
 """Demonstrations replaced by random actions in the poor setting (section VII-E)."""
@@ -59,7 +60,7 @@ class Plan:
     """Scenario -> episodes of a run."""
     evaluate_every: int = 10
     """Episodes between two validations; the best validated actor is the one that is tested."""
-    evaluation_runs: int = 20
+    evaluation_runs: int = 100
     """Episodes of a validation."""
     test_runs: int = 50
     """Test episodes in each scene, with the seeds 0, 1, ... for every policy (section VII-D)."""

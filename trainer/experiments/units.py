@@ -14,6 +14,7 @@ from edge_runtime.files import read_bytes
 from trainer.drivers import make_environment
 from trainer.experiments.plan import (
     HUMAN_MODEL,
+    LAST_ACTOR,
     LEARNER_OF,
     POOR,
     POOR_SHARE,
@@ -96,6 +97,7 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
         checkpoint_every=plan.checkpoint_every,
         device=device,
         threads=1,
+        averaged_actor=unit.setting != LAST_ACTOR,
         poor_guidance_share=POOR_SHARE if unit.setting == POOR else 0.0,
         learner=learner,
     )

@@ -36,6 +36,8 @@ class HumanTraining:
         self.env, self.config, self.seed = env, config, seed
         expert = EXPERTS[env.scenario](env)
         self.expert = expert
+        # With a memory of its own: whoever takes over looks at the scene afresh.
+        self.adviser = EXPERTS[env.scenario](env)
         self.guide = HumanGuide(expert, TRIGGERS[env.scenario](expert))
         self.model = HumanModel(config, seed, env.action_space.shape[0])
 
@@ -53,6 +55,7 @@ class HumanTraining:
         seed = seeds.episode_seed(self.seed, seeds.HUMAN_EPISODES, episode)
         observation, info = self.env.reset(seed=seed)
         self.guide.reset()
+        self.adviser.reset()
         interventions, ended = 0, False
         while not ended:
             action = self.model.act(observation)
@@ -62,6 +65,8 @@ class HumanTraining:
                     self.expert.act(observation) if intervention is None else intervention.action
                 )
                 self.model.add(observation, action)
+            elif self.config.label_every_step:
+                self.model.add(observation, self.adviser.act(observation))
             interventions += intervention is not None and intervention.first
             observation, _, terminated, truncated, info = self.env.step(action)
             ended = terminated or truncated

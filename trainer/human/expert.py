@@ -20,6 +20,8 @@ class LeftTurnExpert:
 
     HORIZON_S = 6.0
     START_MARGIN_M = 2.5
+    """Room to every car while turning. With 1.5 m the expert is as safe, but of its imitators, who
+    start some tenths of a second early or late, every tenth touches the car that just passed."""
     KEEP_MARGIN_M = 0.3
     POINT_OF_NO_RETURN_M = 8.0
     """Path length at which the nose comes within 0.5 m of the cars of the near lane."""

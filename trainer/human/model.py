@@ -50,7 +50,10 @@ class HumanModelConfig:
     """The person drives the whole of one episode in this many, from the second on; 0: never.
     Interventions alone, the paper's only source, show little of what right driving looks like
     when nothing goes wrong."""
-
+    label_every_step: bool = False
+    """Whether the person also says, at every step that the model drives, what they would do. A
+    scripted expert can (DAgger as of Ross et al. 2011), a person cannot. Interventions alone leave
+    the model without an answer where it errs and nobody need step in, as too far from the line."""
     refining_updates: int = 0
     """Gradient steps after the last episode, under a learning rate that falls to zero. Not in the
     paper; 2000 of them made no difference that a few seeds could show."""

@@ -60,10 +60,11 @@ class TD3Learner:
         self.updates = 0
 
     @torch.no_grad()
-    def act(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """pi(s) for one observation [2, 45, 80]: float32 [action size]."""
+    def act(self, frames: NDArray[np.uint8], averaged: bool = False) -> NDArray[np.float32]:
+        """pi(s) for one observation [2, 45, 80], or the target actor's: float32 [action size]."""
         batch = torch.from_numpy(frames)[None].to(self.device)
-        return self.actor(batch)[0].cpu().numpy()
+        actor = self.target_actor if averaged else self.actor
+        return actor(batch)[0].cpu().numpy()
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
         """One step of algorithm 1 on a drawn minibatch; ``beta`` is eq. 15's exponent."""

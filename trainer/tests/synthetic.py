@@ -23,6 +23,7 @@ FACTORS = {
     "remedy": 1.0,
     "exact_losses": 0.9,
     "importance": 0.9,
+    "last_actor": 0.95,
 }
 
 

@@ -11,6 +11,7 @@ from trainer.human.dagger import HumanTraining
 from trainer.human.model import HumanModelConfig
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.congestion_config import CongestionConfig
+from trainer.scenarios.vehicle_types import CAR
 from trainer.tests.test_congestion import CENTRED, LEFT, RIGHT, STRAIGHT
 
 ALONE = replace(CENTRED, side_cars=1, side_front_m=(60.0, 60.0))
@@ -44,7 +45,7 @@ def test_the_expert_steers_back_and_then_straight():
 
 
 def test_the_expert_seeks_the_middle_of_the_gap():
-    env = environment()
+    env = environment(config=replace(CENTRED, traffic_mix=((CAR, 1.0),)))
     expert = CongestionExpert(env)
     assert expert.middle_m() == pytest.approx(0.0)
     for car in env.traffic:

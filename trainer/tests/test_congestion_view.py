@@ -63,7 +63,7 @@ def test_render_and_scene_show_what_is_there():
     assert first.dtype == np.uint8
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 10
     scene = env.scene()
-    assert [v["ego"] for v in scene["vehicles"]] == [True] + 7 * [False]
+    assert [v["ego"] for v in scene["vehicles"]] == [True] + 8 * [False]
     assert scene["road_width_m"] == 10.5
     for _ in range(100):
         env.step(STRAIGHT)

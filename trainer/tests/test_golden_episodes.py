@@ -23,10 +23,10 @@ QUEUE = LeftTurnConfig(traffic_cars=8, first_car_m=(-30.0, 12.0), short_gap_m=(7
 """A longer queue than usual, closely packed: the followers brake."""
 
 GOLDEN = {
-    "random": "0f3a9c7c8db4c30f775c624ea948b5f147b3444eb56dce48ac01d316f5d41f30",
-    "expert": "a29cf534201f42a6c8ad18897a74f7b54330d161a55fedfd201bd91f3e3a0a2e",
-    "guided": "cbfc56f9caff5d247fd3bf3df695b14d72813b1bcf1ddb279586dcfa0cd2b679",
-    "queue": "da97ff84e8ebac5ca02462987a66ea680166121280eea174427d09ef0d245749",
+    "random": "4919dea65601fa82481b39f3e0200a62adbaee2f98728d95572abbeea5255927",
+    "expert": "fe283cd598c08709a5089edf6820655d7b4b57618db77b148ecc3a5860af9d82",
+    "guided": "6bccdc728fec9379b8da4561798543acd8bdc6273b287e44e9344b7e9b72f3d0",
+    "queue": "765a45f4236b450263b2aa6d1822cf028d8aa1db5dbb4cd1656e8aff04b0c0a4",
 }
 
 

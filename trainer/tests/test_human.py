@@ -43,7 +43,7 @@ def test_foresight_agrees_with_what_then_happens():
             *_, info = env.step(FULL)
         agreed += foreseen == (info["outcome"] == "goal")
     # Traffic is foreseen at constant speed; IDM speeds differ a little.
-    assert agreed >= 76
+    assert agreed >= 74
 
 
 @pytest.mark.parametrize(("first_car_m", "clear"), [(9.0, False), (60.0, True)])

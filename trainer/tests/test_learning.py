@@ -72,7 +72,7 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
         threads.append(threading.current_thread())
         return losses(1.0)
 
-    def act(seen):
+    def act(seen, averaged):
         threads.append(threading.current_thread())
         return np.zeros(1, np.float32)
 
@@ -93,9 +93,9 @@ def test_validation_acts_in_the_learners_thread(tmp_path):
     run.validation_env = ScriptedEnv(3, "goal")
     act, threads = run.learning.learner.act, []
 
-    def spy(seen):
+    def spy(seen, averaged):
         threads.append(threading.current_thread())
-        return act(seen)
+        return act(seen, averaged)
 
     run.learning.learner.act = spy
     validations = []

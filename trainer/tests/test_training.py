@@ -40,7 +40,7 @@ def train(config: RunConfig, directory: Path, resume: bool = False) -> TrainingR
 
 
 def actor_weights(run: TrainingRun) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in run.learning.actor.parameters()])
+    return torch.cat([p.detach().flatten() for p in run.learning.learner.actor.parameters()])
 
 
 def replay(run: TrainingRun) -> ReplayBuffer:
@@ -170,3 +170,31 @@ def test_episode_seeds_never_meet_small_test_seeds():
 def test_metrics_are_plain_csv(trained):
     with (trained.run_dir / "metrics.csv").open(newline="") as file:
         assert len(list(csv.reader(file))) == 5
+
+
+@pytest.mark.parametrize(("averaged", "name"), [(True, "target_actor"), (False, "actor")])
+def test_what_is_kept_is_the_network_that_was_validated(averaged, name, tmp_path):
+    run = TrainingRun(
+        replace(TINY, episodes=1, evaluate_every=1, averaged_actor=averaged), tmp_path
+    )
+    asked, act = [], run.learning.act
+
+    def spy(frames, judged=False):
+        asked.append(judged)
+        return act(frames, judged)
+
+    run.learning.act = spy
+    run.advance()
+    with torch.no_grad():
+        run.learning.learner.actor.head.output.bias += 0.5  # now the two differ
+    asked.clear()
+    run.episode = 0
+    run.train()
+    run.save()
+    assert asked[-1] is averaged
+    wanted = getattr(run.learning.learner, name).state_dict()
+    for path in (BEST_FILE, CHECKPOINT_FILE):
+        if path == CHECKPOINT_FILE:
+            (tmp_path / BEST_FILE).unlink()
+        kept = load_actor(tmp_path)[0].state_dict()
+        assert all(torch.equal(kept[key], wanted[key]) for key in wanted)

@@ -20,7 +20,6 @@ from trainer.learner.algorithms import Algorithm
 from trainer.learner.captured import captured, changed_by_learning
 from trainer.learner.config import LearnerConfig
 from trainer.learner.device_replay import DeviceReplay
-from trainer.learner.networks import Actor
 from trainer.learner.replay import FRAME_SHAPE
 from trainer.learner.staging import Staging
 from trainer.learner.td3 import TD3Learner
@@ -73,16 +72,14 @@ class AcceleratorLearning:
         """Transitions stored since the run began."""
         return self.replay.added
 
-    @property
-    def actor(self) -> Actor:
-        """The policy network; what reads it on the device comes after the update begun last."""
-        return self.learner.actor
-
-    def act(self, observation: Observation) -> Action:
-        """pi(s), float32 [action size]; waits for the update before it."""
+    def act(self, observation: Observation, averaged: bool = False) -> Action:
+        """The actor's action or the target actor's, float32 [action size]; waits for the update."""
         self._seen.row()["frames"] = observation
         self._seen.send()
-        self._run_graph("act", self._choose_action)
+        if averaged:
+            self._run_graph("act_averaged", self._choose_averaged_action)
+        else:
+            self._run_graph("act", self._choose_action)
         self._read_action.copy_(self._action, non_blocking=True)
         began_s = time.perf_counter()
         if self.device.type == "cuda":
@@ -155,6 +152,9 @@ class AcceleratorLearning:
     @torch.no_grad()
     def _choose_action(self) -> None:
         self._action.copy_(self.learner.actor(self._seen.fields["frames"])[0])
+
+    def _choose_averaged_action(self) -> None:
+        self._action.copy_(self.learner.target_actor(self._seen.fields["frames"])[0])
 
     def _store(self) -> None:
         self._run_graph("store", self.replay.store_record)

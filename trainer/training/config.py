@@ -39,6 +39,9 @@ class RunConfig:
     penalise_stuck: bool = False
     """Whether taking over from a car that only waits too long is penalised, too. A stuck car
     looks like one that rightly waits, so the penalty teaches to fear waiting."""
+    averaged_actor: bool = True
+    """Whether the target actor is what is validated, kept and exported. It is a running average
+    (Polyak and Juditsky, 1992) of the actor that learns, which swings from episode to episode."""
     poor_guidance_share: float = 0.0
     """Share of the human's actions that are replaced by random ones (section VII-E: one third)."""
     evaluate_every: int = 20

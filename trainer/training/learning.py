@@ -22,7 +22,6 @@ from trainer.files import as_arrays, as_tensors
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
 from trainer.learner.minibatch import Losses
-from trainer.learner.networks import Actor
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import TD3Learner
 
@@ -39,12 +38,12 @@ class Learning(Protocol):
         ...
 
     @property
-    def actor(self) -> Actor:
-        """The policy network, as of the last finished update."""
+    def learner(self) -> TD3Learner:
+        """The networks, as of the last finished update."""
         ...
 
-    def act(self, observation: Observation) -> Action:
-        """pi(s), float32 [action size]; not between ``begin`` and ``finish``."""
+    def act(self, observation: Observation, averaged: bool = False) -> Action:
+        """The actor's action, or the target actor's, float32 [action size]; not while updating."""
         ...
 
     def start_episode(self, observation: Observation) -> None:
@@ -95,17 +94,22 @@ NO_LOSSES = (math.nan,) * 4
 
 
 class LearningDriver:
-    """The policy that is being learned at the wheel, asked where it is learned."""
+    """The policy that is being learned at the wheel, asked where it is learned.
 
-    def __init__(self, learning: Learning) -> None:
-        self.learning = learning
+    Args:
+        learning: where.
+        averaged: whether the target actor drives, the running average of the one that learns.
+    """
+
+    def __init__(self, learning: Learning, averaged: bool) -> None:
+        self.learning, self.averaged = learning, averaged
 
     def reset(self) -> None:
         """Networks have no memory."""
 
     def act(self, observation: Observation) -> Action:
-        """pi(s), float32 [action size]; not while an update is under way."""
-        return self.learning.act(observation)
+        """The action, float32 [action size]; not while an update is under way."""
+        return self.learning.act(observation, self.averaged)
 
 
 class ProcessorLearning:
@@ -140,14 +144,9 @@ class ProcessorLearning:
         """Transitions stored since the run began."""
         return self.replay.added
 
-    @property
-    def actor(self) -> Actor:
-        """The policy network, as of the last finished update."""
-        return self.learner.actor
-
-    def act(self, observation: Observation) -> Action:
-        """pi(s), float32 [action size]; not between ``begin`` and ``finish``."""
-        return self.in_thread(self.learner.act, observation)
+    def act(self, observation: Observation, averaged: bool = False) -> Action:
+        """The actor's action, or the target actor's, float32 [action size]; not while updating."""
+        return self.in_thread(self.learner.act, observation, averaged)
 
     def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
         """What ``work(*arguments)`` returns in the updates' thread, after the update under way."""

@@ -108,6 +108,7 @@ class TrainingRun:
             {
                 **self._label(),
                 "learning": self.learning.state_dict(),
+                "kept_actor": self._kept_actor,
                 "exploration": self.exploration.bit_generator.state,
                 "guidance": self.guidance.bit_generator.state,
                 "best_validation": self.best_validation,
@@ -232,7 +233,7 @@ class TrainingRun:
             seeds.episode_seed(self.config.seed, seeds.VALIDATION, run)
             for run in range(self.config.evaluation_runs)
         ]
-        driver = LearningDriver(self.learning)
+        driver = LearningDriver(self.learning, self.config.averaged_actor)
         results = drive_episodes(self.validation_env, driver, chosen, latency=self.network)
         success = float(np.mean([result.outcome == GOAL for result in results]))
         distance_m = float(np.mean([result.distance_m for result in results]))
@@ -240,8 +241,14 @@ class TrainingRun:
         reward = float(np.mean([result.reward for result in results]))
         if (success, reward) >= self.best_validation:
             self.best_validation = (success, reward)
-            state = {**self._label(), "actor": self.learning.actor.state_dict()}
+            kept = getattr(self.learning.learner, self._kept_actor)
+            state = {**self._label(), "actor": kept.state_dict()}
             save_torch(self.run_dir / BEST_FILE, state)
+
+    @property
+    def _kept_actor(self) -> str:
+        """The learner's network that is validated and kept."""
+        return "target_actor" if self.config.averaged_actor else "actor"
 
     def _label(self) -> dict[str, Any]:
         c = self.config

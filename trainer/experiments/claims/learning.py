@@ -18,7 +18,14 @@ from trainer.experiments.claims.compare import (
 )
 from trainer.experiments.figures.curves import ALONE, METRICS, Line
 from trainer.experiments.gathered import Gathered
-from trainer.experiments.plan import EXACT_LOSSES, IMPORTANCE, REMEDY, SCENARIO_TITLES, TOUGH
+from trainer.experiments.plan import (
+    EXACT_LOSSES,
+    IMPORTANCE,
+    LAST_ACTOR,
+    REMEDY,
+    SCENARIO_TITLES,
+    TOUGH,
+)
 from trainer.experiments.statistics import Holds, above, mean_estimate
 from trainer.experiments.verdict import Claim, claim
 
@@ -31,6 +38,7 @@ NO_CLONING, NO_TDQA, NO_SHAPING = map(
 )
 HI_REMEDY, PER_REMEDY = Line("hi_td3", REMEDY), Line("per_td3", REMEDY)
 EXACT, WEIGHED = Line("phil_td3", EXACT_LOSSES), Line("phil_td3", IMPORTANCE)
+LAST = Line("phil_td3", LAST_ACTOR)
 
 SPEEDS = {("left_turn", "episode_return"): 7.0, ("congestion", "distance_m"): 2.2}
 """The paper's learning efficiency, where it gives one."""
@@ -249,4 +257,7 @@ def judge_switches(gathered: Gathered) -> list[Claim]:
                         "one mean over the batch ends above eq. 22 and 23 as printed", "–"),
             final_claim(*place, PHIL, [WEIGHED], "no importance weights end above eq. 15", "–"),
         ]  # fmt: skip
+    for scenario in SCENARIO_TITLES:
+        text = "the averaged actor ends above the last one"
+        claims.append(final_claim(gathered, scenario, ALONE, PHIL, [LAST], text, "–"))
     return claims

@@ -18,6 +18,9 @@ METRICS = {"episode_return": "training reward", "distance_m": "surviving distanc
 ALONE = "validation_distance_m"
 TITLES = {**METRICS, ALONE: "surviving distance of the policy alone, m"}
 
+STYLES = ("-", "--", ":", "-.")
+"""Of an algorithm's settings, the normal one first."""
+
 
 class Line(NamedTuple):
     """One curve of a panel."""
@@ -69,7 +72,8 @@ def _draw_panel(
         outcomes = gathered.of(scenario, line.algorithm, line.setting)
         named = f"{line.label} ({len(outcomes)} of {gathered.seeds} seeds)"
         shade = colour(line.algorithm, place)
-        style = "-" if line.setting == NORMAL else "--"
+        settings = [other.setting for other in lines if other.algorithm == line.algorithm]
+        style = STYLES[settings.index(line.setting)] if NORMAL in settings else STYLES[1]
         if not outcomes:
             panel.plot([], [], style, color=shade, alpha=0.4, label=named)
             continue
