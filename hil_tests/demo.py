@@ -50,7 +50,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="of the PHIL-TD3 training, at most",
     )
     parser.add_argument(
-        "--human-episodes", type=positive, default=50, help="of the human model's training"
+        "--human-episodes", type=positive, default=60, help="of the human model's training"
     )
     parser.add_argument(
         "--minutes",
@@ -136,7 +136,8 @@ class Demo:
             heading("1  A person drives and takes over; the human model learns to imitate that")
             run_command(
                 "trainer", "human", "--out", str(self.human_dir), "--seed", seed,
-                "--episodes", str(arguments.human_episodes),
+                "--episodes", str(arguments.human_episodes), "--frames", "2", "--label-every-step",
+                "--refining-updates", "1000",
             )  # fmt: skip
         heading("2  PHIL-TD3 learns to drive; the human model takes over when it must")
         run_command(
