@@ -70,6 +70,15 @@ def test_a_gap_between_fresh_states_starts_the_count_again_without_any_tick():
     assert modes == ["safe_stop"] * 8 + ["drive"]
 
 
+@pytest.mark.parametrize("after_s", [0.2, 0.21, 0.22])
+def test_no_drive_goes_on_with_another_simulator(after_s):
+    """It may take over from 2 T on, within the grace for a lost state, too."""
+    controller = make()
+    answer(controller, 0, 0.0)
+    order = answer(controller, 0, after_s, session="simulator-b")
+    assert (order.mode, order.reason) == ("safe_stop", "no_fresh_state")
+
+
 def test_a_nan_stops_with_the_very_state_and_every_further_one():
     controller = make()
     answer(controller, 0, 0.0)
