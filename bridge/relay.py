@@ -93,7 +93,7 @@ def _check(arguments: Any) -> LatencySpec:
 
 
 def _check_plain(endpoint: str) -> None:
-    """With TLS it would need two certificates: it is a simulator to one end, an edge to the other."""
+    """With TLS it would need two certificates: a simulator to one end, an edge to the other."""
     if is_tls(endpoint):
         raise UserError(
             f"endpoint {endpoint} is not for the relay: it speaks plain text only, for the bench;"

@@ -53,6 +53,14 @@ class BrokenVehicle(MockVehicle):
             raise OSError("bus off")
 
 
+class NotingRunner(VehicleRunner):
+    def __init__(self, vehicle):
+        self.heard: list = []
+        self.faults: list = []
+        super().__init__(vehicle, ["pedal"], self.heard.append)
+        self.on_fault = lambda: self.faults.append(True)
+
+
 @pytest.fixture
 def vehicle():
     return BrokenVehicle()
@@ -60,9 +68,7 @@ def vehicle():
 
 @pytest.fixture
 def runner(vehicle):
-    runner = VehicleRunner(vehicle, ["pedal"], lambda feedback: runner.heard.append(feedback))
-    runner.heard, runner.faults = [], []
-    runner.on_fault = lambda: runner.faults.append(True)
+    runner = NotingRunner(vehicle)
     runner.start()
     yield runner
     vehicle.released.set()
