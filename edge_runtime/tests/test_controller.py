@@ -210,6 +210,21 @@ def test_only_a_stopped_vehicle_without_permission_waits_for_the_operator():
     assert not controller.waits_for_rearm
 
 
+def test_a_vehicle_fault_between_two_states_takes_the_permission_back():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0)
+    stop(controller)
+    for step in range(1, 5):
+        answer(controller, step, 0.4 + step * 0.1)
+    assert controller.rearm(0.81) == ""
+    controller.vehicle_fault = "vehicle_lying"
+    controller.tick(0.85)
+    controller.vehicle_fault = ""
+    assert controller.waits_for_rearm
+    orders = [answer(controller, step, 0.4 + step * 0.1) for step in range(5, 12)]
+    assert {(order.mode, order.reason) for order in orders} == {("safe_stop", "vehicle_fault")}
+
+
 def test_a_safe_stop_holds_the_last_steering():
     controller = make(actions=(PEDAL, STEERING))
     answer(controller, 0, 0.0, np.array([0.4, -0.25], np.float32))
