@@ -100,8 +100,8 @@ class Controller:
         was = self.safety.mode
         if was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
-        elif was is Mode.DRIVE and self.vehicle_fault:
-            self._apply(Event.VEHICLE)
+        elif self.vehicle_fault and (was is Mode.DRIVE or self.safety.rearmed):
+            self._apply(Event.VEHICLE)  # it may be over before the next state
         if self.safety.mode is not Mode.SAFE_STOP:
             return None
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:

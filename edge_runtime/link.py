@@ -54,14 +54,17 @@ class Link:
             _reply(query, self._status(health()))
 
         def rearm_asked(query: zenoh.Query) -> None:
+            # `phil/**` asks what is there: a look at everything is nobody's permission to move.
+            if str(query.key_expr) != rearm_key:
+                return
             refusal = rearm()
             _reply(query, {"accepted": not refusal, "detail": refusal, "mode": health().mode})
 
-        session = self._session
+        session, rearm_key = self._session, key(self.vehicle_id, "rearm")
         self._declared = [
             session.declare_subscriber(key(self.vehicle_id, "state"), state_came),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
-            session.declare_queryable(key(self.vehicle_id, "rearm"), rearm_asked),
+            session.declare_queryable(rearm_key, rearm_asked),
         ]
 
     def appear(self, open_client: OpenClient, give_way: Callable[[], None]) -> None:
