@@ -59,7 +59,7 @@ class Link:
 
         session = self._session
         self._declared = [
-            session.declare_subscriber(key(self.vehicle_id, "state"), state_came),
+            session.declare_subscriber(key(self.vehicle_id, "state"), _at_once(state_came)),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
             session.declare_queryable(key(self.vehicle_id, "rearm"), rearm_asked),
         ]
@@ -102,6 +102,14 @@ class Link:
         status["version"] = __version__
         status["manifest"] = msgspec.to_builtins(self._manifest)
         return status
+
+
+def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
+    """Zenoh's own thread calls it: no second thread to wake, and no queue of old states between.
+
+    The callback must be quick, for nothing else is received meanwhile.
+    """
+    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
