@@ -10,6 +10,7 @@ import zenoh
 
 from edge_runtime import __version__, log
 from edge_runtime.manifest import Manifest
+from edge_runtime.native_thread import keep_state
 from edge_runtime.presence import OpenClient, Presence
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
@@ -109,7 +110,12 @@ def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
 
     The callback must be quick, for nothing else is received meanwhile.
     """
-    return zenoh.handlers.Callback(callback, indirect=False)
+
+    def call(sample: zenoh.Sample) -> None:
+        keep_state()
+        callback(sample)
+
+    return zenoh.handlers.Callback(call, indirect=False)
 
 
 def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
