@@ -15,7 +15,13 @@ from hil_tests.faults.link import address
 from hil_tests.faults.processes import wait_until
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
-from hil_tests.faults.timeline import CommandSeen, first, last_drive_s, longest_gap_s
+from hil_tests.faults.timeline import (
+    CommandSeen,
+    first,
+    last_drive_s,
+    longest_gap_s,
+    stops_between,
+)
 
 STOPPED_S = 1.0
 CUT_S = 1.0
@@ -241,8 +247,7 @@ def _stepped(rig: Rig, process: object, number: int) -> Try:
     end_s = rig.mark()
     commands = list(rig.timeline.commands)
     gap_s = longest_gap_s((c.seen_s for c in commands), begin_s, end_s)
-    stops = [c for c in commands if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP]
-    return Try(gap_s, wrong=[f"safe stop: {stops[0].reason}"] if stops else [])
+    return Try(gap_s, wrong=stops_between(commands, begin_s, end_s))
 
 
 _EXPECT_OWN = "simulator brakes by itself: no_command"
@@ -275,7 +280,7 @@ ROWS = (
     Row("slow_inference", "inference of about 2.5 T for 0.5 s",
         "edge sends safe_stop: inference_too_long",
         "last answered state at the probe to safe_stop on the wire", slow_inference,
-        policy="slow", flows=True),
+        policy="slow", flows=True, alone=True),
     Row("cpu_starved", "two spinning processes for each core, 2 s", "drives on or safe_stop",
         "longest gap between commands", cpu_starved, alone=True),
 )  # fmt: skip

@@ -26,7 +26,7 @@ from hil_tests.faults.processes import wait_until
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
 from hil_tests.faults.sender import make_state
-from hil_tests.faults.timeline import longest_gap_s
+from hil_tests.faults.timeline import longest_gap_s, stops_between
 
 COUNT = 10_000
 PER_S = 2_500
@@ -256,6 +256,8 @@ def _drove_on(
     """The try of a row in which nothing is to happen but counting."""
     gap_s = longest_gap_s((c.seen_s for c in list(rig.timeline.commands)), begin_s, end_s)
     wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
+    # Safe stops come as steadily as drives: the gaps alone would not tell.
+    wrong += stops_between(rig.timeline.commands, begin_s, end_s)
     return Try(gap_s, rejected=dict(counted), wrong=wrong)
 
 
