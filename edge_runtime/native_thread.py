@@ -13,7 +13,7 @@ def keep_state() -> None:
 
     A native thread that calls into Python is given a new state by PyGILState_Ensure, and it is
     taken down when the call returns: tens of microseconds of each call. One Ensure that is never
-    released keeps it. A thread ends with the session; so few states are left to the end of the process.
+    released keeps it. These threads live as long as the session, so nothing piles up.
     """
     if not getattr(_thread, "kept", False):
         ctypes.pythonapi.PyGILState_Ensure()

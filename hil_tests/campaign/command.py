@@ -128,6 +128,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _choose(arguments: argparse.Namespace) -> tuple[list[Axis], list[str] | None]:
     """The latency axes, and the faults by name ([]: all of them; None: no faults)."""
+    from hil_tests.faults import check_rows
+
     known = {axis.name: axis for axis in AXES}
     if arguments.rows == NO_ROWS:
         return [], None
@@ -137,7 +139,10 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[Axis], list[str] | None
     if faults and arguments.only == "latency":
         raise UserError(f"no latency axis {faults[0]!r}; choose from {', '.join(known)}")
     if arguments.only == "faults":
+        if named and not faults:
+            raise UserError(f"{arguments.rows} names latency axes, no fault")
         axes = []
+    check_rows(faults)  # now, not after the hours of the latency rows
     without_faults = arguments.only == "latency" or (named and not faults)
     return axes, None if without_faults else faults
 

@@ -117,6 +117,8 @@ def test_intervals_that_do_not_meet_do_not_agree():
     [
         (["--check-realtime", "delay=5"], "is not understood"),
         (["--rows", "lag", "--only", "latency"], "no latency axis 'lag'"),
+        (["--rows", "delay,edge_kiled"], "no fault 'edge_kiled'"),
+        (["--rows", "delay", "--only", "faults"], "no fault"),
         (["--against", "r.json"], "write NAME=R.json"),
         (["--policy", "nowhere.onnx", "--only", "latency"], "nowhere.onnx"),
     ],
