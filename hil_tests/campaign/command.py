@@ -54,7 +54,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         f"{NO_ROWS}: only what --check-realtime asks for",
     )
     parser.add_argument(
-        "--runs", type=positive, default=100, help="episodes of each latency row, the same seeds"
+        "--runs", type=_several, default=100, help="episodes of each latency row, the same seeds"
     )
     parser.add_argument("--seed", type=not_negative, default=0, help="of each row's first episode")
     parser.add_argument(
@@ -82,7 +82,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="drive these networks in real time, too, and say whether success agrees",
     )
     parser.add_argument(
-        "--realtime-runs", type=positive, default=40, help="episodes of each of those"
+        "--realtime-runs", type=_several, default=40, help="episodes of each of those"
     )
     parser.add_argument(
         "--realtime-jobs", type=positive, default=4, metavar="N", help="vehicles at once in those"
@@ -175,6 +175,13 @@ def _other(text: str) -> tuple[str, dict[str, Any]]:
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is no report of a latency campaign") from None
     return name, latency
+
+
+def _several(text: str) -> int:
+    count = positive(text)
+    if count < 2:
+        raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
+    return count
 
 
 def _share(text: str) -> float:

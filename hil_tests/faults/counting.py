@@ -27,6 +27,7 @@ def edge_counts(rig: Rig) -> Counter[str]:
 
 
 def simulator_counts(rig: Rig) -> Counter[str]:
+    """The simulator's counts, from the report that it wrote at its end."""
     report = json.loads((rig.directory / "report.json").read_text())
     return Counter(report["rejected_by_simulator"])
 

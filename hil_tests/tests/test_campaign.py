@@ -131,6 +131,13 @@ def test_a_mistake_is_one_line(options, said, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_one_episode_has_no_interval_that_a_report_could_hold(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["campaign", "--out", str(tmp_path / "r.json"), "--runs", "1"])
+    assert ended.value.code == 2
+    assert "2 or more have an interval" in capsys.readouterr().err
+
+
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
     few = Axis("delay", "delay", "ms", (0, 100), "delay={}ms", "none", "{} of delay")
     monkeypatch.setattr(command, "AXES", (few,))
