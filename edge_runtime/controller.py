@@ -88,6 +88,9 @@ class Controller:
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + CONTROL_PERIOD_S
             return self._stop_order(inference_ns)
+        if self._needs_rearm and self._newest.state.final:
+            # A vehicle that is told to drive on would do so until its own watchdog ends it.
+            return self._stop_order(inference_ns)._replace(reason=Event.FINAL.value)
         self._last_action = limit_action(wanted, self._last_action, self._rows)
         return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
 

@@ -115,6 +115,16 @@ def test_between_episodes_there_is_no_watchdog():
     assert controller.safety.safe_stops == 0
 
 
+def test_a_vehicle_stands_at_the_end_of_an_episode_and_drives_in_the_next():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0)
+    order = answer(controller, 1, 0.1, final=True)
+    assert (order.mode, order.reason, order.action) == ("safe_stop", "final_state", [-1.0])
+    assert controller.safety.mode is Mode.STANDBY
+    assert controller.safety.safe_stops == 0  # it is no fault
+    assert answer(controller, 2, 0.2).mode == "drive"
+
+
 def test_nothing_is_due_before_the_first_state():
     controller = make()
     assert controller.next_deadline_s() is None
