@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import zenoh
 
+from edge_runtime import access
 from edge_runtime.cli import UserError
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
@@ -116,8 +117,11 @@ def open_feed(
 ) -> Iterator[Feed]:
     """Listen to one vehicle, or to ANY_VEHICLE.
 
-    UserError if no simulator for it is at ``connect`` within ``wait_s``.
+    UserError if no simulator for it is at ``connect`` within ``wait_s``, and for a certificate that
+    may not listen: from here that would look the same.
     """
+    if tls is not None:
+        access.check_name(tls.name, access.VIEWER)
     if vehicle_id != ANY_VEHICLE:
         check_vehicle_id(vehicle_id)
     give_up_s = time.monotonic() + wait_s

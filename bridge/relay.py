@@ -18,6 +18,7 @@ from bridge.simulate import DEFAULT_VEHICLE_ID
 from edge_runtime.cli import ArgumentParser, UserError, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
+from edge_runtime.tls import is_tls
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
 
@@ -81,14 +82,23 @@ def _carry(arguments: Any, spec: LatencySpec, running: Relay) -> None:
 
 
 def _check(arguments: Any) -> LatencySpec:
-    check_endpoint(arguments.listen)
-    check_endpoint(arguments.connect)
+    for endpoint in (arguments.listen, arguments.connect):
+        _check_plain(check_endpoint(endpoint))
     if arguments.listen == arguments.connect:
         raise UserError(f"--listen and --connect are both {arguments.listen}: that is a circle")
     check_vehicle_id(arguments.vehicle_id)
     if arguments.out is not None:
         check_writable(arguments.out)
     return parse_spec(arguments.latency)
+
+
+def _check_plain(endpoint: str) -> None:
+    """With TLS it would need two certificates: a simulator to one end, an edge to the other."""
+    if is_tls(endpoint):
+        raise UserError(
+            f"endpoint {endpoint} is not for the relay: it speaks plain text only, for the bench;"
+            " use tcp/ or udp/"
+        )
 
 
 def _report(arguments: Any, spec: LatencySpec, running: Relay, duration_s: float) -> dict[str, Any]:

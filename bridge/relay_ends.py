@@ -18,7 +18,8 @@ from edge_runtime.latency.model import LatencySpec
 from edge_runtime.topics import key
 from edge_runtime.transport import open_session
 
-QUERIES = ("status", "rearm")
+REARM = "rearm"
+QUERIES = ("status", REARM)
 QUERY_S = 2.0
 """As long as the operator's commands wait for an answer."""
 
@@ -85,6 +86,9 @@ class Relay:
         asked = key(self._vehicle_id, topic)
 
         def came(query: zenoh.Query) -> None:
+            # As the edge runtime itself: a look at everything (`phil/**`) re-arms nobody.
+            if topic == REARM and str(query.key_expr) != asked:
+                return
             with self._lock:
                 self.queries[topic] += 1
 

@@ -112,6 +112,8 @@ def replay(arguments: Any) -> int:
 
 def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:
     if arguments.policy is not None:
+        if arguments.tls is not None:
+            raise UserError("--tls is for a link, of --listen or --connect; --policy has none")
         policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
         return policy.policy_id, replay_in_process(drive, policy)
     endpoint = check_endpoint(arguments.listen or arguments.connect)

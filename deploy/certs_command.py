@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import datetime
+import ipaddress
 import os
 import re
 import shutil
@@ -17,6 +18,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
 from deploy.certs import (
+    CA_DAYS,
     CA_KEY_FILE,
     LOOPBACK_HOSTS,
     Authority,
@@ -34,7 +36,10 @@ CA_FOLDER = "ca"
 DEFAULT_OUT = "certs"
 DEFAULT_VEHICLE_ID = "hunter01"
 DEFAULT_DAYS = 365
-_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9])?|::1?")
+MAX_NAME_CHARS = 64
+"""Of a certificate's common name (RFC 5280)."""
+_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
+_HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
 
 
 class Request(NamedTuple):
@@ -104,13 +109,28 @@ def _check(arguments: argparse.Namespace) -> Request:
     vehicle_ids = arguments.vehicle_id or [DEFAULT_VEHICLE_ID]
     for vehicle_id in vehicle_ids:
         check_vehicle_id(vehicle_id)
+    for name in party_roles(vehicle_ids):
+        if len(name) > MAX_NAME_CHARS:
+            raise UserError(
+                f"no certificate can name {name}: its {len(name)} characters are over"
+                f" {MAX_NAME_CHARS}; choose a shorter --vehicle-id"
+            )
     for host in arguments.host:
-        if not _HOST.fullmatch(host):
+        if not _is_host(host):
             raise UserError(f"host {host!r} is not valid: write a name or an address, without port")
     if arguments.days < 1:
         raise UserError(f"--days {arguments.days} is too short: at least 1")
+    if arguments.days > CA_DAYS:
+        raise UserError(f"--days {arguments.days} is too long: at most {CA_DAYS}")
     hosts = [*LOOPBACK_HOSTS, *arguments.host]
     return Request(Path(arguments.out), list(dict.fromkeys(vehicle_ids)), hosts, arguments.days)
+
+
+def _is_host(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(text)
+        return True
+    return _HOST_NAME.fullmatch(text) is not None
 
 
 def _missing(request: Request) -> dict[str, str]:

@@ -106,9 +106,10 @@ def check_name(name: str, *able: str) -> None:
     Zenoh would not say so: the messages would go nowhere.
     """
     if name not in able:
+        one_vehicles = any(each not in ROLES for each in able)
         raise UserError(
             f"--tls names the certificate of {name}, and this takes that of {' or '.join(able)};"
-            " choose another directory, or another --vehicle-id"
+            f" choose another directory{', or another --vehicle-id' if one_vehicles else ''}"
         )
 
 

@@ -88,6 +88,9 @@ class Controller:
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + CONTROL_PERIOD_S
             return self._stop_order(inference_ns)
+        if self._needs_rearm and self._newest.state.final:
+            # A vehicle that is told to drive on would do so until its own watchdog ends it.
+            return self._stop_order(inference_ns)._replace(reason=Event.FINAL.value)
         self._last_action = limit_action(wanted, self._last_action, self._rows)
         return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
 
@@ -100,8 +103,8 @@ class Controller:
         was = self.safety.mode
         if was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
-        elif was is Mode.DRIVE and self.vehicle_fault:
-            self._apply(Event.VEHICLE)
+        elif self.vehicle_fault and (was is Mode.DRIVE or self.safety.rearmed):
+            self._apply(Event.VEHICLE)  # it may be over before the next state
         if self.safety.mode is not Mode.SAFE_STOP:
             return None
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:

@@ -10,6 +10,7 @@ import zenoh
 
 from edge_runtime import __version__, log
 from edge_runtime.manifest import Manifest
+from edge_runtime.native_thread import keep_state
 from edge_runtime.presence import OpenClient, Presence
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
@@ -54,14 +55,17 @@ class Link:
             _reply(query, self._status(health()))
 
         def rearm_asked(query: zenoh.Query) -> None:
+            # `phil/**` asks what is there: a look at everything is nobody's permission to move.
+            if str(query.key_expr) != rearm_key:
+                return
             refusal = rearm()
             _reply(query, {"accepted": not refusal, "detail": refusal, "mode": health().mode})
 
-        session = self._session
+        session, rearm_key = self._session, key(self.vehicle_id, "rearm")
         self._declared = [
-            session.declare_subscriber(key(self.vehicle_id, "state"), state_came),
+            session.declare_subscriber(key(self.vehicle_id, "state"), _at_once(state_came)),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
-            session.declare_queryable(key(self.vehicle_id, "rearm"), rearm_asked),
+            session.declare_queryable(rearm_key, rearm_asked),
         ]
 
     def appear(self, open_client: OpenClient, give_way: Callable[[], None]) -> None:
@@ -102,6 +106,19 @@ class Link:
         status["version"] = __version__
         status["manifest"] = msgspec.to_builtins(self._manifest)
         return status
+
+
+def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
+    """Zenoh's own thread calls it: no second thread to wake, and no queue of old states between.
+
+    The callback must be quick, for nothing else is received meanwhile.
+    """
+
+    def call(sample: zenoh.Sample) -> None:
+        keep_state()
+        callback(sample)
+
+    return zenoh.handlers.Callback(call, indirect=False)
 
 
 def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:

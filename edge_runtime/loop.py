@@ -1,7 +1,8 @@
 """The control loop: the thin shell of clocks, threads and Zenoh around controller.py.
 
 Three kinds of threads meet here, under one lock:
-- Zenoh's call `_on_state`, which judges a message and leaves the newest state in a slot;
+- Zenoh's receiving thread calls `_on_state`, which judges a message and leaves the newest state
+  in a slot;
 - the policy's thread takes the slot, infers outside the lock, and sends the answer;
 - the main thread is the watchdog: it wakes at absolute deadlines, sends safe stops and health,
   and tells systemd that all of this works.
@@ -11,6 +12,7 @@ A command is sent under the lock, so that no late answer can follow a safe stop.
 from __future__ import annotations
 
 import math
+import queue
 import threading
 import time
 from typing import Optional
@@ -24,7 +26,7 @@ from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
 from edge_runtime.policy import Policy
-from edge_runtime.safety import Mode, Safety
+from edge_runtime.safety import MAX_INFERENCE_S, Mode, Safety
 from edge_runtime.sd_notify import Notifier
 from edge_runtime.vehicles.runner import VehicleRunner
 from edge_runtime.wire import TOPICS, Command, Health, Rejection, decode_state
@@ -65,9 +67,10 @@ class ControlLoop:
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
         self._lock = threading.RLock()
-        self._state_came = threading.Condition(self._lock)
+        # Wakes the policy's thread: once for a state in an empty slot, once to end. Unlike a
+        # Condition it wakes outside the lock, which the woken thread would have to wait for.
+        self._wakes: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._timer = threading.Condition(self._lock)
-        self._wakes_s = 0.0
         self._worker = threading.Thread(target=self._work, name="policy", daemon=True)
 
     def start(self) -> None:
@@ -100,7 +103,7 @@ class ControlLoop:
         with self._lock:
             self._stopping = True
             self._timer.notify_all()
-            self._state_came.notify_all()
+        self._wakes.put(None)
 
     def close(self) -> bool:
         """Send a last safe stop and end the policy's thread; False where that thread hangs."""
@@ -147,20 +150,21 @@ class ControlLoop:
             if rejection is not None:
                 self._log_rejection(rejection, arrived_s)
                 return
-            self._superseded += int(self._slot is not None)
+            is_waiting = self._slot is not None
+            self._superseded += int(is_waiting)
             self._slot = Received(state, arrived_s, arrived_ns)
-            self._state_came.notify()
+        if not is_waiting:
+            self._wakes.put(None)
 
     def _work(self) -> None:
         while True:
+            self._wakes.get()
             with self._lock:
-                self._state_came.wait_for(lambda: self._slot is not None or self._stopping)
                 if self._stopping or self._slot is None:
                     return
                 received, self._slot = self._slot, None
                 self._busy_since_s = time.monotonic()
                 self._controller.begin(received, self._busy_since_s)
-                self._wake_watchdog()
             inference = infer(self._policy, received.state.frames_array())
             with self._lock:
                 self._busy_since_s = None
@@ -188,7 +192,6 @@ class ControlLoop:
     def _vehicle_failed(self) -> None:
         """The vehicle's thread has seen a fault: the watchdog need not wait for its deadline."""
         with self._lock:
-            self._wakes_s = 0.0
             self._timer.notify()
 
     def _rearm(self) -> str:
@@ -201,17 +204,14 @@ class ControlLoop:
     def _sleep(self, until_s: float) -> None:
         """Wait for the next deadline; holds the lock before and after."""
         due_s = self._controller.next_deadline_s()
-        self._wakes_s = until_s if due_s is None else min(until_s, due_s)
+        if due_s is not None:
+            until_s = min(until_s, due_s)
         if self._vehicle is not None and not self._controller.vehicle_fault:
-            self._wakes_s = min(self._wakes_s, self._vehicle.silent_at_s)
-        pause_s = self._wakes_s - time.monotonic()
+            until_s = min(until_s, self._vehicle.silent_at_s)
+        # Never longer than the policy may take: so nobody need wake it when the policy starts.
+        pause_s = min(until_s - time.monotonic(), MAX_INFERENCE_S)
         if pause_s > 0:
             self._timer.wait(pause_s)
-
-    def _wake_watchdog(self) -> None:
-        due_s = self._controller.next_deadline_s()
-        if due_s is not None and due_s < self._wakes_s:
-            self._timer.notify()
 
     def _send(self, order: Optional[Order]) -> None:
         self._log_transition()

@@ -121,8 +121,9 @@ def classify_arrival(
     """Which event the time before a state and its sender are; None where it follows in time."""
     if safety.last_fresh_s is None:
         return None
-    if needs_rearm and session != safety.session:
-        return Event.OTHER_SESSION
+    if session != safety.session:
+        # It was let in because the one before was silent for 2 T, whatever the grace says.
+        return Event.OTHER_SESSION if needs_rearm else Event.SILENT
     pause_s = arrived_s - safety.last_fresh_s
     if needs_rearm and safety.mode is Mode.STANDBY and pause_s > MAX_PAUSE_S:
         return Event.PAUSED

@@ -8,7 +8,7 @@ messages.py; both are re-exported here.
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, List, Tuple, Type, TypeVar, Union
+from typing import Any, Dict, Iterator, Tuple, Type, TypeVar, Union
 
 import msgspec
 
@@ -129,12 +129,16 @@ def _decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
 
 def _check_fields(message: _M) -> Union[_M, Rejection]:
     """Finite floats, short texts and no negative counts, for every field of every message."""
+    least = _LEAST.get(type(message), 0)
     for name, value in _leaves(message):
-        if isinstance(value, float) and not math.isfinite(value):
-            return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
-        if isinstance(value, str) and len(value) > MAX_TEXT_CHARS:
-            return Rejection(Reason.MALFORMED, f"{name} is longer than {MAX_TEXT_CHARS} characters")
-        if isinstance(value, int) and value < _LEAST.get(type(message), 0):
+        if isinstance(value, float):
+            if not math.isfinite(value):
+                return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
+        elif isinstance(value, str):
+            if len(value) > MAX_TEXT_CHARS:
+                detail = f"{name} is longer than {MAX_TEXT_CHARS} characters"
+                return Rejection(Reason.MALFORMED, detail)
+        elif isinstance(value, int) and value < least:
             return Rejection(Reason.MALFORMED, f"{name} is {value}, below the least value")
     return message
 
@@ -143,14 +147,14 @@ def _check_fields(message: _M) -> Union[_M, Rejection]:
 _LEAST: Dict[Any, int] = {Feedback: -1}
 
 
-def _leaves(message: Message) -> List[Tuple[str, Any]]:
-    leaves: List[Tuple[str, Any]] = []
+def _leaves(message: Message) -> Iterator[Tuple[str, Any]]:
     for name in message.__struct_fields__:
         value = getattr(message, name)
         if isinstance(value, dict):
-            leaves.extend((f"{name}.{label}", item) for label, item in value.items())
+            for label, item in value.items():
+                yield f"{name}.{label}", item
         elif isinstance(value, list):
-            leaves.extend((f"{name}[{index}]", item) for index, item in enumerate(value))
+            for index, item in enumerate(value):
+                yield f"{name}[{index}]", item
         else:
-            leaves.append((name, value))
-    return leaves
+            yield name, value

@@ -10,13 +10,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zenoh
 from mcap.reader import NonSeekingReader, make_reader
 
-from bridge.feed import QUEUE_MESSAGES, Feed
+from bridge.feed import QUEUE_MESSAGES, Feed, Heard
+from bridge.record import _listen
 from bridge.recording.reader import Recording
+from bridge.recording.writer import RecordingWriter
 from bridge.tests.processes import (
     SLOW_TOY,
     BridgeProcess,
@@ -180,6 +183,30 @@ def test_a_feed_that_falls_behind_drops_and_counts():
     finally:
         session.close()
     assert feed.waiting == QUEUE_MESSAGES
+
+
+class WithoutSimulator(Feed):
+    """An edge runtime behind a router, whose simulator has gone: it goes on saying how it is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.simulator_gone.set()
+        self.said = 0
+
+    def next(self, timeout_s: float) -> Heard | None:
+        time.sleep(0.005)
+        self.said += 1
+        if self.said > 1000:
+            raise AssertionError("it listens on")
+        return Heard("phil/car/health", "health", b"", self.now_ns(), 0)
+
+
+def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path):
+    writer = RecordingWriter(tmp_path / "drive.mcap")
+    _listen(WithoutSimulator(), writer, SimpleNamespace(duration_s=None, linger_s=0.05))
+    writer.finish(0)
+    writer.close()
+    assert writer.messages > 0
 
 
 def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):

@@ -118,6 +118,8 @@ def test_two_unmodified_ends_drive_through_a_relay(tmp_path):
         (["--listen", "tcp/127.0.0.1:7001"], "--connect"),
         (["--listen", "here", "--connect", "tcp/127.0.0.1:7001"], "endpoint"),
         (["--listen", "tcp/127.0.0.1:7001", "--connect", "tcp/127.0.0.1:7001"], "circle"),
+        (["--listen", "tls/127.0.0.1:7001", "--connect", "tcp/127.0.0.1:7002"], "plain text only"),
+        (["--listen", "tcp/127.0.0.1:7001", "--connect", "quic/127.0.0.1:7002"], "plain text only"),
         (
             ["--listen", "tcp/127.0.0.1:7001", "--connect", "udp/127.0.0.1:7001", "--latency", "5"],
             "latency",

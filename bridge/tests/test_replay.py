@@ -244,6 +244,7 @@ def test_through_a_running_edge_runtime(hand, path, tmp_path):
     ("options", "part"),
     [
         (["--policy", "none.onnx"], "does not exist"),
+        (["--policy", "none.onnx", "--tls", "certs/viewer"], "--tls is for a link"),
         ([], "--policy"),
         (["--policy", "a.onnx", "--connect", free_endpoint()], "not allowed"),
         (["--listen", "here"], "endpoint"),

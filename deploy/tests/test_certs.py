@@ -90,7 +90,10 @@ def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
         (["--vehicle-id", "a/b"], "a/b"),
         (["--vehicle-id", "new", "--host", "tcp/host:1"], "tcp/host:1"),
         (["--vehicle-id", "new", "--days", "0"], "--days 0"),
-        (["--vehicle-id", "new", "--days", "99999"], "authority's own"),
+        (["--vehicle-id", "new", "--host", "a..b"], "a..b"),
+        (["--vehicle-id", "new", "--days", "3650"], "authority's own"),
+        (["--vehicle-id", "new", "--days", "99999999999"], "at most 3650"),
+        (["--vehicle-id", "x" * 55], "shorter --vehicle-id"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(made, options, word, capsys):

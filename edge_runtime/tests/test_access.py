@@ -93,5 +93,7 @@ def test_a_wrong_name_says_which_would_be_right():
     check_name("edge-a", common_name(EDGE, "a"))
     with pytest.raises(UserError, match=r"certificate of viewer.*simulator-a or router"):
         check_name("viewer", common_name(SIMULATOR, "a"), common_name(ROUTER))
+    with pytest.raises(UserError, match=r"of viewer, .* that of router; choose another directory$"):
+        check_name("viewer", common_name(ROUTER))
     with pytest.raises(UserError, match="vehicle id"):
         common_name(EDGE, "a/b")

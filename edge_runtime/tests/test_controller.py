@@ -70,6 +70,15 @@ def test_a_gap_between_fresh_states_starts_the_count_again_without_any_tick():
     assert modes == ["safe_stop"] * 8 + ["drive"]
 
 
+@pytest.mark.parametrize("after_s", [0.2, 0.21, 0.22])
+def test_no_drive_goes_on_with_another_simulator(after_s):
+    """It may take over from 2 T on, within the grace for a lost state, too."""
+    controller = make()
+    answer(controller, 0, 0.0)
+    order = answer(controller, 0, after_s, session="simulator-b")
+    assert (order.mode, order.reason) == ("safe_stop", "no_fresh_state")
+
+
 def test_a_nan_stops_with_the_very_state_and_every_further_one():
     controller = make()
     answer(controller, 0, 0.0)
@@ -104,6 +113,16 @@ def test_between_episodes_there_is_no_watchdog():
     assert controller.tick(9.0) is None
     assert answer(controller, 0, 10.0, episode=1).mode == "drive"
     assert controller.safety.safe_stops == 0
+
+
+def test_a_vehicle_stands_at_the_end_of_an_episode_and_drives_in_the_next():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0)
+    order = answer(controller, 1, 0.1, final=True)
+    assert (order.mode, order.reason, order.action) == ("safe_stop", "final_state", [-1.0])
+    assert controller.safety.mode is Mode.STANDBY
+    assert controller.safety.safe_stops == 0  # it is no fault
+    assert answer(controller, 2, 0.2).mode == "drive"
 
 
 def test_nothing_is_due_before_the_first_state():
@@ -199,6 +218,21 @@ def test_only_a_stopped_vehicle_without_permission_waits_for_the_operator():
     answer(controller, 1, 0.35)
     assert controller.rearm(0.4) == ""
     assert not controller.waits_for_rearm
+
+
+def test_a_vehicle_fault_between_two_states_takes_the_permission_back():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0)
+    stop(controller)
+    for step in range(1, 5):
+        answer(controller, step, 0.4 + step * 0.1)
+    assert controller.rearm(0.81) == ""
+    controller.vehicle_fault = "vehicle_lying"
+    controller.tick(0.85)
+    controller.vehicle_fault = ""
+    assert controller.waits_for_rearm
+    orders = [answer(controller, step, 0.4 + step * 0.1) for step in range(5, 12)]
+    assert {(order.mode, order.reason) for order in orders} == {("safe_stop", "vehicle_fault")}
 
 
 def test_a_safe_stop_holds_the_last_steering():

@@ -143,7 +143,13 @@ class AnyHistory(RuleBasedStateMachine):
 
     def _note(self, order: Order) -> None:
         if order.mode == "drive":
+            assert not (self.vehicle and order.answers.state.final)
             self._check_drive(order)
+        elif order.reason == "final_state":  # the vehicle stands, and nothing has gone wrong
+            assert self.vehicle
+            assert not self._is_stopped()
+            assert order.action[0] == self.rows[0].low
+            order = order._replace(mode="standby")
         else:
             assert order.mode == "safe_stop"
             assert order.reason

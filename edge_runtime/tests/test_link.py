@@ -137,6 +137,30 @@ def test_a_muted_link_sends_nothing():
     assert session.sent == 1
 
 
+def test_only_a_query_by_its_own_name_re_arms():
+    session: Any = FakeSession()
+    manifest: Any = None
+    asked: dict = {}
+    session.declare_subscriber = lambda key, handler: None
+    session.declare_queryable = asked.__setitem__
+    calls: List[str] = []
+
+    def rearm() -> str:
+        calls.append("rearm")
+        return ""
+
+    Link(session, "hunter01", manifest).declare(lambda payload: None, lambda: HEALTH, rearm)
+    for selector in ("phil/**", "phil/*/rearm", "phil/hunter01/*", "phil/hunter01/re$*"):
+        asked["phil/hunter01/rearm"](query_of(selector))
+    assert calls == []  # somebody looked at everything that is there
+    asked["phil/hunter01/rearm"](query_of("phil/hunter01/rearm"))
+    assert calls == ["rearm"]
+
+
+def query_of(selector: str) -> Any:
+    return SimpleNamespace(key_expr=selector, reply=lambda *_, **__: None)
+
+
 def test_the_session_is_closed_even_where_nothing_can_be_undeclared():
     session: Any = FakeSession(fails=True)
     manifest: Any = None

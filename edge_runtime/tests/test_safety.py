@@ -91,14 +91,14 @@ def test_the_limits_are_the_contracts():
         (STANDBY, 0.3, "a", Event.SILENT, Event.SILENT),
         (STANDBY, 10.0, "a", Event.SILENT, Event.SILENT),
         (STANDBY, 10.001, "a", Event.SILENT, Event.PAUSED),
-        (STANDBY, 0.1, "b", None, Event.OTHER_SESSION),
-        (STANDBY, 0.1, "0", None, Event.OTHER_SESSION),
+        (STANDBY, 0.1, "b", Event.SILENT, Event.OTHER_SESSION),
+        (STANDBY, 0.1, "0", Event.SILENT, Event.OTHER_SESSION),
         (STANDBY, 60.0, "b", Event.SILENT, Event.OTHER_SESSION),
         (DRIVE, 0.2, "a", None, None),
         (DRIVE, 60.0, "a", Event.SILENT, Event.SILENT),
-        (DRIVE, 0.2, "b", None, Event.OTHER_SESSION),
+        (DRIVE, 0.2, "b", Event.SILENT, Event.OTHER_SESSION),
         (STOP, 60.0, "a", Event.SILENT, Event.SILENT),
-        (STOP, 0.2, "b", None, Event.OTHER_SESSION),
+        (STOP, 0.2, "b", Event.SILENT, Event.OTHER_SESSION),
     ],
 )
 def test_what_the_time_before_a_state_means(mode, gap_s, session, without, with_vehicle):

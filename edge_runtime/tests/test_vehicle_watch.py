@@ -6,10 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.tests.harness import wait_until
 from edge_runtime.vehicles.interface import VehicleReport
 from edge_runtime.vehicles.mock import MockVehicle
-from edge_runtime.vehicles.runner import VehicleRunner
 from edge_runtime.vehicles.watch import DEVIATES_S, LYING, SILENCE_S, SILENT, STUCK, VehicleWatch
 
 TICK_S = 0.05
@@ -109,33 +107,3 @@ def test_the_mock_is_never_accused(pedals):
                 watch.command({"pedal": pedal, "steering": 0.0}, now_s)
             watch.report(vehicle.feedback(now_s), now_s)
             assert watch.fault(now_s) == ""
-
-
-class BrokenVehicle(MockVehicle):
-    def __init__(self):
-        super().__init__()
-        self.broken = False
-
-    def feedback(self, now_s):
-        if self.broken:
-            raise OSError("no such device")
-        return super().feedback(now_s)
-
-
-def test_a_driver_that_raises_is_silent_and_its_thread_lives_on():
-    heard: list = []
-    vehicle = BrokenVehicle()
-    runner = VehicleRunner(vehicle, ["pedal"], heard.append)
-    faults: list = []
-    runner.on_fault = lambda: faults.append(True)
-    runner.start()
-    try:
-        wait_until(lambda: heard, "feedback")
-        vehicle.broken = True
-        wait_until(lambda: faults, "the fault")
-        assert runner.fault(runner.silent_at_s + 0.001) == SILENT
-        vehicle.broken = False
-        count = len(heard)
-        wait_until(lambda: len(heard) > count, "feedback again")
-    finally:
-        runner.close()

@@ -1,6 +1,7 @@
 """Gives a vehicle its commands and publishes its feedback, from a thread of its own.
 
-So the feedback goes on when the control loop hangs, and shows the vehicle braking by itself.
+So the feedback goes on when the control loop hangs, and shows the vehicle braking by itself; and
+the control loop goes on, and says safe stop, when the driver raises or hangs.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Callable, Optional, Sequence
 
 from edge_runtime import log
 from edge_runtime.vehicles.interface import Vehicle, VehicleReport
-from edge_runtime.vehicles.watch import VehicleWatch
+from edge_runtime.vehicles.watch import SILENT, VehicleWatch
 from edge_runtime.wire import SAFE_STOP, TOPICS, Command, Feedback
 
 _PERIOD_S = 1.0 / TOPICS["feedback"].rate_hz
@@ -19,7 +20,7 @@ _JOIN_S = 0.5
 
 
 class VehicleRunner:
-    """Owns the vehicle: all calls to it happen under its lock.
+    """Owns the vehicle: once started, its own thread alone calls it until `close`.
 
     `action_names` are the policy's, in the order of a command's action.
     """
@@ -32,10 +33,12 @@ class VehicleRunner:
         self._publish = publish
         self.on_fault: Callable[[], None] = lambda: None
         self._watch = VehicleWatch()
+        self._refuses = False  # the driver raised at the newest command
         self._failing = False
-        self._lock = threading.Lock()
+        self._next: Optional[Command] = None  # the newest, until the driver takes it
         self._last: Optional[Command] = None
-        self._stopping = threading.Event()
+        self._stopping = False
+        self._due = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
 
     @property
@@ -49,57 +52,90 @@ class VehicleRunner:
         return self._watch.silent_at_s
 
     def fault(self, now_s: float) -> str:
-        """What is wrong with the vehicle, empty if nothing. Takes no lock: a driver may hang."""
-        return self._watch.fault(now_s)
+        """What is wrong with the vehicle, empty if nothing. Waits for nobody."""
+        return SILENT if self._refuses else self._watch.fault(now_s)
 
     def start(self) -> None:
         """Enable the vehicle and start its feedback."""
-        with self._lock:
-            now_s = time.monotonic()
-            self._vehicle.enable(now_s)
-            self._watch.begin(now_s)
+        now_s = time.monotonic()
+        self._vehicle.enable(now_s)
+        self._watch.begin(now_s)
         self._thread.start()
 
     def command(self, command: Command) -> None:
-        """Hand a command to the vehicle. Its mode alone means brake in a safe stop."""
-        with self._lock:
-            self._last = command
+        """Hand on a command, in place of one that the driver has not taken yet. Never waits."""
+        with self._due:
+            self._next = command
+            self._due.notify()
+
+    def close(self) -> None:
+        """Brake, end the feedback, close the driver; one that hangs is left alone."""
+        with self._due:
+            self._stopping = True
+            self._due.notify()
+        if self._thread.is_alive():
+            self._thread.join(_JOIN_S)
+        if self._thread.is_alive():
+            log.event("error", "driver_hangs", vehicle=self.name)
+            return
+        for end in (lambda: self._vehicle.brake(time.monotonic()), self._vehicle.close):
+            try:
+                end()
+            except Exception as error:  # the rest of the runtime must still come to its end
+                log.event("error", "driver_not_closed", detail=error)
+
+    def _run(self) -> None:
+        next_s = time.monotonic()
+        while not self._stopping:
+            command = self._wait(next_s)
+            if command is not None:
+                self._obey(command)
             now_s = time.monotonic()
-            action = dict(zip(self._action_names, command.action))
-            self._watch.command(action, now_s)
+            if now_s >= next_s:
+                # Absolute deadlines; after a long pause one report, not one for each missed period.
+                next_s = max(next_s + _PERIOD_S, now_s)
+                self._report()
+
+    def _wait(self, until_s: float) -> Optional[Command]:
+        """The newest command as soon as there is one; None when it is time, or it ends."""
+        with self._due:
+            pause_s = max(0.0, until_s - time.monotonic())
+            self._due.wait_for(lambda: self._next is not None or self._stopping, pause_s)
+            command, self._next = self._next, None
+            return command
+
+    def _obey(self, command: Command) -> None:
+        """Ask the driver. A safe stop's mode alone means brake."""
+        self._last = command
+        now_s = time.monotonic()
+        action = dict(zip(self._action_names, command.action))
+        self._watch.command(action, now_s)
+        try:
             if command.mode == SAFE_STOP:
                 self._vehicle.brake(now_s)
             else:
                 self._vehicle.command(action, now_s)
+        except Exception as error:  # a driver may raise anything; its thread must live on
+            if not self._refuses:
+                log.event("error", "not_obeyed", detail=error)
+            self._refuses = True
+            self.on_fault()
+            return
+        self._refuses = False
 
-    def close(self) -> None:
-        """Brake, end the feedback, close the driver."""
-        self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(_JOIN_S)
-        with self._lock:
-            self._vehicle.brake(time.monotonic())
-            self._vehicle.close()
-
-    def _run(self) -> None:
-        next_s = time.monotonic()
-        while not self._stopping.wait(max(0.0, next_s - time.monotonic())):
-            # Absolute deadlines; after a long pause one report, not one for each missed period.
-            next_s = max(next_s + _PERIOD_S, time.monotonic())
-            with self._lock:
-                report = self._ask()
-                last = self._last
-            fault = self._watch.fault(time.monotonic())
-            if fault:
-                self.on_fault()
-            if report is not None:
-                self._publish(self._feedback(report, last, fault))
+    def _report(self) -> None:
+        report = self._ask()
+        fault = self.fault(time.monotonic())
+        if fault:
+            self.on_fault()
+        if report is not None:
+            self._publish(self._feedback(report, self._last, fault))
 
     def _ask(self) -> Optional[VehicleReport]:
         """The vehicle's report; None where the driver fails, which is silence like any other."""
         try:
             report = self._vehicle.feedback(time.monotonic())
-        except Exception as error:  # a driver may raise anything; its thread must live on
+        except Exception as error:  # as in _obey
             if not self._failing:
                 log.event("error", "no_feedback", detail=error)
             self._failing = True

@@ -54,7 +54,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         f"{NO_ROWS}: only what --check-realtime asks for",
     )
     parser.add_argument(
-        "--runs", type=positive, default=100, help="episodes of each latency row, the same seeds"
+        "--runs", type=_several, default=100, help="episodes of each latency row, the same seeds"
     )
     parser.add_argument("--seed", type=not_negative, default=0, help="of each row's first episode")
     parser.add_argument(
@@ -82,7 +82,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="drive these networks in real time, too, and say whether success agrees",
     )
     parser.add_argument(
-        "--realtime-runs", type=positive, default=40, help="episodes of each of those"
+        "--realtime-runs", type=_several, default=40, help="episodes of each of those"
     )
     parser.add_argument(
         "--realtime-jobs", type=positive, default=4, metavar="N", help="vehicles at once in those"
@@ -128,6 +128,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _choose(arguments: argparse.Namespace) -> tuple[list[Axis], list[str] | None]:
     """The latency axes, and the faults by name ([]: all of them; None: no faults)."""
+    from hil_tests.faults import check_rows
+
     known = {axis.name: axis for axis in AXES}
     if arguments.rows == NO_ROWS:
         return [], None
@@ -137,7 +139,10 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[Axis], list[str] | None
     if faults and arguments.only == "latency":
         raise UserError(f"no latency axis {faults[0]!r}; choose from {', '.join(known)}")
     if arguments.only == "faults":
+        if named and not faults:
+            raise UserError(f"{arguments.rows} names latency axes, no fault")
         axes = []
+    check_rows(faults)  # now, not after the hours of the latency rows
     without_faults = arguments.only == "latency" or (named and not faults)
     return axes, None if without_faults else faults
 
@@ -170,6 +175,13 @@ def _other(text: str) -> tuple[str, dict[str, Any]]:
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is no report of a latency campaign") from None
     return name, latency
+
+
+def _several(text: str) -> int:
+    count = positive(text)
+    if count < 2:
+        raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
+    return count
 
 
 def _share(text: str) -> float:

@@ -154,12 +154,19 @@ def _judge(row: Row, rig: Rig, outcome: Outcome) -> None:
         outcome.unsafe.append(f"{timeline.unreadable} commands that nobody would take")
 
 
-def _choose(names: Sequence[str] | None) -> list[Row]:
-    known = {row.name: row for row in ROWS}
-    for name in names or ():
+def check_rows(names: Sequence[str]) -> None:
+    """Raise UserError for a name that the table does not hold."""
+    known = [row.name for row in ROWS]
+    for name in names:
         if name not in known:
             raise UserError(f"no fault {name!r}; choose from {', '.join(known)}")
-    return list(ROWS) if names is None else [known[name] for name in names]
+
+
+def _choose(names: Sequence[str] | None) -> list[Row]:
+    if names is None:
+        return list(ROWS)
+    check_rows(names)
+    return [row for name in names for row in ROWS if row.name == name]
 
 
 def _trusted(policy: Path | None) -> list[str]:

@@ -10,12 +10,21 @@ import time
 
 import numpy as np
 
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP
+from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP
 from hil_tests.faults.link import address
 from hil_tests.faults.processes import wait_until
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
-from hil_tests.faults.timeline import CommandSeen, first, last_drive_s, longest_gap_s
+from hil_tests.faults.timeline import last_drive_s, longest_gap_s, stops_between
+from hil_tests.faults.waits import (
+    drive_after_s,
+    last_answered_s,
+    last_state_s,
+    logged_stop,
+    must_stop_first,
+    own_brake_s,
+    stop_command,
+)
 
 STOPPED_S = 1.0
 CUT_S = 1.0
@@ -177,62 +186,6 @@ def spin() -> None:
         pass
 
 
-def own_brake_s(rig: Rig, since_s: float) -> float:
-    """When the simulated vehicle's brake went on after ``since_s``."""
-    what = "the simulator's own brake"
-    return wait_until(
-        lambda: first(rig.brakes(), lambda b: b.pressed and b.seen_s > since_s), what
-    ).seen_s
-
-
-def stop_command(rig: Rig, since_s: float) -> CommandSeen:
-    """The first safe_stop command after ``since_s``."""
-    return wait_until(
-        lambda: first(rig.timeline.commands, lambda c: c.seen_s > since_s and c.mode == SAFE_STOP),
-        "a safe_stop command",
-    )
-
-
-def logged_stop(rig: Rig, since_s: float) -> tuple[float, str]:
-    """When the edge runtime went into safe stop by its log, and why."""
-    mode = wait_until(
-        lambda: first(rig.timeline.modes, lambda m: m.seen_s > since_s and m.mode == SAFE_STOP),
-        "safe_stop in the log",
-    )
-    return mode.seen_s, mode.reason
-
-
-def drive_after_s(rig: Rig, since_s: float) -> float:
-    """When the first drive command after ``since_s`` came."""
-    return wait_until(
-        lambda: first(
-            # By its sending: what a link held up was driven before.
-            rig.timeline.commands,
-            lambda c: c.sent_s > since_s and c.mode == DRIVE,
-        ),
-        "a drive command",
-    ).seen_s
-
-
-def last_state_s(rig: Rig, before_s: float) -> float:
-    """When the probe saw the newest state before ``before_s``."""
-    return max(s for s in list(rig.timeline.states.values()) if s < before_s)
-
-
-def last_answered_s(rig: Rig, before_s: float) -> float:
-    """When the probe saw the newest state that a drive command answered before ``before_s``."""
-    answered = (c.place for c in rig.timeline.commands if c.mode == DRIVE and c.seen_s < before_s)
-    return max(rig.timeline.states[place] for place in answered if place in rig.timeline.states)
-
-
-def must_stop_first(rig: Rig, since_s: float) -> list[str]:
-    """Wrong where the first command after a silence is a drive."""
-    command = first(rig.timeline.commands, lambda c: c.sent_s > since_s)
-    if command is not None and command.mode == DRIVE:
-        return ["drove on without a safe stop"]
-    return []
-
-
 def _stepped(rig: Rig, process: object, number: int) -> Try:
     at_any_phase(number)
     begin_s = rig.mark()
@@ -241,8 +194,7 @@ def _stepped(rig: Rig, process: object, number: int) -> Try:
     end_s = rig.mark()
     commands = list(rig.timeline.commands)
     gap_s = longest_gap_s((c.seen_s for c in commands), begin_s, end_s)
-    stops = [c for c in commands if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP]
-    return Try(gap_s, wrong=[f"safe stop: {stops[0].reason}"] if stops else [])
+    return Try(gap_s, wrong=stops_between(commands, begin_s, end_s))
 
 
 _EXPECT_OWN = "simulator brakes by itself: no_command"
@@ -275,7 +227,7 @@ ROWS = (
     Row("slow_inference", "inference of about 2.5 T for 0.5 s",
         "edge sends safe_stop: inference_too_long",
         "last answered state at the probe to safe_stop on the wire", slow_inference,
-        policy="slow", flows=True),
+        policy="slow", flows=True, alone=True),
     Row("cpu_starved", "two spinning processes for each core, 2 s", "drives on or safe_stop",
         "longest gap between commands", cpu_starved, alone=True),
 )  # fmt: skip

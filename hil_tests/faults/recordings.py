@@ -12,7 +12,7 @@ from hil_tests.faults.ends import at_any_phase
 from hil_tests.faults.processes import Process
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
-from hil_tests.faults.timeline import longest_gap_s
+from hil_tests.faults.timeline import longest_gap_s, stops_between
 
 FULL_AT_BYTES = 60_000
 """The recorder writes about 1 kB for each state: the picture of noise compresses badly."""
@@ -83,6 +83,7 @@ def _drove_on(
     if len(states) < _FEWEST_STATES:
         wrong = [*wrong, f"only {len(states)} states can be read"]
     gap_s = longest_gap_s((c.seen_s for c in list(rig.timeline.commands)), begin_s, end_s)
+    wrong = [*wrong, *stops_between(rig.timeline.commands, begin_s, end_s)]
     return Try(gap_s, wrong=wrong, figures=figures or {})
 
 

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from hil_tests.faults import ends, messages, recordings, vehicles
+from hil_tests.faults import ends, garbage, messages, recordings, vehicles
 from hil_tests.faults.row import Row
 
-ROWS: tuple[Row, ...] = (*ends.ROWS, *messages.ROWS, *vehicles.ROWS, *recordings.ROWS)
+ROWS: tuple[Row, ...] = (
+    *ends.ROWS,
+    *garbage.ROWS,
+    *messages.ROWS,
+    *vehicles.ROWS,
+    *recordings.ROWS,
+)

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE
+from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP
 
 REACTION_LIMIT_S = 2 * CONTROL_PERIOD_S + 0.05
 """After the last good state a safe stop is out, or the other end brakes by itself."""
@@ -111,6 +111,12 @@ def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> flo
     """The longest stretch within [begin, end] without an event."""
     inside = [begin_s, *sorted(t for t in times_s if begin_s < t < end_s), end_s]
     return max(after - before for before, after in pairwise(inside))
+
+
+def stops_between(commands: Iterable[CommandSeen], begin_s: float, end_s: float) -> list[str]:
+    """A line for each reason of the safe stops in between, where the drive was to go on."""
+    seen = [c for c in list(commands) if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP]
+    return [f"safe stop: {reason}" for reason in dict.fromkeys(c.reason for c in seen)]
 
 
 def spread_ms(values_s: Iterable[float]) -> dict[str, float] | None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 
 from edge_runtime.wire import DRIVE
-from hil_tests.faults.ends import at_any_phase, drive_after_s, stop_command
+from hil_tests.faults.ends import at_any_phase
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
+from hil_tests.faults.waits import drive_after_s, stop_command
 
 SWITCH = "vehicle"
 FAULT_S = 1.0

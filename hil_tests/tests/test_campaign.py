@@ -117,6 +117,8 @@ def test_intervals_that_do_not_meet_do_not_agree():
     [
         (["--check-realtime", "delay=5"], "is not understood"),
         (["--rows", "lag", "--only", "latency"], "no latency axis 'lag'"),
+        (["--rows", "delay,edge_kiled"], "no fault 'edge_kiled'"),
+        (["--rows", "delay", "--only", "faults"], "no fault"),
         (["--against", "r.json"], "write NAME=R.json"),
         (["--policy", "nowhere.onnx", "--only", "latency"], "nowhere.onnx"),
     ],
@@ -127,6 +129,13 @@ def test_a_mistake_is_one_line(options, said, tmp_path, capsys):
     assert said in errors
     assert "\n" not in errors
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_episode_has_no_interval_that_a_report_could_hold(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["campaign", "--out", str(tmp_path / "r.json"), "--runs", "1"])
+    assert ended.value.code == 2
+    assert "2 or more have an interval" in capsys.readouterr().err
 
 
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):

@@ -16,6 +16,7 @@ from hil_tests.faults.timeline import (
     CommandSeen,
     longest_gap_s,
     spread_ms,
+    stops_between,
     unsafe_commands,
 )
 
@@ -53,6 +54,15 @@ def test_a_stepped_clock_is_judged_by_arrival():
     stepped = [command(sent_s=3610.0)]
     assert unsafe_commands(stepped, STATES, by_arrival=True) == []
     assert unsafe_commands(stepped, STATES) != []
+
+
+def test_safe_stops_at_the_pace_of_drives_are_no_drive():
+    stop = command(mode="safe_stop", reason="no_fresh_state")
+    stops = [stop._replace(seen_s=10.0 + 0.1 * number) for number in range(5)]
+    assert longest_gap_s((c.seen_s for c in stops), 10.0, 10.4) < REACTION_LIMIT_S
+    assert stops_between([command(), *stops], 9.9, 10.5) == ["safe stop: no_fresh_state"]
+    assert stops_between([command()], 9.9, 10.5) == []
+    assert stops_between(stops, 10.5, 11.0) == []
 
 
 def test_gaps_count_the_edges_of_the_window():

@@ -187,3 +187,12 @@ def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(par
         assert edge.end() == 0
     router.terminate()
     assert router.wait(10) == 0
+
+
+@pytest.mark.parametrize("name", ["operator-hunter01", "simulator-hunter01"])
+def test_who_may_not_listen_is_told_so_and_not_that_nobody_is_there(parties, name):
+    with (
+        pytest.raises(UserError, match=f"of {name}, and this takes that of viewer"),
+        open_feed(free_endpoint("tls"), "hunter01", 0.0, load_tls(parties / name)),
+    ):
+        pass

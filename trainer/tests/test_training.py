@@ -183,10 +183,10 @@ def test_what_is_kept_is_the_network_that_was_validated(averaged, name, tmp_path
         asked.append(judged)
         return act(frames, judged)
 
-    run.learning.act = spy
+    run.learning.act = spy  # type: ignore[method-assign]
     run.advance()
     with torch.no_grad():
-        run.learning.learner.actor.head.output.bias += 0.5  # now the two differ
+        run.learning.learner.actor.head.output.bias.add_(0.5)  # now the two differ
     asked.clear()
     run.episode = 0
     run.train()

@@ -1,0 +1,120 @@
+"""What the runner makes of a driver that raises or hangs: a fault, and nothing worse."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from edge_runtime.tests.harness import wait_until
+from edge_runtime.vehicles.mock import MockVehicle
+from edge_runtime.vehicles.runner import VehicleRunner
+from edge_runtime.vehicles.watch import SILENT
+from edge_runtime.wire import Command
+
+
+def make_command(mode="drive", step=0):
+    return Command(
+        session="s", episode=0, step=step, mode=mode, action=[0.5], policy_id="p",
+        received_ns=0, inference_ns=0, sent_ns=0,
+    )  # fmt: skip
+
+
+class BrokenVehicle(MockVehicle):
+    """Fails where it is told to, and notes what it was asked."""
+
+    def __init__(self):
+        super().__init__()
+        self.broken = ""
+        self.asked: list = []
+        self.hangs = threading.Event()
+        self.released = threading.Event()
+
+    def feedback(self, now_s):
+        if self.broken == "feedback":
+            raise OSError("no such device")
+        if self.broken == "hang":
+            self.hangs.set()
+            self.released.wait()
+        return super().feedback(now_s)
+
+    def command(self, action, now_s):
+        self._ask("command")
+        super().command(action, now_s)
+
+    def brake(self, now_s):
+        self._ask("brake")
+        super().brake(now_s)
+
+    def _ask(self, what):
+        self.asked.append(what)
+        if self.broken == "command":
+            raise OSError("bus off")
+
+
+class NotingRunner(VehicleRunner):
+    def __init__(self, vehicle):
+        self.heard: list = []
+        self.faults: list = []
+        super().__init__(vehicle, ["pedal"], self.heard.append)
+        self.on_fault = lambda: self.faults.append(True)
+
+
+@pytest.fixture
+def vehicle():
+    return BrokenVehicle()
+
+
+@pytest.fixture
+def runner(vehicle):
+    runner = NotingRunner(vehicle)
+    runner.start()
+    yield runner
+    vehicle.released.set()
+    runner.close()
+
+
+def test_a_driver_that_raises_is_silent_and_its_thread_lives_on(vehicle, runner):
+    wait_until(lambda: runner.heard, "feedback")
+    vehicle.broken = "feedback"
+    wait_until(lambda: runner.faults, "the fault")
+    assert runner.fault(runner.silent_at_s + 0.001) == SILENT
+    vehicle.broken = ""
+    count = len(runner.heard)
+    wait_until(lambda: len(runner.heard) > count, "feedback again")
+
+
+def test_a_driver_that_takes_no_command_is_at_fault_until_it_takes_one(vehicle, runner):
+    vehicle.broken = "command"
+    runner.command(make_command())  # raises nothing here
+    wait_until(lambda: runner.faults, "the fault")
+    wait_until(lambda: runner.heard and runner.heard[-1].faults == [SILENT], "it in the feedback")
+    vehicle.broken = ""
+    runner.command(make_command("safe_stop", step=1))
+    wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
+    assert vehicle.asked == ["command", "brake"]
+
+
+def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(vehicle, runner):
+    vehicle.broken = "hang"
+    assert vehicle.hangs.wait(10.0)
+    runner.command(make_command())
+    runner.command(make_command("safe_stop", step=1))
+    wait_until(lambda: runner.fault(time.monotonic()) == SILENT, "the fault")
+    assert vehicle.asked == []
+    vehicle.broken = ""
+    vehicle.released.set()
+    wait_until(lambda: vehicle.asked == ["brake"], "the brake alone")
+
+
+def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner):
+    vehicle.broken = "hang"
+    assert vehicle.hangs.wait(10.0)
+    runner.close()
+    assert vehicle.asked == []  # it may be in the middle of a call
+    vehicle.broken = "command"
+    vehicle.released.set()
+    runner._thread.join(10.0)
+    runner.close()
+    assert vehicle.asked == ["brake"]
