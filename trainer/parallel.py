@@ -83,6 +83,11 @@ def drive_episodes_in_parallel(
             f"a worker process died after {len(results)} of {len(seeds)} episodes; "
             "where memory is short, fewer jobs need less"
         ) from error
+    except KeyboardInterrupt:
+        # Their episodes are of no use any more, and one that is just starting may take long.
+        for worker in multiprocessing.active_children():
+            worker.kill()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
     return results
