@@ -27,12 +27,11 @@ from edge_runtime.latency.command_hold import (
 from edge_runtime.latency.event_heap import EventHeap
 from edge_runtime.latency.model import LatencySpec, make_link
 from edge_runtime.safety import (
-    Event,
     Mode,
     Safety,
     advance,
+    classify_arrival,
     classify_fresh,
-    is_silent,
     note_arrival,
 )
 from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command
@@ -41,6 +40,9 @@ STATE_BYTES = 7322
 COMMAND_BYTES = 217
 """What the messages take on the wire, for links of limited rate: the same for every message, so
 that a longer session name or another digit does not change a drive."""
+
+_SESSION = ""
+"""An episode has one simulator."""
 
 Message = TypeVar("Message")
 
@@ -133,11 +135,12 @@ class VirtualLink(Generic[Message]):
 
     def _note_fresh(self, now_s: float) -> None:
         """What the edge runtime's safety machine makes of a fresh state's moment."""
-        if is_silent(self._safety, now_s - ROUNDING_S):
-            self._safety = advance(self._safety, Event.SILENT)
-        self._safety = note_arrival(self._safety, "", now_s)
-        event = classify_fresh(self._safety, final=False, needs_rearm=False)
-        self._safety = advance(self._safety, event)
+        gap = classify_arrival(self._safety, _SESSION, now_s - ROUNDING_S, needs_rearm=False)
+        if gap is not None:
+            self._safety = advance(self._safety, gap)
+        self._safety = note_arrival(self._safety, _SESSION, now_s)
+        fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
+        self._safety = advance(self._safety, fresh)
 
     def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
         answered_step = self.hold.newest_step
