@@ -74,7 +74,7 @@ class Plan:
     """Least steps of an algorithm before the next one has its turn."""
 
 
-PLAN = Plan(episodes={"left_turn": 150, "congestion": 100})
+PLAN = Plan(episodes={"left_turn": 200, "congestion": 100})
 QUICK = Plan(
     episodes={"left_turn": 3, "congestion": 3},
     evaluate_every=2,
