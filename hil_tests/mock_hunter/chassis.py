@@ -9,13 +9,13 @@ one is documented).
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import Enum, StrEnum
 from typing import NamedTuple
 
 from hil_tests.mock_hunter.faults import BITS
 
 
-class Control(str, Enum):
+class Control(StrEnum):
     """Who drives. ``*_OVER_CAN``: the bus had control and gets it back."""
 
     STANDBY = "standby"
@@ -25,7 +25,7 @@ class Control(str, Enum):
     REMOTE_OVER_CAN = "remote_over_can"
 
 
-class Condition(str, Enum):
+class Condition(StrEnum):
     """Whether anybody may drive."""
 
     OK = "ok"
@@ -34,7 +34,7 @@ class Condition(str, Enum):
     ESTOP_AND_EXCEPTION = "estop_and_exception"
 
 
-class Event(str, Enum):
+class Event(StrEnum):
     """What can happen. The first three are frames of the bus."""
 
     CAN_MODE = "0x421 = 1"

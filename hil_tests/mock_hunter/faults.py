@@ -5,30 +5,45 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from edge_runtime.errors import UserError
+from edge_runtime.vehicles.hunter import faults as words
+
+STEERING, REAR_RIGHT, REAR_LEFT = range(3)
+_LOW_SUPPLY, _MOTOR_HOT, _OVERCURRENT = 1 << 0, 1 << 1, 1 << 2
+_DRIVER_HOT, _SENSOR, _DRIVER = 1 << 3, 1 << 4, 1 << 5
 
 
 class Bit(NamedTuple):
-    """An error that the chassis shows in 0x211.
+    """An error that the chassis shows in 0x211, by the driver's words for it.
 
     ``stops``: it then lets nobody drive. ``latches``: it stays until 0x441 clears it. Which do
-    so the manual leaves open: assumed.
+    so the manual leaves open: assumed. ``motors`` show ``motor_bits`` in 0x261 to 0x263.
     """
 
     words: str
     stops: bool = True
     latches: bool = False
+    motors: tuple[int, ...] = ()
+    motor_bits: int = 0
 
 
 BITS: dict[str, Bit] = {
-    "steering_encoder": Bit("the steering encoder fails", latches=True),
-    "driver": Bit("a motor driver fails", latches=True),
-    "undervoltage": Bit("the battery is nearly empty"),
-    "link_steer": Bit("no link to the steering motor"),
-    "link_rear_right": Bit("no link to the right rear motor"),
-    "link_rear_left": Bit("no link to the left rear motor"),
-    "overtemperature": Bit("a motor driver is too hot"),
-    "overcurrent": Bit("a motor takes too much current", latches=True),
-    "remote_lost": Bit("the remote control is out of reach", stops=False),
+    "steering_encoder": Bit(
+        words.STEER_ENCODER, latches=True, motors=(STEERING,), motor_bits=_SENSOR
+    ),
+    "driver": Bit(words.DRIVER, latches=True, motors=(REAR_RIGHT,), motor_bits=_DRIVER),
+    "undervoltage": Bit(
+        words.UNDERVOLTAGE, motors=(STEERING, REAR_RIGHT, REAR_LEFT), motor_bits=_LOW_SUPPLY
+    ),
+    "link_steer": Bit(words.LINK_STEER),
+    "link_rear_right": Bit(words.LINK_REAR_RIGHT),
+    "link_rear_left": Bit(words.LINK_REAR_LEFT),
+    "overtemperature": Bit(
+        words.OVERTEMPERATURE, motors=(REAR_RIGHT, REAR_LEFT), motor_bits=_DRIVER_HOT | _MOTOR_HOT
+    ),
+    "overcurrent": Bit(
+        words.OVERCURRENT, latches=True, motors=(REAR_RIGHT,), motor_bits=_OVERCURRENT
+    ),
+    "remote_lost": Bit(words.REMOTE_LOST, stops=False),
 }
 
 BEHAVIOURS: dict[str, str] = {

@@ -31,10 +31,10 @@ class Parameters:
     """Of the inner wheel."""
     motor_revolutions_per_m: float = 20.0
     """Of path of a rear wheel."""
+    steer_revolutions_per_rad: float = 20.0
+    """Of the steering motor, for each radian of the inner wheel."""
     pulses_per_revolution: float = 100.0
     """Of a motor's encoder."""
-    steer_pulses_per_rad: float = 10_000.0
-    steer_revolutions_per_rad: float = 20.0
     full_v: float = 28.0
     empty_v: float = 21.0
     undervoltage_v: float = 22.0
