@@ -32,7 +32,7 @@ from hil_tests.faults.processes import Process
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.slow_policy import write_steady
 from trainer.benches.machine import processor_model
-from trainer.commands.options import positive
+from trainer.commands.options import not_negative, positive
 from trainer.revision import source_revision
 
 P99_BAR_MS = 25.0
@@ -49,6 +49,10 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         "--busy", type=positive, default=os.cpu_count() or 1, help="processes that never wait"
     )
+    parser.add_argument(
+        "--realtime-priority", type=not_negative, default=0, metavar="1..99",
+        help="of both senders, as the edge runtime's; 0: none, that of the busy processes",
+    )
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
     arguments = parser.parse_args(argv)
     if not 0.0 < arguments.minutes < 24 * 60:
@@ -59,22 +63,24 @@ def main(argv: list[str]) -> int:
         "machine": {"processor": processor_model(), "cores": os.cpu_count()},
         "source_revision": source_revision(),
         "busy_processes": arguments.busy,
-        **measure(arguments.minutes * 60.0, arguments.busy),
+        "realtime_priority": arguments.realtime_priority,
+        **measure(arguments.minutes * 60.0, arguments.busy, arguments.realtime_priority),
     }
     write_json_out(arguments.out, report)
     print(render(report))
     return 0
 
 
-def measure(seconds: float, busy: int) -> dict[str, Any]:
+def measure(seconds: float, busy: int, priority: int = 0) -> dict[str, Any]:
     """Stream so long; the gaps of both senders, and what became of the drive."""
     with tempfile.TemporaryDirectory(prefix="phil-can-") as work:
         policy = Path(work) / "steady.onnx"
         write_steady(policy)
         flags = ["--policy", str(policy), "--allow-unsigned"]
+        flags += ["--realtime-priority", str(priority)]
         with (
             Rig(flags, Path(work), vehicle="hunter", model="hunter-2.0") as rig,
-            _floor() as floor,
+            _floor(priority) as floor,
             _busy(busy),
         ):
             assert rig.ears is not None
@@ -114,7 +120,7 @@ def render(report: dict[str, Any]) -> str:
     """The table for a person."""
     lines = [
         f"50 Hz over udp_multicast, {report['seconds'] / 60:.1f} min,"
-        f" {report['busy_processes']} busy processes",
+        f" {report['busy_processes']} busy processes, priority {report['realtime_priority']}",
         "| gap between frames, ms | p50 | p99 | longest | over 25 | frames |",
         "|---|---|---|---|---|---|",
     ]
@@ -133,10 +139,10 @@ def render(report: dict[str, Any]) -> str:
 
 
 @contextmanager
-def _floor() -> Iterator[CanEars]:
+def _floor(priority: int) -> Iterator[CanEars]:
     bus = free_bus()
     ears = CanEars(bus, (CAN_ID,))
-    process = Process("hil_tests.benches.can_floor", bus)
+    process = Process("hil_tests.benches.can_floor", bus, str(priority))
     try:
         process.wait_for_line("ready")
         yield ears

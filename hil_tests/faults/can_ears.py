@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import can
 
-from edge_runtime.vehicles.can_bus import open_bus
+from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+from edge_runtime.vehicles.hunter.frames import FRAMES
 
 _POLL_S = 0.1
 
@@ -27,8 +28,10 @@ class CanEars:
 
     def __init__(self, bus: str, can_ids: tuple[int, ...]) -> None:
         self.heard: list[Heard] = []
+        self.strange: list[Heard] = []
+        """Frames that are not the Hunter's: nobody should send any."""
         self._can_ids = frozenset(can_ids)
-        self._bus = open_bus(bus)
+        self._bus = open_bus(parse_bus(bus))
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
@@ -47,9 +50,14 @@ class CanEars:
         while not self._ending.is_set():
             with contextlib.suppress(can.CanError):
                 message = self._bus.recv(_POLL_S)
-                if message is not None and message.arbitration_id in self._can_ids:
-                    # The stamp is the kernel's, by the wall clock: how late this thread runs
-                    # does not count.
-                    seen_s = message.timestamp + time.monotonic() - time.time()
-                    data = bytes(message.data)
-                    self.heard.append(Heard(seen_s, message.arbitration_id, data))
+                if message is not None:
+                    self._note(message)
+
+    def _note(self, message: can.Message) -> None:
+        # The stamp is the kernel's, by the wall clock: how late this thread runs does not count.
+        seen_s = message.timestamp + time.monotonic() - time.time()
+        heard = Heard(seen_s, message.arbitration_id, bytes(message.data))
+        if heard.can_id in self._can_ids:
+            self.heard.append(heard)
+        if heard.can_id not in FRAMES or message.is_extended_id:
+            self.strange.append(heard)

@@ -6,7 +6,7 @@ import re
 import socket
 from typing import NamedTuple
 
-from edge_runtime.vehicles.can_bus import DEFAULT_GROUP
+from edge_runtime.vehicles.hunter.bus import MULTICAST_GROUP
 from hil_tests.faults.processes import Process, wait_until
 
 _TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(\w+)")
@@ -26,7 +26,7 @@ def free_bus() -> str:
     """A bus of its own: Linux mixes buses that share a port, whatever their groups."""
     with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as one:
         one.bind(("::", 0))
-        return f"udp_multicast:[{DEFAULT_GROUP}]:{one.getsockname()[1]}"
+        return f"udp_multicast:[{MULTICAST_GROUP}]:{one.getsockname()[1]}"
 
 
 class ChassisProcess:

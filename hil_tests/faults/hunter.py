@@ -129,7 +129,8 @@ def _told_s(ears: CanEars, on_s: float, until_s: float) -> float:
 def _stayed(
     rig: Rig, chassis: ChassisProcess, stop_s: float, stands_s: float, until_s: float
 ) -> list[str]:
-    wrong = []
+    assert rig.ears is not None
+    wrong = _kept_to_its_own(rig.ears)
     if chassis.moved_between(stands_s, until_s):
         wrong.append("moved before it was re-armed")
     if any(c.mode == DRIVE and stop_s < c.seen_s < until_s for c in rig.timeline.commands):
@@ -137,7 +138,17 @@ def _stayed(
     return wrong
 
 
+def _kept_to_its_own(ears: CanEars) -> list[str]:
+    """Wrong where a frame or a set-point was on the bus that should never be."""
+    most_mps = MODELS[MODEL].max_speed_mps
+    fast = [one for one in ears.of(0x111) if abs(speed_mps(one)) > most_mps]
+    wrong = [f"0x{one.can_id:x} was on the bus" for one in ears.strange[:1]]
+    return wrong + [f"asked for {speed_mps(one):.2f} m/s" for one in fast[:1]]
+
+
 def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
+    if not any(health.vehicle_fault for health in rig.probe.health[-2:]):
+        return ["health names no fault of the vehicle"]
     said = [text for seen_s, text in rig.timeline.named if seen_s > since_s]
     if any(one in text for one in expect.says.split("|") for text in said):
         return []

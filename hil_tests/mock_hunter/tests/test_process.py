@@ -9,7 +9,7 @@ import pytest
 
 from edge_runtime.cli import run_cli
 from edge_runtime.errors import UserError
-from edge_runtime.vehicles.can_bus import open_bus
+from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
 from hil_tests.faults.chassis import ChassisProcess, free_bus
 from hil_tests.faults.processes import wait_until
 from hil_tests.mock_hunter.__main__ import main
@@ -98,7 +98,7 @@ def test_a_bus_that_takes_nothing_is_said_once():
 def test_as_a_process_it_obeys_switches_and_ends_on_a_signal():
     name = free_bus()
     chassis = ChassisProcess(name, "--fault", "estop", "--after-s", "0.3")
-    bus = open_bus(name)
+    bus = open_bus(parse_bus(name))
     try:
         assert status_after(bus, lambda data: data[0] == 1)  # the fault of the command line
         chassis.switch("estop", False)
