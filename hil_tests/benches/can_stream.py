@@ -50,7 +50,10 @@ def main(argv: list[str]) -> int:
         "--busy", type=positive, default=os.cpu_count() or 1, help="processes that never wait"
     )
     parser.add_argument(
-        "--realtime-priority", type=not_negative, default=0, metavar="1..99",
+        "--realtime-priority",
+        type=not_negative,
+        default=0,
+        metavar="1..99",
         help="of both senders, as the edge runtime's; 0: none, that of the busy processes",
     )
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")

@@ -17,7 +17,6 @@ from functools import partial
 from typing import NamedTuple
 
 from edge_runtime.vehicles.hunter.set_point import DEVIATES_S, FOLLOWS_S
-
 from edge_runtime.wire import DRIVE
 from hil_tests.faults.can_ears import CanEars, Heard
 from hil_tests.faults.chassis import ChassisProcess

@@ -1,6 +1,7 @@
 """The mock on a bus: inside one process on `virtual`, and as a process of its own."""
 
 import io
+import sys
 import threading
 import time
 
@@ -123,7 +124,12 @@ def test_orders_come_in_turn_and_bad_ones_are_told():
     told = []
     orders = Orders(io.StringIO("remote on\nmeteor on\nremote off\n"), told.append)
     found = []
-    wait_until(lambda: found.extend(orders.newest()) or len(found) == 2, "two orders")
+
+    def both():
+        found.extend(orders.newest())
+        return len(found) == 2
+
+    wait_until(both, "two orders")
     assert found == [("remote", True), ("remote", False)]
     assert len(told) == 1
 
@@ -131,7 +137,8 @@ def test_orders_come_in_turn_and_bad_ones_are_told():
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        (["--bus", "can0"], "is not valid"),
+        (["--bus", "can0"], "is no CAN bus"),
+        (["--bus", "udp_multicast:239.1.2.3"], "does not stay on this machine"),
         (["--fault", "meteor"], "no fault 'meteor'; choose from silent"),
         (["--after-s", "3"], "--after-s follows a --fault"),
         (["--fault", "silent", "--after-s", "-1"], "no time in seconds"),
@@ -141,11 +148,10 @@ def test_orders_come_in_turn_and_bad_ones_are_told():
     ],
 )
 def test_wrong_options_are_one_line_and_status_2(arguments, why, capsys):
-    try:
-        status = run_cli(main, arguments)
-    except SystemExit as ended:
-        status = ended.code
+    # argparse ends the process itself, a UserError gives its status.
+    with pytest.raises(SystemExit) as ended:
+        sys.exit(run_cli(main, arguments))
     said = capsys.readouterr().err
-    assert status == 2
+    assert ended.value.code == 2
     assert why in said
     assert said.count("\n") == 1
