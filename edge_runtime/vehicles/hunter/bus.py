@@ -38,7 +38,7 @@ class BusName(NamedTuple):
 
     @property
     def hears_itself(self) -> bool:
-        """Whether our own frames come back: then a command on the bus need not be somebody else's."""
+        """Whether our own frames come back: then a command need not be somebody else's."""
         return self.interface == "udp_multicast"
 
 
