@@ -121,9 +121,9 @@ def test_orders_that_are_none_are_refused(line):
 
 
 def test_orders_come_in_turn_and_bad_ones_are_told():
-    told = []
+    told: list[str] = []
     orders = Orders(io.StringIO("remote on\nmeteor on\nremote off\n"), told.append)
-    found = []
+    found: list[tuple[str, bool]] = []
 
     def both():
         found.extend(orders.newest())
