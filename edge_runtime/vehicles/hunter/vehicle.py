@@ -1,7 +1,8 @@
 """The driver of a Hunter: two threads and a bus around core.py.
 
 - The stream's thread sends what `tick` gives, 50 times a second at absolute deadlines, and at
-  once when somebody brakes or the chassis says what stops it. It is the only one that sends, until `close` has joined it.
+  once when somebody brakes or the chassis says what stops it. It is the only one that sends, until
+  `close` has joined it.
 - The listener's thread hands every frame to `hear`.
 Both inherit the priority that `realtime` gave the process. All calls of the core hold one lock;
 the bus is called outside of it, so that nobody waits for a bus.
