@@ -1,6 +1,7 @@
 """The chassis's state machine: every pair of its tables, and the traps by their names."""
 
 import itertools
+from pathlib import Path
 
 import pytest
 
@@ -130,7 +131,8 @@ def test_of_two_errors_the_second_still_stops():
     assert rules.obeys(rules.take_cause(one, "undervoltage", False))
 
 
-def test_the_tables_are_rendered_whole():
+def test_the_tables_are_rendered_whole_and_stand_in_the_readme():
     text = rules.render_tables()
+    assert text in Path(rules.__file__).with_name("README.md").read_text()
     assert "| 0x111 | standby | can | can | remote | remote_over_can |" in text
     assert text.count("\n| ") + 1 >= len(Event)
