@@ -216,6 +216,38 @@ def test_what_is_at_rest():
     assert not bench.core.is_at_rest(bench.now_s + 1.0)  # that was then
 
 
+def test_a_status_from_before_confirms_nothing():
+    bench = Bench()
+    bench.tell(frames.SYSTEM_STATUS, OK)
+    bench.core.enable(bench.now_s)
+    bench.tell(frames.REAR_LEFT_SLOW, frames.MotorSlow(24.0, 30, 30, 0))
+    assert bench.core.state is State.ENABLING
+    bench.now_s += 0.05
+    bench.tell(frames.REAR_LEFT_SLOW, frames.MotorSlow(24.0, 30, 30, 0))
+    assert bench.core.state is State.ENABLING
+    bench.tell(frames.SYSTEM_STATUS, OK)
+    assert bench.core.state is State.ENABLED
+
+
+def test_to_enable_it_again_gives_it_the_whole_time_again():
+    bench = Bench()
+    bench.hears = False
+    bench.core.enable(bench.now_s)
+    bench.step(45)
+    bench.core.enable(bench.now_s)
+    bench.step(45)
+    assert bench.core.state is State.ENABLING
+
+
+def test_to_enable_it_while_it_drives_makes_it_stand_until_the_next_command():
+    bench = Bench().driving()
+    bench.core.enable(bench.now_s)
+    count = len(bench.sent)
+    bench.step(6)
+    assert bench.core.state is State.ENABLED
+    assert set(bench.motions(count)) == {(0.0, 0.0)}
+
+
 def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow():
     bench = Bench().driving(1.0)
     bench.obeys, bench.speed_mps = False, 0.7
