@@ -390,9 +390,9 @@ def expected(state, event):
 
 
 def test_every_pair_of_state_and_event():
-    assert TRANSITIONS == {
+    assert {
         (state, event): expected(state, event) for state in State for event in Event
-    }
+    } == TRANSITIONS
     assert render_table().count("\n") == len(Event) + 1
 
 

@@ -6,6 +6,7 @@ board without a CAN vehicle need not have it.
 
 from __future__ import annotations
 
+import logging
 from typing import Any, Dict, NamedTuple, Optional
 
 from edge_runtime.errors import UserError
@@ -86,6 +87,8 @@ def _pin(name: BusName, bus: Any) -> None:
 
 def import_can() -> Any:
     """The python-can package. Raises UserError where it is not installed."""
+    # Its backends say on stderr what they miss; our error says it in its one line.
+    logging.getLogger("can").setLevel(logging.CRITICAL)
     try:
         import can
     except ImportError:
@@ -114,7 +117,7 @@ def _explain(name: BusName, error: Exception) -> str:
         return f"{where}: choose from {', '.join(sorted(can.VALID_INTERFACES))}"
     if name.interface == "udp_multicast":
         return f"{where}: {cause}; it needs msgpack, and a route for multicast (`ip route`)"
-    return f"{where}: {cause}"
+    return f"{where}: {cause}; python-can's manual says what its {name.interface} needs"
 
 
 class Gate:
