@@ -72,3 +72,21 @@ def test_an_observation_is_a_picture_that_moves(scenario):
     moved, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
     assert np.array_equal(moved[0], start[1])
     assert not np.array_equal(moved[0], moved[1])
+
+
+@every_scenario
+def test_standing_changes_the_ego_cars_speed_and_nothing_else(scenario):
+    env = make_environment(scenario)
+    env.reset(seed=4)
+    moving = (
+        env.ego.speed,
+        env.ego.position.tolist(),
+        [(c.speed, *c.position) for c in env.traffic],
+    )
+    observation, info = env.reset(seed=4, options={"standing": True})
+    standing = (env.ego.position.tolist(), [(c.speed, *c.position) for c in env.traffic])
+    assert moving[0] > 0.0
+    assert info["speed_mps"] == 0.0
+    assert standing == moving[1:]
+    assert np.array_equal(observation, env.reset(seed=4)[0])
+    assert env.ego.speed == moving[0]
