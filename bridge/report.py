@@ -39,10 +39,12 @@ def make_report(
     command_ages_ms: Sequence[float],
     counts: Mapping[str, Any],
     settings: Mapping[str, Any],
+    vehicle: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Join the summary of the episodes with what happened on the wire.
 
-    ``settings`` holds scenario, condition, policy_ids, seed, clock, latency_spec and wall_s;
+    ``settings`` holds scenario, condition, policy_ids, seed, clock, loop, standing, latency_spec
+    and wall_s; ``vehicle`` is the part of a vehicle in the loop;
     ``counts`` holds deadline_misses, tick_overruns, missed_ticks, edge_changes,
     wall_clock_stalls and ``rejections``. The report's policy_id is that of the policy that
     answered last.
@@ -61,9 +63,10 @@ def make_report(
         "command_age_ms": quantiles(command_ages_ms),
         **counts,
         "safe_stops": len(safe_stop_events),
-        "clock": settings["clock"],
+        **{name: settings[name] for name in ("clock", "loop", "standing")},
         "latency_spec": settings["latency_spec"],
         "wall_s": settings["wall_s"],
+        "vehicle": vehicle,
         "times_real_time": sum(result.time_s for result in results) / settings["wall_s"],
         "safe_stop_events": [asdict(event) for event in safe_stop_events],
         "per_episode": [result.as_dict() for result in results],

@@ -83,6 +83,9 @@ class Feedback(msgspec.Struct, frozen=True, kw_only=True):
     """What the vehicle does. `action` is what the actuators have reached, not what was asked.
 
     `episode` and `step` are those of the last command taken (-1 before the first one).
+    `speed_mps` and `commanded_speed_mps` (what a vehicle that takes a speed is asked for now) are
+    the vehicle's own; `scenario_speed_mps` is the speed of the scenario's car by the similarity.
+    Both are None where the driver knows neither.
     """
 
     vehicle: str
@@ -95,6 +98,8 @@ class Feedback(msgspec.Struct, frozen=True, kw_only=True):
     self_braking: bool
     faults: List[str]
     sent_ns: int
+    scenario_speed_mps: Optional[float] = None
+    commanded_speed_mps: Optional[float] = None
     schema: int = SCHEMA
 
 

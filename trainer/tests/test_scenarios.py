@@ -74,19 +74,19 @@ def test_an_observation_is_a_picture_that_moves(scenario):
     assert not np.array_equal(moved[0], moved[1])
 
 
+def start_of(env):
+    return env.ego.position.tolist(), [(car.speed, *car.position) for car in env.traffic]
+
+
 @every_scenario
 def test_standing_changes_the_ego_cars_speed_and_nothing_else(scenario):
     env = make_environment(scenario)
-    env.reset(seed=4)
-    moving = (
-        env.ego.speed,
-        env.ego.position.tolist(),
-        [(c.speed, *c.position) for c in env.traffic],
-    )
-    observation, info = env.reset(seed=4, options={"standing": True})
-    standing = (env.ego.position.tolist(), [(c.speed, *c.position) for c in env.traffic])
-    assert moving[0] > 0.0
+    moving, _ = env.reset(seed=4)
+    speed_mps, start = env.ego.speed, start_of(env)
+    standing, info = env.reset(seed=4, options={"standing": True})
+    assert speed_mps > 0.0
     assert info["speed_mps"] == 0.0
-    assert standing == moving[1:]
-    assert np.array_equal(observation, env.reset(seed=4)[0])
-    assert env.ego.speed == moving[0]
+    assert start_of(env) == start
+    assert np.array_equal(standing, moving)
+    env.reset(seed=4)
+    assert env.ego.speed == speed_mps
