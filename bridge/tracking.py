@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from edge_runtime.wire import Command, Feedback
 
-MAX_LAG_S = 1.0
+MAX_LAG_S = 2.0
 LAG_STEP_S = 0.005
 LEAST_SPREAD = 0.02
 """Standard deviation (of full action, or in m/s) below which too little was asked to tell a lag."""
@@ -130,6 +130,7 @@ class TrackingLog:
         return {
             "name": self.vehicle,
             "scale": self._scale(),
+            "samples": sum(len(episode.feedback) for episode in self._episodes),
             "speed_error_mps": errors(speed),
             "action_error": {name: errors(series) for name, series in actions.items()},
             "lag_ms": {

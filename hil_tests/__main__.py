@@ -10,11 +10,13 @@ from hil_tests import demo
 from hil_tests.campaign import command as campaign
 from hil_tests.mock_hunter import command as mock_hunter
 from hil_tests.network import command as network
+from hil_tests.vehicle import command as vehicle
 
 COMMANDS: dict[str, tuple[Any, str]] = {
     "demo": (demo, "train, export and drive the left turn, end to end"),
     "campaign": (campaign, "every fault, every latency row, one report"),
     "mock_hunter": (mock_hunter, "a Hunter on a CAN bus, with a switch for each fault"),
+    "vehicle": (vehicle, "policy in the loop against vehicle in the loop, and the lag it may have"),
     "network": (network, "the left turn over a kernel's TCP and UDP, and the model in two times"),
 }
 
