@@ -66,7 +66,7 @@ def _start_vehicle(drive: Drive, directory: Path, stack: ExitStack) -> tuple[str
         )
     )
     config = directory / "edge.toml"
-    config.write_text(f'[hunter]\nbus = "{bus}"\n')
+    config.write_text(f'bus = "{bus}"\n')
     return ("--vehicle", "hunter", "--config", str(config))
 
 

@@ -6,7 +6,7 @@ import multiprocessing
 import statistics
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
@@ -50,24 +50,11 @@ def run_sweep(
     Raises:
         UserError: the policy does not load, or a worker died.
     """
-    rows: dict[str, dict[str, Any]] = {}
-    pool = ProcessPoolExecutor(
-        jobs, multiprocessing.get_context("spawn"), initializer=_watch_the_parent
-    )
-    try:
-        with interrupts_blocked():
-            futures: list[Future[dict[str, Any]]] = [
-                pool.submit(drive_point, task, lag) for lag in lags
-            ]
-        for future in as_completed(futures):
-            row = future.result()
-            rows[row["spec"]] = row
-            on_point(row)
-    except BrokenProcessPool as error:
-        raise UserError("a worker process of the sweep died; use fewer --jobs") from error
-    finally:
-        pool.shutdown(cancel_futures=True)
-    rows = {lag.spec: rows[lag.spec] for lag in lags}
+    driven: dict[str, dict[str, Any]] = {}
+    for row in _drive_points(task, lags, jobs):
+        driven[row["spec"]] = row
+        on_point(row)
+    rows = {lag.spec: driven[lag.spec] for lag in lags}
     name = Path(task.policy).stem
     axes = [axis for axis in LAG_AXES if all(axis.spec(value) in rows for value in axis.values)]
     return {
@@ -82,6 +69,31 @@ def run_sweep(
         "budget": budget(axes, rows, target, name) if axes else None,
         "lag_budget": lag_budget(list(rows.values()), target),
     }
+
+
+def _drive_points(task: SweepTask, lags: Sequence[Lag], jobs: int) -> Iterator[dict[str, Any]]:
+    """The rows, each as soon as it is there; one job is this process."""
+    if jobs == 1:
+        yield from (drive_point(task, lag) for lag in lags)
+        return
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, context, initializer=_watch_the_parent)
+    try:
+        with interrupts_blocked():
+            futures: list[Future[dict[str, Any]]] = [
+                pool.submit(drive_point, task, lag) for lag in lags
+            ]
+        for future in as_completed(futures):
+            yield future.result()
+    except BrokenProcessPool as error:
+        raise UserError("a worker process of the sweep died; use fewer --jobs") from error
+    except BaseException:
+        # Also on ^C: a point takes long, and is of no use any more.
+        for worker in multiprocessing.active_children():
+            worker.kill()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def lag_budget(rows: Sequence[Mapping[str, Any]], target: float) -> dict[str, Any]:
