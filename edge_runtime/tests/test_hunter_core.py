@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.vehicles.hunter import core as rules
 from edge_runtime.vehicles.hunter import frames
-from edge_runtime.vehicles.hunter.core import HunterCore
+from edge_runtime.vehicles.hunter.core import HunterCore, Sent
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.hunter.states import TRANSITIONS, Event, State, render_table
 from edge_runtime.vehicles.similarity import CARS, similarity_to
@@ -48,7 +48,7 @@ class Bench:
 
     def _answer(self, parts):
         for frame, data in parts:
-            message = frames.decode(frame.can_id, data).message
+            message = told_by(Sent(frame, data))
             if isinstance(message, frames.MotionCommand) and self.obeys:
                 self.speed_mps, self.inner_rad = message
         if not self.hears:
@@ -77,11 +77,13 @@ class Bench:
         return self.core.report(self.now_s).faults
 
     def motions(self, since=0):
-        return [
-            frames.decode(0x111, part.data).message
-            for _, part in self.sent[since:]
-            if part.frame.can_id == 0x111
-        ]
+        return [told_by(part) for _, part in self.sent[since:] if part.frame.can_id == 0x111]
+
+
+def told_by(part):
+    decoded = frames.decode(part.frame.can_id, part.data)
+    assert decoded is not None
+    return decoded.message
 
 
 def sent_ids(bench):
@@ -204,7 +206,7 @@ def test_without_a_fresh_command_it_stops_within_the_promise_and_latches():
     stopped_s = next(
         time_s
         for time_s, part in bench.sent[count:]
-        if part.frame.can_id == 0x111 and frames.decode(0x111, part.data).message.speed_mps == 0
+        if part.frame.can_id == 0x111 and told_by(part).speed_mps == 0
     )
     assert 0.2 < stopped_s - last_s <= 0.25 + 0.02
     assert bench.words == ["no command for 0.24 s"]
@@ -435,7 +437,7 @@ _HAPPENS = st.sampled_from(
 @given(st.lists(st.tuples(_HAPPENS, st.floats(-1, 1)), max_size=120))
 def test_it_only_moves_enabled_on_a_fresh_command(happenings):
     bench = Bench()
-    core, commanded_s, allowed = bench.core, None, False
+    core, commanded_s, allowed = bench.core, -1e9, False
     for what, number in happenings:
         if what == "tick":
             before = len(bench.sent)

@@ -61,7 +61,7 @@ def follow_speed(
     max_speed_mps: float,
     similarity: Similarity,
 ) -> float:
-    """The speed to ask for where the scenario has the pedals: its car's, within its accelerations."""
+    """The speed to ask for where the scenario has the pedals: its car's, as fast as that could."""
     most_mps = pedal_to_acceleration(1.0, similarity) * step_s
     least_mps = pedal_to_acceleration(-1.0, similarity) * step_s
     wanted_mps = similarity.vehicle_mps(scenario_speed_mps)

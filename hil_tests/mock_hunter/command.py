@@ -10,14 +10,14 @@ import time
 from typing import Any
 
 from edge_runtime.errors import UserError
-from edge_runtime.vehicles.can_bus import DEFAULT_GROUP, DEFAULT_PORT, open_bus
+from edge_runtime.vehicles.hunter.bus import MULTICAST_GROUP, MULTICAST_PORT, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.faults import FAULTS, check_fault
 from hil_tests.mock_hunter.hunter import MockHunter
 from hil_tests.mock_hunter.parameters import MODELS, SOURCES, make_parameters
 from hil_tests.mock_hunter.process import Orders, Server
 
-DEFAULT_BUS = f"udp_multicast:[{DEFAULT_GROUP}]:{DEFAULT_PORT}"
+DEFAULT_BUS = f"udp_multicast:[{MULTICAST_GROUP}]:{MULTICAST_PORT}"
 
 
 class _AfterFault(argparse.Action):
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Be a Hunter until a signal comes."""
     parameters = make_parameters(arguments.model, _changes(arguments.set))
-    bus = open_bus(arguments.bus)
+    bus = open_bus(parse_bus(arguments.bus))
     try:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
         server = Server(hunter, bus, _tell, arguments.fault)

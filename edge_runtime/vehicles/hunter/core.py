@@ -94,9 +94,9 @@ class HunterCore:
             self._apply(Finding(Event.FOREIGN, f"somebody else sends 0x{can_id:x}"), now_s)
             return
         self.reports.hear(can_id, data, now_s)
-        if can_id == frames.SYSTEM_STATUS.can_id and self.reports.status_s == now_s:
-            self._judge(now_s)
-        elif can_id in frames.MOTOR_OF_SLOW and self.state is State.ENABLED:
+        if can_id == frames.MOTION_STATUS.can_id:
+            return  # 50 of these a second, and none of them confirms anything
+        if self.reports.status_s == now_s or self.state is State.ENABLED:
             self._judge(now_s)
 
     def bus_failed(self, words: str, now_s: float, fatal: bool = False) -> None:
@@ -229,7 +229,7 @@ class HunterCore:
         return words + [more for more in self.standing(now_s) if more not in words]
 
     def _pedal(self) -> float:
-        """From the measured acceleration; a vehicle that stands and is to stand has its brake on."""
+        """From the measured acceleration; the brake where it stands and is to stand."""
         if self.reports.stands and self.set_point.speed_mps == 0.0:
             return -1.0
         return mapping.acceleration_to_pedal(self.reports.acceleration_mps2(), self._similarity)

@@ -72,7 +72,7 @@ class Reports:
 
     @property
     def needs_clearing(self) -> bool:
-        """Whether it shows an error beside the lost link, which goes with the stream's first frame."""
+        """Whether it shows an error; a lost link goes by itself, with the stream's first frame."""
         is_exception = self.status is not None and self.status.state == frames.STATE_EXCEPTION
         return is_exception or bool(set(self.errors()) - {LINK_LOST})
 
@@ -114,7 +114,7 @@ class Reports:
         return None
 
     def finding(self) -> Optional[Finding]:
-        """What stands between the chassis and our commands now, the gravest first; None if nothing."""
+        """What stands between the chassis and our commands now; the gravest only."""
         status = self.status
         if status is None:
             return Finding(Event.SILENT, "the chassis sends no 0x211")

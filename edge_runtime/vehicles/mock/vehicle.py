@@ -63,7 +63,7 @@ class MockVehicle(Vehicle):
     name: ClassVar[str] = "mock"
     # A full swing within one control period: 20 / s is 2.0 in T = 0.1 s, so that every action
     # of a policy goes through unchanged. What the body does with it is the lag's business.
-    limits: ClassVar[Dict[str, ActionLimit]] = {
+    limits: Dict[str, ActionLimit] = {  # noqa: RUF012
         "pedal": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
         "steering": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
     }
