@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from edge_runtime.files import read_bytes
 from edge_runtime.transport import free_endpoint
+from edge_runtime.vehicles.hunter.bus import MULTICAST_GROUP
 from hil_tests.commands import BackgroundCommand
-from hil_tests.mock_hunter.command import DEFAULT_GROUP
 from hil_tests.operator import Operator
 
 VEHICLE_ID = "rig01"
@@ -58,7 +58,7 @@ def run_rig(drive: Drive) -> dict[str, Any]:
 
 def _start_vehicle(drive: Drive, directory: Path, stack: ExitStack) -> tuple[str, ...]:
     """Start a mock Hunter on a bus of its own; the edge runtime's options to drive it."""
-    bus = f"udp_multicast:[{DEFAULT_GROUP}]:{_free_port()}"
+    bus = f"udp_multicast:[{MULTICAST_GROUP}]:{_free_port()}"
     settings = [f"--set={name}={value}" for name, value in drive.changes.items()]
     stack.enter_context(
         BackgroundCommand(
