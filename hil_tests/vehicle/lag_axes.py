@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from hil_tests.campaign.axes import Axis
 
-DEAD_TIMES_MS = (0, 50, 100, 150, 200, 300, 400, 500, 600, 800, 1000)
-TIME_CONSTANTS_MS = (20, 50, 100, 200, 300, 400, 500, 750, 1000, 1500)
+DEAD_TIMES_MS = (0, 50, 100, 200, 300, 400, 500, 600, 800)
+TIME_CONSTANTS_MS = (20, 50, 100, 200, 300, 500, 750, 1000)
 LINE_DEAD_MS, LINE_CONSTANT_MS = 50, 100
 """Where the lines lie: of the table, the values nearest to the mock's own (30 and 100 ms)."""
 
