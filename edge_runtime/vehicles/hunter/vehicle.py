@@ -1,7 +1,8 @@
 """The driver of a Hunter: two threads and a bus around core.py.
 
 - The stream's thread sends what `tick` gives, 50 times a second at absolute deadlines, and at
-  once when somebody brakes. It is the only one that sends, until `close` has joined it.
+  once when somebody brakes or the chassis says what stops it. It is the only one that sends, until
+  `close` has joined it.
 - The listener's thread hands every frame to `hear`.
 Both inherit the priority that `realtime` gave the process. All calls of the core hold one lock;
 the bus is called outside of it, so that nobody waits for a bus.
@@ -67,9 +68,7 @@ class HunterVehicle(Vehicle):
         with self._lock:
             self._core.enable(now_s)
             self._gate.open()
-        for thread in self._threads:
-            if thread.ident is None:
-                thread.start()
+        self._start()
         self._wake.set()
 
     def command(
@@ -86,7 +85,8 @@ class HunterVehicle(Vehicle):
         self._wake.set()
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """From the newest frames of the chassis."""
+        """From the newest frames of the chassis, which it listens to before `enable`, too."""
+        self._start()
         with self._lock:
             report = self._core.report(now_s)
             self._log_state()
@@ -114,6 +114,12 @@ class HunterVehicle(Vehicle):
         self._bus.shutdown()
         if self._sent_s is not None:
             log.event("info", "hunter_stream", **_rounded(self._gaps.summary_ms()))
+
+    def _start(self) -> None:
+        if not self._closed:
+            for thread in self._threads:
+                if thread.ident is None:
+                    thread.start()
 
     def _wait_for_a_stand(self) -> None:
         end_s = time.monotonic() + STOP_TAKES_S
@@ -161,13 +167,10 @@ class HunterVehicle(Vehicle):
                 message = self._bus.recv(_LISTEN_S)
             except Exception as error:  # as in _send_due; it may raise at once, again and again
                 self._note_bus(error)
-                self._wait_out()
+                time.sleep(STREAM_PERIOD_S)
                 continue
             if message is not None:
                 self._hear(message)
-
-    def _wait_out(self) -> None:
-        time.sleep(STREAM_PERIOD_S)
 
     def _hear(self, message: Any) -> None:
         if message.is_error_frame:
@@ -179,7 +182,11 @@ class HunterVehicle(Vehicle):
         if self._ignores_commands and self._core.is_command(message.arbitration_id):
             return
         with self._lock:
+            was = self._core.state
             self._core.hear(message.arbitration_id, bytes(message.data), time.monotonic())
+            stopped = self._core.state is State.STOPPED and was is not State.STOPPED
+        if stopped:
+            self._wake.set()
 
     def _note_bus(self, error: object, fatal: bool = False) -> None:
         words = " ".join(str(error).split()) or type(error).__name__
