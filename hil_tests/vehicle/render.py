@@ -65,7 +65,7 @@ def render_sweep(sweep: Mapping[str, Any], figures: Mapping[str, str]) -> str:
         *(f"{sentence}\n" for sentence in sentences),
         *(f"![{name}]({path})\n" for name, path in figures.items()),
         f"Success of {sweep['runs']} episodes, and in brackets the lag of the speed that the "
-        "drives showed, ms:",
+        "drives showed, ms; a star where the driver stopped the vehicle, which did not follow:",
         "",
         "| " + " | ".join(head) + " |",
         "|---" * len(head) + "|",
@@ -78,7 +78,8 @@ def render_sweep(sweep: Mapping[str, Any], figures: Mapping[str, str]) -> str:
 
 
 def _point(row: Mapping[str, Any]) -> str:
-    return f"{row['success']['value']:.0%} ({_number(row['lag_ms'], 0)})"
+    star = "*" if row["stops"] else ""
+    return f"{row['success']['value']:.0%}{star} ({_number(row['lag_ms'], 0)})"
 
 
 def _line(name: str, cells: Sequence[str]) -> str:
