@@ -18,6 +18,7 @@ from hil_tests.commands import end_children
 from hil_tests.mock_hunter.parameters import make_parameters
 from hil_tests.vehicle.comparison import PART_EPISODES, run_comparison
 from hil_tests.vehicle.figures import write_figures
+from hil_tests.vehicle.kept import KeptPoints
 from hil_tests.vehicle.lag_axes import LAGS, Lag
 from hil_tests.vehicle.render import lag_sentence, render_comparison, render_sweep, verdict
 from hil_tests.vehicle.rigs import VEHICLE, Drive
@@ -32,7 +33,10 @@ PARTS = ("compare", "sweep")
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--out", required=True, metavar="R.json", help="the report; R.md and pictures go beside it"
+        "--out",
+        required=True,
+        metavar="R.json",
+        help="the report; R.md, pictures and R_rows/ (points that are done) go beside it",
     )
     parser.add_argument(
         "--policy",
@@ -95,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
             report["comparison"] = _compare(arguments, policy, changes)
             text += ["", "## In real time", "", render_comparison(report["comparison"])]
         if arguments.only != "compare":
-            report["sweep"] = _sweep(arguments, policy, changes, lags)
+            report["sweep"] = _sweep(arguments, policy, policy_id, changes, lags)
             figures = write_figures(out, report["sweep"])
             report["sweep"]["figures"] = figures
             text += ["", "## Lag, in virtual time", "", render_sweep(report["sweep"], figures)]
@@ -125,18 +129,24 @@ def _compare(
 
 
 def _sweep(
-    arguments: argparse.Namespace, policy: Path, changes: dict[str, float], lags: list[Lag]
+    arguments: argparse.Namespace,
+    policy: Path,
+    policy_id: str,
+    changes: dict[str, float],
+    lags: list[Lag],
 ) -> dict[str, Any]:
     task = SweepTask(
         str(policy), arguments.scenario, arguments.condition, arguments.seed, arguments.runs,
         changes,
     )  # fmt: skip
+    out = Path(arguments.out)
+    kept = KeptPoints(out.with_name(f"{out.stem}_rows"), task._asdict(), policy_id)
     with ProgressBar("lags", len(lags)) as bar:
 
         def on_point(row: dict[str, Any]) -> None:
             bar.advance({"success": f"{row['success']['value']:.2f}", "at": row["spec"]})
 
-        return run_sweep(task, lags, arguments.target, arguments.jobs or cores(), on_point)
+        return run_sweep(task, lags, arguments.target, arguments.jobs or cores(), kept, on_point)
 
 
 def _conclude(out: Path, report: dict[str, Any]) -> int:

@@ -18,6 +18,7 @@ from edge_runtime.errors import UserError
 from hil_tests.campaign.axes import Axis
 from hil_tests.campaign.budget import budget
 from hil_tests.mock_hunter.parameters import make_parameters
+from hil_tests.vehicle.kept import KeptPoints
 from hil_tests.vehicle.lag_axes import LAG_AXES, Lag
 from hil_tests.vehicle.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
@@ -43,18 +44,23 @@ def run_sweep(
     lags: Sequence[Lag],
     target: float,
     jobs: int,
+    kept: KeptPoints,
     on_point: Callable[[dict[str, Any]], None] = lambda row: None,
 ) -> dict[str, Any]:
-    """Drive every point, ``jobs`` at a time; the report's part ``sweep``.
+    """Drive every point that is not kept, ``jobs`` at a time; the report's part ``sweep``.
 
     Raises:
         UserError: the policy does not load, or a worker died.
     """
-    driven: dict[str, dict[str, Any]] = {}
-    for row in _drive_points(task, lags, jobs):
-        driven[row["spec"]] = row
+    found = {lag: row for lag in lags if (row := kept.load(lag)) is not None}
+    for row in found.values():
         on_point(row)
-    rows = {lag.spec: driven[lag.spec] for lag in lags}
+    for row in _drive_points(task, [lag for lag in lags if lag not in found], jobs):
+        lag = Lag(row["dead_ms"], row["constant_ms"])
+        kept.save(lag, row)
+        found[lag] = row
+        on_point(row)
+    rows = {lag.spec: found[lag] for lag in lags}
     name = Path(task.policy).stem
     axes = [axis for axis in LAG_AXES if all(axis.spec(value) in rows for value in axis.values)]
     return {
