@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from edge_runtime.files import read_bytes
 from edge_runtime.transport import free_endpoint
-from edge_runtime.vehicles.hunter.bus import MULTICAST_GROUP
+from edge_runtime.vehicles.hunter import multicast
 from hil_tests.commands import BackgroundCommand
 from hil_tests.operator import Operator
 
@@ -58,7 +58,7 @@ def run_rig(drive: Drive) -> dict[str, Any]:
 
 def _start_vehicle(drive: Drive, directory: Path, stack: ExitStack) -> tuple[str, ...]:
     """Start a mock Hunter on a bus of its own; the edge runtime's options to drive it."""
-    bus = f"udp_multicast:[{MULTICAST_GROUP}]:{_free_port()}"
+    bus = f"udp_multicast:{multicast.GROUP}:{_free_port()}"
     settings = [f"--set={name}={value}" for name, value in drive.changes.items()]
     stack.enter_context(
         BackgroundCommand(
@@ -85,7 +85,7 @@ def _simulate(drive: Drive, endpoint: str, out: Path) -> dict[str, Any]:
 
 def _free_port() -> int:
     """A UDP port that nobody uses now."""
-    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
-        probe.bind(("::1", 0))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
     return port
