@@ -11,7 +11,7 @@ BENCH := results/bench
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-ray test-network lint format bench bench-quick bench-gpu bench-loop \
-	bench-can network recording mutate lock clean
+	bench-can network vehicle recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -80,6 +80,10 @@ bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, 
 bench-can: $(STAMP)  ## ten minutes of the 50 Hz CAN stream, every core busy, beside a bare sender
 	@mkdir -p $(BENCH)
 	$(BIN)/python -m hil_tests.benches.can_stream --out $(BENCH)/can_stream.json
+
+vehicle: $(STAMP)  ## policy in the loop against a mock Hunter in the loop, and the lag it may have; some 15 minutes
+	@mkdir -p results/vehicle
+	$(BIN)/python -m hil_tests vehicle --out results/vehicle/left_turn.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
 	$(BIN)/python -m hil_tests.recordings.make

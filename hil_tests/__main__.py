@@ -14,6 +14,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "hil_tests.mock_hunter.command",
         "a Hunter on a CAN bus, with a switch for each fault",
     ),
+    "vehicle": (
+        "hil_tests.vehicle.command",
+        "policy in the loop against vehicle in the loop, and the lag it may have",
+    ),
     "network": (
         "hil_tests.network.command",
         "the left turn over a kernel's TCP and UDP, and the model in two times",
