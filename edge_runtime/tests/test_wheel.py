@@ -66,7 +66,7 @@ def test_the_wheel_holds_only_the_runtime(wheel):
         "phil_edge_runtime",
     }
     assert not [name for name in names if "/tests/" in name or "conftest" in name]
-    assert {"edge_runtime/__main__.py", "edge_runtime/vehicles/mock.py"} <= set(names)
+    assert {"edge_runtime/__main__.py", "edge_runtime/vehicles/mock/vehicle.py"} <= set(names)
     assert "edge_runtime/config.example.toml" in names
     assert "edge_runtime/py.typed" in names
 
