@@ -51,7 +51,8 @@ def decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
         return Rejection(Reason.SCHEMA, f"CDR of kind {representation:#06x}, not plain CDR")
     buffer = Buffer(payload, align_offset=HEADER_BYTES)
     try:
-        message: _M = kind.deserialize(buffer)
+        # A buffer of our own in place of the bytes, to see where the message ends.
+        message: _M = kind.deserialize(buffer)  # type: ignore[arg-type]
     except _DECODE_ERRORS as error:
         return Rejection(Reason.MALFORMED, str(error))
     # pycdr2 takes a text or data that is cut off for a short one; and the type is not in the

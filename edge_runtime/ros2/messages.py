@@ -7,7 +7,7 @@ in need this module; it is the one that imports pycdr2.
 """
 
 from dataclasses import dataclass, field
-from typing import List
+from typing import TYPE_CHECKING, List
 
 from edge_runtime.errors import UserError
 
@@ -21,6 +21,10 @@ except ImportError:
     ) from None
 
 COVARIANCE_SIZE = 36
+if TYPE_CHECKING:
+    Covariance = List[float]
+else:
+    Covariance = array[float64, COVARIANCE_SIZE]
 
 
 def no_covariance() -> List[float]:
@@ -107,7 +111,7 @@ class PoseWithCovariance(IdlStruct, typename="geometry_msgs/msg/PoseWithCovarian
     """A pose, and the covariance of x, y, z and the rotations about them."""
 
     pose: Pose = field(default_factory=Pose)
-    covariance: array[float64, COVARIANCE_SIZE] = field(default_factory=no_covariance)
+    covariance: Covariance = field(default_factory=no_covariance)
 
 
 @dataclass
@@ -115,7 +119,7 @@ class TwistWithCovariance(IdlStruct, typename="geometry_msgs/msg/TwistWithCovari
     """A velocity and its covariance."""
 
     twist: Twist = field(default_factory=Twist)
-    covariance: array[float64, COVARIANCE_SIZE] = field(default_factory=no_covariance)
+    covariance: Covariance = field(default_factory=no_covariance)
 
 
 @dataclass

@@ -87,6 +87,4 @@ def topic_token(zid: str, kind: str, topic_key: str, type_name: str, qos: Qos) -
 def _qos_chunk(qos: Qos, type_hash: str) -> str:
     """`<keyed>:<reliability>:<durability>:<history>,<depth>:<user data>`; ours have no key."""
     history = f"0,{qos.depth}"  # Keep last.
-    return (
-        f":{int(qos.reliable)}:{int(qos.transient_local)}:{history}:typehash=RIHS01_{type_hash};"
-    )
+    return f":{int(qos.reliable)}:{int(qos.transient_local)}:{history}:typehash=RIHS01_{type_hash};"

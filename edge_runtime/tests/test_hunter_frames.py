@@ -84,9 +84,7 @@ def test_every_count_survives_decoding_and_encoding(frame, data):
     raw = bytearray(frame.length)
     for field in frame.fields:
         size = frames._PACKERS[field.code].size
-        raw[field.offset : field.offset + size] = data.draw(
-            st.binary(min_size=size, max_size=size)
-        )
+        raw[field.offset : field.offset + size] = data.draw(st.binary(min_size=size, max_size=size))
     decoded = decode(frame.can_id, bytes(raw))
     assert decoded.frame is frame
     assert encode(frame, decoded.message) == bytes(raw)

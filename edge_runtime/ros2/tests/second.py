@@ -47,7 +47,7 @@ def _build(type_name: str, message: Dict[str, Any]) -> Any:
     for name, (_, kind) in fields:
         value = message[name]
         if isinstance(value, dict):
-            value = _build(kind[0] if isinstance(kind, tuple) else kind, value)
+            value = _build(str(kind), value)
         elif isinstance(value, bytes):
             value = np.frombuffer(value, dtype=np.uint8)
         elif isinstance(value, list):

@@ -9,9 +9,7 @@ from edge_runtime.ros2 import messages as ros
 DOUBLES = st.floats(allow_nan=False, allow_infinity=False)
 FLOATS = st.floats(allow_nan=False, allow_infinity=False, width=32)
 # A zero ends a text in CDR, and half a surrogate pair is no text.
-TEXTS = st.text(
-    st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=40
-)
+TEXTS = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=40)
 UINT32 = st.integers(0, 2**32 - 1)
 
 TIMES = st.builds(ros.Time, st.integers(-(2**31), 2**31 - 1), UINT32)

@@ -123,7 +123,7 @@ def test_an_image_of_the_policy_goes_through_whole():
 
 def test_threads_do_not_share_a_buffer():
     """pycdr2's own buffer, one for each type, would mix their bytes."""
-    wrong = []
+    wrong: list[int] = []
 
     def go(number):
         message = ros.Image(data=bytes([number]) * 3000)

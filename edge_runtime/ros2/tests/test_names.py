@@ -32,7 +32,9 @@ def test_a_key_is_the_name_without_the_first_slash(namespace, topic, key):
     assert names.key(namespace, topic) == key
 
 
-@pytest.mark.parametrize("name", ["", "1a", "a/1", "a-b", "a//b", "a b", "*", "/**", "é", "a" * 201])
+@pytest.mark.parametrize(
+    "name", ["", "1a", "a/1", "a-b", "a//b", "a b", "*", "/**", "é", "a" * 201]
+)
 def test_what_is_no_ros_name_is_refused_in_one_line(name):
     with pytest.raises(UserError) as caught:
         names.key("/", name)

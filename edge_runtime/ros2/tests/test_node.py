@@ -29,7 +29,7 @@ def sessions():
 
 def watch_tokens(session):
     """What a bridge watches: the tokens that are there now, by key."""
-    here = set()
+    here: set[str] = set()
 
     def change(sample):
         change_set = here.add if "PUT" in str(sample.kind) else here.discard
@@ -70,7 +70,7 @@ def test_a_late_bridge_learns_of_us_too(sessions):
 
 def test_we_hear_the_second_library_and_count_what_is_none(sessions):
     ours, theirs = sessions
-    heard = []
+    heard: list[ros.Odometry] = []
     odometry = ros.Odometry(ros.Header(ros.Time(5, 6), "odom"), "base_link")
     odometry.twist.twist.linear.x = 0.75
     good = second.serialize("nav_msgs/msg/Odometry", asdict(odometry))
