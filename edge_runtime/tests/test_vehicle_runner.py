@@ -39,13 +39,17 @@ class BrokenVehicle(MockVehicle):
             self.released.wait()
         return super().feedback(now_s)
 
-    def command(self, action, now_s):
-        self._ask("command")
-        super().command(action, now_s)
+    def enable(self, now_s):
+        self._ask("enable")
+        super().enable(now_s)
 
-    def brake(self, now_s):
+    def command(self, action, now_s, scenario_speed_mps=None):
+        self._ask("command")
+        super().command(action, now_s, scenario_speed_mps)
+
+    def brake(self, now_s, latch=True):
         self._ask("brake")
-        super().brake(now_s)
+        super().brake(now_s, latch)
 
     def _ask(self, what):
         self.asked.append(what)
@@ -70,6 +74,8 @@ def vehicle():
 def runner(vehicle):
     runner = NotingRunner(vehicle)
     runner.start()
+    assert vehicle.asked == ["enable"]
+    vehicle.asked.clear()
     yield runner
     vehicle.released.set()
     runner.close()
