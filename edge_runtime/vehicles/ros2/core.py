@@ -161,7 +161,7 @@ class Ros2Core:
         return mapping.inner_to_centre(self._set_point.inner_rad, spec.wheelbase_m, spec.track_m)
 
     def _pedal(self) -> float:
-        """From the measured acceleration; a vehicle that stands and is to stand has its brake on."""
+        """From the measured acceleration; what stands, and is to stand, has its brake on."""
         if self.odometry.stands and self._set_point.speed_mps == 0.0:
             return -1.0
         acceleration_mps2 = self.odometry.acceleration_mps2()

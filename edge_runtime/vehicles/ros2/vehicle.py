@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any, Callable, ClassVar, Dict, List, Optional
-
-import zenoh
+from typing import Callable, ClassVar, Dict, List, Optional
 
 from edge_runtime import log
+from edge_runtime.ros2 import messages as ros
 from edge_runtime.ros2.endpoint import open_ros2_session
+from edge_runtime.ros2.node import Ros2Node
 from edge_runtime.vehicles import mapping
 from edge_runtime.vehicles.hunter.specs import HunterSpec
 from edge_runtime.vehicles.interface import ActionLimit, Vehicle, VehicleReport
+from edge_runtime.vehicles.ros2.convert import drive_of, measured_of, twist_of
 from edge_runtime.vehicles.ros2.core import Motion, Ros2Core
 from edge_runtime.vehicles.ros2.settings import Ros2Settings, check_settings
 from edge_runtime.vehicles.ros2.states import State
@@ -32,31 +33,33 @@ _PEDAL_SLEW_PER_S = 20.0
 
 
 class Ros2Vehicle(Vehicle):
-    """Opens its session at the first `enable`, and publishes nothing before.
+    """Opens its session and announces its topics when made; publishes nothing before `enable`.
 
-    Raises UserError, when made, for settings that are not valid and where pycdr2 is missing, and
-    at `enable` for a session that cannot be opened.
+    Raises UserError, when made, for settings that are not valid and for a busy port.
     """
 
     name: ClassVar[str] = "ros2"
 
     def __init__(self, settings: Ros2Settings, spec: HunterSpec, similarity: Similarity) -> None:
         check_settings(settings)
-        # Only who drives through ROS 2 needs pycdr2.
-        from edge_runtime.ros2.node import Ros2Node  # noqa: F401
-
         self._settings, self._spec = settings, spec
         self._core = Ros2Core(settings, spec, similarity)
         self.limits: Dict[str, ActionLimit] = _limits(spec, similarity)
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._stopping = False
-        self._session: Optional[zenoh.Session] = None
-        self._node: Any = None
-        self._publish: List[Callable[[Motion], None]] = []
+        self._closed = False
         self._logged = ""
         self._failing = False
+        self._publish: List[Callable[[Motion], None]] = []
         self._thread = threading.Thread(target=self._stream, name="ros2-stream", daemon=True)
+        self._session = open_ros2_session(settings.listen, settings.connect)
+        try:
+            self._node = Ros2Node(self._session, settings.namespace)
+            self._declare()
+        except BaseException:
+            self._session.close()  # An open session would hang the process at its exit.
+            raise
 
     @property
     def state(self) -> State:
@@ -66,15 +69,13 @@ class Ros2Vehicle(Vehicle):
     @property
     def rejected(self) -> Dict[str, int]:
         """Odometry that could not be read or was not new, by reason."""
-        counts = dict(self._node.rejected) if self._node is not None else {}
+        counts = dict(self._node.rejected)
         if self._core.odometry.stale:
             counts["stale"] = self._core.odometry.stale
         return counts
 
     def enable(self, now_s: float) -> None:
         """Publish speed 0, and drive once odometry comes; `feedback` tells whether it does."""
-        if self._session is None:
-            self._open()
         with self._lock:
             self._core.enable(now_s)
         if self._thread.ident is None:
@@ -103,9 +104,9 @@ class Ros2Vehicle(Vehicle):
 
     def close(self) -> None:
         """Publish speed 0 once more, and leave."""
-        if self._session is None:
+        if self._closed:
             return
-        session, self._session = self._session, None
+        self._closed = True
         self.brake(time.monotonic())
         self._stopping = True
         self._wake.set()
@@ -119,16 +120,10 @@ class Ros2Vehicle(Vehicle):
         finally:
             with self._lock:
                 self._core.close(time.monotonic())
-            session.close()  # Zenoh would hang at the process's end.
+            self._session.close()
 
-    def _open(self) -> None:
-        from edge_runtime.ros2 import messages as ros
-        from edge_runtime.ros2.node import Ros2Node
-        from edge_runtime.vehicles.ros2.convert import drive_of, measured_of, twist_of
-
-        settings = self._settings
-        session = open_ros2_session(settings.listen, settings.connect)
-        node = Ros2Node(session, settings.namespace)
+    def _declare(self) -> None:
+        settings, node = self._settings, self._node
         if settings.twist_topic:
             twist = node.publisher(settings.twist_topic, ros.Twist)
             angular, wheelbase_m = settings.twist_angular, self._spec.wheelbase_m
@@ -142,7 +137,6 @@ class Ros2Vehicle(Vehicle):
                 self._core.hear(measured_of(odometry), time.monotonic())
 
         node.subscribe(settings.odometry_topic, ros.Odometry, hear)
-        self._session, self._node = session, node
 
     def _stream(self) -> None:
         next_s = time.monotonic()

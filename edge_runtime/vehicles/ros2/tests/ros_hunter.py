@@ -36,12 +36,13 @@ class RosHunter:
         self._session = open_session(listen=listen, connect=connect, mode="router")
         prefix = f"{namespace}/" if namespace else ""
         self._odometry = self._session.declare_publisher(f"{prefix}odom")
-        self._declared = [
+        self._declared: List[Any] = [
             self._session.declare_subscriber(f"{prefix}cmd_vel", self._hear_twist),
             self._session.declare_subscriber(f"{prefix}ackermann_cmd", self._hear_drive),
             self._session.liveliness().declare_subscriber(
                 "@/*/@ros2_lv/**", self._hear_token, history=True
             ),
+            self._odometry,
         ]
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -53,7 +54,7 @@ class RosHunter:
     def __exit__(self, *_: object) -> None:
         self._stopping.set()
         self._thread.join()
-        for declared in [*self._declared, self._odometry]:
+        for declared in self._declared:
             declared.undeclare()
         self._session.close()
 
