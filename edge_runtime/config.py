@@ -81,10 +81,12 @@ def _read(path: PathLike) -> Config:
 
 def _explain(text: str) -> str:
     """The sentence of msgspec with the key in front, and for an unknown key the known ones."""
-    if "unknown field" in text:
-        return f"{text}; known are {', '.join(Config.__struct_fields__)}"
     sentence, _, place = text.partition(" - at ")
-    return f"{place.strip('`').replace('$.', '')}: {sentence}" if place else text
+    table = place.strip("`").replace("$.", "")
+    if "unknown field" in text:
+        known = getattr(Config(), table, None) if table else Config()
+        sentence += f"; known are {', '.join(known.__struct_fields__)}" if known else ""
+    return f"{table}: {sentence}" if table else sentence
 
 
 def _is_wrong(config: Config) -> bool:
