@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from bridge.feed import Heard
 from bridge.to_ros2.dead_reckoning import DeadReckoning
@@ -171,6 +172,11 @@ def left_turn_status():
     return {"policy_id": "p", "manifest": manifest}
 
 
+def congestion_status():
+    manifest = {"scenario": "congestion", "action": [{"name": "steering"}]}
+    return {"policy_id": "p", "manifest": manifest}
+
+
 def nobody():
     raise UserError("nobody")
 
@@ -203,6 +209,22 @@ def test_a_policy_of_an_unknown_car_is_said_once(capsys):
     for _ in range(2):
         outlet.take(heard("command", encode(make_command(1.0))))
     assert capsys.readouterr().err.count("'parking' is not known") == 1
+
+
+@pytest.mark.parametrize(("scenario_mps", "scale"), [(None, 1.0), (4.0, 0.25)])
+def test_the_vehicles_scale_is_its_speed_over_the_scenarios(scenario_mps, scale):
+    """The Hunter's path is four times as curved as the car's; a stand says nothing of the scale."""
+    node, outlet = outlet_with(congestion_status)
+    outlet.take(heard("command", encode(make_command(0.0))))
+    for speed_mps in (1.0, 0.0, 1.0):
+        feedback = structs.replace(
+            make_feedback(speed_mps, -1.0),
+            scenario_speed_mps=None if scenario_mps is None else scenario_mps * speed_mps,
+        )
+        outlet.take(heard("feedback", encode(feedback), at_s=len(node.published["odom"])))
+    car_curvature = feedback_curvature(make_feedback(1.0, -1.0), STEERING, 1.0)
+    yaw_rates = [message.twist.twist.angular.z for message in node.published["odom"]]
+    assert yaw_rates == pytest.approx([car_curvature / scale, 0.0, car_curvature / scale])
 
 
 def test_a_flood_is_bounded_and_the_pose_still_right():

@@ -91,10 +91,9 @@ class Outlet:
 
 def _scale_of(feedback: Feedback, last: float) -> float:
     """Metres of the vehicle for one of the scenario, where it moves and reports both speeds."""
-    scenario_mps = getattr(feedback, "scenario_speed_mps", None)
-    if not scenario_mps or not feedback.speed_mps:
+    if not feedback.scenario_speed_mps or not feedback.speed_mps:
         return last
-    return abs(feedback.speed_mps / float(scenario_mps))
+    return abs(feedback.speed_mps / feedback.scenario_speed_mps)
 
 
 _ROWS: dict[str, tuple[Callable[[bytes], Any], Callable[[Outlet, Any, bool], None]]] = {
