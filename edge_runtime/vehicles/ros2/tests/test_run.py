@@ -51,11 +51,10 @@ def test_it_drives_stops_with_the_link_and_drives_again_only_after_a_rearm(polic
         'odometry_topic = "/odom"\n'
     )
     flags = ("--policy", str(policy), "--allow-unsigned", "--vehicle", "ros2")
-    with (
-        Simulator(endpoint) as simulator,
-        EdgeProcess(*flags, "--connect", endpoint, "--config", str(settings)) as edge,
-        RosHunter(connect=ros_endpoint) as hunter,
-    ):
+    arguments = (*flags, "--connect", endpoint, "--config", str(settings))
+    with Simulator(endpoint) as simulator, EdgeProcess(*arguments) as edge, RosHunter(
+        connect=ros_endpoint
+    ) as hunter:
         simulator.wait_for_edge()
         wait_until(lambda: len(hunter.twists) > 10, "zeros")
         assert hunter.asked_mps == 0.0
