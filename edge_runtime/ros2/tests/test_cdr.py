@@ -121,6 +121,17 @@ def test_an_image_of_the_policy_goes_through_whole():
     assert second.deserialize(type_name(ros.Image), cdr.encode(image))["data"] == pixels
 
 
+def test_a_message_that_dds_has_filled_up_is_read():
+    """As Cyclone DDS writes it: up to 4 bytes, and how many were added in the header."""
+    image = ros.Image(height=1, width=3, step=3, data=b"abc")
+    plain = cdr.encode(image)
+    padding = -len(plain) % 4
+    assert padding == 1
+    assert cdr.decode(b"\0\1\0\1" + plain[4:] + b"\0", ros.Image) == image
+    too_much = cdr.decode(plain + bytes(4), ros.Image)
+    assert isinstance(too_much, Rejection)
+
+
 def test_threads_do_not_share_a_buffer():
     """pycdr2's own buffer, one for each type, would mix their bytes."""
     wrong: list[int] = []
