@@ -11,7 +11,7 @@ BENCH := results/bench
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-ray test-network lint format bench bench-quick bench-gpu bench-loop \
-	network recording mutate lock clean
+	bench-can network recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -76,6 +76,10 @@ bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
 	@mkdir -p $(BENCH)
 	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
+
+bench-can: $(STAMP)  ## ten minutes of the 50 Hz CAN stream, every core busy, beside a bare sender
+	@mkdir -p $(BENCH)
+	$(BIN)/python -m hil_tests.benches.can_stream --out $(BENCH)/can_stream.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
 	$(BIN)/python -m hil_tests.recordings.make

@@ -8,11 +8,13 @@ from typing import Any
 from edge_runtime.cli import ArgumentParser, run_cli
 from hil_tests import demo
 from hil_tests.campaign import command as campaign
+from hil_tests.mock_hunter import command as mock_hunter
 from hil_tests.network import command as network
 
 COMMANDS: dict[str, tuple[Any, str]] = {
     "demo": (demo, "train, export and drive the left turn, end to end"),
     "campaign": (campaign, "every fault, every latency row, one report"),
+    "mock_hunter": (mock_hunter, "a Hunter on a CAN bus, with a switch for each fault"),
     "network": (network, "the left turn over a kernel's TCP and UDP, and the model in two times"),
 }
 

@@ -12,7 +12,7 @@ from typing import Callable, List, NamedTuple, Optional, Sequence, Tuple
 
 from edge_runtime import log
 from edge_runtime.vehicles.interface import Vehicle, VehicleReport
-from edge_runtime.vehicles.watch import SILENT, VehicleWatch
+from edge_runtime.vehicles.watch import SILENCE_S, SILENT, VehicleWatch
 from edge_runtime.wire import MAX_TEXT_CHARS, SAFE_STOP, TOPICS, Command, Feedback
 
 _PERIOD_S = 1.0 / TOPICS["feedback"].rate_hz
@@ -25,6 +25,7 @@ class _Task(NamedTuple):
     command: Command
     scenario_speed_mps: Optional[float]
     latch: bool
+    given_s: float
 
 
 class VehicleRunner:
@@ -101,7 +102,7 @@ class VehicleRunner:
         be followed by a drive without `enable`.
         """
         with self._due:
-            self._next = _Task(command, scenario_speed_mps, latch)
+            self._next = _Task(command, scenario_speed_mps, latch, time.monotonic())
             self._due.notify()
 
     def close(self) -> None:
@@ -163,7 +164,7 @@ class VehicleRunner:
         try:
             if command.mode == SAFE_STOP:
                 self._vehicle.brake(now_s, task.latch)
-            else:
+            elif now_s - task.given_s <= SILENCE_S:  # a driver that hung must not obey the past
                 self._vehicle.command(action, now_s, task.scenario_speed_mps)
         except Exception as error:  # a driver may raise anything; its thread must live on
             if not self._refuses:

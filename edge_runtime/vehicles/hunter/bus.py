@@ -6,6 +6,8 @@ board without a CAN vehicle need not have it.
 
 from __future__ import annotations
 
+import ipaddress
+import re
 from typing import Any, Dict, NamedTuple, Optional
 
 from edge_runtime.errors import UserError
@@ -15,7 +17,13 @@ DEFAULT_BUS = "socketcan:can0"
 SYNTAX = "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0"
 # Without a bit rate: the first has it from `ip link`, the others know none.
 _WITHOUT_BITRATE = ("socketcan", "virtual", "udp_multicast")
-# Frames for a multicast group stay on this machine: no router and no neighbour hears them.
+# Between processes of one machine. Groups of interface-local scope (RFC 4291, 2.7) the kernel
+# neither sends to a network nor takes from one, and that without any privilege. Linux hands what
+# comes for any group to every socket of its port: two buses need two ports.
+MULTICAST_GROUP = "ff01::7068:696c"  # "phil"
+MULTICAST_PORT = 43113  # python-can's own
+_LOCAL_GROUPS = ipaddress.IPv6Network("ff01::/16")
+_GROUP_AND_PORT = re.compile(r"([0-9a-fA-F:]+)|\[([0-9a-fA-F:]+)\](?::(\d+))?")
 _OPTIONS: Dict[str, Dict[str, Any]] = {"udp_multicast": {"hop_limit": 0, "fd": False}}
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
 
@@ -26,6 +34,7 @@ class BusName(NamedTuple):
     interface: str
     channel: str
     bitrate: Optional[int]
+    port: Optional[int] = None  # of udp_multicast
 
     @property
     def hears_itself(self) -> bool:
@@ -36,6 +45,8 @@ class BusName(NamedTuple):
 def parse_bus(text: str) -> BusName:
     """The bus of INTERFACE:CHANNEL[:BITRATE]. Raises UserError for anything else."""
     interface, _, channel = text.partition(":")
+    if interface == "udp_multicast":
+        return _parse_multicast(text, channel)
     if interface in _WITHOUT_BITRATE:  # so that a channel may be an IPv6 group
         if interface and channel:
             return BusName(interface, channel, None)
@@ -46,12 +57,33 @@ def parse_bus(text: str) -> BusName:
     raise UserError(f"bus {text!r} is no CAN bus: write it as {SYNTAX}")
 
 
+def _parse_multicast(text: str, channel: str) -> BusName:
+    found = _GROUP_AND_PORT.fullmatch(channel or MULTICAST_GROUP)
+    group = (found[1] or found[2]) if found else ""
+    port = int(found[3] or MULTICAST_PORT) if found else 0
+    if not _is_local(group) or not 1 <= port <= 65535:
+        raise UserError(
+            f"bus {text!r} does not stay on this machine: use a group in {_LOCAL_GROUPS} and a"
+            f" port, like udp_multicast:[{MULTICAST_GROUP}]:{MULTICAST_PORT}"
+        )
+    return BusName("udp_multicast", group, None, port)
+
+
+def _is_local(group: str) -> bool:
+    try:
+        return ipaddress.IPv6Address(group) in _LOCAL_GROUPS
+    except ValueError:
+        return False
+
+
 def open_bus(name: BusName) -> Any:
     """An open python-can bus; nothing is sent. Raises UserError, one line that says what to do."""
     can = import_can()
     options = dict(_OPTIONS.get(name.interface, {}))
     if name.bitrate is not None:
         options["bitrate"] = name.bitrate
+    if name.port is not None:
+        options["port"] = name.port
     try:
         return can.Bus(interface=name.interface, channel=name.channel, **options)
     except Exception as error:  # each backend raises what its library raises, NameError included

@@ -136,7 +136,7 @@ class HunterCore:
 
     def standing(self, now_s: float) -> List[str]:
         """What would make an `enable` now be in vain, in words."""
-        if self.state is not State.STOPPED:
+        if self.state not in (State.STOPPED, State.DISABLED):
             return []
         found = [self.reports.commander(), self.reports.silence(-math.inf, now_s)]
         words = [finding.words for finding in found if finding is not None]

@@ -67,9 +67,7 @@ class HunterVehicle(Vehicle):
         with self._lock:
             self._core.enable(now_s)
             self._gate.open()
-        for thread in self._threads:
-            if thread.ident is None:
-                thread.start()
+        self._start()
         self._wake.set()
 
     def command(
@@ -86,7 +84,8 @@ class HunterVehicle(Vehicle):
         self._wake.set()
 
     def feedback(self, now_s: float) -> VehicleReport:
-        """From the newest frames of the chassis."""
+        """From the newest frames of the chassis, which it listens to before `enable`, too."""
+        self._start()
         with self._lock:
             report = self._core.report(now_s)
             self._log_state()
@@ -114,6 +113,12 @@ class HunterVehicle(Vehicle):
         self._bus.shutdown()
         if self._sent_s is not None:
             log.event("info", "hunter_stream", **_rounded(self._gaps.summary_ms()))
+
+    def _start(self) -> None:
+        if not self._closed:
+            for thread in self._threads:
+                if thread.ident is None:
+                    thread.start()
 
     def _wait_for_a_stand(self) -> None:
         end_s = time.monotonic() + STOP_TAKES_S
@@ -161,13 +166,10 @@ class HunterVehicle(Vehicle):
                 message = self._bus.recv(_LISTEN_S)
             except Exception as error:  # as in _send_due; it may raise at once, again and again
                 self._note_bus(error)
-                self._wait_out()
+                time.sleep(STREAM_PERIOD_S)
                 continue
             if message is not None:
                 self._hear(message)
-
-    def _wait_out(self) -> None:
-        time.sleep(STREAM_PERIOD_S)
 
     def _hear(self, message: Any) -> None:
         if message.is_error_frame:
