@@ -112,8 +112,15 @@ class Ros2Core:
 
     def standing(self, now_s: float) -> List[str]:
         """What would make an `enable` now be in vain, in words."""
+        if self.state not in (State.STOPPED, State.DISABLED):
+            return []
         silence = self._silence(-math.inf, now_s)
-        return [silence] if silence and self.state is State.STOPPED else []
+        return [silence] if silence else []
+
+    def is_at_rest(self, now_s: float) -> bool:
+        """Whether the vehicle is known to stand, or nothing was ever asked of it."""
+        is_fresh = not self._silence(-math.inf, now_s)
+        return self.state is State.DISABLED or (is_fresh and self.odometry.stands)
 
     def _apply(self, event: Event, words: str, now_s: float) -> None:
         after = LEADS_TO[event].get(self.state, self.state)

@@ -13,6 +13,7 @@ import time
 from typing import Callable, ClassVar, Dict, List, Optional
 
 from edge_runtime import log
+from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.ros2 import messages as ros
 from edge_runtime.ros2.endpoint import open_ros2_session
 from edge_runtime.ros2.node import Ros2Node
@@ -27,6 +28,7 @@ from edge_runtime.vehicles.similarity import Similarity
 
 # The Hunter's own: its ROS driver makes a frame of each message, and has no stream of its own.
 STREAM_PERIOD_S = 0.02
+STOP_TAKES_S = 1.0  # zeros go out for so long at the end, unless it is known to stand before
 _JOIN_S = 0.5
 # A pedal is integrated to a speed, so that any leap of it is a ramp: 2.0 in T = 0.1 s.
 _PEDAL_SLEW_PER_S = 20.0
@@ -51,6 +53,8 @@ class Ros2Vehicle(Vehicle):
         self._closed = False
         self._logged = ""
         self._failing = False
+        self._sent_s: Optional[float] = None
+        self._gaps = LatencyWindow()
         self._publish: List[Callable[[Motion], None]] = []
         self._thread = threading.Thread(target=self._stream, name="ros2-stream", daemon=True)
         self._session = open_ros2_session(settings.listen, settings.connect)
@@ -103,19 +107,22 @@ class Ros2Vehicle(Vehicle):
         return report
 
     def close(self) -> None:
-        """Publish speed 0 once more, and leave."""
+        """Publish speed 0 until it stands, and leave."""
         if self._closed:
             return
         self._closed = True
         self.brake(time.monotonic())
+        self._wait_for_a_stand()
         self._stopping = True
         self._wake.set()
         if self._thread.ident is not None:
             self._thread.join(_JOIN_S)
         try:
-            self._send_due()
             if self.rejected:
                 log.event("info", "ros2_odometry_rejected", **self.rejected)
+            if self._sent_s is not None:
+                gaps = self._gaps.summary_ms().items()
+                log.event("info", "ros2_stream", **{f"gap_{k}_ms": round(v, 2) for k, v in gaps})
             self._node.close()
         finally:
             with self._lock:
@@ -137,6 +144,14 @@ class Ros2Vehicle(Vehicle):
                 self._core.hear(measured_of(odometry), time.monotonic())
 
         node.subscribe(settings.odometry_topic, ros.Odometry, hear)
+
+    def _wait_for_a_stand(self) -> None:
+        end_s = time.monotonic() + STOP_TAKES_S
+        while self._thread.is_alive() and time.monotonic() < end_s:
+            with self._lock:
+                if self._core.is_at_rest(time.monotonic()):
+                    return
+            time.sleep(STREAM_PERIOD_S)
 
     def _stream(self) -> None:
         next_s = time.monotonic()
@@ -164,6 +179,10 @@ class Ros2Vehicle(Vehicle):
             self._failing = True
             return
         self._failing = False
+        now_s = time.monotonic()
+        if self._sent_s is not None:
+            self._gaps.add(int((now_s - self._sent_s) * 1e9))
+        self._sent_s = now_s
 
     def _log_state(self) -> None:
         """Each state once, when feedback is asked for: never from the stream's thread."""

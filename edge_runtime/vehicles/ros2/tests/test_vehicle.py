@@ -178,6 +178,19 @@ def test_the_stream_goes_on_with_zeros_while_stopped():
         vehicle.close()
 
 
+def test_at_the_end_zeros_go_out_until_it_stands():
+    endpoint = free_endpoint()
+    vehicle = make_vehicle(listen=endpoint)
+    vehicle.enable(time.monotonic())
+    with RosHunter(connect=endpoint) as hunter:
+        enable(vehicle)
+        with Commands(vehicle, {"pedal": 1.0}):
+            wait_until(lambda: hunter.speed_mps > 0.5, "the Hunter to drive")
+        vehicle.close()
+        assert hunter.speed_mps < 0.1
+        assert [twist["linear"]["x"] for _, twist in hunter.twists[-5:]] == [0.0] * 5
+
+
 def test_what_is_no_odometry_is_counted_and_confirms_nothing():
     endpoint = free_endpoint()
     with RosHunter(listen=endpoint) as hunter:
