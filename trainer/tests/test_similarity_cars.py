@@ -37,7 +37,7 @@ def test_every_scenario_has_its_car_as_long_as_highway_envs(scenario):
 def test_the_curvature_is_the_bicycles_own():
     """One step of highway-env's model: heading gained over way covered."""
     action = 0.5
-    ego = EgoVehicle(None, (0.0, 0.0), 0.0, 4.0)  # type: ignore[arg-type]
+    ego = EgoVehicle(None, (0.0, 0.0), 0.0, 4.0)
     ego.drive(0.0, action * CongestionConfig().lambda_rad, 6.0, 0.1)
     left_rad = -ego.heading  # its y axis points down: positive turns right
     way_m = math.hypot(*ego.position)

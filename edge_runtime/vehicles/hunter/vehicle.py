@@ -1,7 +1,8 @@
 """The driver of a Hunter: two threads and a bus around core.py.
 
 - The stream's thread sends what `tick` gives, 50 times a second at absolute deadlines, and at
-  once when somebody brakes. It is the only one that sends, until `close` has joined it.
+  once when somebody brakes or the chassis says what stops it. It is the only one that sends, until
+  `close` has joined it.
 - The listener's thread hands every frame to `hear`.
 Both inherit the priority that `realtime` gave the process. All calls of the core hold one lock;
 the bus is called outside of it, so that nobody waits for a bus.
@@ -181,7 +182,11 @@ class HunterVehicle(Vehicle):
         if self._ignores_commands and self._core.is_command(message.arbitration_id):
             return
         with self._lock:
+            was = self._core.state
             self._core.hear(message.arbitration_id, bytes(message.data), time.monotonic())
+            stopped = self._core.state is State.STOPPED and was is not State.STOPPED
+        if stopped:
+            self._wake.set()
 
     def _note_bus(self, error: object, fatal: bool = False) -> None:
         words = " ".join(str(error).split()) or type(error).__name__
