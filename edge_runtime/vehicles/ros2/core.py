@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Dict, List, NamedTuple, Optional
 
+from edge_runtime.safety import SILENCE_S
 from edge_runtime.vehicles import mapping
 from edge_runtime.vehicles.hunter.set_point import SetPoint, SpeedWatch, Wish, steering_of, wish_of
 from edge_runtime.vehicles.hunter.specs import HunterSpec
@@ -19,7 +20,7 @@ from edge_runtime.vehicles.ros2.states import LEADS_TO, Event, State
 from edge_runtime.vehicles.similarity import Similarity
 from edge_runtime.wire import CONTROL_PERIOD_S
 
-SILENCE_S = 2 * CONTROL_PERIOD_S
+ODOMETRY_SILENCE_S = 2 * CONTROL_PERIOD_S
 # A beat later than the runtime's own silence rule, which then tells the reason.
 COMMAND_TIMEOUT_S = SILENCE_S + 0.02
 ENABLE_TIMEOUT_S = 1.0
@@ -153,7 +154,7 @@ class Ros2Core:
             self._apply(Event.STUCK, words, now_s)
 
     def _silence(self, since_s: float, now_s: float) -> str:
-        if now_s - max(self.odometry.heard_s, since_s) <= SILENCE_S:
+        if now_s - max(self.odometry.heard_s, since_s) <= ODOMETRY_SILENCE_S:
             return ""
         return f"no fresh odometry on {self._topic}"
 

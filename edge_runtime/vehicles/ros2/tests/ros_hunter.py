@@ -31,7 +31,7 @@ class RosHunter:
         self.drives: List[Dict[str, Any]] = []
         self.tokens: set[str] = set()
         self.speed_mps = self.inner_rad = 0.0
-        self.silent = self.stuck = False
+        self.silent = False
         self._commanded_s = -math.inf
         self._session = open_session(listen=listen, connect=connect, mode="router")
         prefix = f"{namespace}/" if namespace else ""
@@ -93,8 +93,7 @@ class RosHunter:
         while not self._stopping.wait(PERIOD_S):
             is_late = time.monotonic() - self._commanded_s > CHASSIS_TIMEOUT_S
             target_mps = 0.0 if is_late else self.asked_mps
-            if not self.stuck:
-                self.speed_mps += 0.3 * (target_mps - self.speed_mps)
+            self.speed_mps += 0.3 * (target_mps - self.speed_mps)
             if not self.silent:
                 self._odometry.put(second.serialize("nav_msgs/msg/Odometry", self._message()))
 
