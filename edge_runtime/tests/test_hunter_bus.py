@@ -247,15 +247,17 @@ def test_what_is_no_name_of_a_bus(text):
         parse_bus(text)
 
 
-def test_buses_that_cannot_be_opened_are_one_line():
+def test_buses_that_cannot_be_opened_are_one_line(caplog):
     for text, words in (
         ("socketcan:can97", "bus socketcan:can97 cannot be opened"),
         ("nosuch:can0", "choose from .*socketcan"),
-        ("slcan:/dev/nothing", "/dev/nothing"),
+        ("slcan:/dev/nothing", "/dev/nothing.*manual says what its slcan needs"),
+        ("kvaser:0", "bus kvaser:0 cannot be opened"),
     ):
         with pytest.raises(UserError, match=words) as caught:
             open_bus(parse_bus(text))
         assert "\n" not in str(caught.value)
+    assert caplog.records == []  # a line of a library would be a second one
 
 
 def test_python_can_is_asked_for_where_it_is_missing(monkeypatch):

@@ -26,8 +26,8 @@ from hil_tests.faults.sender import Sender
 from hil_tests.faults.timeline import BrakeSeen, ModeSeen, Timeline, last_drive_s
 
 VEHICLE_ID = "faults"
-EARS = (0x111, 0x211, 0x221)
-"""What is kept of the CAN bus: the set-point, the chassis's state, its speed."""
+EARS = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
+"""What is kept of the CAN bus: all commands, the chassis's state, its speed."""
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
 _REARM_EVERY_S = 2.0

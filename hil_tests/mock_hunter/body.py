@@ -8,11 +8,17 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from hil_tests.mock_hunter.chassis import Setpoint
 from hil_tests.mock_hunter.parameters import Parameters
 
 STANDS_MPS = 0.005
 """Slower than this it stands: half of what one count in 0x221 could show is 0.0005."""
+
+
+class Setpoint(NamedTuple):
+    """What is asked of the body: speed, and the angle of the inner front wheel."""
+
+    speed_mps: float = 0.0
+    inner_rad: float = 0.0
 
 
 class Body(NamedTuple):

@@ -105,13 +105,6 @@ CONDITION: dict[tuple[Condition, Event], Condition] = {
 }
 
 
-class Setpoint(NamedTuple):
-    """What is asked of the body: speed, and the angle of the inner front wheel."""
-
-    speed_mps: float = 0.0
-    inner_rad: float = 0.0
-
-
 class Chassis(NamedTuple):
     """Where the chassis stands. Power-on: standby, brake locked, no error.
 
@@ -122,7 +115,6 @@ class Chassis(NamedTuple):
     control: Control = Control.STANDBY
     condition: Condition = Condition.OK
     brake_locked: bool = True
-    setpoint: Setpoint = Setpoint()
     commanded_s: float = float("-inf")
     """When the newest 0x111 came, or CAN control was taken."""
     causes: frozenset[str] = frozenset()
@@ -137,17 +129,15 @@ def advance(chassis: Chassis, event: Event) -> Chassis:
 
 
 def take_can_mode(chassis: Chassis, now_s: float) -> Chassis:
-    """0x421 = 1. The time-out counts from here; what was asked before is forgotten."""
+    """0x421 = 1. The time-out counts from the moment in which control changes hands."""
     after = advance(chassis, Event.CAN_MODE)
-    if after.control is Control.CAN and chassis.control is not Control.CAN:
-        return after._replace(commanded_s=now_s, setpoint=Setpoint())
-    return after
+    taken = after.control is Control.CAN and chassis.control is not Control.CAN
+    return after._replace(commanded_s=now_s) if taken else after
 
 
-def take_command(chassis: Chassis, setpoint: Setpoint, now_s: float) -> Chassis:
-    """0x111: kept whoever drives, obeyed where `obeys` says so."""
-    after = advance(chassis, Event.COMMAND)
-    return after._replace(setpoint=setpoint, commanded_s=now_s)
+def take_command(chassis: Chassis, now_s: float) -> Chassis:
+    """0x111: noted whoever drives, obeyed where `obeys` says so."""
+    return advance(chassis, Event.COMMAND)._replace(commanded_s=now_s)
 
 
 def take_time(chassis: Chassis, now_s: float, timeout_s: float) -> Chassis:

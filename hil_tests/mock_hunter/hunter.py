@@ -11,8 +11,8 @@ from typing import NamedTuple
 from edge_runtime.vehicles.hunter import frames as codec
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.battery import Battery
-from hil_tests.mock_hunter.body import Body, advance, roll
-from hil_tests.mock_hunter.chassis import Chassis, Event, Setpoint
+from hil_tests.mock_hunter.body import Body, Setpoint, advance, roll
+from hil_tests.mock_hunter.chassis import Chassis, Event
 from hil_tests.mock_hunter.faults import BITS, LATE_S, check_fault
 from hil_tests.mock_hunter.feedback import Reported, fast_frames, slow_frames
 from hil_tests.mock_hunter.parameters import Parameters
@@ -102,7 +102,8 @@ class MockHunter:
     def _obey(self, message: object, now_s: float) -> None:
         if isinstance(message, codec.MotionCommand):
             asked = Setpoint(message.speed_mps, message.inner_steering_rad)
-            self.chassis = rules.take_command(self.chassis, asked, now_s)
+            self.chassis = rules.take_command(self.chassis, now_s)
+            self._under_way.append((now_s + self._parameters.dead_time_s, asked))
         elif isinstance(message, codec.ModeCommand):
             if message.mode == codec.CAN_CONTROL:
                 self.chassis = rules.take_can_mode(self.chassis, now_s)
@@ -112,7 +113,6 @@ class MockHunter:
             self.chassis = self.chassis._replace(brake_locked=message.locked == 1)
         elif isinstance(message, codec.ClearCommand):
             self.chassis = rules.take_clear(self.chassis)
-        self._under_way.append((now_s + self._parameters.dead_time_s, self.chassis.setpoint))
 
     def _apply(self, event: Event) -> None:
         self.chassis = rules.advance(self.chassis, event)

@@ -7,6 +7,7 @@ board without a CAN vehicle need not have it.
 from __future__ import annotations
 
 import ipaddress
+import logging
 import re
 from typing import Any, Dict, NamedTuple, Optional
 
@@ -92,6 +93,8 @@ def open_bus(name: BusName) -> Any:
 
 def import_can() -> Any:
     """The python-can package. Raises UserError where it is not installed."""
+    # Its backends say on stderr what they miss; our error says it in its one line.
+    logging.getLogger("can").setLevel(logging.CRITICAL)
     try:
         import can
     except ImportError:
@@ -118,7 +121,7 @@ def _explain(name: BusName, error: Exception) -> str:
     if "Unknown interface" in cause:
         can = import_can()
         return f"{where}: choose from {', '.join(sorted(can.VALID_INTERFACES))}"
-    return f"{where}: {cause}"
+    return f"{where}: {cause}; python-can's manual says what its {name.interface} needs"
 
 
 class Gate:

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from edge_runtime.errors import UserError
 from edge_runtime.vehicles.hunter.specs import SPECS
 from hil_tests.mock_hunter.battery import Battery
-from hil_tests.mock_hunter.body import Body, advance, curvature
-from hil_tests.mock_hunter.chassis import Setpoint
+from hil_tests.mock_hunter.body import Body, Setpoint, advance, curvature
 from hil_tests.mock_hunter.parameters import MODELS, SOURCES, Parameters, make_parameters
 
 P = MODELS["hunter-2.0"]

@@ -1,6 +1,7 @@
 """The chassis's state machine: every pair of its tables, and the traps by their names."""
 
 import itertools
+from pathlib import Path
 
 import pytest
 
@@ -12,12 +13,10 @@ from hil_tests.mock_hunter.chassis import (
     Condition,
     Control,
     Event,
-    Setpoint,
 )
 from hil_tests.mock_hunter.faults import BITS
 
 TIMEOUT_S = 0.5
-FAST = Setpoint(1.0, 0.1)
 CONTROL_EVENTS = [
     Event.CAN_MODE, Event.STANDBY_MODE, Event.COMMAND, Event.TIMEOUT, Event.REMOTE_ON,
     Event.REMOTE_OFF,
@@ -72,37 +71,35 @@ def test_the_bus_drives_only_in_can_control_without_errors_and_brake(control, co
 
 def test_it_wakes_in_standby_with_the_brake_on():
     assert (Chassis().control, Chassis().brake_locked) == (Control.STANDBY, True)
-    commanded = rules.take_command(Chassis(brake_locked=False), FAST, 0.0)
+    commanded = rules.take_command(Chassis(brake_locked=False), 0.0)
     assert not rules.obeys(commanded)
 
 
 def test_the_link_is_lost_after_its_time_and_not_before():
     assert rules.take_time(DRIVING, 0.5, TIMEOUT_S).control is Control.CAN
     assert rules.take_time(DRIVING, 0.501, TIMEOUT_S).control is Control.LINK_LOST
-    kept = rules.take_command(DRIVING, FAST, 0.4)
+    kept = rules.take_command(DRIVING, 0.4)
     assert rules.take_time(kept, 0.9, TIMEOUT_S).control is Control.CAN
 
 
 def test_the_trap_frames_that_come_back_take_control_by_themselves():
     lost = rules.take_time(DRIVING, 5.0, TIMEOUT_S)
     assert not rules.obeys(lost)
-    resumed = rules.take_command(lost, FAST, 5.1)
+    resumed = rules.take_command(lost, 5.1)
     assert rules.obeys(resumed)
-    assert resumed.setpoint == FAST
 
 
 def test_standby_by_frame_is_kept_whatever_is_commanded():
     stood_down = rules.advance(DRIVING, Event.STANDBY_MODE)
-    assert not rules.obeys(rules.take_command(stood_down, FAST, 0.1))
+    assert not rules.obeys(rules.take_command(stood_down, 0.1))
 
 
-def test_can_mode_starts_its_own_time_and_forgets_what_was_asked():
-    stale = Chassis(brake_locked=False, setpoint=FAST, commanded_s=1.0)
+def test_can_mode_starts_its_own_time_and_does_not_prolong_it():
+    stale = Chassis(brake_locked=False, commanded_s=1.0)
     taken = rules.take_can_mode(stale, 9.0)
-    assert taken.setpoint == Setpoint()
     assert rules.take_time(taken, 9.5, TIMEOUT_S).control is Control.CAN
-    again = rules.take_can_mode(taken._replace(setpoint=FAST), 9.4)
-    assert (again.commanded_s, again.setpoint) == (9.0, FAST)  # it had control already
+    again = rules.take_can_mode(taken, 9.4)
+    assert rules.take_time(again, 9.6, TIMEOUT_S).control is Control.LINK_LOST
 
 
 @pytest.mark.parametrize("name", BITS)
@@ -134,7 +131,8 @@ def test_of_two_errors_the_second_still_stops():
     assert rules.obeys(rules.take_cause(one, "undervoltage", False))
 
 
-def test_the_tables_are_rendered_whole():
+def test_the_tables_are_rendered_whole_and_stand_in_the_readme():
     text = rules.render_tables()
+    assert text in Path(rules.__file__).with_name("README.md").read_text()
     assert "| 0x111 | standby | can | can | remote | remote_over_can |" in text
     assert text.count("\n| ") + 1 >= len(Event)

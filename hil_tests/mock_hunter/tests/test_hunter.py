@@ -250,6 +250,19 @@ def test_off_the_bus_it_hears_nothing_either():
     assert bench.hunter.chassis.control == "link_lost"
 
 
+def test_back_on_the_bus_it_does_not_drive_what_it_last_heard():
+    """A multicast bus brings its own reports back to it, before the first new command."""
+    bench = enabled(FAST_AHEAD)
+    bench.switch("bus_off")
+    bench.run(1.5, STOP)
+    bench.switch("bus_off", on=False)
+    bench.send((0x221, bytes(8)), (0x211, bytes(8)))
+    bench.run(0.01)
+    where_m = bench.hunter.body.right_m
+    assert bench.run(0.5, STOP).hunter.body.right_m == where_m
+    assert mode(bench) == 1  # the trap: it has control again
+
+
 def test_stuck_it_holds_its_speed_until_it_is_braked():
     bench = enabled(FAST_AHEAD)
     bench.switch("stuck")

@@ -40,7 +40,7 @@ def served():
     """A bus with a mock at its other end, which says what it is told to the list."""
     near = can.Bus(interface="virtual", channel="test_process")
     far = can.Bus(interface="virtual", channel="test_process")
-    said = []
+    said: list[str] = []
     server = Server(MockHunter(MODELS["hunter-2.0"], time.monotonic()), far, said.append)
     thread = threading.Thread(target=server.run)
     thread.start()
@@ -85,7 +85,8 @@ class DeafBus(can.BusABC):
 
 
 def test_a_bus_that_takes_nothing_is_said_once():
-    bus, said = DeafBus(), []
+    bus = DeafBus()
+    said: list[str] = []
     server = Server(MockHunter(MODELS["hunter-2.0"], time.monotonic()), bus, said.append)
     thread = threading.Thread(target=server.run)
     thread.start()
