@@ -10,9 +10,8 @@ import math
 import struct
 from typing import Any, Iterator, Tuple, Type, TypeVar, Union
 
-from pycdr2._support import Buffer, Endianness
-
 from edge_runtime.messages import Reason, Rejection
+from edge_runtime.ros2.library import Buffer, Endianness
 from edge_runtime.ros2.messages import (
     AckermannDriveStamped,
     Image,

@@ -3,22 +3,21 @@
 Field names, order and types are those of the packages' .msg files (common_interfaces and
 ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
 the left, positive steering and yaw to the left (REP 103). Only cdr.py and those who fill a message
-in need this module; it is the one that imports pycdr2.
+in need this module, and with it pycdr2.
 """
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, List
 
-from edge_runtime.errors import UserError
-
-try:
-    from pycdr2 import IdlStruct
-    from pycdr2.types import array, float32, float64, int32, uint8, uint32
-except ImportError:
-    raise UserError(
-        "ROS 2 messages need the package pycdr2: pip install 'phil-edge-runtime[ros2]',"
-        " or pip install pycdr2"
-    ) from None
+from edge_runtime.ros2.library import (
+    IdlStruct,
+    array,
+    float32,
+    float64,
+    int32,
+    uint8,
+    uint32,
+)
 
 COVARIANCE_SIZE = 36
 if TYPE_CHECKING:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import asdict
 
 import pytest
@@ -84,3 +86,16 @@ def test_we_hear_the_second_library_and_count_what_is_none(sessions):
         theirs.put("hunter01/odom", cdr.encode(TWIST))
         wait_until(lambda: sum(node.rejected.values()) >= 4, "the rejections")
         assert node.rejected == {"malformed": 2, "schema": 1, "oversized": 1}
+
+
+def test_without_pycdr2_one_line_says_what_to_install():
+    code = (
+        "import sys; sys.modules['pycdr2'] = None\n"
+        "from edge_runtime.errors import UserError\n"
+        "import edge_runtime.vehicles.registry\n"
+        "try: import edge_runtime.ros2.cdr\n"
+        "except UserError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    (line,) = done.stdout.splitlines()
+    assert "pip install pycdr2" in line
