@@ -232,7 +232,7 @@ def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(ch
     ("text", "name"),
     [
         ("socketcan:can0", BusName("socketcan", "can0", None)),
-        ("udp_multicast:ff01::6", BusName("udp_multicast", "ff01::6", None, 43113)),
+        ("udp_multicast:239.1.2.3:7", BusName("udp_multicast", "239.1.2.3", None, 7)),
         ("slcan:/dev/ttyACM0", BusName("slcan", "/dev/ttyACM0", 500_000)),
         ("slcan:/dev/ttyACM0:250000", BusName("slcan", "/dev/ttyACM0", 250_000)),
     ],

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
+from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.wire import SAFE_STOP
 from hil_tests.benches.can_floor import CAN_ID
@@ -84,26 +85,37 @@ def measure(seconds: float, busy: int, priority: int = 0) -> dict[str, Any]:
         with (
             Rig(flags, Path(work), vehicle="hunter", model="hunter-2.0") as rig,
             _floor(priority) as floor,
-            _busy(busy),
         ):
-            assert rig.ears is not None
-            assert rig.chassis is not None
-            rig.wait_until_driving()
-            time.sleep(_SETTLE_S)
-            begin_s = rig.mark()
-            _wait(seconds)
-            end_s = rig.mark()
-            ours = [one.seen_s for one in rig.ears.of(CAN_ID, begin_s) if one.seen_s < end_s]
-            bare = [one.seen_s for one in floor.of(CAN_ID, begin_s) if one.seen_s < end_s]
-            during = [one for one in rig.chassis.truth if begin_s < one.since_s < end_s]
-            stops = [m for m in rig.timeline.modes if begin_s < m.seen_s < end_s]
-            return {
-                "seconds": round(end_s - begin_s, 1),
-                "driver": gaps(ours),
-                "floor": gaps(bare),
-                "links_lost": sum(one.control == "link_lost" for one in during),
-                "safe_stops": sum(mode.mode == SAFE_STOP for mode in stops),
-            }
+            _wait_for_a_drive(rig)
+            with _busy(busy):
+                time.sleep(_SETTLE_S)
+                begin_s = rig.mark()
+                _wait(seconds)
+                end_s = rig.mark()
+            return _report(rig, floor, begin_s, end_s)
+
+
+def _wait_for_a_drive(rig: Rig) -> None:
+    try:
+        rig.wait_until_driving()
+    except TimeoutError as error:
+        raise UserError(f"no drive to measure, the machine is too busy: {error}") from None
+
+
+def _report(rig: Rig, floor: CanEars, begin_s: float, end_s: float) -> dict[str, Any]:
+    assert rig.ears is not None
+    assert rig.chassis is not None
+    ours = [one.seen_s for one in rig.ears.of(CAN_ID, begin_s) if one.seen_s < end_s]
+    bare = [one.seen_s for one in floor.of(CAN_ID, begin_s) if one.seen_s < end_s]
+    during = [one for one in rig.chassis.truth if begin_s < one.since_s < end_s]
+    stops = [m for m in rig.timeline.modes if begin_s < m.seen_s < end_s]
+    return {
+        "seconds": round(end_s - begin_s, 1),
+        "driver": gaps(ours),
+        "floor": gaps(bare),
+        "links_lost": sum(one.control == "link_lost" for one in during),
+        "safe_stops": sum(mode.mode == SAFE_STOP for mode in stops),
+    }
 
 
 def gaps(times_s: Sequence[float]) -> dict[str, float]:

@@ -6,7 +6,7 @@ import re
 import socket
 from typing import NamedTuple
 
-from edge_runtime.vehicles.hunter.bus import MULTICAST_GROUP
+from edge_runtime.vehicles.hunter import multicast
 from hil_tests.faults.processes import Process, wait_until
 
 _TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(\w+)")
@@ -24,9 +24,9 @@ class Truth(NamedTuple):
 
 def free_bus() -> str:
     """A bus of its own: Linux mixes buses that share a port, whatever their groups."""
-    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as one:
-        one.bind(("::", 0))
-        return f"udp_multicast:[{MULTICAST_GROUP}]:{one.getsockname()[1]}"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", 0))
+        return f"udp_multicast:{multicast.GROUP}:{one.getsockname()[1]}"
 
 
 class ChassisProcess:

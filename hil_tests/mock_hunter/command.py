@@ -10,14 +10,13 @@ import time
 from typing import Any
 
 from edge_runtime.errors import UserError
-from edge_runtime.vehicles.hunter.bus import MULTICAST_GROUP, MULTICAST_PORT, open_bus, parse_bus
+from edge_runtime.vehicles.hunter import multicast
+from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
 from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.faults import FAULTS, check_fault
 from hil_tests.mock_hunter.hunter import MockHunter
 from hil_tests.mock_hunter.parameters import MODELS, SOURCES, make_parameters
 from hil_tests.mock_hunter.process import Orders, Server
-
-DEFAULT_BUS = f"udp_multicast:[{MULTICAST_GROUP}]:{MULTICAST_PORT}"
 
 
 class _AfterFault(argparse.Action):
@@ -35,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
         f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
     )
-    parser.add_argument("--bus", default=DEFAULT_BUS, metavar="INTERFACE:CHANNEL")
+    parser.add_argument("--bus", default=multicast.SYNTAX, metavar="INTERFACE:CHANNEL")
     parser.add_argument("--model", default="hunter-2.0", choices=list(MODELS))
     parser.add_argument(
         "--profile", default=DEFAULT_PROFILE, choices=list(PROFILES), help="firmware's fault bits"

@@ -47,7 +47,7 @@ class MockHunter:
         self._under_way: deque[tuple[float, Setpoint]] = deque()
         self._setpoint = Setpoint()
         self._tick = 0
-        self._late: deque[tuple[float, Wire]] = deque()
+        self._outgoing: deque[tuple[float, Wire]] = deque()
 
     def describe(self) -> str:
         """Where it stands in one line that only changes when something happens."""
@@ -149,12 +149,12 @@ class MockHunter:
         if self.faults & {"silent", "bus_off"}:
             return
         release_s = now_s + (LATE_S if "late" in self.faults else 0.0)
-        if self._late:
-            release_s = max(release_s, self._late[-1][0])  # a bus keeps their order
-        self._late.extend((release_s, Wire(*frame)) for frame in frames)
+        if self._outgoing:
+            release_s = max(release_s, self._outgoing[-1][0])  # a bus keeps their order
+        self._outgoing.extend((release_s, Wire(*frame)) for frame in frames)
 
     def _released(self, now_s: float) -> list[Wire]:
         found = []
-        while self._late and self._late[0][0] <= now_s:
-            found.append(self._late.popleft()[1])
+        while self._outgoing and self._outgoing[0][0] <= now_s:
+            found.append(self._outgoing.popleft()[1])
         return found

@@ -6,25 +6,18 @@ board without a CAN vehicle need not have it.
 
 from __future__ import annotations
 
-import ipaddress
 import logging
-import re
 from typing import Any, Dict, NamedTuple, Optional
 
 from edge_runtime.errors import UserError
+from edge_runtime.vehicles.hunter import multicast
 from edge_runtime.vehicles.hunter.frames import BITRATE, COMMANDS, Frame
 
 DEFAULT_BUS = "socketcan:can0"
 SYNTAX = "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0"
 # Without a bit rate: the first has it from `ip link`, the others know none.
-_WITHOUT_BITRATE = ("socketcan", "virtual", "udp_multicast")
-# Between processes of one machine. Groups of interface-local scope (RFC 4291, 2.7) the kernel
-# neither sends to a network nor takes from one, and that without any privilege. Linux hands what
-# comes for any group to every socket of its port: two buses need two ports.
-MULTICAST_GROUP = "ff01::7068:696c"  # "phil"
-MULTICAST_PORT = 43113  # python-can's own
-_LOCAL_GROUPS = ipaddress.IPv6Network("ff01::/16")
-_GROUP_AND_PORT = re.compile(r"([0-9a-fA-F:]+)|\[([0-9a-fA-F:]+)\](?::(\d+))?")
+_WITHOUT_BITRATE = ("socketcan", "virtual")
+# Pinned to the loopback device as well: no neighbour hears it either way.
 _OPTIONS: Dict[str, Dict[str, Any]] = {"udp_multicast": {"hop_limit": 0, "fd": False}}
 _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
 
@@ -48,7 +41,7 @@ def parse_bus(text: str) -> BusName:
     interface, _, channel = text.partition(":")
     if interface == "udp_multicast":
         return _parse_multicast(text, channel)
-    if interface in _WITHOUT_BITRATE:  # so that a channel may be an IPv6 group
+    if interface in _WITHOUT_BITRATE:
         if interface and channel:
             return BusName(interface, channel, None)
     elif interface and channel:
@@ -59,22 +52,12 @@ def parse_bus(text: str) -> BusName:
 
 
 def _parse_multicast(text: str, channel: str) -> BusName:
-    found = _GROUP_AND_PORT.fullmatch(channel or MULTICAST_GROUP)
-    group = (found[1] or found[2]) if found else ""
-    port = int(found[3] or MULTICAST_PORT) if found else 0
-    if not _is_local(group) or not 1 <= port <= 65535:
+    found = multicast.parse_channel(channel)
+    if found is None:
         raise UserError(
-            f"bus {text!r} does not stay on this machine: use a group in {_LOCAL_GROUPS} and a"
-            f" port, like udp_multicast:[{MULTICAST_GROUP}]:{MULTICAST_PORT}"
+            f"bus {text!r} is no IPv4 multicast group and port: write it as {multicast.SYNTAX}"
         )
-    return BusName("udp_multicast", group, None, port)
-
-
-def _is_local(group: str) -> bool:
-    try:
-        return ipaddress.IPv6Address(group) in _LOCAL_GROUPS
-    except ValueError:
-        return False
+    return BusName("udp_multicast", found[0], None, found[1])
 
 
 def open_bus(name: BusName) -> Any:
@@ -86,8 +69,19 @@ def open_bus(name: BusName) -> Any:
     if name.port is not None:
         options["port"] = name.port
     try:
-        return can.Bus(interface=name.interface, channel=name.channel, **options)
+        bus = can.Bus(interface=name.interface, channel=name.channel, **options)
     except Exception as error:  # each backend raises what its library raises, NameError included
+        raise UserError(_explain(name, error)) from None
+    if name.interface == "udp_multicast":
+        _pin(name, bus)
+    return bus
+
+
+def _pin(name: BusName, bus: Any) -> None:
+    try:
+        multicast.pin_to_loopback(bus, name.channel)
+    except OSError as error:
+        bus.shutdown()
         raise UserError(_explain(name, error)) from None
 
 
@@ -121,6 +115,8 @@ def _explain(name: BusName, error: Exception) -> str:
     if "Unknown interface" in cause:
         can = import_can()
         return f"{where}: choose from {', '.join(sorted(can.VALID_INTERFACES))}"
+    if name.interface == "udp_multicast":
+        return f"{where}: {cause}; it needs msgpack, and a route for multicast (`ip route`)"
     return f"{where}: {cause}; python-can's manual says what its {name.interface} needs"
 
 

@@ -57,7 +57,6 @@ class HunterCore:
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the chassis confirms it."""
         self._wish = None
-        self.set_point.stand()
         self._speed_watch.begin()
         self._ask_s = now_s
         self._apply(Finding(Event.ENABLE, ""), now_s)
@@ -74,7 +73,6 @@ class HunterCore:
     def brake(self, now_s: float, latch: bool = True) -> None:
         """Speed 0 at the next tick, until the next command or (latched) the next `enable`."""
         self._wish = None
-        self.set_point.stand()
         if latch:
             self._apply(Finding(Event.BRAKE, ""), now_s)
 
@@ -82,6 +80,7 @@ class HunterCore:
         """The last frames: stand, park, give control back. None where it was never taken."""
         if self.state is State.DISABLED:
             return []
+        self.set_point.stand()
         parts = [self._motion(), _sent(frames.MODE_COMMAND, frames.ModeCommand(frames.STANDBY))]
         if not self.reports.remote_drives:
             parts.insert(1, _sent(frames.BRAKE_COMMAND, frames.BrakeCommand(1)))
@@ -94,9 +93,7 @@ class HunterCore:
             self._apply(Finding(Event.FOREIGN, f"somebody else sends 0x{can_id:x}"), now_s)
             return
         self.reports.hear(can_id, data, now_s)
-        if can_id == frames.MOTION_STATUS.can_id:
-            return  # 50 of these a second, and none of them confirms anything
-        if self.reports.status_s == now_s or self.state is State.ENABLED:
+        if can_id == frames.SYSTEM_STATUS.can_id or can_id in frames.MOTOR_OF_SLOW:
             self._judge(now_s)
 
     def bus_failed(self, words: str, now_s: float, fatal: bool = False) -> None:

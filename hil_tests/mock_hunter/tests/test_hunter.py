@@ -6,10 +6,11 @@ Only here the driver's codec is not used: the mock must not be right merely by a
 import struct
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.errors import UserError
+from hil_tests.mock_hunter.chassis import obeys
 from hil_tests.mock_hunter.faults import BITS, FAULTS, LATE_S
 from hil_tests.mock_hunter.hunter import MockHunter
 from hil_tests.mock_hunter.parameters import MODELS
@@ -303,6 +304,33 @@ def test_every_fault_has_a_test_here_and_others_are_refused():
 def test_no_single_frame_moves_it_out_of_standby(can_id, data):
     bench = Bench((can_id, data))
     assert bench.run(0.2, (can_id, data)).hunter.body.stands
+
+
+happenings = st.lists(
+    st.one_of(
+        st.sampled_from([CAN_MODE, STANDBY, RELEASE, LOCK, CLEAR, FAST_AHEAD, TURNED, STOP]),
+        st.tuples(st.sampled_from(sorted(set(FAULTS) - {"stuck"})), st.booleans()),
+        st.floats(0.005, 0.3),
+    ),
+    max_size=30,
+)
+
+
+@settings(max_examples=60)
+@given(happenings)
+def test_whatever_happens_it_keeps_its_limits_and_brakes_where_it_does_not_obey(happened):
+    bench = Bench(CAN_MODE, RELEASE, FAST_AHEAD)
+    for one in happened:
+        if isinstance(one, float):
+            bench.run(one, FAST_AHEAD)
+        elif isinstance(one[1], bool):
+            bench.switch(*one)
+        else:
+            bench.send(one)
+        assert abs(bench.speed_mps) <= P.max_speed_mps
+    bench.run(2.0)  # the commands cease
+    assert bench.hunter.body.stands
+    assert not obeys(bench.hunter.chassis)
 
 
 def test_pulses_count_the_way():

@@ -139,7 +139,7 @@ def test_orders_come_in_turn_and_bad_ones_are_told():
     ("arguments", "why"),
     [
         (["--bus", "can0"], "is no CAN bus"),
-        (["--bus", "udp_multicast:239.1.2.3"], "does not stay on this machine"),
+        (["--bus", "udp_multicast:10.1.2.3"], "is no IPv4 multicast group"),
         (["--fault", "meteor"], "no fault 'meteor'; choose from silent"),
         (["--after-s", "3"], "--after-s follows a --fault"),
         (["--fault", "silent", "--after-s", "-1"], "no time in seconds"),
