@@ -12,10 +12,9 @@ import functools
 import time
 from typing import Any
 
-from bridge.arguments import add_tls, non_negative_seconds
+from bridge.arguments import add_connect, add_tls, add_vehicle_id, non_negative_seconds
 from bridge.feed import Feed, open_feed
 from bridge.signals import sigterm_as_interrupt
-from bridge.simulate import DEFAULT_VEHICLE_ID
 from bridge.to_ros2.outlet import Outlet
 from bridge.to_ros2.policies import Policies
 from edge_runtime.cli import ArgumentParser, HelpFormatter, write_json_out
@@ -25,7 +24,7 @@ from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT, check_ros2_endpoin
 from edge_runtime.ros2.names import check_ros_name, namespace_of
 from edge_runtime.ros2.node import Ros2Node, open_node
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
 
 POLL_S = 0.1
@@ -52,16 +51,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.formatter_class = _Formatter
     parser.epilog = EXAMPLES.format(endpoint=DEFAULT_ROS2_ENDPOINT)
-    parser.add_argument(
-        "--connect",
-        metavar="PROTOCOL/HOST:PORT",
-        default=DEFAULT_ENDPOINT,
-        help="where the simulator or the router listens",
-    )
+    add_connect(parser)
     add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to show"
-    )
+    add_vehicle_id(parser, "the vehicle to show")
     side = parser.add_mutually_exclusive_group()
     side.add_argument(
         "--ros2-listen",

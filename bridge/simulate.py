@@ -11,7 +11,13 @@ from typing import Any
 
 import gymnasium
 
-from bridge.arguments import add_tls, non_negative_int, non_negative_seconds, positive_int
+from bridge.arguments import (
+    add_tls,
+    add_vehicle_id,
+    add_wait_edge,
+    non_negative_int,
+    positive_int,
+)
 from bridge.clock import Clock, Publish
 from bridge.command_check import CommandCheck
 from bridge.environments import CONDITIONS, NOMINAL, SCENARIOS, make_environment, scenario_of
@@ -26,10 +32,9 @@ from edge_runtime.cli import ArgumentParser, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.tls import TlsFiles, tls_for
+from edge_runtime.topics import check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
-from edge_runtime.wire import check_vehicle_id
 
-DEFAULT_VEHICLE_ID = "hunter01"
 CLOCKS: dict[str, Callable[[Publish, CommandCheck, LatencySpec], Clock]] = {
     "lockstep": LockStepClock,
     "realtime": RealTimeClock,
@@ -77,9 +82,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_where(parser)
     add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to simulate"
-    )
+    add_vehicle_id(parser, "the vehicle to simulate")
     network = "injected network: " + GRAMMAR.replace("%", "%%")
     parser.add_argument("--latency", metavar="SPEC", default="none", help=network)
     parser.add_argument(
@@ -89,13 +92,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=0,
         help="episode i is reset with seed + i",
     )
-    parser.add_argument(
-        "--wait-edge-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        default=30.0,
-        help="how long to wait for an edge runtime, in seconds",
-    )
+    add_wait_edge(parser)
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
 
 
