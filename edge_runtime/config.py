@@ -19,6 +19,7 @@ from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
 from edge_runtime.vehicles.hunter.faults import PROFILES
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.registry import NONE, VEHICLE_NAMES
+from edge_runtime.vehicles.ros2.settings import Ros2Settings, check_settings
 from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
 
 MAX_PRIORITY = 99  # of SCHED_FIFO
@@ -43,6 +44,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     bus: str = DEFAULT_BUS
     hunter: HunterSettings = msgspec.field(default_factory=HunterSettings)
     similarity: SimilaritySettings = msgspec.field(default_factory=SimilaritySettings)
+    ros2: Ros2Settings = msgspec.field(default_factory=Ros2Settings)
 
 
 def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
@@ -79,10 +81,12 @@ def _read(path: PathLike) -> Config:
 
 def _explain(text: str) -> str:
     """The sentence of msgspec with the key in front, and for an unknown key the known ones."""
-    if "unknown field" in text:
-        return f"{text}; known are {', '.join(Config.__struct_fields__)}"
     sentence, _, place = text.partition(" - at ")
-    return f"{place.strip('`').replace('$.', '')}: {sentence}" if place else text
+    table = place.strip("`").replace("$.", "")
+    if "unknown field" in text:
+        known = getattr(Config(), table, None) if table else Config()
+        sentence += f"; known are {', '.join(known.__struct_fields__)}" if known else ""
+    return f"{table}: {sentence}" if table else sentence
 
 
 def _is_wrong(config: Config) -> bool:
@@ -103,6 +107,7 @@ def _check(config: Config) -> None:
     _check_choice("hunter.model", config.hunter.model, tuple(SPECS))
     _check_choice("hunter.profile", config.hunter.profile, tuple(PROFILES))
     _check_similarity(config.similarity)
+    check_settings(config.ros2)
     _check_choice("log_level", config.log_level, log.LEVELS)
     _check_choice("log_format", config.log_format, log.FORMATS)
     if not 0 <= config.realtime_priority <= MAX_PRIORITY:

@@ -75,7 +75,9 @@ def _closed_on_error(vehicle: Optional[Vehicle]) -> Iterator[None]:
 
 
 def _vehicle(config: Config, policy: Policy) -> Optional[Vehicle]:
-    setup = VehicleSetup(policy.manifest.scenario, config.bus, config.hunter, config.similarity)
+    setup = VehicleSetup(
+        policy.manifest.scenario, config.bus, config.hunter, config.similarity, config.ros2
+    )
     return make_vehicle(config.vehicle, setup)
 
 

@@ -11,6 +11,7 @@ from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.interface import Vehicle
 from edge_runtime.vehicles.mock import MockVehicle
+from edge_runtime.vehicles.ros2.settings import Ros2Settings
 from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
 from edge_runtime.vehicles.similarity import ScenarioCar, Similarity, car_of, similarity_to
 
@@ -24,6 +25,7 @@ class VehicleSetup(NamedTuple):
     bus: str = DEFAULT_BUS
     hunter: HunterSettings = HunterSettings()
     similarity: SimilaritySettings = SimilaritySettings()
+    ros2: Ros2Settings = Ros2Settings()
 
 
 def _mock(setup: VehicleSetup) -> Vehicle:
@@ -39,7 +41,19 @@ def _hunter(setup: VehicleSetup) -> Vehicle:
     return HunterVehicle(parse_bus(setup.bus), spec, setup.hunter.profile, similarity)
 
 
-_MAKERS: Dict[str, Callable[[VehicleSetup], Vehicle]] = {"mock": _mock, "hunter": _hunter}
+def _ros2(setup: VehicleSetup) -> Vehicle:
+    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle  # As above; and it needs pycdr2.
+
+    spec = SPECS[setup.ros2.model]
+    similarity = make_similarity(setup, "ros2", spec.max_speed_mps)
+    return Ros2Vehicle(setup.ros2, spec, similarity)
+
+
+_MAKERS: Dict[str, Callable[[VehicleSetup], Vehicle]] = {
+    "mock": _mock,
+    "hunter": _hunter,
+    "ros2": _ros2,
+}
 VEHICLE_NAMES = (NONE, *_MAKERS)
 
 

@@ -27,11 +27,16 @@ class Wish(NamedTuple):
 
 
 def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wish:
-    """The command of an action. Raises ValueError for a number that is not finite."""
+    """The command of an action, within -1 to 1. Raises ValueError for what is not finite."""
     wish = Wish(action.get("pedal"), scenario_speed_mps, action.get("steering"))
     if not all(math.isfinite(value) for value in wish if value is not None):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
-    return wish
+    return Wish(_within(wish.pedal), scenario_speed_mps, _within(wish.steering))
+
+
+def _within(action: Optional[float]) -> Optional[float]:
+    """A pedal of 1e308 times a step of 0 s is no number."""
+    return None if action is None else min(max(action, -1.0), 1.0)
 
 
 class SetPoint:
