@@ -152,6 +152,7 @@ def test_a_new_core_knows_nothing():
     assert (report.faults, report.speed_mps, report.battery_v) == ([], 0.0, None)
     assert report.action == {"pedal": -1.0, "steering": 0.0}
     assert report.self_braking
+    assert core.standing(0.0) == ["the chassis sends no 0x221"]
 
 
 def test_errors_are_cleared_before_control_is_asked_for():
@@ -186,6 +187,14 @@ def test_time_limits_to_the_instant():
     for at_s, state in ((now_s, State.ENABLED), (now_s + 1e-9, State.STOPPED)):
         core.reports.motion_s = core.reports.status_s = at_s
         core.tick(at_s)
+        assert core.state is state
+    core.state = State.ENABLED
+    for at_s, state in (
+        (0.0, State.ENABLED),
+        (rules.BUS_PATIENCE_S, State.ENABLED),
+        (rules.BUS_PATIENCE_S + 1e-9, State.STOPPED),
+    ):
+        core.bus_failed("full", at_s)
         assert core.state is state
     core.state, core._since_s = State.ENABLING, 0.0
     core.tick(rules.ENABLE_TIMEOUT_S)
