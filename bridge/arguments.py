@@ -6,6 +6,7 @@ import math
 from argparse import ArgumentParser, ArgumentTypeError
 from typing import Any
 
+from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 
 
@@ -19,15 +20,40 @@ def non_negative_int(text: str) -> int:
     return _int_from(text, 0)
 
 
+def non_negative(text: str) -> float:
+    """Read a finite number of at least 0."""
+    return _from_zero(text, "a number")
+
+
 def non_negative_seconds(text: str) -> float:
     """Read a finite number of seconds, at least 0."""
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not (math.isfinite(seconds) and seconds >= 0):
-        raise ArgumentTypeError(f"{text!r} is not a number of seconds, at least 0")
-    return seconds
+    return _from_zero(text, "a number of seconds")
+
+
+def add_connect(parser: ArgumentParser) -> None:
+    """Declare ``--connect`` of a command that listens to the wire."""
+    parser.add_argument(
+        "--connect",
+        metavar="PROTOCOL/HOST:PORT",
+        default=DEFAULT_ENDPOINT,
+        help="where the simulator or the router listens",
+    )
+
+
+def add_vehicle_id(parser: ArgumentParser, what: str) -> None:
+    """Declare ``--vehicle-id`` of a command that is about one vehicle."""
+    parser.add_argument("--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help=what)
+
+
+def add_wait_edge(parser: ArgumentParser) -> None:
+    """Declare ``--wait-edge-s`` of a command that plays the simulator."""
+    parser.add_argument(
+        "--wait-edge-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        default=30.0,
+        help="how long to wait for an edge runtime, in seconds",
+    )
 
 
 def add_tls(parser: ArgumentParser) -> None:
@@ -59,6 +85,16 @@ def check_where(arguments: Any) -> tuple[str | None, str | None]:
     if arguments.connect is not None:
         return None, check_endpoint(arguments.connect)
     return check_endpoint(arguments.listen or DEFAULT_ENDPOINT), None
+
+
+def _from_zero(text: str, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0):
+        raise ArgumentTypeError(f"{text!r} is not {what}, at least 0")
+    return value
 
 
 def _int_from(text: str, least: int) -> int:

@@ -8,14 +8,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bridge.arguments import add_tls, non_negative_seconds
+from bridge.arguments import add_connect, add_tls, non_negative_seconds
 from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
 from bridge.recording.writer import RecordingWriter
 from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, UserError
 from edge_runtime.files import check_writable
 from edge_runtime.tls import tls_for
-from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
 
 POLL_S = 0.1
@@ -30,12 +30,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="F.mcap", required=True, help="the recording; it must not exist yet"
     )
-    parser.add_argument(
-        "--connect",
-        metavar="PROTOCOL/HOST:PORT",
-        default=DEFAULT_ENDPOINT,
-        help="where the simulator or the router listens",
-    )
+    add_connect(parser)
     add_tls(parser)
     parser.add_argument(
         "--vehicle-id", metavar="ID", help="record this vehicle only (otherwise all)"

@@ -11,10 +11,9 @@ import threading
 import time
 from typing import Any
 
-from bridge.arguments import non_negative_int
+from bridge.arguments import add_vehicle_id, non_negative_int
 from bridge.relay_ends import Relay, open_relay
 from bridge.signals import sigterm_as_interrupt
-from bridge.simulate import DEFAULT_VEHICLE_ID
 from edge_runtime.cli import ArgumentParser, UserError, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
@@ -42,9 +41,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--seed", metavar="N", type=non_negative_int, default=0, help="of delays and losses"
     )
-    parser.add_argument(
-        "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to relay"
-    )
+    add_vehicle_id(parser, "the vehicle to relay")
     parser.add_argument(
         "--out", metavar="R.json", help="write the counts to this file at the end (SIGTERM or ^C)"
     )

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import sys
-from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import Any
 
-from bridge.arguments import add_tls, non_negative_seconds
+from bridge.arguments import add_tls, add_wait_edge, non_negative
 from bridge.port import open_port
 from bridge.progress import count_bar
 from bridge.replaying.comparison import compare
@@ -26,17 +24,6 @@ DEFAULT_TOLERANCE = 1e-5
 """Two processors round differently; a graph of the same weights stays far below this."""
 DIFFERENT = 1
 """Exit status where at least one command differs."""
-
-
-def tolerance(text: str) -> float:
-    """Read a finite number, at least 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value >= 0):
-        raise ArgumentTypeError(f"{text!r} is not a tolerance, a number of at least 0")
-    return value
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -71,17 +58,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--tolerance",
         metavar="X",
-        type=tolerance,
+        type=non_negative,
         default=DEFAULT_TOLERANCE,
         help="how far two actions may be apart, of a range of -1 to 1",
     )
-    parser.add_argument(
-        "--wait-edge-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        default=30.0,
-        help="how long to wait for an edge runtime, in seconds",
-    )
+    add_wait_edge(parser)
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
 
 

@@ -11,10 +11,8 @@ from bridge.signals import sigterm_as_interrupt
 from edge_runtime import access
 from edge_runtime.cli import ArgumentParser
 from edge_runtime.tls import tls_for
+from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, open_session
-from edge_runtime.wire import check_vehicle_id
-
-DEFAULT_VEHICLE_ID = "hunter01"
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -12,10 +12,11 @@ import gymnasium
 from bridge.actions import policy_action
 from bridge.arguments import (
     add_tls,
+    add_vehicle_id,
+    add_wait_edge,
     add_where,
     check_where,
     non_negative_int,
-    non_negative_seconds,
     positive_int,
 )
 from bridge.clock import Clock
@@ -34,9 +35,8 @@ from edge_runtime.cli import ArgumentParser, UserError, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.wire import check_vehicle_id
+from edge_runtime.topics import check_vehicle_id
 
-DEFAULT_VEHICLE_ID = "hunter01"
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 
 
@@ -95,9 +95,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_where(parser)
     add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to simulate"
-    )
+    add_vehicle_id(parser, "the vehicle to simulate")
     network = "injected network: " + GRAMMAR.replace("%", "%%")
     parser.add_argument("--latency", metavar="SPEC", default="none", help=network)
     parser.add_argument(
@@ -107,13 +105,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=0,
         help="episode i is reset with seed + i",
     )
-    parser.add_argument(
-        "--wait-edge-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        default=30.0,
-        help="how long to wait for an edge runtime, in seconds",
-    )
+    add_wait_edge(parser)
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
 
 

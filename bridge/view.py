@@ -11,18 +11,17 @@ from typing import Any
 
 import rerun as rr
 
-from bridge.arguments import add_tls, non_negative_seconds
+from bridge.arguments import add_connect, add_tls, add_vehicle_id, non_negative_seconds
 from bridge.feed import Feed, Heard, open_feed
 from bridge.scene import decode_scene
 from bridge.signals import sigterm_as_interrupt
-from bridge.simulate import DEFAULT_VEHICLE_ID
 from bridge.viewer import sinks
 from bridge.viewer.wire_log import WireLog
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser
 from edge_runtime.files import check_writable
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+from edge_runtime.transport import check_endpoint
 
 POLL_S = 0.1
 
@@ -43,16 +42,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--serve", action="store_true", help="serve a web page on this machine's loopback only"
     )
     where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
-    parser.add_argument(
-        "--connect",
-        metavar="PROTOCOL/HOST:PORT",
-        default=DEFAULT_ENDPOINT,
-        help="where the simulator or the router listens",
-    )
+    add_connect(parser)
     add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help="the vehicle to watch"
-    )
+    add_vehicle_id(parser, "the vehicle to watch")
     parser.add_argument(
         "--wait-s",
         metavar="SECONDS",

@@ -30,11 +30,10 @@ from deploy.certs import (
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
-from edge_runtime.topics import check_vehicle_id
+from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 
 CA_FOLDER = "ca"
 DEFAULT_OUT = "certs"
-DEFAULT_VEHICLE_ID = "hunter01"
 DEFAULT_DAYS = 365
 MAX_NAME_CHARS = 64
 """Of a certificate's common name (RFC 5280)."""

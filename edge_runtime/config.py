@@ -13,13 +13,13 @@ from edge_runtime import log
 from edge_runtime.errors import UserError
 from edge_runtime.files import PathLike, read_bytes
 from edge_runtime.tls import check_fits
+from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
 from edge_runtime.vehicles.hunter.faults import PROFILES
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.registry import NONE, VEHICLE_NAMES
 from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
-from edge_runtime.wire import check_vehicle_id
 
 MAX_PRIORITY = 99  # of SCHED_FIFO
 
@@ -30,7 +30,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     policy: Optional[str] = None
     connect: str = DEFAULT_ENDPOINT
     tls: Optional[str] = None
-    vehicle_id: str = "hunter01"
+    vehicle_id: str = DEFAULT_VEHICLE_ID
     vehicle: str = NONE
     public_key: Optional[str] = None
     allow_unsigned: bool = False

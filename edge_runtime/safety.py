@@ -35,9 +35,9 @@ class Event(str, Enum):
     FRESH = "fresh_state"
     RECOVERED = "recovered"  # the fresh state that meets the condition to drive again
     FINAL = "final_state"  # the episode ends with it
-    SILENT = "no_fresh_state"  # for more than 2 T
+    SILENT = "no_fresh_state"  # for longer than SILENCE_S
     NOT_FINITE = "output_not_finite"
-    TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than 2 T
+    TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than SILENCE_S
     PAUSED = "pause_too_long"  # a vehicle stood by for more than MAX_PAUSE_S
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
     NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
@@ -111,7 +111,7 @@ class Safety(NamedTuple):
 
 
 def is_silent(safety: Safety, now_s: float) -> bool:
-    """Whether the newest state is older than 2 T (or there was none)."""
+    """Whether the newest state is older than SILENCE_S (or there was none)."""
     return safety.last_fresh_s is None or now_s - safety.last_fresh_s > SILENCE_S
 
 
@@ -122,7 +122,7 @@ def classify_arrival(
     if safety.last_fresh_s is None:
         return None
     if session != safety.session:
-        # It was let in because the one before was silent for 2 T, whatever the grace says.
+        # It was let in because the one before was silent for 2 T, whatever GRACE_S says.
         return Event.OTHER_SESSION if needs_rearm else Event.SILENT
     pause_s = arrived_s - safety.last_fresh_s
     if needs_rearm and safety.mode is Mode.STANDBY and pause_s > MAX_PAUSE_S:

@@ -8,6 +8,7 @@ from typing import Dict, NamedTuple
 from edge_runtime.errors import UserError
 
 CONTROL_PERIOD_S = 0.1
+DEFAULT_VEHICLE_ID = "hunter01"  # of both ends, so that a single vehicle needs no option
 
 
 class Topic(NamedTuple):
