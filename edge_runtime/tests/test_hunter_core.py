@@ -152,6 +152,7 @@ def test_a_new_core_knows_nothing():
     assert (report.faults, report.speed_mps, report.battery_v) == ([], 0.0, None)
     assert report.action == {"pedal": -1.0, "steering": 0.0}
     assert report.self_braking
+    assert core.standing(0.0) == ["the chassis sends no 0x221"]
 
 
 def test_errors_are_cleared_before_control_is_asked_for():
@@ -187,6 +188,14 @@ def test_time_limits_to_the_instant():
         core.reports.motion_s = core.reports.status_s = at_s
         core.tick(at_s)
         assert core.state is state
+    core.state = State.ENABLED
+    for at_s, state in (
+        (0.0, State.ENABLED),
+        (rules.BUS_PATIENCE_S, State.ENABLED),
+        (rules.BUS_PATIENCE_S + 1e-9, State.STOPPED),
+    ):
+        core.bus_failed("full", at_s)
+        assert core.state is state
     core.state, core._since_s = State.ENABLING, 0.0
     core.tick(rules.ENABLE_TIMEOUT_S)
     assert core.state is State.ENABLING
@@ -214,6 +223,38 @@ def test_what_is_at_rest():
     bench.step(1)
     assert bench.core.is_at_rest(bench.now_s)
     assert not bench.core.is_at_rest(bench.now_s + 1.0)  # that was then
+
+
+def test_a_status_from_before_confirms_nothing():
+    bench = Bench()
+    bench.tell(frames.SYSTEM_STATUS, OK)
+    bench.core.enable(bench.now_s)
+    bench.tell(frames.REAR_LEFT_SLOW, frames.MotorSlow(24.0, 30, 30, 0))
+    assert bench.core.state is State.ENABLING
+    bench.now_s += 0.05
+    bench.tell(frames.REAR_LEFT_SLOW, frames.MotorSlow(24.0, 30, 30, 0))
+    assert bench.core.state is State.ENABLING
+    bench.tell(frames.SYSTEM_STATUS, OK)
+    assert bench.core.state is State.ENABLED
+
+
+def test_to_enable_it_again_gives_it_the_whole_time_again():
+    bench = Bench()
+    bench.hears = False
+    bench.core.enable(bench.now_s)
+    bench.step(45)
+    bench.core.enable(bench.now_s)
+    bench.step(45)
+    assert bench.core.state is State.ENABLING
+
+
+def test_to_enable_it_while_it_drives_makes_it_stand_until_the_next_command():
+    bench = Bench().driving()
+    bench.core.enable(bench.now_s)
+    count = len(bench.sent)
+    bench.step(6)
+    assert bench.core.state is State.ENABLED
+    assert set(bench.motions(count)) == {(0.0, 0.0)}
 
 
 def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow():

@@ -50,7 +50,7 @@ class HunterCore:
         self._wish: Optional[Wish] = None  # None: stand
         self._wished_s = self._ticked_s = -math.inf
         self._since_s = -math.inf  # when this state began
-        self._ask_s = math.inf
+        self._ask_s = math.inf  # when to ask the chassis for something next
         self._bus_words = ""  # empty while it works
         self._bus_failed_s: Optional[float] = None  # when the failures began
 
