@@ -17,7 +17,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
-from hil_tests.faults.slow_policy import write_mean, write_slow, write_steady
+from hil_tests.faults.slow_policy import write_full, write_mean, write_slow, write_steady
 from hil_tests.faults.table import ROWS
 from hil_tests.faults.timeline import longest_gap_s, spread_ms, unsafe_commands
 
@@ -92,7 +92,9 @@ class _Campaign:
         self._done, self._total = 0, sum(self._tries_of(row) for row in rows)
         self._lock = threading.Lock()
         self._policies = {"given": _trusted(policy)}
-        makers = {"slow": write_slow, "steady": write_steady, "mean": write_mean}
+        makers = {
+            "slow": write_slow, "steady": write_steady, "full": write_full, "mean": write_mean,
+        }  # fmt: skip
         for kind in {row.policy for row in rows} & set(makers):
             path = work / f"{kind}.onnx"
             makers[kind](path)

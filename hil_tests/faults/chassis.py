@@ -30,12 +30,12 @@ def free_bus() -> str:
 
 
 class ChassisProcess:
-    """``python -m hil_tests.mock_hunter`` on a bus; tell it to `switch` a fault."""
+    """``python -m hil_tests mock_hunter`` on a bus; tell it to `switch` a fault."""
 
     def __init__(self, bus: str, *arguments: str) -> None:
         self.truth: list[Truth] = []
         self.switched: list[tuple[float, str, str]] = []
-        command = ["hil_tests.mock_hunter", "--bus", bus, *arguments]
+        command = ["hil_tests", "mock_hunter", "--bus", bus, *arguments]
         self.process = Process(*command, told=True, on_line=self._on_line)
         self.process.wait_for_line("ready")
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +92,13 @@ class Rig:
         """The router process between edge and probe, not waited for."""
         return self._start("router", "hil_tests.faults.router", self.router_endpoint, self._hub)
 
-    def wait_until_driving(self, timeout_s: float = 30.0) -> None:
-        """Until drive commands come steadily and the simulated vehicle's brake is off."""
+    def wait_until_driving(
+        self, timeout_s: float = 30.0, ready: Callable[[], bool] = lambda: True
+    ) -> None:
+        """Until drive commands come steadily, the simulated vehicle's brake is off, and ``ready``.
+
+        A vehicle is re-armed until then.
+        """
         rearmed_s = time.monotonic()
 
         def driving() -> bool:
@@ -101,7 +107,7 @@ class Rig:
                 # A busy machine may have stopped it once more: the operator stays beside it.
                 self._ask_to_rearm()
                 rearmed_s = time.monotonic()
-            return self._is_driving()
+            return self._is_driving() and ready()
 
         wait_until(driving, "a steady drive", timeout_s)
 

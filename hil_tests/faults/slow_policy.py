@@ -35,3 +35,8 @@ def write_mean(path: Path) -> None:
 def write_steady(path: Path) -> None:
     """A policy that always gives the same pedal."""
     policies.write_policy(path, "constant", _STEADY_PEDAL)
+
+
+def write_full(path: Path) -> None:
+    """A policy that always gives full throttle."""
+    policies.write_policy(path, "constant", 1.0)

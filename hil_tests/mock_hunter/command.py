@@ -34,16 +34,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
         f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
     )
-    parser.add_argument("--bus", default=multicast.SYNTAX, metavar="INTERFACE:CHANNEL")
+    parser.add_argument(
+        "--bus", default=multicast.SYNTAX, metavar="INTERFACE:CHANNEL", help="where it is"
+    )
     parser.add_argument("--model", default="hunter-2.0", choices=list(MODELS))
     parser.add_argument(
         "--profile", default=DEFAULT_PROFILE, choices=list(PROFILES), help="firmware's fault bits"
     )
+    parser.add_argument("--set", action="append", metavar="NAME=VALUE", help="a parameter's value")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter's value"
-    )
-    parser.add_argument(
-        "--fault", action="append", type=_fault, default=[], metavar="NAME", help="from the start"
+        "--fault", action="append", type=_fault, metavar="NAME", help="from the start"
     )
     parser.add_argument(
         "--after-s", action=_AfterFault, type=_seconds, metavar="S", help="that fault comes later"
@@ -52,11 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Be a Hunter until a signal comes."""
-    parameters = make_parameters(arguments.model, _changes(arguments.set))
+    parameters = make_parameters(arguments.model, _changes(arguments.set or []))
     bus = open_bus(parse_bus(arguments.bus))
     try:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
-        server = Server(hunter, bus, _tell, arguments.fault)
+        server = Server(hunter, bus, _tell, arguments.fault or ())
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: server.stop())
         orders = Orders(sys.stdin, lambda line: print(line, file=sys.stderr, flush=True))

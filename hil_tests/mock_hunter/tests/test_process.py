@@ -11,9 +11,9 @@ import pytest
 from edge_runtime.cli import run_cli
 from edge_runtime.errors import UserError
 from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+from hil_tests.__main__ import main
 from hil_tests.faults.chassis import ChassisProcess, free_bus
 from hil_tests.faults.processes import wait_until
-from hil_tests.mock_hunter.__main__ import main
 from hil_tests.mock_hunter.hunter import MockHunter
 from hil_tests.mock_hunter.parameters import MODELS
 from hil_tests.mock_hunter.process import Orders, Server, parse_switch
@@ -151,7 +151,7 @@ def test_orders_come_in_turn_and_bad_ones_are_told():
 def test_wrong_options_are_one_line_and_status_2(arguments, why, capsys):
     # argparse ends the process itself, a UserError gives its status.
     with pytest.raises(SystemExit) as ended:
-        sys.exit(run_cli(main, arguments))
+        sys.exit(run_cli(main, ["mock_hunter", *arguments]))
     said = capsys.readouterr().err
     assert ended.value.code == 2
     assert why in said
