@@ -22,7 +22,7 @@ SHORT_TOY = "bridge.tests.toy:BridgeToyShort-v0"
 
 def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it():
     drive = Drive(POLICY, SHORT_TOY, "nominal", VEHICLE, 0, 1, {"dead_time_s": 0.1})
-    for _ in range(6):  # A busy machine may pause a process for over 2 T.
+    for _ in range(3):  # A busy machine may pause a process for over 2 T.
         report = run_rig(drive)
         if not report["safe_stops"]:
             break

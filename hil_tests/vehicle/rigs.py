@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import socket
 import tempfile
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -13,8 +12,8 @@ from typing import Any, NamedTuple
 
 from edge_runtime.files import read_bytes
 from edge_runtime.transport import free_endpoint
-from edge_runtime.vehicles.hunter import multicast
 from hil_tests.commands import BackgroundCommand
+from hil_tests.faults.chassis import free_bus
 from hil_tests.operator import Operator
 
 VEHICLE_ID = "rig01"
@@ -58,7 +57,7 @@ def run_rig(drive: Drive) -> dict[str, Any]:
 
 def _start_vehicle(drive: Drive, directory: Path, stack: ExitStack) -> tuple[str, ...]:
     """Start a mock Hunter on a bus of its own; the edge runtime's options to drive it."""
-    bus = f"udp_multicast:{multicast.GROUP}:{_free_port()}"
+    bus = free_bus()
     settings = [f"--set={name}={value}" for name, value in drive.changes.items()]
     stack.enter_context(
         BackgroundCommand(
@@ -81,11 +80,3 @@ def _simulate(drive: Drive, endpoint: str, out: Path) -> dict[str, Any]:
         simulator.wait(LONGEST_EPISODE_S * (1 + drive.episodes))
     report: dict[str, Any] = json.loads(read_bytes(out, "report"))
     return {**report, "command": f"python -m {shlex.join(arguments)}"}
-
-
-def _free_port() -> int:
-    """A UDP port that nobody uses now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    return port
