@@ -400,11 +400,22 @@ def test_a_status_that_falls_silent_alone():
     ("motion", "words"),
     [((3.0, 0.0), "the chassis reports 3.0 m/s"), ((0.0, 1.0), "a steering angle of 1.00 rad")],
 )
-def test_feedback_that_cannot_be_stops_it(motion, words):
+def test_feedback_that_cannot_be_stops_it_before_the_next_tick(motion, words):
     bench = Bench().driving()
     bench.tell(frames.MOTION_STATUS, frames.MotionStatus(*motion))
-    bench.core.tick(bench.now_s)
+    assert bench.core.state is State.STOPPED
     assert words in bench.words[0]
+
+
+def test_feedback_that_could_not_be_while_it_is_enabled_stops_it_then():
+    bench = Bench()
+    bench.core.enable(bench.now_s)
+    bench.step(1)
+    bench.tell(frames.MOTION_STATUS, frames.MotionStatus(3.0, 0.0))
+    assert bench.core.state is State.ENABLING
+    bench.tell(frames.SYSTEM_STATUS, OK)
+    bench.step(1)
+    assert bench.core.state is State.STOPPED
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 0.7])

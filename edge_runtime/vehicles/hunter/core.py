@@ -95,6 +95,10 @@ class HunterCore:
         self.reports.hear(can_id, data, now_s)
         if can_id == frames.SYSTEM_STATUS.can_id or can_id in frames.MOTOR_OF_SLOW:
             self._judge(now_s)
+        elif can_id == frames.MOTION_STATUS.can_id:
+            # At once, not with the next tick: else the runtime's own watch would stop it first,
+            # and what it then says is over with the lie.
+            self._apply_if_enabled(self.reports.lie(), now_s)
 
     def bus_failed(self, words: str, now_s: float, fatal: bool = False) -> None:
         """The bus did not take a frame, or gave none; `fatal`: it says that it is off."""
@@ -189,8 +193,11 @@ class HunterCore:
         if self._speed_watch.is_stuck(asked_mps, measured_mps, now_s) and found is None:
             words = f"the speed stays at {measured_mps:.2f} m/s, asked for {asked_mps:.2f}"
             found = Finding(Event.STUCK, words)
-        if found is not None:
-            self._apply(found, now_s)
+        self._apply_if_enabled(found, now_s)
+
+    def _apply_if_enabled(self, finding: Optional[Finding], now_s: float) -> None:
+        if finding is not None and self.state is State.ENABLED:
+            self._apply(finding, now_s)
 
     def _requests(self, now_s: float) -> List[Sent]:
         """Beside the stream: for control while ENABLING, for the brake while STOPPED."""
