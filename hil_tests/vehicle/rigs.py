@@ -61,7 +61,7 @@ def _start_vehicle(drive: Drive, directory: Path, stack: ExitStack) -> tuple[str
     settings = [f"--set={name}={value}" for name, value in drive.changes.items()]
     stack.enter_context(
         BackgroundCommand(
-            "hil_tests.mock_hunter", "--bus", bus, *settings, ready="ready", quiet=True
+            "hil_tests", "mock_hunter", "--bus", bus, *settings, ready="ready", quiet=True
         )
     )
     config = directory / "edge.toml"
