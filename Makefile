@@ -28,8 +28,9 @@ install: $(STAMP)  ## the virtual environment with the locked dependencies
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
 
+# Tests mostly wait for processes: a second worker takes a third off their time.
 test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'

@@ -70,8 +70,8 @@ def rig_of(spec="none"):
 
 def test_each_tick_ends_with_what_the_vehicle_did_in_it():
     with rig_of() as rig:
-        rig.clock.begin(0, seed=0)
         began_s = time.monotonic()
+        rig.clock.begin(0, seed=0)
         decisions = [rig.clock.exchange(make_state(n, session="here")) for n in range(4)]
         assert time.monotonic() - began_s >= 4 * CONTROL_PERIOD_S
     assert [decision.feedback.step for decision in decisions] == [0, 1, 2, 3]
