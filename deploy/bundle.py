@@ -31,7 +31,9 @@ from edge_runtime.vehicles.registry import NONE
 
 UNITS = Path(__file__).parent / "systemd"
 _DIGITS = 8
-_OF_THE_BUNDLE = ("policy", "tls", "public_key", "allow_unsigned", "armed_at_start")
+HOLD = "../../state/hold"
+"""Seen from a release's folder: what the installer locks while it judges."""
+_OF_THE_BUNDLE = ("policy", "tls", "public_key", "allow_unsigned", "hold")
 
 
 class Inputs(NamedTuple):
@@ -112,7 +114,7 @@ def _config(inputs: Inputs) -> tuple[Config, str]:
     given = read_bytes(inputs.config, "config file").decode() if inputs.config else ""
     plain = load_config(inputs.config, {"policy": str(inputs.policy), **_tls_flag(inputs)})
     keys = tomllib.loads(given).keys()
-    for name in _OF_THE_BUNDLE[:-1]:
+    for name in _OF_THE_BUNDLE:
         if name in keys:
             raise UserError(
                 f"config file {inputs.config}: {name} is the bundle's to say; leave it out"
@@ -126,6 +128,7 @@ def _config(inputs: Inputs) -> tuple[Config, str]:
         "# Made by `deploy bundle`; paths are of the release's folder, where the service starts.",
         f'policy = "{POLICY}"',
         f'public_key = "{PUBLIC_KEY}"',
+        f'hold = "{HOLD}"',
         *([f'tls = "{TLS.rstrip("/")}"'] if inputs.tls else []),
         *([] if "armed_at_start" in keys else ["armed_at_start = false"]),
         "",

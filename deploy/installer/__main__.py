@@ -10,14 +10,15 @@ from typing import Any, NoReturn
 
 from deploy.installer import ed25519
 from deploy.installer.errors import UnhealthyError, UserError
+from deploy.installer.health import Limits
 from deploy.installer.layout import DEFAULT_ROOT, Layout
 from deploy.installer.manifest import parse_manifest
 from deploy.installer.release import MANIFEST, why_not_whole
 from deploy.installer.service import WAYS, choose
 from deploy.installer.steps import Way, install, rollback, uninstall
 from deploy.installer.supervise import supervise
-from deploy.installer.trial import DEFAULT_LIMIT_S
 
+LIMITS = Limits()
 UNHEALTHY, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
@@ -74,13 +75,12 @@ def _parser() -> argparse.ArgumentParser:
                 help="who runs it (default: systemd where it runs this computer, else none)",
             )
         if name in ("install", "rollback"):
-            command.add_argument(
-                "--health-limit",
-                metavar="S",
-                type=float,
-                default=DEFAULT_LIMIT_S,
-                help=f"healthy within this time or back, s (default: {DEFAULT_LIMIT_S:g})",
-            )
+            for option, default, text in (
+                ("--health-limit", LIMITS.within_s, "healthy within this time, or back"),
+                ("--settle", LIMITS.settle_s, "and for so long after that"),
+            ):
+                text = f"{text}, s (default: {default:g})"
+                command.add_argument(option, metavar="S", type=float, default=default, help=text)
         if name == "install":
             command.add_argument("bundle", metavar="BUNDLE.tar")
             command.add_argument(
@@ -99,12 +99,13 @@ def _dispatch(arguments: argparse.Namespace) -> int:
     if arguments.command == "status":
         return _status(layout, service, arguments.json)
     if arguments.command == "uninstall":
-        uninstall(layout, Way(service, DEFAULT_LIMIT_S))
+        uninstall(layout, Way(service, LIMITS))
         print(f"removed from {layout.root}")
         return 0
-    if arguments.health_limit <= 0:
-        raise UserError(f"--health-limit {arguments.health_limit:g} is not above 0")
-    way = Way(service, arguments.health_limit)
+    limits = Limits(arguments.health_limit, arguments.settle)
+    if not (limits.within_s > 0 and limits.settle_s >= 0):
+        raise UserError("--health-limit must be above 0, and --settle 0 or more")
+    way = Way(service, limits)
     if arguments.command == "install":
         version = install(arguments.bundle, arguments.trust, layout, way)
     else:

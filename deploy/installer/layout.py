@@ -33,6 +33,7 @@ class Layout:
         self.releases = self.root / "releases"
         self.trusted = self.root / "trusted.pub"
         self.state = self.root / "state"
+        self.hold = self.state / "hold"
 
     def release(self, version: str) -> Path:
         """The folder of a release."""
@@ -87,6 +88,16 @@ class Layout:
         if self.releases.is_dir():
             for path in self.releases.glob(f"{_MAKING}*"):
                 remove_tree(path)
+
+    @contextlib.contextmanager
+    def holding(self) -> Iterator[None]:
+        """Keep the service from sending any command (`hold` in its settings).
+
+        A lock, not a file's existence: it ends with this process, whatever ends that.
+        """
+        with open(str(self.hold), "w") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX)
+            yield
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:

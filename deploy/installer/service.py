@@ -16,11 +16,11 @@ from typing import Any
 from deploy.installer import systemctl
 from deploy.installer.apart import Account
 from deploy.installer.errors import UnhealthyError, UserError
+from deploy.installer.health import Limits, settle
 from deploy.installer.layout import write_whole
 
 WAYS = ("systemd", "process", "none")
 _STOP_LIMIT_S = 10.0
-_SETTLE_S = 2.0
 _WAY = "way"
 
 
@@ -39,7 +39,7 @@ class NoService:
     def start(self, release: Path) -> None:
         """Nothing is started."""
 
-    def watch(self, limit_s: float) -> None:
+    def watch(self, limits: Limits) -> None:
         """Nothing can be wrong."""
 
     def describe(self) -> str:
@@ -84,21 +84,9 @@ class SupervisedProcess(NoService):
                 cwd="/", stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
 
-    def watch(self, limit_s: float) -> None:
+    def watch(self, limits: Limits) -> None:
         """Raise UnhealthyError unless it is ready within the limit and stays so for a while."""
-        end_s = time.monotonic() + limit_s
-        since_s: float | None = None
-        while since_s is None or time.monotonic() - since_s < _SETTLE_S:
-            shown = self._read()
-            if shown.get("restarts"):
-                raise UnhealthyError(f"the service ended; see {self._state / 'service.log'}")
-            if not shown.get("ready"):
-                since_s = None
-            elif since_s is None:
-                since_s = time.monotonic()
-            if since_s is None and time.monotonic() > end_s:
-                raise UnhealthyError(f"the service is not ready within {limit_s:g} s")
-            time.sleep(0.05)
+        settle(self._is_ready, limits, "the service")
 
     def describe(self) -> str:
         """How it is, in a few words."""
@@ -112,6 +100,12 @@ class SupervisedProcess(NoService):
     def remove(self) -> None:
         """Stop it; its files go with the root."""
         self.stop()
+
+    def _is_ready(self) -> bool:
+        shown = self._read()
+        if shown.get("restarts"):
+            raise UnhealthyError(f"the service ended; see {self._state / 'service.log'}")
+        return bool(shown.get("ready"))
 
     def _read(self) -> dict[str, Any]:
         try:

@@ -16,6 +16,7 @@ from deploy.installer import ed25519
 from deploy.installer.archive import Bundle, open_bundle
 from deploy.installer.errors import UnhealthyError, UserError
 from deploy.installer.fits import check_fits
+from deploy.installer.health import Limits
 from deploy.installer.layout import Layout, write_whole
 from deploy.installer.manifest import parse_manifest
 from deploy.installer.release import MANIFEST, check_policy, make_release, why_not_whole
@@ -24,10 +25,10 @@ from deploy.installer.trial import try_release
 
 
 class Way(NamedTuple):
-    """How the service runs, and how long it may take to be healthy, in seconds."""
+    """How the service runs, and what is healthy."""
 
     service: Any
-    limit_s: float
+    limits: Limits
 
 
 def install(bundle_path: str, trust: str | None, layout: Layout, way: Way) -> str:
@@ -149,7 +150,7 @@ def _prove(folder: Path, way: Way) -> None:
     _say("edge_runtime check: the policy may drive")
     if way.service.name != "none":
         policy_id = parse_manifest((folder / MANIFEST).read_bytes()).policy_id
-        how = try_release(folder, policy_id, way.service.account(), way.limit_s)
+        how = try_release(folder, policy_id, way.service.account(), way.limits)
         _say(f"trial: healthy, kept apart {how}")
 
 
@@ -173,8 +174,14 @@ def _switch(version: str, before: str | None, layout: Layout, way: Way) -> None:
 
 
 def _start(version: str, layout: Layout, way: Way) -> None:
-    way.service.start(layout.release(version))
-    way.service.watch(way.limit_s)
+    """Let the service run; the vehicle hears nothing of it until it is healthy."""
+    with layout.holding():
+        try:
+            way.service.start(layout.release(version))
+            way.service.watch(way.limits)
+        except UnhealthyError:
+            way.service.stop()
+            raise
 
 
 def _go_back(version: str, good: str | None, earlier: str | None, layout: Layout, way: Way) -> None:

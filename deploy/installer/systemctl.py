@@ -6,18 +6,17 @@ import contextlib
 import grp
 import pwd
 import subprocess
-import time
 from pathlib import Path
 
 from deploy.installer.apart import Account
 from deploy.installer.errors import UnhealthyError, UserError
+from deploy.installer.health import Limits, settle
 from deploy.installer.layout import DEFAULT_ROOT, write_whole
 
 MAIN_UNIT = "phil-edge.service"
 USER = "phil"
 UNIT_FOLDER = Path("/etc/systemd/system")
 _BOOTED = Path("/run/systemd/system")
-_SETTLE_S = 3.0
 _LIST = "phil-units"
 
 
@@ -67,23 +66,9 @@ class Systemd:
         self._systemctl("reset-failed", MAIN_UNIT, check=False)
         self._systemctl("start", MAIN_UNIT)
 
-    def watch(self, limit_s: float) -> None:
-        """Raise UnhealthyError unless the service is active within the limit and stays so a while."""
-        end_s = time.monotonic() + limit_s
-        since_s: float | None = None
-        while since_s is None or time.monotonic() - since_s < _SETTLE_S:
-            shown = self._show()
-            if shown.get("ActiveState") == "failed" or shown.get("NRestarts", "0") != "0":
-                raise UnhealthyError(
-                    f"{MAIN_UNIT} ended ({shown.get('Result', '?')}); journalctl -u"
-                )
-            if shown.get("ActiveState") != "active":
-                since_s = None
-            elif since_s is None:
-                since_s = time.monotonic()
-            if since_s is None and time.monotonic() > end_s:
-                raise UnhealthyError(f"{MAIN_UNIT} is not active within {limit_s:g} s")
-            time.sleep(0.2)
+    def watch(self, limits: Limits) -> None:
+        """Raise UnhealthyError unless it is active within the limit and stays so for a while."""
+        settle(self._is_active, limits, MAIN_UNIT)
 
     def describe(self) -> str:
         """How it is, in a few words."""
@@ -98,6 +83,13 @@ class Systemd:
         with contextlib.suppress(FileNotFoundError):
             self._list.unlink()
         self._systemctl("daemon-reload")
+
+    def _is_active(self) -> bool:
+        shown = self._show()
+        if shown.get("ActiveState") == "failed" or shown.get("NRestarts", "0") != "0":
+            result = shown.get("Result", "?")
+            raise UnhealthyError(f"{MAIN_UNIT} ended: {result} (journalctl --unit {MAIN_UNIT})")
+        return shown.get("ActiveState") == "active"
 
     def _forget(self, kept: set) -> None:
         """Take away the units of an earlier release that are not among those kept."""

@@ -3,8 +3,8 @@
 The release's own runtime runs with its own policy, certificates and settings, but with no vehicle,
 towards a port where nobody listens, and, where the kernel permits, in a network namespace of its
 own: no CAN, no network. Whatever is wrong with it, the vehicle gets no command from it. Healthy is:
-it says READY=1 and the policy's id within the limit, and then that it works (WATCHDOG=1), again
-and again. `current` is changed only after that.
+within the limit it says READY=1 and the policy's id, and it goes on to say that it works
+(WATCHDOG=1). `current` is changed only after that.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ from typing import TextIO
 
 from deploy.installer.apart import Account, before_exec, can_isolate
 from deploy.installer.errors import UnhealthyError
+from deploy.installer.health import Limits, settle
 from deploy.installer.notify import NotifySocket
 from deploy.installer.release import CONFIG, LAUNCHER, TLS, last_line
 
-DEFAULT_LIMIT_S = 10.0
 WATCHDOG_S = 1.0
 """The runtime says that it works twice in this time."""
-PINGS = 4
 _NOWHERE = "127.0.0.1:9"
 """The discard port: nobody listens there, and in a namespace of its own nobody can."""
 _END_LIMIT_S = 3.0
@@ -35,8 +34,8 @@ _END_LIMIT_S = 3.0
 def try_release(
     folder: Path,
     policy_id: str,
-    account: Account | None = None,
-    limit_s: float = DEFAULT_LIMIT_S,
+    account: Account | None,
+    limits: Limits,
 ) -> str:
     """Return how it was kept apart. Raises UnhealthyError with the reason."""
     isolated = can_isolate()
@@ -46,7 +45,7 @@ def try_release(
         log = stack.enter_context(open(os.path.join(place, "log"), "w+"))
         process = _start(folder, isolated, account, notify.environment(WATCHDOG_S), log)
         try:
-            _watch(process, notify, limit_s)
+            _watch(process, notify, limits)
         except UnhealthyError as error:
             said = _read(log)
             raise UnhealthyError(f"{error}: {last_line(said, 0)}" if said else str(error)) from None
@@ -81,15 +80,17 @@ def _start(
     )
 
 
-def _watch(process: subprocess.Popen, notify: NotifySocket, limit_s: float) -> None:
-    end_s = time.monotonic() + limit_s
-    while not (notify.ready and notify.pings >= PINGS):
+def _watch(process: subprocess.Popen, notify: NotifySocket, limits: Limits) -> None:
+    def looks_well() -> bool:
+        notify.receive(0.0)
         if process.poll() is not None:
             raise UnhealthyError(f"it ended with status {process.returncode}")
-        if time.monotonic() > end_s:
-            fault = "did not go on working" if notify.ready else "was not ready"
-            raise UnhealthyError(f"it {fault} within {limit_s:g} s")
-        notify.receive(0.1)
+        silent_s = time.monotonic() - notify.last_ping_s
+        if notify.pings and silent_s > WATCHDOG_S:
+            raise UnhealthyError(f"it has not said for {silent_s:.1f} s that it works")
+        return notify.ready and notify.pings > 0
+
+    settle(looks_well, limits, "it")
 
 
 def _end(process: subprocess.Popen) -> None:
