@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from deploy import certs_command
+from deploy import certs_command, router_command
 from deploy.keys import DEFAULT_DIRECTORY, write_key_pair
 from edge_runtime.cli import ArgumentParser, run_cli
 
@@ -25,8 +25,13 @@ def main(argv: list[str]) -> int:
     )
     certs = commands.add_parser("certs", help="make an authority and certificates for TLS")
     certs_command.add_arguments(certs)
+    router_command.add_arguments(
+        commands.add_parser("router", help="write a fleet's router settings, for zenohd")
+    )
     arguments = parser.parse_args(argv)
-    return certs_command.certs(arguments) if arguments.command == "certs" else _keys(arguments)
+    return {"keys": _keys, "certs": certs_command.certs, "router": router_command.router}[
+        arguments.command
+    ](arguments)
 
 
 def _keys(arguments: Any) -> int:
