@@ -68,11 +68,14 @@ class EdgeCounts:
         """Add what is new since the last health."""
         with self._lock:
             last = self._last
-            if last is not None and health.sent_ns <= last.sent_ns:
-                return  # A message and an answer have overtaken one another.
-            self._last = health
             if last is None:
+                self._last = health
                 return
+            # Where a message and an answer have overtaken one another both clocks say so; a wall
+            # clock that was set back, or a restart, turns back only one of the two.
+            if health.sent_ns <= last.sent_ns and health.uptime_s <= last.uptime_s:
+                return
+            self._last = health
             # A restarted edge runtime has a younger clock; it and another one count for themselves.
             another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id
             self._changes += another

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from deploy import bundle_command, certs_command, push
+from deploy import bundle_command, certs_command, push, router_command
 from deploy.keys import DEFAULT_DIRECTORY, write_key_pair
 from edge_runtime.cli import ArgumentParser, run_cli
 
@@ -19,6 +19,7 @@ def main(argv: list[str]) -> int:
         "certs": certs_command.certs,
         "bundle": bundle_command.bundle,
         "push": push.push,
+        "router": router_command.router,
     }[arguments.command](arguments)
 
 
@@ -41,6 +42,9 @@ def build_parser() -> ArgumentParser:
         commands.add_parser("bundle", help="make one signed archive for one board and vehicle")
     )
     push.add_arguments(commands.add_parser("push", help="bring a bundle to a board and install it"))
+    router_command.add_arguments(
+        commands.add_parser("router", help="write a fleet's router settings, for zenohd")
+    )
     return parser
 
 

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import queue
+import threading
+from collections import Counter
+
+import pytest
+
 from deploy.tests.boards import Board, changed_wheel
 from edge_runtime.tests.harness import Simulator, make_state, wait_until
 
-LOOP, NOTIFY, RUN = (f"edge_runtime/{name}.py" for name in ("loop", "sd_notify", "run_command"))
+NOTIFY, RUN = "edge_runtime/sd_notify.py", "edge_runtime/run_command.py"
 MOCK = "edge_runtime/vehicles/mock.py"
-FAULTS = {
-    "it never says that it is ready": (NOTIFY, "READY=1\\n", ""),
+WITH_VEHICLE = """\
+            if config.vehicle != "none":
+                import threading
+
+                threading.Timer(0.3, os._exit, (5,)).start()
+            loop.run()"""
+IN_TRIAL = {
     "it is ready and then silent": (NOTIFY, 'self._send("WATCHDOG=1")', "pass"),
+    "it never says that it is ready": (NOTIFY, "READY=1\\n", ""),
     "it ends as soon as it is ready": (RUN, "            loop.run()", "            os._exit(3)"),
     "it has loaded another policy": (RUN, "policy_id={policy.policy_id}", "policy_id=0"),
-    "it starts no vehicle": (MOCK, "        self._now_s = now_s\n", "        os._exit(4)\n"),
-    "it works until there is a vehicle": (RUN, "    finally:\n        notifier.st", "XX"),
 }
+AS_SERVICE = {
+    "it answers for a while, then ends": (RUN, "            loop.run()", WITH_VEHICLE),
+    "it cannot open the vehicle": (MOCK, "        self._now_s = now_s\n", "        1 / 0\n"),
+}
+"""Faults that show only with the vehicle, which the trial does without."""
 
 
 def lines(text: str) -> list[str]:
@@ -86,7 +101,17 @@ class Listener:
         self.simulator.__exit__()
 
 
-def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(board: Board, tmp_path):
+@pytest.mark.parametrize(
+    "faults",
+    [
+        dict([*list(IN_TRIAL.items())[:1], *list(AS_SERVICE.items())[:1]]),
+        pytest.param(IN_TRIAL | AS_SERVICE, marks=pytest.mark.board),
+    ],
+    ids=["two faults", "all faults"],
+)
+def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(
+    board: Board, tmp_path, faults
+):
     """Beside a good release that drives a simulator all the while; each fault in its own way."""
     shop = board.workshop
     good = shop.make(0.1)
@@ -96,10 +121,10 @@ def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(board: Boa
         assert board.install(good.path, "process").returncode == 0
         wait_until(lambda: listener.by_policy[good.manifest.policy_id], "the good one drives")
         bad_ids = set()
-        for number, (fault, change) in enumerate(FAULTS.items()):
+        for number, (fault, change) in enumerate(faults.items()):
             wheel = changed_wheel(shop.edge_wheel, tmp_path / str(number), *change)
             bad = shop.make(0.5 + number / 10, wheels=[wheel, shop.host], config=config)
-            done = board.install(bad.path, "process", "--health-limit", "3")
+            done = board.install(bad.path, "process", "--health-limit", "3", "--settle", "0.8")
             assert (done.returncode, len(lines(done.stderr))) == (1, 1), (fault, done.stderr)
             assert good.manifest.version in done.stderr
             shown = board.status()
@@ -110,7 +135,7 @@ def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(board: Boa
             wait_until(
                 lambda b=before: listener.by_policy[good.manifest.policy_id] > b, "it drives on"
             )
-        assert len(bad_ids) == len(FAULTS)
+        assert len(bad_ids) == len(faults)
         assert set(listener.by_policy) == {good.manifest.policy_id}
         # The mock's feedback names the command it took last: never one, for it never ran.
         assert {f.step for f in listener.simulator.feedback} <= {-1}

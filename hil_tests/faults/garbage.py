@@ -74,12 +74,19 @@ def garbage_feedback(rig: Rig, number: int) -> Try:
 
 
 def garbage_health(rig: Rig, number: int) -> Try:
-    """The same on the health's key, which the simulator reads for its report."""
+    """The same on the health's key, which the simulator reads for its report and counts."""
     wait_until(lambda: rig.probe.health, "a health message")
     valid: Health = rig.probe.health[-1]
+    payloads = list(mutated(encode(valid), COUNT, number))
+    decoded = [wire.decode_health(payload) for payload in payloads]
+    wanted = Counter(f"health_{m.reason.value}" for m in decoded if isinstance(m, Rejection))
     begin_s = rig.mark()
-    _put_all(rig, "health", mutated(encode(valid), COUNT, number))
-    return drove_on(rig, begin_s, rig.mark(), Counter(), Counter())
+    _put_all(rig, "health", payloads)
+    end_s = rig.mark()
+    rig.end_drive()
+    counts = simulator_counts(rig)
+    unread = Counter({name: n for name, n in counts.items() if name.startswith("health_")})
+    return drove_on(rig, begin_s, end_s, wanted, unread)
 
 
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
@@ -142,9 +149,11 @@ ROWS = (
     counted_row(
         "garbage_health",
         f"{COUNT:,} random and mutated health messages",
-        "drives on",
+        DRIVES_ON,
         GAP,
         garbage_health,
         recovery_limit_s=None,
+        new_rig_each_try=True,
+        flows=False,
     ),
 )

@@ -10,7 +10,7 @@ from itertools import product
 
 from matplotlib.figure import Figure
 
-from trainer.experiments.claims import guidance, learning, testing
+from trainer.experiments.claims import guidance, learning, ours, testing
 from trainer.experiments.figures.bars import draw_difficulty, draw_guidance, draw_tests
 from trainer.experiments.figures.curves import Line, draw_curves
 from trainer.experiments.figures.spread import draw_boxes, draw_distributions, draw_table
@@ -20,6 +20,7 @@ from trainer.experiments.plan import (
     HUMAN_MODEL,
     IMPORTANCE,
     LAST_ACTOR,
+    NETWORK,
     NORMAL,
     POOR,
     REMEDY,
@@ -148,18 +149,24 @@ EXPERIMENTS: dict[str, Experiment] = {
             *_lines(("hi_td3", "per_td3")),
             *_lines(("hi_td3", "per_td3"), REMEDY),
         ),
-        learning.judge_remedy,
+        ours.judge_remedy,
         by_metric=False,
     ),
     "switches": _curves(
         "what the paper leaves open: loss form, importance weights, which actor is judged",
         _lines(("phil_td3",), NORMAL, EXACT_LOSSES, IMPORTANCE, LAST_ACTOR),
-        learning.judge_switches,
+        ours.judge_switches,
+        by_metric=False,
+    ),
+    "network": _curves(
+        "PHIL-TD3 trained with a network between policy and car",
+        _lines(("phil_td3",), NORMAL, NETWORK),
+        ours.judge_network,
         by_metric=False,
     ),
 }
 """Name on the command line -> experiment; ``time`` is measured and has no units."""
-OURS = ("remedy", "switches")
+OURS = ("remedy", "switches", "network")
 """Experiments that the paper does not have: computed last."""
 TIME = "time"
 NAMES = (*(name for name in EXPERIMENTS if name not in OURS), TIME, *OURS)

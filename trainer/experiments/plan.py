@@ -9,16 +9,18 @@ from typing import Any, NamedTuple
 HUMAN_MODEL = "human_model"
 """Stands in an algorithm's place where the human model itself is tested: nothing is trained."""
 
-NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE, LAST_ACTOR = SETTINGS = (
-    "normal", "tough", "poor", "remedy", "exact_losses", "importance", "last_actor",
+NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE, LAST_ACTOR, NETWORK = SETTINGS = (
+    "normal", "tough", "poor", "remedy", "exact_losses", "importance", "last_actor", "network",
 )  # fmt: skip
 """Section VI's definition; one frame instead of two; one third of the demonstrations random; a
 price on the action before tanh, for algorithms whose policy saturates; losses as eq. 22 and 23 are
 printed; the importance weights that the paper calls optional; the actor as it stands judged, not
-its average."""
+its average; training behind ``NETWORK_SPEC``."""
 
 POOR_SHARE = 1.0 / 3.0
 """Demonstrations replaced by random actions in the poor setting (section VII-E)."""
+NETWORK_SPEC = "delay=100ms,jitter=20ms,loss=2%"
+"""Each way, as in ``trainer train --latency``."""
 LEARNER_OF: Mapping[str, Mapping[str, Any]] = {
     TOUGH: {"frames": 1},
     # Not in the paper; measured on one run of a prototype.
@@ -74,7 +76,7 @@ class Plan:
     """Least steps of an algorithm before the next one has its turn."""
 
 
-PLAN = Plan(episodes={"left_turn": 150, "congestion": 100})
+PLAN = Plan(episodes={"left_turn": 200, "congestion": 100})
 QUICK = Plan(
     episodes={"left_turn": 3, "congestion": 3},
     evaluate_every=2,

@@ -16,6 +16,8 @@ from trainer.experiments.plan import (
     HUMAN_MODEL,
     LAST_ACTOR,
     LEARNER_OF,
+    NETWORK,
+    NETWORK_SPEC,
     POOR,
     POOR_SHARE,
     SETTINGS,
@@ -99,6 +101,7 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
         threads=1,
         averaged_actor=unit.setting != LAST_ACTOR,
         poor_guidance_share=POOR_SHARE if unit.setting == POOR else 0.0,
+        latency=NETWORK_SPEC if unit.setting == NETWORK else "none",
         learner=learner,
     )
 

@@ -24,6 +24,7 @@ FACTORS = {
     "exact_losses": 0.9,
     "importance": 0.9,
     "last_actor": 0.95,
+    "network": 0.95,
 }
 
 

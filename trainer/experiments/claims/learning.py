@@ -1,4 +1,4 @@
-"""Claims about training: figs. 7, 8, 11 to 13, the ablation, and what the paper leaves open."""
+"""Claims about training: figs. 7, 8, 11 to 13 and the ablation."""
 
 from __future__ import annotations
 
@@ -19,10 +19,6 @@ from trainer.experiments.claims.compare import (
 from trainer.experiments.figures.curves import ALONE, METRICS, Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import (
-    EXACT_LOSSES,
-    IMPORTANCE,
-    LAST_ACTOR,
-    REMEDY,
     SCENARIO_TITLES,
     TOUGH,
 )
@@ -36,9 +32,6 @@ RD2, RD2_PHIL = Line("rd2_td3"), Line("rd2_phil")
 NO_CLONING, NO_TDQA, NO_SHAPING = map(
     Line, ("phil_without_cloning", "phil_without_tdqa", "phil_without_shaping")
 )
-HI_REMEDY, PER_REMEDY = Line("hi_td3", REMEDY), Line("per_td3", REMEDY)
-EXACT, WEIGHED = Line("phil_td3", EXACT_LOSSES), Line("phil_td3", IMPORTANCE)
-LAST = Line("phil_td3", LAST_ACTOR)
 
 SPEEDS = {("left_turn", "episode_return"): 7.0, ("congestion", "distance_m"): 2.2}
 """The paper's learning efficiency, where it gives one."""
@@ -231,33 +224,4 @@ def judge_ablation(gathered: Gathered) -> list[Claim]:
             claims.append(
                 final_claim(gathered, scenario, "distance_m", other, [NO_TDQA], text, paper)
             )
-    return claims
-
-
-def judge_remedy(gathered: Gathered) -> list[Claim]:
-    """Not in the paper: whether the order is one of saturated policies only."""
-    claims = []
-    for scenario, metric in EVERYWHERE:
-        place = (gathered, scenario, metric)
-        claims += [
-            final_claim(*place, PHIL, [HI_REMEDY, PER_REMEDY],
-                        "PHIL-TD3 stays first where the baselines have the remedy", "–"),
-            final_claim(*place, PER_REMEDY, [PER], "the remedy helps vanilla TD3", "–"),
-        ]  # fmt: skip
-    return claims
-
-
-def judge_switches(gathered: Gathered) -> list[Claim]:
-    """Not in the paper: whether what it leaves open is set for the better here."""
-    claims = []
-    for scenario, metric in product(SCENARIO_TITLES, (*METRICS, ALONE)):
-        place = (gathered, scenario, metric)
-        claims += [
-            final_claim(*place, PHIL, [EXACT],
-                        "one mean over the batch ends above eq. 22 and 23 as printed", "–"),
-            final_claim(*place, PHIL, [WEIGHED], "no importance weights end above eq. 15", "–"),
-        ]  # fmt: skip
-    for scenario in SCENARIO_TITLES:
-        text = "the averaged actor ends above the last one"
-        claims.append(final_claim(gathered, scenario, ALONE, PHIL, [LAST], text, "–"))
     return claims

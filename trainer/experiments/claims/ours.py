@@ -1,0 +1,65 @@
+"""Claims of the experiments that the paper does not have: what it leaves open, and the network."""
+
+from __future__ import annotations
+
+from itertools import product
+
+from trainer.experiments.claims.compare import final_claim
+from trainer.experiments.figures.curves import ALONE, METRICS, Line
+from trainer.experiments.gathered import Gathered
+from trainer.experiments.plan import (
+    EXACT_LOSSES,
+    IMPORTANCE,
+    LAST_ACTOR,
+    NETWORK,
+    REMEDY,
+    SCENARIO_TITLES,
+)
+from trainer.experiments.verdict import Claim
+
+PHIL, PER = Line("phil_td3"), Line("per_td3")
+HI_REMEDY, PER_REMEDY = Line("hi_td3", REMEDY), Line("per_td3", REMEDY)
+EXACT, WEIGHED = Line("phil_td3", EXACT_LOSSES), Line("phil_td3", IMPORTANCE)
+LAST = Line("phil_td3", LAST_ACTOR)
+BEHIND_NETWORK = Line("phil_td3", NETWORK)
+
+
+def judge_remedy(gathered: Gathered) -> list[Claim]:
+    """Whether the order is one of saturated policies only."""
+    claims = []
+    for scenario, metric in product(SCENARIO_TITLES, METRICS):
+        place = (gathered, scenario, metric)
+        claims += [
+            final_claim(*place, PHIL, [HI_REMEDY, PER_REMEDY],
+                        "PHIL-TD3 stays first where the baselines have the remedy", "–"),
+            final_claim(*place, PER_REMEDY, [PER], "the remedy helps vanilla TD3", "–"),
+        ]  # fmt: skip
+    return claims
+
+
+def judge_switches(gathered: Gathered) -> list[Claim]:
+    """Whether what the paper leaves open is set for the better here."""
+    claims = []
+    for scenario, metric in product(SCENARIO_TITLES, (*METRICS, ALONE)):
+        place = (gathered, scenario, metric)
+        claims += [
+            final_claim(*place, PHIL, [EXACT],
+                        "one mean over the batch ends above eq. 22 and 23 as printed", "–"),
+            final_claim(*place, PHIL, [WEIGHED], "no importance weights end above eq. 15", "–"),
+        ]  # fmt: skip
+    for scenario in SCENARIO_TITLES:
+        text = "the averaged actor ends above the last one"
+        claims.append(final_claim(gathered, scenario, ALONE, PHIL, [LAST], text, "–"))
+    return claims
+
+
+def judge_network(gathered: Gathered) -> list[Claim]:
+    """Each policy alone, validated as it was trained: what the network costs.
+
+    What such training is worth, a latency campaign says (``python -m hil_tests campaign``).
+    """
+    text = "trained and validated without a network ends above trained and validated behind one"
+    return [
+        final_claim(gathered, scenario, ALONE, PHIL, [BEHIND_NETWORK], text, "–")
+        for scenario in SCENARIO_TITLES
+    ]
