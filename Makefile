@@ -44,7 +44,7 @@ lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests
-	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime
+	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer
 
 $(CONTAINER_STAMP): requirements/container.txt
 	$(PYTHON) -m venv $(CONTAINER)
