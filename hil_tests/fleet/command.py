@@ -23,7 +23,7 @@ from trainer.benches.machine import processor_model
 from trainer.commands.options import positive
 
 _SIZES = (1, 5, 10, 20)
-_RULES = (10, 100, 1_000, 10_000)
+_RULES = (10, 100, 1_000)
 
 
 def add_arguments(parser: ArgumentParser) -> None:
