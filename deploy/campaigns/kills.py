@@ -20,8 +20,8 @@ from pathlib import Path
 from deploy.campaigns.rig import Board, Kit, kit_of, make_kit
 from deploy.installer.archive import MANIFEST
 from deploy.installer.manifest import parse_manifest
-from edge_runtime.cli import ArgumentParser, UserError, run_cli
-from edge_runtime.files import check_writable, write_json
+from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
+from edge_runtime.files import check_writable
 
 SLACK = 1.1
 """Some tries come after the end: a whole run must survive a power cut, too."""
@@ -35,9 +35,9 @@ def main(argv: list[str]) -> int:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         kit = _kit(arguments, folder)
-        report = campaign(Board(folder / "board", kit), arguments.tries, arguments.seed)
-    if arguments.out:
-        write_json(arguments.out, report)
+        report = campaign(
+            Board(folder / "board", kit), arguments.tries, arguments.seed, arguments.out
+        )
     print(
         f"{report['tries']} kills: {report['broken']} broken boards,"
         f" {report['not_completed']} that the same command did not complete"
@@ -45,47 +45,53 @@ def main(argv: list[str]) -> int:
     return 1 if report["broken"] or report["not_completed"] else 0
 
 
-def campaign(board: Board, tries: int, seed: int) -> dict:
-    """Kill `tries` runs of the installer; the report."""
+def campaign(board: Board, tries: int, seed: int, out: str | None = None) -> dict:
+    """Kill `tries` runs of the installer; the report, which also goes to `out` as it grows."""
     choice = random.Random(seed)
-    tally = Tally()
-    durations_s = {kind: _measure(board, kind) for kind in ("install", "upgrade")}
+    tally = Tally(seed, {kind: _measure(board, kind) for kind in ("install", "upgrade")})
     for number in range(tries):
-        kind = "install" if number < tries // 2 else "upgrade"
-        moment_s = choice.uniform(0.0, SLACK * durations_s[kind])
-        tally.add(number, kind, *_try(board, kind, moment_s))
-        if (number + 1) % 10 == 0:
+        kind = "install" if number % 20 < 10 else "upgrade"
+        moment_s = choice.uniform(0.0, SLACK * tally.durations_s[kind])
+        tally.add(kind, *_try(board, kind, moment_s))
+        if (number + 1) % 10 == 0 or number + 1 == tries:
+            write_json_out(out, tally.report())
             print(f"{number + 1} of {tries}", file=sys.stderr)
     board.run("uninstall")
-    return {
-        "tries": tries,
-        "seed": seed,
-        "broken": len(tally.broken),
-        "not_completed": len(tally.stuck),
-        "faults": tally.broken + tally.stuck,
-        "a_whole_run_s": {kind: round(value, 2) for kind, value in durations_s.items()},
-        "killed_after_it_said": dict(sorted(tally.phases.items())),
-        "current_after_the_kill": dict(sorted(tally.current.items())),
-    }
+    return tally.report()
 
 
 class Tally:
     """What came of the tries."""
 
-    def __init__(self) -> None:
+    def __init__(self, seed: int, durations_s: dict[str, float]) -> None:
+        self.seed = seed
+        self.durations_s = durations_s
+        self.tries = 0
         self.broken: list[str] = []
         self.stuck: list[str] = []
         self.phases: Counter[str] = Counter()
         self.current: Counter[str] = Counter()
 
-    def add(
-        self, number: int, kind: str, phase: str, current: str, broken: str, stuck: str
-    ) -> None:
+    def add(self, kind: str, phase: str, current: str, broken: str, stuck: str) -> None:
         """Count one try; `broken` and `stuck` are empty where all is well."""
         self.phases[f"{kind}: {phase}"] += 1
         self.current[f"{kind}: {current}"] += 1
-        self.broken += [f"try {number}, {kind}: {broken}"] if broken else []
-        self.stuck += [f"try {number}, {kind}: {stuck}"] if stuck else []
+        self.broken += [f"try {self.tries}, {kind}: {broken}"] if broken else []
+        self.stuck += [f"try {self.tries}, {kind}: {stuck}"] if stuck else []
+        self.tries += 1
+
+    def report(self) -> dict:
+        """All of it, for a JSON file."""
+        return {
+            "tries": self.tries,
+            "seed": self.seed,
+            "broken": len(self.broken),
+            "not_completed": len(self.stuck),
+            "faults": self.broken + self.stuck,
+            "a_whole_run_s": {kind: round(s, 2) for kind, s in self.durations_s.items()},
+            "killed_after_it_said": dict(sorted(self.phases.items())),
+            "current_after_the_kill": dict(sorted(self.current.items())),
+        }
 
 
 def _try(board: Board, kind: str, moment_s: float) -> tuple[str, str, str, str]:
