@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from deploy.campaigns.rig import Board, Kit, kit_of, make_kit
+from deploy.campaigns.rig import Board, Kit, kit_of, make_kit, unless_busy
 from deploy.installer.archive import MANIFEST
 from deploy.installer.manifest import parse_manifest
 from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
@@ -129,9 +129,13 @@ def _clear(board: Board) -> None:
 
 def _complete(board: Board, bundle: Path) -> str:
     """The same command again; what it complains of, empty where it is done."""
-    process = board.start_install(bundle)
-    _, error = process.communicate()
-    return error.strip() if process.returncode else ""
+
+    def run() -> str:
+        process = board.start_install(bundle)
+        _, error = process.communicate()
+        return error.strip() if process.returncode else ""
+
+    return unless_busy(run)
 
 
 def _measure(board: Board, kind: str) -> float:
