@@ -6,6 +6,7 @@ import subprocess
 from pathlib import Path
 
 from deploy.installer.apart import before_exec
+from hil_tests.faults.processes import wait_until
 
 # Before onnxruntime is imported, /proc, /sys and /dev must be there.
 _ENTER = """\
@@ -18,8 +19,7 @@ else
     mount --rbind /dev "$1/dev"
     printf '127.0.0.1 localhost\\n' > "$1/etc/hosts"
 fi
-echo ready
-exec chroot "$1" /bin/sh -c 'while :; do sleep 3600 & wait; done'
+exec chroot "$1" /bin/sh -c 'echo ready; while :; do sleep 3600 & wait; done'
 """
 
 
@@ -65,9 +65,19 @@ class Place:
         )  # fmt: skip
 
     def close(self) -> None:
-        """End all that runs inside."""
+        """End all that runs inside, and wait until it has ended."""
         self._unshare.kill()
         self._unshare.communicate()
+        wait_until(self._is_empty, "the end of what ran inside")
+
+    def _is_empty(self) -> bool:
+        """The kernel lets the first process of a place end (state Z) after all others."""
+        try:
+            return (
+                Path(f"/proc/{self._holder}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+            )
+        except FileNotFoundError:
+            return True
 
     def __enter__(self) -> Place:
         return self

@@ -152,7 +152,9 @@ def _drive(place: Place, certificates: Path) -> tuple[dict[str, Any], float]:
         first_s = float(seen.said().split()[-1])
     report = json.loads(out.read_text())
     kept = ("success_rate", "answered_states", "latency_ms", "safe_stops", "rejected", "policy_id")
-    return {**{name: report[name] for name in kept}, "of": report["per_episode"]}, first_s
+    (row,) = report["per_episode"]
+    of_row = {name: row[name] for name in ("outcome", "steps", "distance_m", "time_s")}
+    return {**{name: report[name] for name in kept}, **of_row}, first_s
 
 
 def _version(site: Site) -> str:
