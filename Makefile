@@ -12,7 +12,7 @@ CONTAINER_STAMP := $(CONTAINER)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray test-network lint format lint-container bench bench-quick bench-gpu \
+.PHONY: help install demo test test-ray test-network test-board lint format lint-container bench bench-quick bench-gpu \
 	bench-loop network fleet recording mutate lock clean
 
 help:  ## this list
@@ -39,6 +39,9 @@ test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 
 test-network: $(STAMP)  ## the loop over a kernel network of two namespaces; needs root
 	$(BIN)/python -m pytest -m network hil_tests
+
+test-board: $(STAMP)  ## whole bundles installed, every fault of a release, every step of a crash; minutes
+	$(BIN)/python -m pytest -m board
 
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .

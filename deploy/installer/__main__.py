@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import sys
 from typing import Any, NoReturn
 
@@ -31,6 +32,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: list[str]) -> int:
     """Run one command; the exit status."""
+    os.umask(0o022)  # The service's user must read the release, whatever the caller's umask.
     try:
         return _dispatch(_parser().parse_args(argv))
     except UserError as error:

@@ -196,7 +196,10 @@ def _go_back(version: str, good: str | None, earlier: str | None, layout: Layout
     else:
         layout.unlink("previous")
     layout.remove_release(version)
-    _start(good, layout, way)
+    try:
+        _start(good, layout, way)
+    except UnhealthyError as error:
+        raise UnhealthyError(f"{version} was not healthy, nor is {good} again: {error}") from None
 
 
 def _say(text: str) -> None:

@@ -9,36 +9,19 @@ from __future__ import annotations
 import io
 import json
 import os
-import platform
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
-import numpy
-
 from deploy.bundle import Inputs, Made, make_bundle
-from deploy.installer.manifest import Target
+from deploy.campaigns.light import HERE, host_wheel
 from deploy.keys import write_key_pair
 from deploy.pyz import NAME, build_installer
 from edge_runtime.tests.policies import public_pem, write_policy
 from edge_runtime.transport import free_endpoint
 
-HERE = Target(
-    name="here",
-    python=f"{sys.version_info[0]}.{sys.version_info[1]}",
-    machine=platform.machine(),
-    glibc="2.17",
-)
 QUICK = ("--settle", "0.2")
-
-
-def host_wheel(folder: Path) -> Path:
-    """A wheel that holds a path file only."""
-    path = folder / "host-1.0-py3-none-any.whl"
-    with zipfile.ZipFile(path, "w") as wheel:
-        wheel.writestr("host.pth", f"{Path(numpy.__file__).parents[1]}\n")
-    return path
 
 
 def changed_wheel(wheel: Path, out: Path, member: str, old: str, new: str) -> Path:
