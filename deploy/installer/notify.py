@@ -40,7 +40,9 @@ class NotifySocket:
             except (socket.timeout, BlockingIOError):
                 return
             self._socket.settimeout(1e-6)
-            self.ready = self.ready or "READY=1" in lines
+            if "READY=1" in lines:
+                # From here on it must say that it works: a slow start was no silence.
+                self.ready, self.last_ping_s = True, time.monotonic()
             if "WATCHDOG=1" in lines:
                 self.pings += 1
                 self.last_ping_s = time.monotonic()
