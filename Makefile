@@ -13,7 +13,7 @@ BENCH := results/bench
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-ray test-network test-board lint format lint-container bench bench-quick bench-gpu \
-	bench-loop bench-can network vehicle fleet recording mutate lock clean
+	bench-loop bench-can network vehicle board fleet recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -40,7 +40,7 @@ test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 test-network: $(STAMP)  ## the loop over a kernel network of two namespaces; needs root
 	$(BIN)/python -m pytest -m network hil_tests
 
-test-board: $(STAMP)  ## whole bundles installed, every fault of a release, every step of a crash; minutes
+test-board: $(STAMP)  ## whole bundles installed, on an emulated board, too, with every fault; minutes, root
 	$(BIN)/python -m pytest -m board
 
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
@@ -81,6 +81,11 @@ network: $(STAMP)  ## TCP, UDP, relay and virtual time on the same network; need
 	@mkdir -p results/network
 	$(BIN)/python -m hil_tests network --out results/network/network.json --report results/network
 	$(BIN)/python -m hil_tests.network.variants --out results/network/variants.json
+
+board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
+	@mkdir -p results/deploy
+	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
+	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
 
 fleet: $(STAMP)  ## a router with 1, 5, 10 and 20 edge runtimes: processor, memory, bandwidth each
 	@mkdir -p results/deploy
