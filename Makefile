@@ -13,7 +13,7 @@ BENCH := results/bench
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-ray test-network test-board lint format lint-container bench bench-quick bench-gpu \
-	bench-loop network board fleet recording mutate lock clean
+	bench-loop bench-can network vehicle board fleet recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -99,6 +99,14 @@ bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
 	@mkdir -p $(BENCH)
 	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
+
+bench-can: $(STAMP)  ## ten minutes of the 50 Hz CAN stream, every core busy, beside a bare sender
+	@mkdir -p $(BENCH)
+	$(BIN)/python -m hil_tests.benches.can_stream --out $(BENCH)/can_stream.json
+
+vehicle: $(STAMP)  ## policy in the loop against a mock Hunter in the loop, and the lag it may have; some 15 minutes
+	@mkdir -p results/vehicle
+	$(BIN)/python -m hil_tests vehicle --out results/vehicle/left_turn.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
 	$(BIN)/python -m hil_tests.recordings.make

@@ -14,6 +14,7 @@ SUBCOMMANDS = {
     "record": "write everything on the wire to an MCAP recording",
     "replay": "run recorded states through a policy or runtime, and compare its commands",
     "repair": "give a recording that was cut off its index back",
+    "ros2": "show the wire to ROS 2, through a zenoh-bridge-ros2dds",
     "view": "show the wire in rerun, live or in a file",
 }
 """By the name of its module in here, which has ``add_arguments`` and a function of that name."""

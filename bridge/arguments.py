@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from argparse import ArgumentParser, ArgumentTypeError
+from typing import Any
 
 from edge_runtime.topics import DEFAULT_VEHICLE_ID
-from edge_runtime.transport import DEFAULT_ENDPOINT
+from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 
 
 def positive_int(text: str) -> int:
@@ -62,6 +63,28 @@ def add_tls(parser: ArgumentParser) -> None:
         metavar="DIR",
         help="ca.pem, cert.pem, key.pem of this party (python -m deploy certs); endpoint tls/...",
     )
+
+
+def add_where(parser: ArgumentParser) -> None:
+    """Declare --listen and --connect, of which one is taken (``check_where``)."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--listen",
+        metavar="PROTOCOL/HOST:PORT",
+        help=f"where the edge runtime and viewers connect to (default: {DEFAULT_ENDPOINT})",
+    )
+    where.add_argument(
+        "--connect",
+        metavar="PROTOCOL/HOST:PORT",
+        help="share a router with other vehicles instead of listening",
+    )
+
+
+def check_where(arguments: Any) -> tuple[str | None, str | None]:
+    """Return listen and connect, of which one is an endpoint and the other None."""
+    if arguments.connect is not None:
+        return None, check_endpoint(arguments.connect)
+    return check_endpoint(arguments.listen or DEFAULT_ENDPOINT), None
 
 
 def _from_zero(text: str, what: str) -> float:

@@ -10,8 +10,8 @@ import gymnasium
 import msgspec
 import numpy as np
 
+from bridge.actions import Apply, policy_action
 from bridge.clock import Clock
-from bridge.environments import brake_action, press_brake
 from bridge.safe_stops import SafeStopLog
 from edge_runtime.cli import UserError
 from edge_runtime.episode_report import EpisodeResult
@@ -34,6 +34,8 @@ class EpisodeRunner:
         session: str,
         publish_scene: PublishScene,
         on_tick: OnTick,
+        apply: Apply = policy_action,
+        standing: bool = False,
     ) -> None:
         self.safe_stops = SafeStopLog(CONTROL_PERIOD_S)
         self.deadline_misses = 0
@@ -45,6 +47,8 @@ class EpisodeRunner:
         self._session = session
         self._publish_scene = publish_scene
         self._on_tick = on_tick
+        self._apply = apply
+        self._options = {"standing": True} if standing else None
 
     def run(self, episode: int, seed: int) -> EpisodeResult:
         """Drive one episode to its end; the seed decides the environment and the link.
@@ -63,7 +67,7 @@ class EpisodeRunner:
             raise
 
     def _drive(self, episode: int, seed: int) -> EpisodeResult:
-        observation, info = self._environment.reset(seed=seed)
+        observation, info = self._environment.reset(seed=seed, options=self._options)
         self._clock.begin(episode, seed)
         steps: list[_Step] = []
         ended = False
@@ -72,7 +76,7 @@ class EpisodeRunner:
             self._show(state)
             self._under_way = state
             decision = self._clock.exchange(state)
-            action = self._action(decision)
+            action = self._apply(self._environment, decision)
             observation, reward, terminated, truncated, info = self._environment.step(action)
             steps.append(_Step(action, float(reward), info))
             self._note(state, decision, _speed_mps(info))
@@ -111,15 +115,6 @@ class EpisodeRunner:
             state.sim_time_s,
             answered[-1] if answered else None,
         )
-
-    def _action(self, decision: Decision) -> np.ndarray:
-        """The command's action, the safe stop's, or (before the first command) hands off: zeros."""
-        press_brake(self._environment, bool(decision.brake_reason))
-        if decision.brake_reason:
-            return brake_action(self._environment)
-        if decision.command is None:
-            return np.zeros(self._environment.action_space.shape or (1,), dtype=np.float32)
-        return np.asarray(decision.command.action, dtype=np.float32)
 
     def _note(self, state: State, decision: Decision, speed_mps: float) -> None:
         self.deadline_misses += not decision.fresh

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import msgspec
 import zenoh
 
 from bridge.edge_counts import EdgeCounts
@@ -16,13 +17,20 @@ from bridge.feed import connect_client
 from bridge.scene import encode_scene, scene_key
 from edge_runtime import access
 from edge_runtime.cli import UserError
+from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
 from edge_runtime.wire import key
 
-CommandHandler = Callable[[bytes], None]
+PayloadHandler = Callable[[bytes], None]
 EDGE_POLL_S = 0.1
 QUERY_S = 1.0
+
+
+class _Status(msgspec.Struct):
+    """What is needed of the answer to the status query."""
+
+    manifest: Manifest
 
 
 def simulator_key(vehicle_id: str) -> str:
@@ -36,7 +44,7 @@ class SimulatorPort:
     def __init__(self, zenoh_session: zenoh.Session, vehicle_id: str) -> None:
         self.session = secrets.token_hex(8)
         self._zenoh = zenoh_session
-        self._vehicle_id = vehicle_id
+        self.vehicle_id = vehicle_id
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
         self._states = zenoh_session.declare_publisher(
@@ -47,16 +55,23 @@ class SimulatorPort:
         )
         self._token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
         self._commands: Any = None
+        self._feedback: Any = None
         self.edge_counts = EdgeCounts()
         self._health = zenoh_session.declare_subscriber(
             key(vehicle_id, "health"),
             lambda sample: self.edge_counts.observe_message(sample.payload.to_bytes()),
         )
 
-    def on_command(self, handler: CommandHandler) -> None:
+    def on_command(self, handler: PayloadHandler) -> None:
         """Call ``handler(payload)`` for every command, on Zenoh's thread: it must be quick."""
         self._commands = self._zenoh.declare_subscriber(
-            key(self._vehicle_id, "command"), lambda sample: handler(sample.payload.to_bytes())
+            key(self.vehicle_id, "command"), lambda sample: handler(sample.payload.to_bytes())
+        )
+
+    def on_feedback(self, handler: PayloadHandler) -> None:
+        """Call ``handler(payload)`` for every feedback of the vehicle, as ``on_command`` does."""
+        self._feedback = self._zenoh.declare_subscriber(
+            key(self.vehicle_id, "feedback"), lambda sample: handler(sample.payload.to_bytes())
         )
 
     def publish_state(self, payload: bytes) -> None:
@@ -86,7 +101,7 @@ class SimulatorPort:
             if time.monotonic() >= give_up_s:
                 raise UserError(
                     f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
-                    f"--policy POLICY.onnx --connect {endpoint} --vehicle-id {self._vehicle_id}"
+                    f"--policy POLICY.onnx --connect {endpoint} --vehicle-id {self.vehicle_id}"
                 )
             time.sleep(EDGE_POLL_S)
 
@@ -101,20 +116,30 @@ class SimulatorPort:
         self.note_edge_counts()
         return self.edge_counts.policy_id
 
+    def edge_action_names(self) -> tuple[str, ...]:
+        """Return the names of the actions of the edge runtime's policy; none if it says nothing."""
+        for reply in self._status_replies():
+            if reply.ok is not None:
+                with contextlib.suppress(msgspec.MsgspecError):
+                    status = msgspec.json.decode(reply.ok.payload.to_bytes(), type=_Status)
+                    return tuple(action.name for action in status.manifest.action)
+        return ()
+
     def _edge_is_there(self) -> bool:
         """Its token is seen, or it answers: the board's Zenoh can lose the token for a while."""
-        alive = key(self._vehicle_id, "alive")
+        alive = key(self.vehicle_id, "alive")
         tokens = self._zenoh.liveliness().get(alive, timeout=QUERY_S)
         return any(reply.ok for reply in tokens) or any(
             reply.ok for reply in self._status_replies()
         )
 
     def _status_replies(self) -> Any:
-        return self._zenoh.get(key(self._vehicle_id, "status"), timeout=QUERY_S)
+        return self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S)
 
     def close(self) -> None:
         """Undeclare everything: a callback left open hangs the process at its end."""
-        for declared in (self._commands, self._health, self._token, self._scenes, self._states):
+        callbacks = (self._commands, self._feedback, self._health)
+        for declared in (*callbacks, self._token, self._scenes, self._states):
             if declared is not None:
                 declared.undeclare()
 

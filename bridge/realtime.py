@@ -20,7 +20,7 @@ from bridge.command_check import CommandCheck
 from bridge.delay_line import DelayLine
 from edge_runtime.latency.command_hold import COMMAND_WINDOW_S, CommandHold, Decision
 from edge_runtime.latency.model import LatencyModel, LatencySpec, make_link
-from edge_runtime.wire import CONTROL_PERIOD_S, Reason, State, encode
+from edge_runtime.wire import CONTROL_PERIOD_S, Command, Reason, State, encode
 
 
 class RealTimeClock:
@@ -51,13 +51,7 @@ class RealTimeClock:
 
     def exchange(self, state: State) -> Decision:
         """Wait for the tick, send its state, and decide when its command window closes."""
-        tick_s = self._wait_for_tick(state.step)
-        payload = encode(_stamp(state))
-        with self._arrived:
-            self._sent_s[state.step] = time.monotonic()
-            self._check.sent(state.step)
-        self._send(self._link.up, payload, self._publish)
-        return self._decide(state.step, tick_s + COMMAND_WINDOW_S)
+        return self._decide(state.step, self._send_state(state) + COMMAND_WINDOW_S)
 
     def finish(self, state: State) -> None:
         """Forget what is under way and publish the final state at once."""
@@ -69,6 +63,16 @@ class RealTimeClock:
     def close(self) -> None:
         """Stop the delay line."""
         self._line.close()
+
+    def _send_state(self, state: State) -> float:
+        """Wait for the state's tick, send it, and return the tick's time."""
+        tick_s = self._wait_for_tick(state.step)
+        payload = encode(_stamp(state))
+        with self._arrived:
+            self._sent_s[state.step] = time.monotonic()
+            self._check.sent(state.step)
+        self._send(self._link.up, payload, self._publish)
+        return tick_s
 
     def _send(self, direction: LatencyModel, payload: bytes, deliver: Publish) -> None:
         # The model's time is the episode's, so that its outages come as in lock-step.
@@ -112,7 +116,11 @@ class RealTimeClock:
                 return
             if command.step > answered_step:
                 self.latencies_ms.append((now_s - self._sent_s[command.step]) * 1e3)
+            self._admitted(command)
             self._arrived.notify()
+
+    def _admitted(self, command: Command) -> None:
+        """Look at a command that the vehicle takes; the caller holds the condition."""
 
 
 def _stamp(state: State) -> State:

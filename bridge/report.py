@@ -39,10 +39,12 @@ def make_report(
     command_ages_ms: Sequence[float],
     counts: Mapping[str, Any],
     settings: Mapping[str, Any],
+    vehicle: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Join the summary of the episodes with what happened on the wire.
 
-    ``settings`` holds scenario, condition, policy_ids, seed, clock, latency_spec and wall_s;
+    ``settings`` holds scenario, condition, policy_ids, seed, clock, loop, standing, latency_spec
+    and wall_s; ``vehicle`` is the part of a vehicle in the loop;
     ``counts`` holds deadline_misses, tick_overruns, missed_ticks, edge_changes,
     wall_clock_stalls and ``rejections``. The report's policy_id is that of the policy that
     answered last.
@@ -61,9 +63,10 @@ def make_report(
         "command_age_ms": quantiles(command_ages_ms),
         **counts,
         "safe_stops": len(safe_stop_events),
-        "clock": settings["clock"],
+        **{name: settings[name] for name in ("clock", "loop", "standing")},
         "latency_spec": settings["latency_spec"],
         "wall_s": settings["wall_s"],
+        "vehicle": vehicle,
         "times_real_time": sum(result.time_s for result in results) / settings["wall_s"],
         "safe_stop_events": [asdict(event) for event in safe_stop_events],
         "per_episode": [result.as_dict() for result in results],
@@ -77,8 +80,16 @@ def summary_line(report: Mapping[str, Any]) -> str:
     if latency["p50"] is not None:
         times = f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
     rejected = sum(report["rejected"].values())
+    vehicle = "" if report["vehicle"] is None else f"; {_vehicle_words(report['vehicle'])}"
     return (
         f"{report['episodes']} episodes: {report['success_rate']:.0%} goal, "
         f"{report['collision_rate']:.0%} collision; {times}; {report['safe_stops']} safe stops, "
-        f"{report['deadline_misses']} deadline misses, {rejected} rejected messages"
+        f"{report['deadline_misses']} deadline misses, {rejected} rejected messages{vehicle}"
     )
+
+
+def _vehicle_words(vehicle: Mapping[str, Any]) -> str:
+    """As in "hunter: lag speed 135 ms, pedal 160 ms"."""
+    told = {name: lag for name, lag in vehicle["lag_ms"].items() if lag is not None}
+    lags = ", ".join(f"{name} {lag:.0f} ms" for name, lag in told.items())
+    return f"{vehicle['name']}: lag {lags or 'not measured'}"

@@ -17,7 +17,8 @@ class SafeStopEvent:
     step: int
     """The first tick in which the vehicle braked."""
     reason: str
-    """``no_command`` if the simulator braked by itself, else the edge runtime's reason."""
+    """``no_command`` if the simulator braked by itself, else the edge runtime's reason; with a
+    vehicle in the loop also ``no_feedback`` and ``self_braking``."""
     brake_after_s: float
     """From the last ``drive`` command to the brake (in lock-step: wall time if the edge runtime
     does not answer, virtual time otherwise)."""

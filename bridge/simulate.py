@@ -2,43 +2,42 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 
+from bridge.actions import policy_action
 from bridge.arguments import (
     add_tls,
     add_vehicle_id,
     add_wait_edge,
+    add_where,
+    check_where,
     non_negative_int,
     positive_int,
 )
-from bridge.clock import Clock, Publish
+from bridge.clock import Clock
+from bridge.clocks import CLOCKS, REALTIME, running_clock
 from bridge.command_check import CommandCheck
 from bridge.environments import CONDITIONS, NOMINAL, SCENARIOS, make_environment, scenario_of
 from bridge.episode import EpisodeRunner
-from bridge.lockstep import LockStepClock
+from bridge.feedback_check import FeedbackCheck
 from bridge.port import SimulatorPort, open_port
 from bridge.progress import EpisodeBar, episode_bar
-from bridge.realtime import RealTimeClock
 from bridge.report import make_report, rejections, summary_line
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, write_json_out
+from bridge.vehicle_clock import VehicleClock
+from bridge.vehicle_loop import VehicleInLoop
+from edge_runtime.cli import ArgumentParser, UserError, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.topics import check_vehicle_id
-from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 
-CLOCKS: dict[str, Callable[[Publish, CommandCheck, LatencySpec], Clock]] = {
-    "lockstep": LockStepClock,
-    "realtime": RealTimeClock,
-}
+POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 
 
 @dataclass(frozen=True)
@@ -49,6 +48,8 @@ class SimulateSettings:
     condition: str
     episodes: int
     clock: str
+    loop: str
+    standing: bool
     listen: str | None
     connect: str | None
     tls: TlsFiles | None
@@ -80,6 +81,18 @@ def add_arguments(parser: ArgumentParser) -> None:
         default="lockstep",
         help="lockstep waits for each command; realtime waits for nobody",
     )
+    parser.add_argument(
+        "--loop",
+        choices=LOOPS,
+        default=POLICY,
+        help="the car does what the policy commands, or (realtime only) what the vehicle behind "
+        "the edge runtime reports to have done",
+    )
+    parser.add_argument(
+        "--standing",
+        action="store_true",
+        help="the car starts every episode at rest, as with --loop vehicle it always does",
+    )
     add_where(parser)
     add_tls(parser)
     add_vehicle_id(parser, "the vehicle to simulate")
@@ -94,28 +107,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_wait_edge(parser)
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
-
-
-def add_where(parser: ArgumentParser) -> None:
-    """Declare --listen and --connect, of which one is taken (``check_where``)."""
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "--listen",
-        metavar="PROTOCOL/HOST:PORT",
-        help=f"where the edge runtime and viewers connect to (default: {DEFAULT_ENDPOINT})",
-    )
-    where.add_argument(
-        "--connect",
-        metavar="PROTOCOL/HOST:PORT",
-        help="share a router with other vehicles instead of listening",
-    )
-
-
-def check_where(arguments: Any) -> tuple[str | None, str | None]:
-    """Return listen and connect, of which one is an endpoint and the other None."""
-    if arguments.connect is not None:
-        return None, check_endpoint(arguments.connect)
-    return check_endpoint(arguments.listen or DEFAULT_ENDPOINT), None
 
 
 def simulate(arguments: Any) -> int:
@@ -134,11 +125,15 @@ def simulate(arguments: Any) -> int:
 
 def _check(arguments: Any) -> SimulateSettings:
     listen, connect = check_where(arguments)
+    if arguments.loop == VEHICLE and arguments.clock != REALTIME:
+        raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
     settings = SimulateSettings(
         env=arguments.env,
         condition=arguments.condition,
         episodes=arguments.episodes,
         clock=arguments.clock,
+        loop=arguments.loop,
+        standing=arguments.standing or arguments.loop == VEHICLE,
         listen=listen,
         connect=connect,
         tls=tls_for(arguments.tls, str(listen or connect)),
@@ -158,24 +153,20 @@ def _serve(settings: SimulateSettings, environment: gymnasium.Env[Any, Any]) -> 
     wait_s, tls = settings.wait_edge_s, settings.tls
     with open_port(settings.listen, settings.vehicle_id, tls, settings.connect, wait_s) as port:
         check = CommandCheck(port.session, action_size)
+        in_loop = settings.loop == VEHICLE
+        feedback = FeedbackCheck(port.session, action_size) if in_loop else None
         with (
-            _running_clock(settings, port.publish_state, check) as clock,
+            running_clock(
+                settings.clock, port.publish_state, check, settings.latency, feedback
+            ) as clock,
             episode_bar(settings.episodes) as bar,
         ):
             port.on_command(clock.receive)
             port.wait_for_edge(wait_s, str(settings.connect or settings.listen))
-            return _drive(settings, environment, port, clock, check, bar)
-
-
-@contextlib.contextmanager
-def _running_clock(
-    settings: SimulateSettings, publish: Publish, check: CommandCheck
-) -> Iterator[Clock]:
-    clock = CLOCKS[settings.clock](publish, check, settings.latency)
-    try:
-        yield clock
-    finally:
-        clock.close()
+            vehicle = (
+                VehicleInLoop(clock, port, wait_s) if isinstance(clock, VehicleClock) else None
+            )
+            return _drive(settings, environment, port, clock, check, bar, vehicle)
 
 
 def _drive(
@@ -185,16 +176,30 @@ def _drive(
     clock: Clock,
     check: CommandCheck,
     bar: EpisodeBar,
+    vehicle: VehicleInLoop | None,
 ) -> dict[str, Any]:
-    runner = EpisodeRunner(environment, clock, port.session, port.publish_scene, bar.tick)
+    runner = EpisodeRunner(
+        environment,
+        clock,
+        port.session,
+        port.publish_scene,
+        bar.tick,
+        apply=vehicle.apply if vehicle else policy_action,
+        standing=settings.standing,
+    )
     results = []
     port.note_edge_counts()
     started_s = time.monotonic()
     for episode in range(settings.episodes):
+        if vehicle is not None:
+            vehicle.clock.wait_for_standstill()
         results.append(runner.run(episode, settings.seed + episode))
         bar.done(episode + 1)
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
+    unbelieved = Counter(port.edge_counts.unreadable)
+    if vehicle is not None:
+        unbelieved += vehicle.rejected()
     return make_report(
         results,
         runner.safe_stops.events,
@@ -206,9 +211,7 @@ def _drive(
             "missed_ticks": clock.missed_ticks,
             "wall_clock_stalls": clock.wall_clock_stalls,
             "edge_changes": port.edge_counts.changes,
-            **rejections(
-                port.edge_counts.rejected, check.rejected + Counter(port.edge_counts.unreadable)
-            ),
+            **rejections(port.edge_counts.rejected, check.rejected + unbelieved),
         },
         settings={
             "scenario": scenario_of(settings.env),
@@ -216,7 +219,10 @@ def _drive(
             "policy_ids": check.policy_ids,
             "seed": settings.seed,
             "clock": settings.clock,
+            "loop": settings.loop,
+            "standing": settings.standing,
             "latency_spec": str(settings.latency),
             "wall_s": wall_s,
         },
+        vehicle=vehicle.report() if vehicle else None,
     )

@@ -5,6 +5,7 @@ The same inputs give the same bytes: the archive says nothing of when, where and
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import tempfile
@@ -190,5 +191,6 @@ def _write(path: Path, manifest: Manifest, key: Ed25519PrivateKey, contents: dic
             stream.write(END)
         draft.replace(path)
     except OSError as error:
-        draft.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            draft.unlink()
         raise UserError(f"cannot write {path}: {error.strerror}") from None

@@ -109,7 +109,11 @@ def _verify(arguments: argparse.Namespace) -> Manifest:
     """The bundle's manifest: what the board would refuse is not sent."""
     pem = read_bytes(arguments.trust, "public key")
     try:
-        with open_bundle(arguments.bundle, ed25519.parse_public_key(pem)) as bundle:
+        key = ed25519.parse_public_key(pem)
+    except installer_errors.UserError as error:
+        raise UserError(f"public key {arguments.trust}: {error}") from None
+    try:
+        with open_bundle(arguments.bundle, key) as bundle:
             return bundle.manifest
     except installer_errors.UserError as error:
         raise UserError(str(error)) from None

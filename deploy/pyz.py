@@ -11,7 +11,10 @@ import deploy.installer
 NAME = "install.pyz"
 _FIRST_DAY = (1980, 1, 1, 0, 0, 0)
 _MAIN = (
-    "import sys\nfrom deploy.installer.__main__ import main\n\n"
+    "import sys\n\nif sys.version_info < (3, 8):\n"
+    '    sys.stderr.write("error: Python 3.8 or newer is needed: try python3.8\\n")\n'
+    "    sys.exit(2)\n\n"
+    "from deploy.installer.__main__ import main\n\n"
     'if __name__ == "__main__":\n    sys.exit(main(sys.argv[1:]))\n'
 )
 

@@ -67,7 +67,10 @@ def gather(target: Target, lock: Path, folder: Path) -> list[Path]:
 
 def download(target: Target, wanted: list[str], folder: Path) -> None:
     """`pip download` of wheels for another computer. Raises UserError with pip's own line."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot keep wheels in {folder}: {error.strerror}") from None
     platforms = [
         f"--platform=manylinux_2_{minor}_{target.machine}"
         for minor in _MANYLINUX

@@ -76,6 +76,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help=f"the vehicle to move besides (default: {_DEFAULTS.vehicle})",
     )
     parser.add_argument(
+        "--bus",
+        metavar="INTERFACE:CHANNEL",
+        help=f"the hunter's CAN bus, as python-can names it (default: {_DEFAULTS.bus})",
+    )
+    parser.add_argument(
         "--config", metavar="FILE.toml", help="settings; flags on the command line win over it"
     )
     parser.add_argument(

@@ -15,7 +15,12 @@ from edge_runtime.files import PathLike, read_bytes
 from edge_runtime.tls import check_fits
 from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
+from edge_runtime.vehicles.hunter.faults import PROFILES
+from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.registry import NONE, VEHICLE_NAMES
+from edge_runtime.vehicles.ros2.settings import Ros2Settings, check_settings
+from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
 
 MAX_PRIORITY = 99  # of SCHED_FIFO
 
@@ -37,6 +42,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     realtime_priority: int = 0
     cpus: List[int] = msgspec.field(default_factory=list)
     lock_memory: bool = False
+    bus: str = DEFAULT_BUS
+    hunter: HunterSettings = msgspec.field(default_factory=HunterSettings)
+    similarity: SimilaritySettings = msgspec.field(default_factory=SimilaritySettings)
+    ros2: Ros2Settings = msgspec.field(default_factory=Ros2Settings)
 
 
 def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
@@ -73,10 +82,12 @@ def _read(path: PathLike) -> Config:
 
 def _explain(text: str) -> str:
     """The sentence of msgspec with the key in front, and for an unknown key the known ones."""
-    if "unknown field" in text:
-        return f"{text}; known are {', '.join(Config.__struct_fields__)}"
     sentence, _, place = text.partition(" - at ")
-    return f"{place.strip('`').replace('$.', '')}: {sentence}" if place else text
+    table = place.strip("`").replace("$.", "")
+    if "unknown field" in text:
+        known = getattr(Config(), table, None) if table else Config()
+        sentence += f"; known are {', '.join(known.__struct_fields__)}" if known else ""
+    return f"{table}: {sentence}" if table else sentence
 
 
 def _is_wrong(config: Config) -> bool:
@@ -93,6 +104,11 @@ def _check(config: Config) -> None:
     check_fits(check_endpoint(config.connect), config.tls is not None)
     check_vehicle_id(config.vehicle_id)
     _check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
+    parse_bus(config.bus)
+    _check_choice("hunter.model", config.hunter.model, tuple(SPECS))
+    _check_choice("hunter.profile", config.hunter.profile, tuple(PROFILES))
+    _check_similarity(config.similarity)
+    check_settings(config.ros2)
     _check_choice("log_level", config.log_level, log.LEVELS)
     _check_choice("log_format", config.log_format, log.FORMATS)
     if not 0 <= config.realtime_priority <= MAX_PRIORITY:
@@ -102,6 +118,17 @@ def _check(config: Config) -> None:
         )
     if any(cpu < 0 for cpu in config.cpus) or len(set(config.cpus)) < len(config.cpus):
         raise UserError(f"cpus {config.cpus} is not valid: list each processor once, like [2, 3]")
+
+
+def _check_similarity(settings: SimilaritySettings) -> None:
+    numbers = {} if settings.car is None else msgspec.structs.asdict(settings.car)
+    if settings.scale is not None:
+        numbers["scale"] = settings.scale
+    for name, value in numbers.items():
+        # To the right, the full angle is below 0.
+        size = abs(value) if name == "full_steering_rad" else value
+        if not 0.0 < size < float("inf") or (name == "full_steering_rad" and size >= 1.5):
+            raise UserError(f"similarity: {name} {value} is not valid: it must be above 0")
 
 
 def _check_choice(key: str, value: str, known: Sequence[str]) -> None:

@@ -27,10 +27,10 @@ from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
 from edge_runtime.policy import Policy
-from edge_runtime.safety import MAX_INFERENCE_S, Mode, Safety
+from edge_runtime.safety import MAX_INFERENCE_S, Event, Mode, Safety
 from edge_runtime.sd_notify import Notifier
 from edge_runtime.vehicles.runner import VehicleRunner
-from edge_runtime.wire import TOPICS, Command, Health, Rejection, decode_state
+from edge_runtime.wire import MAX_TEXT_CHARS, TOPICS, Command, Health, Rejection, decode_state
 
 _HEALTH_PERIOD_S = 1.0 / TOPICS["health"].rate_hz
 _JOIN_S = 0.5
@@ -139,6 +139,7 @@ class ControlLoop:
                 uptime_s=time.monotonic() - self._started_s,
                 sent_ns=time.time_ns(),
                 rivals=self._link.rivals,
+                vehicle_fault=self._controller.vehicle_fault[:MAX_TEXT_CHARS],
                 **self._board.last._asdict(),
             )
 
@@ -199,8 +200,13 @@ class ControlLoop:
 
     def _rearm(self) -> str:
         with self._lock:
-            self._look_at_vehicle(time.monotonic())
-            refusal = self._hold.refusal() or self._controller.rearm(time.monotonic())
+            now_s = time.monotonic()
+            if self._vehicle is not None:
+                # What stopped it and is over ends with `enable`; the next look says if it did.
+                self._controller.vehicle_fault = self._vehicle.standing_fault(now_s)
+            refusal = self._hold.refusal() or self._controller.rearm(now_s)
+            if not refusal and self._vehicle is not None:
+                self._vehicle.enable()
             log.event("info", "rearm", accepted=not refusal, detail=refusal)
             return refusal
 
@@ -235,7 +241,10 @@ class ControlLoop:
         )
         self._link.send("command", command)
         if self._vehicle is not None:
-            self._vehicle.command(command)
+            # The end of an episode is no fault; and a stop that is repeated between the re-arm
+            # and the first fresh state must not take back what the re-arm has given.
+            ends = order.reason == Event.FINAL.value or self._controller.safety.rearmed
+            self._vehicle.command(command, state.speed_mps, latch=not ends)
 
     def _log_transition(self) -> None:
         safety = self._controller.safety

@@ -83,6 +83,9 @@ class Feedback(msgspec.Struct, frozen=True, kw_only=True):
     """What the vehicle does. `action` is what the actuators have reached, not what was asked.
 
     `episode` and `step` are those of the last command taken (-1 before the first one).
+    `speed_mps` and `commanded_speed_mps` (what a vehicle that takes a speed is asked for now) are
+    the vehicle's own; `scenario_speed_mps` is the speed of the scenario's car by the similarity.
+    These two and `battery_v` are None where the driver does not know them.
     """
 
     vehicle: str
@@ -95,6 +98,9 @@ class Feedback(msgspec.Struct, frozen=True, kw_only=True):
     self_braking: bool
     faults: List[str]
     sent_ns: int
+    scenario_speed_mps: Optional[float] = None
+    commanded_speed_mps: Optional[float] = None
+    battery_v: Optional[float] = None
     schema: int = SCHEMA
 
 
@@ -105,6 +111,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     p99 and max over the last 1,024 (0 before the first). `superseded` counts accepted states that
     a newer one replaced before the policy took them, `rivals` other runtimes that were seen under
     this vehicle id. `temperature_c` is the board's hottest sensor, None where it has none.
+    `vehicle_fault` is what is wrong with the vehicle in words, empty if nothing.
     """
 
     vehicle_id: str
@@ -126,6 +133,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     load_1min: float = 0.0
     rss_mb: float = 0.0
     rivals: int = 0
+    vehicle_fault: str = ""
     schema: int = SCHEMA
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import os
 import signal
 import sys
-from typing import Any, Callable, Optional
+from typing import Any, Callable, Iterator, Optional
 
 from edge_runtime import access, log, presence, realtime
 from edge_runtime.config import Config, load_config
@@ -21,7 +22,7 @@ from edge_runtime.sd_notify import Notifier
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.interface import Vehicle
-from edge_runtime.vehicles.registry import make_vehicle
+from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle
 from edge_runtime.vehicles.runner import VehicleRunner
 from edge_runtime.wire import key
 
@@ -55,13 +56,30 @@ def _run(config: Config) -> int:
     stop = StopSignal()
     tls = _certificate(config)
     realtime.configure(config.realtime_priority, config.cpus, config.lock_memory)
-    vehicle = make_vehicle(config.vehicle)
     policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
-    rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
+    vehicle = _vehicle(config, policy)
+    with _closed_on_error(vehicle):
+        rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
     controller = Controller(rows, vehicle is not None, config.armed_at_start)
-    if stop.came:
-        return 0
     return _serve(config, tls, policy, controller, vehicle, stop)
+
+
+@contextlib.contextmanager
+def _closed_on_error(vehicle: Optional[Vehicle]) -> Iterator[None]:
+    """For what may fail while the vehicle has no runner yet, who would close it."""
+    try:
+        yield
+    except BaseException:
+        if vehicle is not None:
+            vehicle.close()
+        raise
+
+
+def _vehicle(config: Config, policy: Policy) -> Optional[Vehicle]:
+    setup = VehicleSetup(
+        policy.manifest.scenario, config.bus, config.hunter, config.similarity, config.ros2
+    )
+    return make_vehicle(config.vehicle, setup)
 
 
 def _certificate(config: Config) -> Optional[TlsFiles]:
@@ -82,18 +100,19 @@ def _serve(
     def open_client() -> Any:
         return open_session(connect=config.connect, mode="client", tls=tls)
 
-    alive = key(config.vehicle_id, "alive")
-    router_is_there = presence.require_free(open_client, alive, config.vehicle_id)
     notifier = Notifier()
-    rules = None if tls is None else access.rules_for_edge(config.vehicle_id)
-    session = open_session(connect=config.connect, mode="peer", tls=tls, access=rules)
-    try:
-        link = Link(session, config.vehicle_id, policy.manifest)
-        runner = _attach(vehicle, policy, link)
-        loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold))
-    except BaseException:
-        session.close()  # An open session would hang the process at its exit.
-        raise
+    with _closed_on_error(vehicle):
+        alive = key(config.vehicle_id, "alive")
+        router_is_there = presence.require_free(open_client, alive, config.vehicle_id)
+        rules = None if tls is None else access.rules_for_edge(config.vehicle_id)
+        session = open_session(connect=config.connect, mode="peer", tls=tls, access=rules)
+        try:
+            link = Link(session, config.vehicle_id, policy.manifest)
+            runner = _attach(vehicle, policy, link)
+            loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold))
+        except BaseException:
+            session.close()  # An open session would hang the process at its exit.
+            raise
     taken = []
 
     def give_way() -> None:
@@ -107,7 +126,7 @@ def _serve(
     gc.freeze()
     try:
         if runner is not None:
-            runner.start()
+            runner.start(config.armed_at_start)
         loop.start()
         if router_is_there:
             presence.wait_for_router(session)

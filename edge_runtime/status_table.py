@@ -11,6 +11,7 @@ _ROWS: List[_Row] = [
     ("vehicle", lambda s: f"{s['vehicle_id']}, driver {s['vehicle']}"),
     ("mode", lambda s: _mode(s)),
     ("states", lambda s: f"{s['accepted']} accepted, {s['superseded']} superseded by newer ones"),
+    ("vehicle fault", lambda s: s.get("vehicle_fault") or "none"),
     ("rejected", lambda s: _counts(s["rejected"])),
     ("safe stops", lambda s: str(s["safe_stops"])),
     ("deadline misses", lambda s: str(s["deadline_misses"])),

@@ -36,6 +36,7 @@ __all__ = [
     "FRAMES_BYTES",
     "FRAMES_SHAPE",
     "MAX_PAYLOAD_BYTES",
+    "MAX_TEXT_CHARS",
     "SAFE_STOP",
     "SCHEMA",
     "TOPICS",

@@ -38,8 +38,8 @@ def environment():
     environment.close()
 
 
-def run(environment, clock):
-    runner = EpisodeRunner(environment, clock, "here", lambda *_: None, lambda *_: None)
+def run(environment, clock, **options):
+    runner = EpisodeRunner(environment, clock, "here", lambda *_: None, lambda *_: None, **options)
     return runner, runner.run(0, seed=3)
 
 
@@ -73,3 +73,10 @@ def test_a_new_episode_starts_with_the_brake_released(environment):
     clock.drive = 10_000
     run(environment, clock)
     assert clock.states[10].speed_mps > 3.5
+
+
+@pytest.mark.parametrize(("options", "speed_mps"), [({}, 5.0), ({"standing": True}, 0.0)])
+def test_an_episode_starts_from_a_stand_where_that_is_asked_for(environment, options, speed_mps):
+    clock = ScriptedClock()
+    run(environment, clock, **options)
+    assert clock.states[0].speed_mps == pytest.approx(speed_mps, abs=1.0)

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,20 +74,22 @@ class Board:
         self.root = root
         self.kit = kit
 
-    def start(self, command: str, *arguments: object) -> subprocess.Popen[str]:
+    def start(
+        self, command: str, *arguments: object, prefix: Sequence[str] = ()
+    ) -> subprocess.Popen[str]:
         """The installer as a process of its own, with its output."""
         line = [
-            self.kit.python, "-I", str(self.kit.installer), command, "--root", str(self.root),
-            *map(str, arguments),
+            *prefix, self.kit.python, "-I", str(self.kit.installer), command,
+            "--root", str(self.root), *map(str, arguments),
         ]  # fmt: skip
         return subprocess.Popen(
             line, text=True, start_new_session=True,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
 
-    def run(self, command: str, *arguments: object) -> tuple[int, str]:
+    def run(self, command: str, *arguments: object, prefix: Sequence[str] = ()) -> tuple[int, str]:
         """Its exit status and all that it said."""
-        process = self.start(command, *arguments)
+        process = self.start(command, *arguments, prefix=prefix)
         out, err = process.communicate()
         return process.returncode, out + err
 

@@ -127,6 +127,7 @@ def test_without_a_private_key_nothing_is_signed(workshop, tmp_path):
         ["--target", "jetpack5", "--policy", "missing.onnx"],
         ["--target", "jetpack5", "--key", "missing.key"],
         ["--target", "jetpack5", "--tls", "nowhere"],
+        ["--target", "jetpack5", "--wheels", "/dev/null/wheels"],
     ],
 )
 def test_a_mistake_is_one_line_before_anything_is_downloaded(
@@ -146,3 +147,9 @@ def run_one(argv: list[str]) -> int:
         return run_cli(main, argv)
     except SystemExit as error:
         return int(error.code or 0)
+
+
+def test_an_out_that_is_a_file_is_said(workshop, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write"):
+        make_bundle(workshop.inputs(), HERE, tmp_path / "file")

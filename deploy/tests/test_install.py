@@ -12,7 +12,7 @@ from deploy.tests.boards import Board, changed_wheel
 from edge_runtime.tests.harness import Simulator, make_state, wait_until
 
 NOTIFY, RUN = "edge_runtime/sd_notify.py", "edge_runtime/run_command.py"
-MOCK = "edge_runtime/vehicles/mock.py"
+MOCK = "edge_runtime/vehicles/mock/vehicle.py"
 WITH_VEHICLE = """\
             if config.vehicle != "none":
                 import threading
@@ -27,7 +27,7 @@ IN_TRIAL = {
 }
 AS_SERVICE = {
     "it answers for a while, then ends": (RUN, "            loop.run()", WITH_VEHICLE),
-    "it cannot open the vehicle": (MOCK, "        self._now_s = now_s\n", "        1 / 0\n"),
+    "it cannot open the vehicle": (MOCK, "self._state = MockState()", "1 / 0"),
 }
 """Faults that show only with the vehicle, which the trial does without."""
 

@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Sequence
 
+import zenoh
+
 from edge_runtime import wire
 from edge_runtime.operator_commands import ask
 from edge_runtime.transport import open_session
@@ -120,9 +122,13 @@ class Simulator:
         wait_until(lambda: self.health, "a health message")
 
     def send(self, state: Any) -> None:
-        """Publish a State, or bytes as they are."""
+        """Publish a State, or bytes as they are; all arrive, on however busy a machine."""
         payload = state if isinstance(state, bytes) else wire.encode(state)
-        self._session.put(wire.key(self.vehicle_id, "state"), payload)
+        self._session.put(
+            wire.key(self.vehicle_id, "state"),
+            payload,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
 
     def ask(self, state: State, timeout_s: float = PATIENCE_S) -> Command:
         """Send a state and wait for the command that answers it, dropping all before."""

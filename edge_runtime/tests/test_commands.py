@@ -57,7 +57,7 @@ def test_policies_that_may_not_drive(tmp_path, command):
         (["run"], ["--policy"]),
         (["run", "--policy", "absent.onnx"], ["absent.onnx", "does not exist"]),
         (["run", "--policy", "p.onnx", "--vehicle", "tank"], ["tank", "none, mock, hunter"]),
-        (["run", "--policy", "p.onnx", "--vehicle", "hunter"], ["not built yet"]),
+        (["run", "--policy", "p.onnx", "--bus", "can0"], ["can0", "socketcan:can0"]),
         (["run", "--policy", "p.onnx", "--connect", "localhost"], ["tcp/127.0.0.1:7447"]),
         (["run", "--policy", "p.onnx", "--vehicle-id", "a/b"], ["a/b"]),
         (["run", "--policy", "p.onnx", "--config", "absent.toml"], ["absent.toml"]),
@@ -97,6 +97,13 @@ def test_status_with_a_simulator_but_no_edge():
         ("cpus = 'all'", "cpus: Expected `array"),
         ("connect = 'localhost'", "localhost.*write it as"),
         ("vehicle_id = 'a/b'", "a/b"),
+        ("bus = 'can0'", "bus 'can0'.*INTERFACE:CHANNEL"),
+        ("[hunter]\nmodel = '3.0'", "hunter.model '3.0'.*2.0, se"),
+        ("[hunter]\nprofile = 'v9'", "hunter.profile 'v9'.*v2, manual"),
+        ("[hunter]\nspeed = 3", "unknown field `speed`"),
+        ("[similarity]\nscale = 0.0", "scale 0.0.*above 0"),
+        ("[similarity]\nscale = nan", "scale nan.*above 0"),
+        ("[similarity.car]\nthrottle_mps2 = 1.0", "brake_mps2"),
     ],
 )
 def test_wrong_config_files(tmp_path, text, match):
@@ -129,7 +136,7 @@ def test_the_example_config_holds_every_key_at_its_default():
     config = load_config(example, {})
     assert config == Config(policy="results/policies/left_turn.onnx")
     text = example.read_text()
-    assert all(f"{name} =" in text for name in Config.__struct_fields__)
+    assert all(f"{name} =" in text or f"[{name}]" in text for name in Config.__struct_fields__)
 
 
 def test_a_busy_port_is_named():

@@ -176,6 +176,8 @@ def test_silence_begins_after_two_periods_and_one_lost_state_is_none():
     assert is_silent(Safety(), 0.0)
     assert not is_silent(safety, 10.21)
     assert is_silent(safety, 10.221)
+    # A state exactly as old as the limit is still in time.
+    assert not is_silent(Safety(last_fresh_s=0.0), SILENCE_S)
 
 
 @given(st.lists(st.sampled_from(Event)), st.booleans())

@@ -28,6 +28,8 @@ class BrokenVehicle(MockVehicle):
         super().__init__()
         self.broken = ""
         self.asked: list = []
+        self.says: list = []
+        self.stands: list = []
         self.hangs = threading.Event()
         self.released = threading.Event()
 
@@ -37,15 +39,21 @@ class BrokenVehicle(MockVehicle):
         if self.broken == "hang":
             self.hangs.set()
             self.released.wait()
-        return super().feedback(now_s)
+        report = super().feedback(now_s)
+        return report._replace(faults=list(self.says), standing=list(self.stands))
 
-    def command(self, action, now_s):
+    def enable(self, now_s):
+        self._ask("enable")
+        super().enable(now_s)
+
+    def command(self, action, now_s, scenario_speed_mps=None):
         self._ask("command")
-        super().command(action, now_s)
+        self.scenario_speed_mps = scenario_speed_mps
+        super().command(action, now_s, scenario_speed_mps)
 
-    def brake(self, now_s):
-        self._ask("brake")
-        super().brake(now_s)
+    def brake(self, now_s, latch=True):
+        self._ask("brake" if latch else "stand")
+        super().brake(now_s, latch)
 
     def _ask(self, what):
         self.asked.append(what)
@@ -70,6 +78,8 @@ def vehicle():
 def runner(vehicle):
     runner = NotingRunner(vehicle)
     runner.start()
+    assert vehicle.asked == ["enable"]
+    vehicle.asked.clear()
     yield runner
     vehicle.released.set()
     runner.close()
@@ -118,3 +128,63 @@ def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner):
     runner._thread.join(10.0)
     runner.close()
     assert vehicle.asked == ["brake"]
+
+
+def test_a_drivers_words_are_a_fault_until_it_is_enabled_again(vehicle, runner):
+    vehicle.says = ["the remote control drives"]
+    vehicle.stands = ["the remote control drives"]
+    wait_until(lambda: runner.fault(time.monotonic()) == "the remote control drives", "the fault")
+    wait_until(lambda: runner.standing_fault(time.monotonic()), "its cause")
+    vehicle.stands = []
+    wait_until(lambda: not runner.standing_fault(time.monotonic()), "the end of its cause")
+    assert runner.fault(time.monotonic()) == "the remote control drives"
+    assert runner.heard[-1].faults == ["the remote control drives"]
+    vehicle.says = []
+    runner.enable()
+    assert runner.fault(time.monotonic()) == ""  # at once: the vehicle shall have its chance
+    wait_until(lambda: vehicle.asked == ["enable"], "the driver to be asked")
+
+
+def test_a_stop_from_before_the_rearm_does_not_undo_it(vehicle, runner):
+    vehicle.broken = "hang"
+    assert vehicle.hangs.wait(10.0)
+    runner.command(make_command("safe_stop"))
+    runner.enable()
+    runner.command(make_command("safe_stop", step=1), latch=False)
+    vehicle.broken = ""
+    vehicle.released.set()
+    wait_until(lambda: vehicle.asked == ["enable", "stand"], "the order of things")
+
+
+def test_a_stop_after_the_rearm_does_undo_it(vehicle, runner):
+    runner.enable()
+    runner.command(make_command("safe_stop"))
+    wait_until(lambda: vehicle.asked == ["enable", "brake"], "both")
+
+
+def test_a_command_that_waited_too_long_moves_nothing(vehicle, runner):
+    vehicle.broken = "hang"
+    assert vehicle.hangs.wait(10.0)
+    runner.command(make_command())
+    time.sleep(0.3)
+    vehicle.broken = ""
+    vehicle.released.set()
+    count = len(runner.heard)
+    wait_until(lambda: len(runner.heard) > count + 1, "feedback again")
+    assert vehicle.asked == []
+    runner.command(make_command(step=1), scenario_speed_mps=4.5)
+    wait_until(lambda: vehicle.asked == ["command"], "a fresh one to be obeyed")
+    assert vehicle.scenario_speed_mps == 4.5
+
+
+def test_a_vehicle_that_is_not_armed_is_not_enabled(vehicle):
+    runner = NotingRunner(vehicle)
+    runner.start(armed=False)
+    wait_until(lambda: runner.heard, "feedback")
+    assert vehicle.asked == []
+    runner.close()
+
+
+def test_words_that_are_too_long_for_the_wire_are_cut(vehicle, runner):
+    vehicle.says = ["x" * 1000]
+    wait_until(lambda: runner.heard and runner.heard[-1].faults == ["x" * 256], "feedback")

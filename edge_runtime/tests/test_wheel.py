@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 import subprocess
 import sys
 import zipfile
@@ -66,7 +67,7 @@ def test_the_wheel_holds_only_the_runtime(wheel):
         "phil_edge_runtime",
     }
     assert not [name for name in names if "/tests/" in name or "conftest" in name]
-    assert {"edge_runtime/__main__.py", "edge_runtime/vehicles/mock.py"} <= set(names)
+    assert {"edge_runtime/__main__.py", "edge_runtime/vehicles/mock/vehicle.py"} <= set(names)
     assert "edge_runtime/config.example.toml" in names
     assert "edge_runtime/py.typed" in names
 
@@ -91,6 +92,18 @@ def test_the_boards_python_and_versions(wheel, make_policy, tmp_path):
     report = json.loads(checked.stdout)
     assert report["policy_id"] == signed.policy_id
     assert report["onnxruntime"] == "1.19.2"
+    # The optional ROS 2 messages, too, in the same bytes.
+    twist = "Twist(Vector3(1.5), Vector3(0.0, 0.0, 0.5))"
+    code = (
+        "from edge_runtime.ros2 import cdr; from edge_runtime.ros2.messages import *;"
+        f" m = {twist}; b = cdr.encode(m); assert cdr.decode(b, Twist) == m; print(b.hex())"
+    )
+    written = subprocess.run(
+        [python, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    assert (written.stdout.strip(), written.stderr) == (
+        "00010000" + struct.pack("<6d", 1.5, 0, 0, 0, 0, 0.5).hex(), ""
+    )  # fmt: skip
     # The board's Zenoh against the workstation's, over the wire.
     endpoint = free_endpoint()
     flags = (*signed.flags, "--connect", endpoint)

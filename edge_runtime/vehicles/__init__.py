@@ -1,1 +1,1 @@
-"""Vehicle drivers: the interface, one file for each vehicle, and the thread that runs one."""
+"""Vehicle drivers: the interface, one folder for each vehicle, and the thread that runs one."""

@@ -2,27 +2,79 @@
 
 from __future__ import annotations
 
-from typing import Callable, Dict, Optional
+from typing import Callable, Dict, NamedTuple, Optional
+
+import msgspec
 
 from edge_runtime.errors import UserError
+from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
+from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.interface import Vehicle
 from edge_runtime.vehicles.mock import MockVehicle
+from edge_runtime.vehicles.ros2.settings import Ros2Settings
+from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
+from edge_runtime.vehicles.similarity import ScenarioCar, Similarity, car_of, similarity_to
 
 NONE = "none"
 
 
-def _hunter() -> Vehicle:
-    raise UserError("the driver for the hunter is not built yet; use --vehicle mock or none")
+class VehicleSetup(NamedTuple):
+    """What a driver is made from: the policy's scenario, and the settings of all vehicles."""
+
+    scenario: str = ""
+    bus: str = DEFAULT_BUS
+    hunter: HunterSettings = HunterSettings()
+    similarity: SimilaritySettings = SimilaritySettings()
+    ros2: Ros2Settings = Ros2Settings()
 
 
-_MAKERS: Dict[str, Callable[[], Vehicle]] = {"mock": MockVehicle, "hunter": _hunter}
+def _mock(setup: VehicleSetup) -> Vehicle:
+    return MockVehicle()
+
+
+def _hunter(setup: VehicleSetup) -> Vehicle:
+    # Imported here: its thread and its bus are for those who have one.
+    from edge_runtime.vehicles.hunter.vehicle import HunterVehicle
+
+    spec = SPECS[setup.hunter.model]
+    similarity = make_similarity(setup, "hunter", spec.max_speed_mps)
+    return HunterVehicle(parse_bus(setup.bus), spec, setup.hunter.profile, similarity)
+
+
+def _ros2(setup: VehicleSetup) -> Vehicle:
+    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle  # As above; and it needs pycdr2.
+
+    spec = SPECS[setup.ros2.model]
+    similarity = make_similarity(setup, "ros2", spec.max_speed_mps)
+    return Ros2Vehicle(setup.ros2, spec, similarity)
+
+
+_MAKERS: Dict[str, Callable[[VehicleSetup], Vehicle]] = {
+    "mock": _mock,
+    "hunter": _hunter,
+    "ros2": _ros2,
+}
 VEHICLE_NAMES = (NONE, *_MAKERS)
 
 
-def make_vehicle(name: str) -> Optional[Vehicle]:
-    """The driver of that name; None for "none". Raises UserError for any other name."""
+def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Optional[Vehicle]:
+    """The driver of that name; None for "none". Nothing is sent before it is enabled.
+
+    Raises UserError for any other name, for a scenario that the vehicle cannot follow, and where
+    what it hangs on cannot be opened.
+    """
     if name == NONE:
         return None
     if name not in _MAKERS:
         raise UserError(f"vehicle {name!r} is not known; choose from {', '.join(VEHICLE_NAMES)}")
-    return _MAKERS[name]()
+    return _MAKERS[name](setup or VehicleSetup())
+
+
+def make_similarity(setup: VehicleSetup, name: str, max_speed_mps: float) -> Similarity:
+    """From the policy's car to a vehicle of this name and top speed. Raises UserError."""
+    settings = setup.similarity
+    if settings.car is not None:
+        car = ScenarioCar(**msgspec.structs.asdict(settings.car))
+    else:
+        car = car_of(setup.scenario, name)
+    return similarity_to(car, max_speed_mps, settings.scale)

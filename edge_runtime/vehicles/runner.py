@@ -8,15 +8,24 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Callable, Optional, Sequence
+from typing import Callable, List, NamedTuple, Optional, Sequence, Tuple
 
 from edge_runtime import log
 from edge_runtime.vehicles.interface import Vehicle, VehicleReport
-from edge_runtime.vehicles.watch import SILENT, VehicleWatch
-from edge_runtime.wire import SAFE_STOP, TOPICS, Command, Feedback
+from edge_runtime.vehicles.watch import SILENCE_S, SILENT, VehicleWatch
+from edge_runtime.wire import MAX_TEXT_CHARS, SAFE_STOP, TOPICS, Command, Feedback
 
 _PERIOD_S = 1.0 / TOPICS["feedback"].rate_hz
 _JOIN_S = 0.5
+
+
+class _Task(NamedTuple):
+    """A command, and what the vehicle needs besides."""
+
+    command: Command
+    scenario_speed_mps: Optional[float]
+    latch: bool
+    given_s: float
 
 
 class VehicleRunner:
@@ -35,8 +44,10 @@ class VehicleRunner:
         self._watch = VehicleWatch()
         self._refuses = False  # the driver raised at the newest command
         self._failing = False
-        self._next: Optional[Command] = None  # the newest, until the driver takes it
+        self._next: Optional[_Task] = None  # the newest, until the driver takes it
         self._last: Optional[Command] = None
+        self._report_seen: Optional[VehicleReport] = None
+        self._enable_due = False
         self._stopping = False
         self._due = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
@@ -53,19 +64,45 @@ class VehicleRunner:
 
     def fault(self, now_s: float) -> str:
         """What is wrong with the vehicle, empty if nothing. Waits for nobody."""
-        return SILENT if self._refuses else self._watch.fault(now_s)
+        with self._due:
+            if self._enable_due:
+                return self._seen_fault(now_s)
+        seen = self._report_seen
+        return self._seen_fault(now_s) or (seen.faults[0] if seen and seen.faults else "")
 
-    def start(self) -> None:
-        """Enable the vehicle and start its feedback."""
+    def standing_fault(self, now_s: float) -> str:
+        """What enabling the vehicle now would not end, empty if nothing. Waits for nobody."""
+        seen = self._report_seen
+        return self._seen_fault(now_s) or (seen.standing[0] if seen and seen.standing else "")
+
+    def start(self, armed: bool = True) -> None:
+        """Start the vehicle's feedback, and enable it unless that is to wait for an operator."""
         now_s = time.monotonic()
-        self._vehicle.enable(now_s)
+        if armed:
+            self._vehicle.enable(now_s)
         self._watch.begin(now_s)
         self._thread.start()
 
-    def command(self, command: Command) -> None:
-        """Hand on a command, in place of one that the driver has not taken yet. Never waits."""
+    def enable(self) -> None:
+        """Have the vehicle enabled again: an operator has re-armed it. Never waits.
+
+        Its old faults no longer count; a command that is still on its way is dropped, because a
+        stop from before would undo it.
+        """
         with self._due:
-            self._next = command
+            self._enable_due, self._next = True, None
+            self._due.notify()
+
+    def command(
+        self, command: Command, scenario_speed_mps: Optional[float] = None, latch: bool = True
+    ) -> None:
+        """Hand on a command, in place of one that the driver has not taken yet. Never waits.
+
+        `scenario_speed_mps` is that of the state it answers. A safe stop with `latch` False may
+        be followed by a drive without `enable`.
+        """
+        with self._due:
+            self._next = _Task(command, scenario_speed_mps, latch, time.monotonic())
             self._due.notify()
 
     def close(self) -> None:
@@ -87,34 +124,48 @@ class VehicleRunner:
     def _run(self) -> None:
         next_s = time.monotonic()
         while not self._stopping:
-            command = self._wait(next_s)
-            if command is not None:
-                self._obey(command)
+            enables, task = self._wait(next_s)
+            if enables:
+                self._enable()
+            if task is not None:
+                self._obey(task)
             now_s = time.monotonic()
             if now_s >= next_s:
                 # Absolute deadlines; after a long pause one report, not one for each missed period.
                 next_s = max(next_s + _PERIOD_S, now_s)
                 self._report()
 
-    def _wait(self, until_s: float) -> Optional[Command]:
-        """The newest command as soon as there is one; None when it is time, or it ends."""
+    def _wait(self, until_s: float) -> Tuple[bool, Optional[_Task]]:
+        """Whether to enable, and then the newest command; as soon as there is one, or at a time."""
         with self._due:
             pause_s = max(0.0, until_s - time.monotonic())
-            self._due.wait_for(lambda: self._next is not None or self._stopping, pause_s)
-            command, self._next = self._next, None
-            return command
+            self._due.wait_for(
+                lambda: self._next is not None or self._enable_due or self._stopping, pause_s
+            )
+            task, self._next = self._next, None
+            return self._enable_due, task
 
-    def _obey(self, command: Command) -> None:
+    def _enable(self) -> None:
+        try:
+            self._vehicle.enable(time.monotonic())
+        except Exception as error:  # as in _obey; its report goes on saying what is wrong
+            log.event("error", "not_enabled", detail=error)
+        else:
+            self._ask()
+        with self._due:
+            self._enable_due = False
+
+    def _obey(self, task: _Task) -> None:
         """Ask the driver. A safe stop's mode alone means brake."""
-        self._last = command
+        self._last = command = task.command
         now_s = time.monotonic()
         action = dict(zip(self._action_names, command.action))
         self._watch.command(action, now_s)
         try:
             if command.mode == SAFE_STOP:
-                self._vehicle.brake(now_s)
-            else:
-                self._vehicle.command(action, now_s)
+                self._vehicle.brake(now_s, task.latch)
+            elif now_s - task.given_s <= SILENCE_S:  # a driver that hung must not obey the past
+                self._vehicle.command(action, now_s, task.scenario_speed_mps)
         except Exception as error:  # a driver may raise anything; its thread must live on
             if not self._refuses:
                 log.event("error", "not_obeyed", detail=error)
@@ -131,6 +182,9 @@ class VehicleRunner:
         if report is not None:
             self._publish(self._feedback(report, self._last, fault))
 
+    def _seen_fault(self, now_s: float) -> str:
+        return SILENT if self._refuses else self._watch.fault(now_s)
+
     def _ask(self) -> Optional[VehicleReport]:
         """The vehicle's report; None where the driver fails, which is silence like any other."""
         try:
@@ -141,6 +195,7 @@ class VehicleRunner:
             self._failing = True
             return None
         self._failing = False
+        self._report_seen = report
         self._watch.report(report, time.monotonic())
         return report
 
@@ -154,6 +209,15 @@ class VehicleRunner:
             action=[report.action.get(name, 0.0) for name in self._action_names],
             speed_mps=report.speed_mps,
             self_braking=report.self_braking,
-            faults=[*report.faults, fault] if fault else report.faults,
+            faults=_texts(report.faults, fault),
             sent_ns=time.time_ns(),
+            scenario_speed_mps=report.scenario_speed_mps,
+            commanded_speed_mps=report.commanded_speed_mps,
+            battery_v=report.battery_v,
         )
+
+
+def _texts(faults: Sequence[str], fault: str) -> List[str]:
+    """All faults once, none longer than the wire takes."""
+    every = [*faults, fault] if fault and fault not in faults else faults
+    return [text[:MAX_TEXT_CHARS] for text in every]

@@ -13,6 +13,7 @@ from typing import Deque, Dict, Optional, Tuple
 from edge_runtime.vehicles.interface import VehicleReport
 from edge_runtime.wire import CONTROL_PERIOD_S
 
+PEDAL = "pedal"
 SILENT, STUCK, LYING = "vehicle_silent", "vehicle_stuck", "vehicle_lying"
 SILENCE_S = 2 * CONTROL_PERIOD_S
 LAG_S = 3 * CONTROL_PERIOD_S  # an actuator may still follow a command of this age
@@ -86,6 +87,8 @@ class VehicleWatch:
         if not self._asked or report.self_braking or self._asked[0][0] > now_s - LAG_S:
             return False  # It obeys nobody yet, or has had no time to.
         for name, value in report.action.items():
+            if name == PEDAL and report.commanded_speed_mps is not None:
+                continue  # worked out from a speed, whose limits it cannot know: the driver judges
             asked = [action[name] for _, action in self._asked if name in action]
             if asked and not min(asked) - DEVIATION <= value <= max(asked) + DEVIATION:
                 return True

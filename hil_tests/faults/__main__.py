@@ -15,7 +15,7 @@ def main(argv: list[str]) -> int:
     """Run rows of the table and print it; 0 where every limit was kept, else 1."""
     parser = ArgumentParser(prog="python -m hil_tests.faults", description="The fault campaign.")
     parser.add_argument("--tries", type=positive, default=3, help="of each fault")
-    parser.add_argument("--rows", help="names with commas between (all if not given)")
+    parser.add_argument("--rows", help="names or patterns (hunter_*), commas between")
     parser.add_argument("--policy", type=Path, help="policy file (the left turn's if not given)")
     parser.add_argument("--jobs", type=positive, default=2, help="rigs at once")
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")

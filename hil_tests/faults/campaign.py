@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fnmatch
 import tempfile
 import threading
 from collections import Counter
@@ -16,7 +17,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try
-from hil_tests.faults.slow_policy import write_slow, write_steady
+from hil_tests.faults.slow_policy import write_full, write_mean, write_slow, write_steady
 from hil_tests.faults.table import ROWS
 from hil_tests.faults.timeline import longest_gap_s, spread_ms, unsafe_commands
 
@@ -53,7 +54,7 @@ def run_faults(
 
     Args:
         tries: of each row.
-        rows: names of the table's rows; None for all.
+        rows: names of the table's rows, or patterns of them (``hunter_*``); None for all.
         policy: an exported policy; None for the repository's own left turn.
         on_progress: called after every try.
         jobs: rigs at once; rows that need the machine for themselves run after the others.
@@ -91,7 +92,9 @@ class _Campaign:
         self._done, self._total = 0, sum(self._tries_of(row) for row in rows)
         self._lock = threading.Lock()
         self._policies = {"given": _trusted(policy)}
-        makers = {"slow": write_slow, "steady": write_steady}
+        makers = {
+            "slow": write_slow, "steady": write_steady, "full": write_full, "mean": write_mean,
+        }  # fmt: skip
         for kind in {row.policy for row in rows} & set(makers):
             path = work / f"{kind}.onnx"
             makers[kind](path)
@@ -155,10 +158,10 @@ def _judge(row: Row, rig: Rig, outcome: Outcome) -> None:
 
 
 def check_rows(names: Sequence[str]) -> None:
-    """Raise UserError for a name that the table does not hold."""
+    """Raise UserError for a name that the table does not hold, or a pattern that fits none."""
     known = [row.name for row in ROWS]
     for name in names:
-        if name not in known:
+        if not fnmatch.filter(known, name):
             raise UserError(f"no fault {name!r}; choose from {', '.join(known)}")
 
 
@@ -166,7 +169,7 @@ def _choose(names: Sequence[str] | None) -> list[Row]:
     if names is None:
         return list(ROWS)
     check_rows(names)
-    return [row for name in names for row in ROWS if row.name == name]
+    return [row for row in ROWS if any(fnmatch.fnmatch(row.name, name) for name in names)]
 
 
 def _trusted(policy: Path | None) -> list[str]:

@@ -91,7 +91,11 @@ class Probe:
         )
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
-        self.timeline.feedback_s.append(time.monotonic())
+        seen_s = time.monotonic()
+        self.timeline.feedback_s.append(seen_s)
+        feedback = wire.decode_feedback(bytes(sample.payload))
+        if isinstance(feedback, wire.Feedback):
+            self.timeline.named += [(seen_s, words) for words in feedback.faults]
 
     def _on_health(self, sample: zenoh.Sample) -> None:
         health = wire.decode_health(bytes(sample.payload))

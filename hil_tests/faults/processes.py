@@ -17,12 +17,16 @@ _CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Pytho
 
 
 class Process:
-    """``python -m ARGUMENTS``; ``on_line(monotonic_s, line)`` hears stdout and stderr."""
+    """``python -m ARGUMENTS``; ``on_line(monotonic_s, line)`` hears stdout and stderr.
+
+    ``told``: it reads its standard input, and `tell` writes there.
+    """
 
     def __init__(
         self,
         *arguments: str,
         environment: Mapping[str, str] | None = None,
+        told: bool = False,
         on_line: Callable[[float, str], None] = lambda seen_s, line: None,
     ) -> None:
         self.lines: list[tuple[float, str]] = []
@@ -30,7 +34,7 @@ class Process:
         self._on_line = on_line
         self._process = subprocess.Popen(
             [sys.executable, "-m", *arguments],
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE if told else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -53,6 +57,12 @@ class Process:
                 timeout_s,
             )
         )
+
+    def tell(self, line: str) -> None:
+        """Write a line to its standard input."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal."""

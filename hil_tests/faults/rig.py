@@ -1,6 +1,6 @@
 """A drive to be disturbed: edge runtime, simulator and, where a row asks, a link or a router.
 
-    edge process -- [link | router process] -- probe -- simulator process
+    [chassis process --] edge process -- [link | router process --] probe -- simulator process
 
 The simulator may also be the rig's own sender, where a row sends states of its own.
 """
@@ -10,12 +10,15 @@ from __future__ import annotations
 import contextlib
 import re
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
 from edge_runtime.operator_commands import ask
 from edge_runtime.transport import free_endpoint
+from hil_tests.faults.can_ears import CanEars
+from hil_tests.faults.chassis import ChassisProcess, free_bus
 from hil_tests.faults.endless import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
 from hil_tests.faults.link import Link
 from hil_tests.faults.probe import Probe
@@ -24,6 +27,8 @@ from hil_tests.faults.sender import Sender
 from hil_tests.faults.timeline import BrakeSeen, ModeSeen, Timeline, last_drive_s
 
 VEHICLE_ID = "faults"
+EARS = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
+"""What is kept of the CAN bus: all commands, the chassis's state, its speed."""
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
 _REARM_EVERY_S = 2.0
@@ -39,13 +44,13 @@ class Rig:
         between: str = "",
         vehicle: str = "none",
         sender: bool = False,
+        model: str = "",
     ) -> None:
         self.timeline = Timeline()
         self.directory = directory
         self.crashes: list[str] = []
         self._policy, self._vehicle = policy, vehicle
         self._processes: list[tuple[str, Process]] = []
-        self._brakes_read = 0
         (directory / BRAKES).touch()
         self._simulator_endpoint, self._hub = free_endpoint(), free_endpoint()
         self.simulator = None if sender else self.start_simulator()
@@ -55,6 +60,11 @@ class Rig:
         self.link = Link(self._hub) if between == "link" else None
         self.router_endpoint = free_endpoint() if between == "router" else ""
         self.router = self.start_router() if self.router_endpoint else None
+        self._bus = free_bus() if model else ""
+        self.chassis = ChassisProcess(self._bus, "--model", model) if model else None
+        self.ears = CanEars(self._bus, EARS) if model else None
+        if self.chassis is not None:
+            self._processes.append(("chassis", self.chassis.process))
         self.edge = self.start_edge()
 
     def start_edge(self) -> Process:
@@ -62,6 +72,8 @@ class Rig:
         endpoint = self.link.endpoint if self.link else self.router_endpoint or self._hub
         arguments = ["edge_runtime", "run", *self._policy, "--connect", endpoint]
         arguments += ["--vehicle-id", VEHICLE_ID, "--vehicle", self._vehicle]
+        if self._bus:
+            arguments += ["--bus", self._bus]
         return self._start("edge", "hil_tests.faults.launch", *arguments)
 
     def start_simulator(self) -> Process:
@@ -80,8 +92,13 @@ class Rig:
         """The router process between edge and probe, not waited for."""
         return self._start("router", "hil_tests.faults.router", self.router_endpoint, self._hub)
 
-    def wait_until_driving(self, timeout_s: float = 30.0) -> None:
-        """Until drive commands come steadily and the simulated vehicle's brake is off."""
+    def wait_until_driving(
+        self, timeout_s: float = 30.0, ready: Callable[[], bool] = lambda: True
+    ) -> None:
+        """Until drive commands come steadily, the simulated vehicle's brake is off, and ``ready``.
+
+        A vehicle is re-armed until then.
+        """
         rearmed_s = time.monotonic()
 
         def driving() -> bool:
@@ -90,7 +107,7 @@ class Rig:
                 # A busy machine may have stopped it once more: the operator stays beside it.
                 self._ask_to_rearm()
                 rearmed_s = time.monotonic()
-            return self._is_driving()
+            return self._is_driving() and ready()
 
         wait_until(driving, "a steady drive", timeout_s)
 
@@ -117,6 +134,10 @@ class Rig:
         """As an operator does, once the runtime takes it."""
         wait_until(self._ask_to_rearm, "the vehicle to be re-armed")
 
+    def try_rearm(self) -> bool:
+        """Ask once; whether the runtime took it."""
+        return self._ask_to_rearm()
+
     def bright(self, on: bool) -> None:
         """Turn the frames white, or back."""
         self.switch(BRIGHT, "" if on else None)
@@ -139,6 +160,8 @@ class Rig:
             process.end()
         if self.link is not None:
             self.link.close()
+        if self.ears is not None:
+            self.ears.close()
         self.probe.close()
 
     def __enter__(self) -> Rig:

@@ -44,7 +44,8 @@ class Row:
     rig: Mapping[str, Any] = field(default_factory=dict)
     """Options of the Rig."""
     policy: str = "given"
-    """``given``, or ``slow``: one that is slow on bright frames, ``steady``: always full pedal."""
+    """``given``, or ``slow``: one that is slow on bright frames, ``steady``: always the same
+    pedal, ``full``: all of it, ``mean``: all of it on bright frames, the brake on others."""
     flows: bool = False
     """Whether the simulator's states go on through the fault: where they do not, the machine stood
     still, and the try is done again (and counted as disturbed)."""

@@ -27,6 +27,16 @@ def write_slow(path: Path) -> None:
     policies.write_policy(path, "slow", loops=loops)
 
 
+def write_mean(path: Path) -> None:
+    """A policy with the brightness for its pedal: full throttle on white frames, else the brake."""
+    policies.write_policy(path, "mean")
+
+
 def write_steady(path: Path) -> None:
     """A policy that always gives the same pedal."""
     policies.write_policy(path, "constant", _STEADY_PEDAL)
+
+
+def write_full(path: Path) -> None:
+    """A policy that always gives full throttle."""
+    policies.write_policy(path, "constant", 1.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hil_tests.faults import ends, garbage, messages, recordings, vehicles
+from hil_tests.faults import ends, garbage, hunter, messages, recordings, vehicles
 from hil_tests.faults.row import Row
 
 ROWS: tuple[Row, ...] = (
@@ -10,5 +10,6 @@ ROWS: tuple[Row, ...] = (
     *garbage.ROWS,
     *messages.ROWS,
     *vehicles.ROWS,
+    *hunter.ROWS,
     *recordings.ROWS,
 )

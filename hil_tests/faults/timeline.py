@@ -63,6 +63,8 @@ class Timeline:
     modes: list[ModeSeen] = field(default_factory=list)
     brakes: list[BrakeSeen] = field(default_factory=list)
     feedback_s: list[float] = field(default_factory=list)
+    named: list[tuple[float, str]] = field(default_factory=list)
+    """When the feedback said what was wrong with the vehicle."""
     unreadable: int = 0
     """Commands that no receiver would take: outside their limits, or no commands at all."""
 

@@ -36,6 +36,8 @@ TARGETS = {
     "latest": ("test_latest",),
     "wire": ("test_wire",),
     "controller": ("test_controller", "test_controller_properties"),
+    "vehicles/hunter/states": ("test_hunter_core",),
+    "vehicles/hunter/core": ("test_hunter_core",),
 }
 
 

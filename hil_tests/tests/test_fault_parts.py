@@ -6,7 +6,7 @@ import pytest
 from edge_runtime import wire
 from edge_runtime.errors import UserError
 from hil_tests.faults import render_faults, run_faults
-from hil_tests.faults.campaign import Outcome, _report_row
+from hil_tests.faults.campaign import Outcome, _choose, _report_row
 from hil_tests.faults.payloads import mutated, with_fields, without
 from hil_tests.faults.row import Row, Try
 from hil_tests.faults.sender import make_state
@@ -134,5 +134,11 @@ def test_the_table_says_what_was_missed():
 def test_every_row_has_a_name_of_its_own_and_others_are_refused():
     names = [row.name for row in ROWS]
     assert len(set(names)) == len(names)
-    with pytest.raises(UserError, match="no fault 'meteor'; choose from edge_killed"):
-        run_faults(1, ["meteor"])
+    for other in ("meteor", "meteor_*"):
+        with pytest.raises(UserError, match=r"no fault 'meteor.*'; choose from edge_killed"):
+            run_faults(1, [other])
+
+
+def test_patterns_choose_rows_once_and_in_the_tables_order():
+    chosen = [row.name for row in _choose(["vehicle_*", "vehicle_stuck", "edge_killed"])]
+    assert chosen == ["edge_killed", "vehicle_silent", "vehicle_stuck", "vehicle_lying"]

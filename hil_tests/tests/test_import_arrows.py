@@ -1,6 +1,7 @@
 """Who may import whom: the table of the five folders, held by reading every file."""
 
 import ast
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +19,8 @@ ARROWS = {
 EDGE_LIBRARIES = {
     "numpy", "onnxruntime", "zenoh", "msgspec", "cryptography", "tomli", "typing_extensions",
 }  # fmt: skip
+CAN_DOOR = Path("edge_runtime/vehicles/hunter/bus.py")
+"""Where alone the edge runtime may load python-can, which a board without a CAN vehicle lacks."""
 ONLY_IN = {"torch": {"trainer"}, "highway_env": {"trainer"}, "onnx": {"trainer"}}
 """Heavy libraries and the only folders that may load them."""
 
@@ -50,7 +53,13 @@ def test_a_folder_imports_only_what_stands_below_it(folder):
 def test_the_edge_runtime_uses_only_libraries_that_a_board_has():
     for path in sources("edge_runtime"):
         foreign = imported(path) - set(sys.stdlib_module_names) - {"edge_runtime"}
-        assert foreign <= EDGE_LIBRARIES, path
+        allowed = EDGE_LIBRARIES | ({"can"} if path == ROOT / CAN_DOOR else set())
+        assert foreign <= allowed, path
+
+
+def test_python_can_is_loaded_only_with_a_bus():
+    code = "import sys, edge_runtime.run_command; assert 'can' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
 @pytest.mark.parametrize(("library", "folders"), ONLY_IN.items())

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from trainer.scenarios.congestion_config import CongestionConfig
 from trainer.scenarios.ego import EgoVehicle
-from trainer.scenarios.environment import Action, DrivingEnv, Observation, Scene, Step
+from trainer.scenarios.environment import (
+    Action,
+    DrivingEnv,
+    Observation,
+    Scene,
+    Step,
+    start_speed_mps,
+)
 from trainer.scenarios.geometry import Rectangle, overlap
 from trainer.scenarios.idm import idm_acceleration
 from trainer.scenarios.jam import LANES, spawn_jam, straight_road
@@ -68,7 +75,10 @@ class CongestionEnv(DrivingEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the seed alone decides traffic and the ego car's place and speed."""
+        """Start an episode; the seed alone decides traffic and the ego car's place and speed.
+
+        Option ``standing``: the ego car is at rest.
+        """
         super().reset(seed=seed)
         c, random = self.config, self.np_random
         self.road = Road(network=self.network, np_random=random)
@@ -76,6 +86,7 @@ class CongestionEnv(DrivingEnv):
             float(random.uniform(*limits))
             for limits in (c.start_offset_m, c.start_heading_rad, c.ego_speed_mps)
         )
+        speed_mps = start_speed_mps(speed_mps, options)
         self.ego = EgoVehicle(self.road, (0.0, offset_m), heading_rad, speed_mps)
         self.traffic = spawn_jam(self.road, self.ego, c, random)
         self._steering = self._last_steering = 0.0

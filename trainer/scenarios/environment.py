@@ -23,6 +23,14 @@ Scene = Literal["nominal", "variant"]
 FAILURES = ("collision", "off_road")
 
 
+def start_speed_mps(drawn_mps: float, options: dict[str, Any] | None) -> float:
+    """The ego car's speed at the start: as drawn, or 0 with the option ``standing`` of ``reset``.
+
+    A robot starts every episode standing. All else stays as the seed has it.
+    """
+    return 0.0 if (options or {}).get("standing", False) else drawn_mps
+
+
 class ScenarioConfig(Protocol):
     """The numbers that every scenario has."""
 

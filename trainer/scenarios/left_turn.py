@@ -14,7 +14,15 @@ from highway_env.road.road import Road
 from numpy.typing import NDArray
 
 from trainer.scenarios.ego import EgoVehicle, PathTracker
-from trainer.scenarios.environment import Action, DrivingEnv, Observation, Range, Scene, Step
+from trainer.scenarios.environment import (
+    Action,
+    DrivingEnv,
+    Observation,
+    Range,
+    Scene,
+    Step,
+    start_speed_mps,
+)
 from trainer.scenarios.geometry import overlap
 from trainer.scenarios.path import LeftTurnPath
 from trainer.scenarios.rasteriser import Rasteriser
@@ -111,13 +119,16 @@ class LeftTurnEnv(DrivingEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the seed alone decides traffic and initial speed."""
+        """Start an episode; the seed alone decides traffic and initial speed.
+
+        Option ``standing``: the ego car is at rest.
+        """
         super().reset(seed=seed)
         c, random = self.config, self.np_random
         self.road = Road(network=self.network, np_random=random)
         self.traffic = self._spawn_traffic()
         start = self.path.pose(0.0)
-        speed_mps = float(random.uniform(*c.ego_speed_mps))
+        speed_mps = start_speed_mps(float(random.uniform(*c.ego_speed_mps)), options)
         self.ego = EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
         self.tracker = PathTracker(self.path)
         self.steps, self.distance_m, self._offset_m = 0, 0.0, 0.0
@@ -139,6 +150,17 @@ class LeftTurnEnv(DrivingEnv):
         self.steps += 1
         self.distance_m, self._offset_m = self.path.project(*self.ego.position.tolist())
         return self._report()
+
+    def pedal_for_speed(self, speed_mps: float) -> float:
+        """The pedal in [-1, 1] after whose step the car has this speed, as nearly as it can.
+
+        For a simulator that follows a real vehicle: what is missed now is made up for later, so
+        that errors do not add up.
+        """
+        c = self.config
+        wanted_mps2 = (speed_mps - self.ego.speed) / c.control_period_s
+        pedal = wanted_mps2 / (c.throttle_mps2 if wanted_mps2 > 0 else c.brake_mps2)
+        return min(max(pedal, -1.0), 1.0)
 
     def scene(self) -> dict[str, Any]:
         """What a viewer needs to draw the scene; plain lists and numbers."""

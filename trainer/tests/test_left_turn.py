@@ -110,3 +110,21 @@ def test_render_shows_road_cars_and_frames():
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
     scene = env.scene()
     assert [v["ego"] for v in scene["vehicles"]] == [True, False, False, False]
+
+
+def test_the_pedal_for_a_speed_gives_the_car_that_speed():
+    env = LeftTurnEnv(EMPTY_ROAD)
+    env.reset(seed=0, options={"standing": True})
+    for speed_mps in (0.1, 0.4, 0.7, 0.55, 0.2, 0.2, 0.0):
+        env.step(np.array([env.pedal_for_speed(speed_mps)], np.float32))
+        assert env.ego.speed == pytest.approx(speed_mps, abs=1e-6)
+
+
+def test_a_speed_out_of_reach_is_made_up_for_later():
+    env = LeftTurnEnv(EMPTY_ROAD)
+    env.reset(seed=0, options={"standing": True})
+    assert env.pedal_for_speed(1.0) == 1.0  # 0.3 m/s a step is all that the engine gives
+    for _ in range(4):
+        env.step(np.array([env.pedal_for_speed(1.0)], np.float32))
+    assert env.ego.speed == pytest.approx(1.0, abs=1e-6)
+    assert env.pedal_for_speed(0.0) == -1.0

@@ -72,3 +72,21 @@ def test_an_observation_is_a_picture_that_moves(scenario):
     moved, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
     assert np.array_equal(moved[0], start[1])
     assert not np.array_equal(moved[0], moved[1])
+
+
+def start_of(env):
+    return env.ego.position.tolist(), [(car.speed, *car.position) for car in env.traffic]
+
+
+@every_scenario
+def test_standing_changes_the_ego_cars_speed_and_nothing_else(scenario):
+    env = make_environment(scenario)
+    moving, _ = env.reset(seed=4)
+    speed_mps, start = env.ego.speed, start_of(env)
+    standing, info = env.reset(seed=4, options={"standing": True})
+    assert speed_mps > 0.0
+    assert info["speed_mps"] == 0.0
+    assert start_of(env) == start
+    assert np.array_equal(standing, moving)
+    env.reset(seed=4)
+    assert env.ego.speed == speed_mps

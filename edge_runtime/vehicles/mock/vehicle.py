@@ -1,4 +1,4 @@
-"""A vehicle of arithmetic: dead time, rate limit and first-order lag before the wheels obey.
+"""Vehicle of arithmetic: dead time, rate limit and first-order lag before the wheels obey.
 
 It integrates its own motion up to the time it is asked about, so that it needs no thread, and a
 test with made-up times sees exactly what a process sees.
@@ -63,7 +63,7 @@ class MockVehicle(Vehicle):
     name: ClassVar[str] = "mock"
     # A full swing within one control period: 20 / s is 2.0 in T = 0.1 s, so that every action
     # of a policy goes through unchanged. What the body does with it is the lag's business.
-    limits: ClassVar[Dict[str, ActionLimit]] = {
+    limits: Dict[str, ActionLimit] = {  # noqa: RUF012
         "pedal": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
         "steering": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
     }
@@ -75,23 +75,30 @@ class MockVehicle(Vehicle):
         self._commanded_s = -math.inf
         self._on_the_way: Deque[Tuple[float, float, float]] = deque()
         self._target = (-1.0, 0.0)
+        self._latched = True  # until it is enabled
 
     def enable(self, now_s: float) -> None:
-        """Start its time; it stands with the brake on."""
-        self._now_s = now_s
+        """Take a stop back; the brake is on until the first command."""
+        self._integrate(now_s)
+        self._latched = False
 
-    def command(self, action: Dict[str, float], now_s: float) -> None:
+    def command(
+        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+    ) -> None:
         """An action that a policy leaves out is zero: no pedal, wheels straight."""
         self._integrate(now_s)
+        if self._latched:
+            return
         self._commanded_s = now_s
         effective_s = now_s + self._parameters.dead_time_s
         self._on_the_way.append(
             (effective_s, action.get("pedal", 0.0), action.get("steering", 0.0))
         )
 
-    def brake(self, now_s: float) -> None:
+    def brake(self, now_s: float, latch: bool = True) -> None:
         """Full brake without the dead time of the command's way."""
         self._integrate(now_s)
+        self._latched = self._latched or latch
         self._on_the_way.clear()
         self._commanded_s = now_s
         self._target = (-1.0, self._target[1])
@@ -116,7 +123,7 @@ class MockVehicle(Vehicle):
 
     def _integrate(self, until_s: float) -> None:
         if self._now_s is None:
-            raise RuntimeError("the vehicle was not enabled")
+            self._now_s = until_s
         self._now_s = max(self._now_s, until_s - _LONGEST_GAP_S)
         while until_s - self._now_s > 1e-9:
             step_s = min(_INTEGRATION_STEP_S, until_s - self._now_s)

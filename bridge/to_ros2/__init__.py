@@ -1,0 +1,1 @@
+"""What is on our wire, as ROS 2 messages."""

@@ -1,0 +1,284 @@
+"""The driver on a real python-can bus within this process, its threads running."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+
+import can
+import pytest
+
+from edge_runtime.errors import UserError
+from edge_runtime.tests.harness import wait_until
+from edge_runtime.vehicles.hunter import bus as buses
+from edge_runtime.vehicles.hunter import frames
+from edge_runtime.vehicles.hunter.bus import BusName, Gate, open_bus, parse_bus
+from edge_runtime.vehicles.hunter.specs import SPECS
+from edge_runtime.vehicles.hunter.states import State
+from edge_runtime.vehicles.hunter.vehicle import HunterVehicle
+from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle
+from edge_runtime.vehicles.settings import CarSettings, SimilaritySettings
+from edge_runtime.vehicles.similarity import CARS, similarity_to
+
+SPEC = SPECS["2.0"]
+LEFT_TURN = similarity_to(CARS["left_turn"], SPEC.max_speed_mps)
+_numbers = itertools.count()
+
+
+def told_by(can_id, data):
+    decoded = frames.decode(can_id, data)
+    assert decoded is not None
+    return decoded.message
+
+
+class Chassis:
+    """Answers as a chassis that obeys at once; keeps every frame that it heard."""
+
+    def __init__(self, channel):
+        self.bus = can.Bus(interface="virtual", channel=channel)
+        self.heard: list = []
+        self.answers = True
+        self.status = frames.SystemStatus(0, frames.STANDBY, 24.0, 0, 1, 0)
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self):
+        while not self._stopping:
+            message = self.bus.recv(0.05)
+            if message is None:
+                continue
+            self.heard.append((message.arbitration_id, bytes(message.data)))
+            decoded = frames.decode(*self.heard[-1])
+            told = decoded.message if decoded is not None else None
+            if isinstance(told, frames.ModeCommand):
+                self.status = self.status._replace(mode=told.mode)
+            elif isinstance(told, frames.BrakeCommand):
+                self.status = self.status._replace(brake=told.locked)
+            elif isinstance(told, frames.MotionCommand) and self.answers:
+                self.send(frames.MOTION_STATUS, frames.MotionStatus(*told))
+                self.send(frames.SYSTEM_STATUS, self.status)
+
+    def send(self, frame, message):
+        data = frames.encode(frame, message)
+        message = can.Message(arbitration_id=frame.can_id, data=data, is_extended_id=False)
+        self.bus.send(message, timeout=0.1)
+
+    @property
+    def speeds(self):
+        return [told_by(*heard).speed_mps for heard in list(self.heard) if heard[0] == 0x111]
+
+    def close(self):
+        self._stopping = True
+        self._thread.join(5.0)
+        self.bus.shutdown()
+
+
+@pytest.fixture
+def channel():
+    return f"hunter-{next(_numbers)}"
+
+
+@pytest.fixture
+def chassis(channel):
+    chassis = Chassis(channel)
+    yield chassis
+    chassis.close()
+
+
+@pytest.fixture
+def vehicle(channel):
+    vehicle = HunterVehicle(BusName("virtual", channel, None), SPEC, "v2", LEFT_TURN)
+    yield vehicle
+    vehicle.close()
+
+
+def drive(vehicle, until, what):
+    """Full throttle at 10 Hz until something holds."""
+
+    def step():
+        vehicle.command({"pedal": 1.0}, time.monotonic())
+        return until()
+
+    wait_until(step, what)
+
+
+def is_enabled(vehicle):
+    return vehicle.state is State.ENABLED
+
+
+def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
+    time.sleep(0.1)
+    assert chassis.heard == []
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed")
+    report = vehicle.feedback(time.monotonic())
+    assert report.speed_mps > 0.1
+    assert report.scenario_speed_mps == pytest.approx(4 * report.speed_mps)
+    vehicle.brake(time.monotonic())
+    wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
+    vehicle.command({"pedal": 1.0}, time.monotonic())
+    count = len(chassis.speeds)
+    wait_until(lambda: len(chassis.speeds) > count + 5, "the stream going on")
+    assert set(chassis.speeds[count:]) == {0.0}
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed again")
+    vehicle.close()
+    wait_until(lambda: chassis.heard[-1] == (0x421, b"\x00"), "control given back")
+    assert (0x131, b"\x01") in chassis.heard[-3:]
+    assert {can_id for can_id, _ in chassis.heard} <= {0x111, 0x131, 0x421}
+    assert not [t for t in threading.enumerate() if t.name.startswith("hunter-")]
+    vehicle.close()
+
+
+def test_commands_that_cease_end_in_a_latched_stop(chassis, vehicle):
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    drive(vehicle, lambda: chassis.speeds[-1] > 0.1, "speed")
+    wait_until(lambda: vehicle.state is State.STOPPED, "its own stop")
+    assert vehicle.feedback(time.monotonic()).faults == ["no command for 0.24 s"]
+    wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
+
+
+def test_the_remote_control_is_reported_and_the_chassis_that_comes_back_is_not_believed(
+    chassis, vehicle
+):
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    chassis.status = chassis.status._replace(mode=frames.REMOTE_CONTROL)
+    wait_until(lambda: vehicle.state is State.STOPPED, "its stop")
+    report = vehicle.feedback(time.monotonic())
+    assert report.faults == ["the remote control drives"] == list(report.standing)
+    chassis.status = chassis.status._replace(mode=frames.CAN_CONTROL)
+    wait_until(lambda: not vehicle.feedback(time.monotonic()).standing, "control back")
+    drive(vehicle, lambda: len(chassis.speeds) > 30, "the stream")
+    assert set(chassis.speeds[-10:]) == {0.0}
+
+
+def test_without_a_chassis_it_says_so(channel, vehicle):
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: vehicle.state is State.STOPPED, "its patience to end")
+    (fault, *_) = vehicle.feedback(time.monotonic()).faults
+    assert fault == "not enabled within 1 s: the chassis sends no 0x221"
+
+
+def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle):
+    crowd = can.Bus(interface="virtual", channel=channel, rx_queue_size=3)
+    try:
+        vehicle.enable(time.monotonic())
+        wait_until(lambda: vehicle.state is State.STOPPED, "its stop")
+        assert "the CAN bus fails: Could not send" in vehicle.feedback(time.monotonic()).faults[0]
+        assert vehicle.feedback(time.monotonic()).standing
+        began_s = time.monotonic()
+        vehicle.command({"pedal": 1.0}, time.monotonic())
+        vehicle.brake(time.monotonic())
+        assert time.monotonic() - began_s < 5.0  # a bus that is waited for is waited for for ever
+        while crowd.recv(0.0) is not None:
+            pass
+        assert crowd.recv(5.0) is not None  # it sends as soon as it can
+    finally:
+        crowd.shutdown()
+
+
+def test_random_frames_on_the_bus_never_move_it(chassis, vehicle):
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    junk = can.Bus(interface="virtual", channel=chassis.bus.channel_id)
+    try:
+        for number in range(2000):
+            message = can.Message(
+                arbitration_id=number * 7919 % 0x800,
+                data=(number * 2654435761 % 2**64).to_bytes(8, "big")[: number % 9],
+                is_extended_id=number % 5 == 0,
+            )
+            junk.send(message, timeout=0.1)
+    finally:
+        junk.shutdown()
+    count = len(vehicle.feedback(time.monotonic()).faults)
+    assert count <= 3
+    assert vehicle._threads[0].is_alive()
+    assert vehicle._threads[1].is_alive()
+    assert set(chassis.speeds) == {0.0}
+
+
+def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(channel):
+    receiver = can.Bus(interface="virtual", channel=channel)
+    sender = can.Bus(interface="virtual", channel=channel)
+    gate = Gate(sender)
+    try:
+        with pytest.raises(RuntimeError, match="before the vehicle is enabled"):
+            gate.send(frames.MOTION_COMMAND, bytes(8))
+        gate.open()
+        for frame in frames.FEEDBACK:
+            with pytest.raises(RuntimeError, match="allow-list"):
+                gate.send(frame, bytes(frame.length))
+        with pytest.raises(RuntimeError, match="allow-list"):
+            gate.send(frames.MOTION_COMMAND, bytes(7))
+        assert receiver.recv(0.0) is None
+        for frame in frames.COMMANDS:
+            gate.send(frame, bytes(frame.length))
+            message = receiver.recv(1.0)
+            assert message is not None
+            assert (message.arbitration_id, message.is_extended_id) == (frame.can_id, False)
+    finally:
+        receiver.shutdown()
+        sender.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("socketcan:can0", BusName("socketcan", "can0", None)),
+        ("udp_multicast:239.1.2.3:7", BusName("udp_multicast", "239.1.2.3", None, 7)),
+        ("slcan:/dev/ttyACM0", BusName("slcan", "/dev/ttyACM0", 500_000)),
+        ("slcan:/dev/ttyACM0:250000", BusName("slcan", "/dev/ttyACM0", 250_000)),
+    ],
+)
+def test_names_of_buses(text, name):
+    assert parse_bus(text) == name
+
+
+@pytest.mark.parametrize("text", ["", "can0", "socketcan:", ":can0", "slcan:a:fast", "slcan:a:0"])
+def test_what_is_no_name_of_a_bus(text):
+    with pytest.raises(UserError, match="write it as INTERFACE:CHANNEL"):
+        parse_bus(text)
+
+
+def test_buses_that_cannot_be_opened_are_one_line(caplog):
+    for text, words in (
+        ("socketcan:can97", "bus socketcan:can97 cannot be opened"),
+        ("nosuch:can0", "choose from .*socketcan"),
+        ("slcan:/dev/nothing", "/dev/nothing.*manual says what its slcan needs"),
+        ("kvaser:0", "bus kvaser:0 cannot be opened"),
+    ):
+        with pytest.raises(UserError, match=words) as caught:
+            open_bus(parse_bus(text))
+        assert "\n" not in str(caught.value)
+    assert caplog.records == []  # a line of a library would be a second one
+
+
+def test_python_can_is_asked_for_where_it_is_missing(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "can", None)
+    with pytest.raises(UserError, match=r"pip install 'phil-edge-runtime\[can\]'"):
+        open_bus(parse_bus(buses.DEFAULT_BUS))
+
+
+def test_the_registry_makes_it_for_a_known_scenario_only(channel):
+    setup = VehicleSetup("left_turn", bus=f"virtual:{channel}")
+    vehicle = make_vehicle("hunter", setup)
+    assert isinstance(vehicle, HunterVehicle)
+    vehicle.close()
+    with pytest.raises(UserError, match="parking"):
+        make_vehicle("hunter", setup._replace(scenario="parking"))
+    car = CarSettings(
+        throttle_mps2=1.0, brake_mps2=1.0, max_speed_mps=3.0, full_steering_rad=0.5,
+        wheelbase_m=2.0,
+    )  # fmt: skip
+    similarity = SimilaritySettings(scale=0.1, car=car)
+    vehicle = make_vehicle("hunter", setup._replace(scenario="parking", similarity=similarity))
+    assert isinstance(vehicle, HunterVehicle)
+    assert vehicle._core._similarity.scale == 0.1
+    vehicle.close()

@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge_runtime.vehicles import mapping
+from edge_runtime.vehicles.hunter.set_point import inner_of, steering_of
+from edge_runtime.vehicles.hunter.specs import SPECS
+from edge_runtime.vehicles.similarity import CARS, similarity_to
+
+HUNTER = SPECS["2.0"]
+LEFT_TURN = similarity_to(CARS["left_turn"], HUNTER.max_speed_mps)
+CONGESTION = similarity_to(CARS["congestion"], HUNTER.max_speed_mps)
+MOST = HUNTER.max_speed_mps
+unit = st.floats(-1, 1)
+
+
+def pedal_to_speed(set_point, pedal, step_s=0.1, measured=None, similarity=LEFT_TURN):
+    measured = set_point if measured is None else measured
+    return mapping.pedal_to_speed(set_point, pedal, step_s, measured, MOST, similarity)
+
+
+def test_pedals_by_hand():
+    """3 m/s2 of throttle and 4 m/s2 of brake, at a quarter, for 0.1 s."""
+    assert pedal_to_speed(0.5, 1.0) == pytest.approx(0.5 + 0.075)
+    assert pedal_to_speed(0.5, -0.5) == pytest.approx(0.5 - 0.05)
+    assert pedal_to_speed(0.5, 0.0) == 0.5
+
+
+def test_the_speed_stays_between_zero_and_the_top_and_leaves_at_once():
+    assert pedal_to_speed(0.02, -1.0) == 0.0
+    assert pedal_to_speed(1.49, 1.0) == MOST
+    assert pedal_to_speed(MOST, -1.0) == pytest.approx(MOST - 0.1)
+
+
+def test_a_vehicle_that_is_held_up_does_not_wind_up():
+    speed = 0.0
+    for _ in range(100):
+        speed = pedal_to_speed(speed, 1.0, measured=0.0)
+    assert speed == pytest.approx(0.75 * mapping.LEAD_S)
+    assert pedal_to_speed(0.0, 0.5, measured=1.0) == pytest.approx(1.0 - 0.375)
+    assert pedal_to_speed(0.0, -0.5, measured=1.0) == 0.0  # a brake that does not bite
+
+
+@given(st.lists(st.tuples(unit, st.floats(0, 0.1), st.floats(-2, 2)), max_size=40))
+def test_no_pedal_leaves_the_range(steps):
+    speed = 0.0
+    for pedal, step_s, measured in steps:
+        speed = pedal_to_speed(speed, pedal, step_s, measured)
+        assert 0.0 <= speed <= MOST
+
+
+@given(unit)
+def test_pedal_to_acceleration_and_back(pedal):
+    acceleration = mapping.pedal_to_acceleration(pedal, LEFT_TURN)
+    assert mapping.acceleration_to_pedal(acceleration, LEFT_TURN) == pytest.approx(pedal)
+    assert abs(mapping.acceleration_to_pedal(100 * acceleration, LEFT_TURN)) <= 1.0
+
+
+def test_without_a_pedal_it_follows_the_scenarios_car_within_its_accelerations():
+    speed = 0.0
+    for _ in range(100):
+        after = mapping.follow_speed(speed, 5.0, 0.02, MOST, CONGESTION)
+        assert after - speed <= 0.75 * 0.02 + 1e-12
+        speed = after
+    assert speed == pytest.approx(5.0 / 4)
+    assert mapping.follow_speed(speed, 0.0, 0.02, MOST, CONGESTION) == pytest.approx(speed - 0.02)
+    assert mapping.follow_speed(MOST, 100.0, 0.1, MOST, CONGESTION) == MOST
+
+
+def test_ackermann_by_hand():
+    """A circle of 2 m radius at the rear axle's middle: the inner wheel's is 1.6975 m."""
+    centre = math.atan(0.650 / 2.0)
+    inner = mapping.centre_to_inner(centre, 0.650, 0.605, 0.576)
+    assert inner == pytest.approx(math.atan(0.650 / (2.0 - 0.3025)))
+    assert mapping.centre_to_inner(-centre, 0.650, 0.605, 0.576) == -inner
+
+
+@pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
+@given(share=unit)
+def test_inner_to_centre_and_back(spec, share):
+    inner = share * spec.max_inner_steering_rad
+    centre = mapping.inner_to_centre(inner, spec.wheelbase_m, spec.track_m)
+    assert abs(centre) <= abs(inner) + 1e-12
+    back = mapping.centre_to_inner(
+        centre, spec.wheelbase_m, spec.track_m, spec.max_inner_steering_rad
+    )
+    assert back == pytest.approx(inner, abs=1e-9)
+
+
+@given(st.floats(-1.5, 1.5))
+def test_the_inner_wheel_is_never_turned_too_far(centre):
+    assert abs(mapping.centre_to_inner(centre, 0.650, 0.605, 0.576)) <= 0.576 + 1e-9
+
+
+@pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
+@given(steering=unit)
+def test_all_the_way_from_the_action_to_the_inner_wheel_and_back(spec, steering):
+    similarity = similarity_to(CARS["congestion"], spec.max_speed_mps)
+    inner = inner_of(steering, spec, similarity)
+    assert steering_of(inner, spec, similarity) == pytest.approx(steering, abs=1e-9)
+    assert inner == 0 or (inner < 0) == (steering > 0)  # its action +1 turns right
+
+
+def test_a_path_of_the_scenario_is_the_same_path_smaller():
+    """The heading that a car and the robot gain on the same share of the way is the same."""
+    angle = 0.15 * 0.7
+    car_rad_per_m = math.sin(math.atan(0.5 * math.tan(angle))) / 2.5
+    centre = mapping.steering_to_centre(-0.7, HUNTER.wheelbase_m, CONGESTION)
+    robot_rad_per_m = math.tan(centre) / HUNTER.wheelbase_m
+    assert robot_rad_per_m * CONGESTION.scale == pytest.approx(car_rad_per_m)

@@ -1,0 +1,1 @@
+"""AgileX Hunter 2.0 and Hunter SE over CAN."""

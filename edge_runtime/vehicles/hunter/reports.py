@@ -1,0 +1,147 @@
+"""What was heard of the chassis, and which event of the state machine it is. No clock, no bus."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Deque, Dict, List, NamedTuple, Optional, Tuple
+
+from edge_runtime.vehicles.hunter import frames
+from edge_runtime.vehicles.hunter.faults import LINK_LOST, motor_faults, status_faults
+from edge_runtime.vehicles.hunter.frames import MotionStatus, MotorSlow, SystemStatus
+from edge_runtime.vehicles.hunter.specs import HunterSpec
+from edge_runtime.vehicles.hunter.states import Event
+from edge_runtime.wire import CONTROL_PERIOD_S
+
+MOTION_SILENCE_S = 2 * CONTROL_PERIOD_S  # ten frames of 0x221
+STATUS_SILENCE_S = 3 * CONTROL_PERIOD_S  # three frames of 0x211
+STANDS_MPS = 0.02
+_IMPOSSIBLE = 1.3  # times what the model can do
+
+REMOTE_WORDS = "the remote control drives"
+ESTOP_WORDS = "the emergency stop is pressed"
+
+
+class Finding(NamedTuple):
+    """An event with what it is in words."""
+
+    event: Event
+    words: str
+
+
+class Reports:
+    """The newest frame of each kind. `hear` is given every frame of the bus."""
+
+    def __init__(self, spec: HunterSpec, profile: str) -> None:
+        self.status: Optional[SystemStatus] = None
+        self.motion: Optional[MotionStatus] = None
+        self.status_s = self.motion_s = -math.inf
+        self._spec, self._profile = spec, profile
+        self._motor_faults: Dict[int, List[str]] = {}
+        self._speeds: Deque[Tuple[float, float]] = deque()
+
+    def hear(self, can_id: int, data: bytes, now_s: float) -> None:
+        """Note a frame; one that is not in the table, or of a wrong length, is none."""
+        decoded = frames.decode(can_id, data)
+        if decoded is None:
+            return
+        message = decoded.message
+        if isinstance(message, SystemStatus):
+            self.status, self.status_s = message, now_s
+        elif isinstance(message, MotionStatus):
+            self.motion, self.motion_s = message, now_s
+            self._speeds.append((now_s, message.speed_mps))
+            while self._speeds[0][0] < now_s - CONTROL_PERIOD_S - 0.01:
+                self._speeds.popleft()
+        elif isinstance(message, MotorSlow):
+            self._motor_faults[can_id] = motor_faults(can_id, message)
+
+    @property
+    def speed_mps(self) -> float:
+        """The newest speed, 0 before the first."""
+        return self.motion.speed_mps if self.motion else 0.0
+
+    @property
+    def stands(self) -> bool:
+        """Whether it stood when it was last heard."""
+        return abs(self.speed_mps) < STANDS_MPS
+
+    def is_known_to_stand(self, now_s: float) -> bool:
+        """Whether it says now that it stands."""
+        return self.stands and now_s - self.motion_s <= MOTION_SILENCE_S
+
+    @property
+    def needs_clearing(self) -> bool:
+        """Whether it shows an error; a lost link goes by itself, with the stream's first frame."""
+        is_exception = self.status is not None and self.status.state == frames.STATE_EXCEPTION
+        return is_exception or bool(set(self.errors()) - {LINK_LOST})
+
+    @property
+    def remote_drives(self) -> bool:
+        """Whether the remote control had the vehicle when it was last heard."""
+        return self.status is not None and self.status.mode == frames.REMOTE_CONTROL
+
+    def acceleration_mps2(self) -> float:
+        """Over the last control period; 0 while there is too little to tell."""
+        if len(self._speeds) < 2:
+            return 0.0
+        (since_s, before_mps), (now_s, speed_mps) = self._speeds[0], self._speeds[-1]
+        return (speed_mps - before_mps) / (now_s - since_s) if now_s > since_s else 0.0
+
+    def errors(self) -> List[str]:
+        """The errors that the chassis names, in words, without those of its operation."""
+        words = status_faults(self.status, self._profile) if self.status else []
+        for motor in self._motor_faults.values():
+            words += motor
+        return words
+
+    def silence(self, since_s: float, now_s: float) -> Optional[Finding]:
+        """SILENT where feedback is missing that was due since `since_s`."""
+        for heard_s, patience_s, name in (
+            (self.motion_s, MOTION_SILENCE_S, "0x221"),
+            (self.status_s, STATUS_SILENCE_S, "0x211"),
+        ):
+            if now_s - max(heard_s, since_s) > patience_s:
+                return Finding(Event.SILENT, f"the chassis sends no {name}")
+        return None
+
+    def commander(self) -> Optional[Finding]:
+        """Who outranks us: the remote control, or the emergency stop."""
+        if self.remote_drives:
+            return Finding(Event.REMOTE, REMOTE_WORDS)
+        if self.status is not None and self.status.state == frames.STATE_ESTOP:
+            return Finding(Event.ESTOP, ESTOP_WORDS)
+        return None
+
+    def finding(self) -> Optional[Finding]:
+        """What stands between the chassis and our commands now; the gravest only."""
+        status = self.status
+        if status is None:
+            return Finding(Event.SILENT, "the chassis sends no 0x211")
+        outranked = self.commander()
+        if outranked is not None:
+            return outranked
+        errors = self.errors()
+        if errors:
+            return Finding(Event.FAULT, ", ".join(errors))
+        if status.state != frames.STATE_OK:
+            return Finding(Event.FAULT, f"the chassis is in state {status.state} (exception)")
+        if status.mode != frames.CAN_CONTROL:
+            name = "standby" if status.mode == frames.STANDBY else f"mode {status.mode}"
+            return Finding(Event.STANDBY, f"the chassis is in {name}, not under CAN control")
+        if status.brake:
+            return Finding(Event.LOCKED, "the chassis has locked its brake")
+        return None
+
+    def lie(self) -> Optional[Finding]:
+        """LYING where it reports what the model cannot do."""
+        if self.motion is None:
+            return None
+        speed_mps, inner_rad = self.motion
+        if abs(speed_mps) > _IMPOSSIBLE * self._spec.max_speed_mps:
+            return Finding(Event.LYING, f"the chassis reports {speed_mps:.1f} m/s")
+        if abs(inner_rad) > _IMPOSSIBLE * self._spec.max_inner_steering_rad:
+            return Finding(
+                Event.LYING, f"the chassis reports a steering angle of {inner_rad:.2f} rad"
+            )
+        return None

@@ -1,0 +1,248 @@
+"""The driver on real Zenoh sessions; the ROS machine in its place speaks through rosbags."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from edge_runtime.errors import UserError
+from edge_runtime.ros2.tests import second
+from edge_runtime.tests.harness import wait_until
+from edge_runtime.transport import free_endpoint
+from edge_runtime.vehicles.hunter.specs import SPECS
+from edge_runtime.vehicles.ros2.settings import Ros2Settings
+from edge_runtime.vehicles.ros2.states import Event, State
+from edge_runtime.vehicles.ros2.tests.ros_hunter import RosHunter
+from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
+from edge_runtime.vehicles.similarity import CARS, similarity_to
+
+SPEC = SPECS["2.0"]
+
+
+def make_vehicle(scenario="left_turn", **changes):
+    similarity = similarity_to(CARS[scenario], SPEC.max_speed_mps)
+    return Ros2Vehicle(Ros2Settings(**changes), SPEC, similarity)
+
+
+class Commands:
+    """A control loop in its place: one action again and again, at 20 Hz."""
+
+    def __init__(self, vehicle, action, scenario_speed_mps=None):
+        self._arguments = vehicle, action, scenario_speed_mps
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self):
+        vehicle, action, scenario_speed_mps = self._arguments
+        while not self._stopping.wait(0.05):
+            vehicle.command(action, time.monotonic(), scenario_speed_mps)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stopping.set()
+        self._thread.join()
+
+
+def report(vehicle):
+    return vehicle.feedback(time.monotonic())
+
+
+@pytest.fixture(params=["we listen", "the bridge listens"])
+def pair(request):
+    endpoint = free_endpoint()
+    if request.param == "we listen":
+        vehicle = make_vehicle(listen=endpoint)
+        vehicle.enable(time.monotonic())
+        hunter = RosHunter(connect=endpoint)
+    else:
+        hunter = RosHunter(listen=endpoint)
+        vehicle = make_vehicle(connect=endpoint)
+        vehicle.enable(time.monotonic())
+    yield vehicle, hunter
+    vehicle.close()
+    hunter.__exit__()
+
+
+def enable(vehicle):
+    """As an operator's re-arm: again, until it is confirmed."""
+
+    def is_enabled():
+        if vehicle.state is State.STOPPED:
+            vehicle.enable(time.monotonic())
+        return vehicle.state is State.ENABLED
+
+    wait_until(is_enabled, "odometry to confirm")
+
+
+def drive(vehicle, hunter, over_mps):
+    """Until it is as quick; where this machine paused for too long, it was stopped: once more."""
+
+    def is_quick():
+        if vehicle.state is State.STOPPED:
+            vehicle.enable(time.monotonic())
+        return hunter.speed_mps > over_mps
+
+    wait_until(is_quick, "the Hunter to drive")
+
+
+def test_a_pedal_drives_the_hunter_and_a_brake_stands_until_enabled_again(pair):
+    vehicle, hunter = pair
+    enable(vehicle)
+    with Commands(vehicle, {"pedal": 1.0}):
+        drive(vehicle, hunter, 0.5)
+        wait_until(lambda: report(vehicle).speed_mps > 0.3, "its odometry")
+        vehicle.brake(time.monotonic())
+        wait_until(lambda: hunter.asked_mps == 0.0, "speed 0")
+        wait_until(lambda: hunter.speed_mps < 0.02, "the Hunter to stand")
+        time.sleep(0.3)  # the commands go on, to nobody
+        assert hunter.asked_mps == 0.0
+        drive(vehicle, hunter, 0.3)
+        assert report(vehicle).faults == []
+
+
+def test_nothing_is_published_before_enable():
+    endpoint = free_endpoint()
+    with RosHunter(listen=endpoint) as hunter:
+        vehicle = make_vehicle(connect=endpoint)
+        vehicle.command({"pedal": 1.0}, time.monotonic())
+        time.sleep(0.3)
+        wait_until(lambda: len(hunter.tokens) == 3, "the tokens: a bridge may get ready")
+        assert not hunter.twists
+        vehicle.close()
+
+
+def test_both_kinds_of_command_below_a_namespace_and_their_tokens():
+    endpoint = free_endpoint()
+    vehicle = make_vehicle(
+        "congestion", listen=endpoint, namespace="/robot", ackermann_topic="ackermann_cmd"
+    )
+    vehicle.enable(time.monotonic())
+    with RosHunter(connect=endpoint, namespace="robot") as hunter:
+        enable(vehicle)
+        with Commands(vehicle, {"steering": -1.0}, scenario_speed_mps=4.0):
+            drive(vehicle, hunter, 0.9)
+            steering = wait_until(
+                lambda: hunter.drives[-1]["drive"]["speed"] > 0.99 and hunter.drives[-1]["drive"],
+                "the drive",
+            )["steering_angle"]
+            # What hunter_ros2 makes of speed and yaw rate is the inner wheel of the same circle.
+            wait_until(lambda: abs(hunter.inner_rad) > steering, "the wheels")
+            wait_until(
+                lambda: report(vehicle).action["steering"] == pytest.approx(-1.0, abs=0.01),
+                "the odometry's word on the steering",
+            )
+        assert steering > 0  # -1 turns left
+        chunks = sorted("/".join(token.split("/")[3:5]) for token in hunter.tokens)
+        assert chunks == ["", "MP/robot§ackermann_cmd", "MP/robot§cmd_vel", "MS/robot§odom"]
+        vehicle.close()
+        wait_until(lambda: not hunter.tokens, "the tokens to go")
+        assert hunter.asked_mps == 0.0
+
+
+def test_silence_stops_it_and_only_an_enable_leads_out():
+    endpoint = free_endpoint()
+    vehicle = make_vehicle(listen=endpoint)
+    vehicle.enable(time.monotonic())
+    with RosHunter(connect=endpoint) as hunter:
+        enable(vehicle)
+        with Commands(vehicle, {"pedal": 1.0}):
+            for _ in range(4):
+                drive(vehicle, hunter, 0.3)
+                hunter.silent = True
+                wait_until(lambda: vehicle.state is State.STOPPED, "the stop")
+                faults = report(vehicle).faults
+                hunter.silent = False
+                if vehicle._core.cause is not Event.COMMAND_LATE:  # this machine paused itself
+                    break
+            assert vehicle._core.cause is Event.SILENT
+            assert faults[0] == "no fresh odometry on odom"
+            time.sleep(0.3)
+            assert vehicle.state is State.STOPPED
+            assert hunter.asked_mps == 0.0
+            drive(vehicle, hunter, 0.3)
+        vehicle.close()
+
+
+def test_the_stream_goes_on_with_zeros_while_stopped():
+    """The chassis is never left to its own time-out, after which any frame gives control back."""
+    endpoint = free_endpoint()
+    vehicle = make_vehicle(listen=endpoint)
+    vehicle.enable(time.monotonic())
+    with RosHunter(connect=endpoint) as hunter:
+        enable(vehicle)
+        vehicle.brake(time.monotonic())
+        count = len(hunter.twists)
+        wait_until(lambda: len(hunter.twists) > count + 25, "half a second of messages")
+        assert {twist["linear"]["x"] for _, twist in hunter.twists} == {0.0}
+        vehicle.close()
+
+
+def test_at_the_end_zeros_go_out_until_it_stands():
+    endpoint = free_endpoint()
+    vehicle = make_vehicle(listen=endpoint)
+    vehicle.enable(time.monotonic())
+    with RosHunter(connect=endpoint) as hunter:
+        enable(vehicle)
+        with Commands(vehicle, {"pedal": 1.0}):
+            drive(vehicle, hunter, 0.5)
+        vehicle.close()
+        assert hunter.speed_mps < 0.1
+        assert [twist["linear"]["x"] for _, twist in hunter.twists[-5:]] == [0.0] * 5
+
+
+def test_what_is_no_odometry_is_counted_and_confirms_nothing():
+    endpoint = free_endpoint()
+    with RosHunter(listen=endpoint) as hunter:
+        hunter.silent = True
+        vehicle = make_vehicle(connect=endpoint)
+        vehicle.enable(time.monotonic())
+        good = hunter._message()
+        wrong = dict(
+            good, twist={"twist": good["twist"]["twist"], "covariance": [float("nan")] * 36}
+        )
+        bad = [b"", b"\0\1\0\0", second.serialize("nav_msgs/msg/Odometry", wrong)]
+
+        def all_are_counted():
+            for payload in bad:
+                hunter.put(payload)
+            return {"malformed", "not_finite"} <= set(vehicle.rejected)
+
+        wait_until(all_are_counted, "the rejections")
+        assert vehicle.state is not State.ENABLED
+        vehicle.close()
+
+
+def test_it_closes_twice_and_without_having_been_enabled():
+    for enables in (False, True):
+        vehicle = make_vehicle(listen=free_endpoint())
+        if enables:
+            vehicle.enable(time.monotonic())
+        vehicle.close()
+        vehicle.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "part"),
+    [
+        ({"listen": "tcp/127.0.0.1:1", "connect": "tcp/127.0.0.1:1"}, "give one of them"),
+        ({"connect": "tls/127.0.0.1:7448"}, "plain text"),
+        ({"connect": "nowhere"}, "endpoint 'nowhere'"),
+        ({"model": "3.0"}, "ros2.model '3.0'"),
+        ({"twist_topic": ""}, "no topic to command by"),
+        ({"odometry_topic": ""}, "no odometry_topic"),
+        ({"odometry_topic": "/cmd_vel"}, "a topic twice: cmd_vel, cmd_vel"),
+        ({"twist_topic": "a b"}, "topic 'a b'"),
+        ({"namespace": "9"}, "namespace '9'"),
+        ({"twist_angular": "degrees"}, "yaw_rate, steering"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_line(changes, part):
+    with pytest.raises(UserError) as caught:
+        make_vehicle(**changes)
+    assert part in str(caught.value)
+    assert "\n" not in str(caught.value)

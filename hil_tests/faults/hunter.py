@@ -1,0 +1,225 @@
+"""Faults of a Hunter on a CAN bus: the edge runtime's driver against the mock as a process.
+
+The rule, for each row: within 2 T + 50 ms after the edge can know, the set-point on the bus is
+speed 0 and stays so; the vehicle stands (by the mock's own truth, whatever it reports), though
+the mock would drive on by itself when the fault is over; feedback names the fault in words; only a
+re-arm lets it move. When the edge can know:
+- silent, bus off, late: at the last frame that came in time, for the next ones were due;
+- the others: at the first frame on the bus that shows it;
+- stuck: at the first set-point that the vehicle should follow and does not (it may lag FOLLOWS_S).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+from edge_runtime.safety import Event
+from edge_runtime.vehicles.hunter.set_point import DEVIATES_S, FOLLOWS_S
+from edge_runtime.wire import DRIVE
+from hil_tests.faults.can_ears import CanEars, Heard
+from hil_tests.faults.chassis import ChassisProcess
+from hil_tests.faults.ends import at_any_phase
+from hil_tests.faults.rig import Rig
+from hil_tests.faults.row import Row, Try
+from hil_tests.faults.timeline import REACTION_LIMIT_S, CommandSeen
+from hil_tests.faults.waits import drive_after_s, stop_command
+from hil_tests.mock_hunter.faults import BITS, FAULTS
+from hil_tests.mock_hunter.parameters import MODELS
+
+MODEL = "hunter-2.0"
+QUIET_S = 0.5
+"""So long it must stand when the fault is over: the mock takes set-points up again within 20 ms."""
+STANDS_WITHIN_S = 2.0
+"""After the fault: our reaction, the chassis's own 0.5 s where it hears nothing, the braking."""
+_FAST_MPS = 0.9 * MODELS[MODEL].max_speed_mps
+_IMPOSSIBLE_MPS = 1.2 * MODELS[MODEL].max_speed_mps
+_DIFFERS_MPS = 0.15
+_NO_FRAME_TO_SHOW_IT = ("silent", "bus_off", "late")
+_REFUSED = ("silent", "bus_off", "remote", "estop")
+"""While these last, the runtime refuses to be re-armed: it would be in vain."""
+
+
+class Expect(NamedTuple):
+    """A fault of the mock: words of it in the feedback, and which frame shows it first."""
+
+    name: str
+    says: str
+    shown: Callable[[Heard], bool] = lambda frame: False
+
+
+def speed_mps(frame: Heard) -> float:
+    """Of 0x111 and 0x221, by hand."""
+    return int.from_bytes(frame.data[:2], "big", signed=True) * 1e-3
+
+
+def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
+    """Stops for it, stands when it is over, and drives again once re-armed."""
+    chassis, ears = rig.chassis, rig.ears
+    assert chassis is not None
+    assert ears is not None
+    rig.wait_until_driving(ready=lambda: _drives(ears))
+    at_any_phase(number)
+    on_s = chassis.switch(expect.name, True)
+    stop = stop_command(rig, on_s)
+    stands_s = chassis.stands_s(on_s, STANDS_WITHIN_S)
+    wrong = _refuses(rig) if expect.name in _REFUSED else []
+    known_s = _known_s(expect, ears, on_s)
+    chassis.switch(expect.name, False)
+    time.sleep(QUIET_S)
+    quiet_s = rig.mark()
+    wrong += _stayed(rig, chassis, stop, stands_s, quiet_s)
+    wrong += _named(rig, expect, on_s)
+    told_s = _told_s(ears, on_s, quiet_s)
+    recovery_s = _rearmed(rig)
+    figures = {"stands, ms": (stands_s - on_s) * 1e3, "safe_stop, ms": (stop.seen_s - on_s) * 1e3}
+    return Try(told_s - known_s, recovery_s, stop.reason, wrong=wrong, figures=figures)
+
+
+def stuck(rig: Rig, number: int) -> Try:
+    """Its motors hold their speed; nobody can know before it is asked for another one."""
+    chassis, ears = rig.chassis, rig.ears
+    assert chassis is not None
+    assert ears is not None
+    rig.bright(True)
+    rig.wait_until_driving(ready=lambda: _drives(ears))
+    at_any_phase(number)
+    on_s = chassis.switch("stuck", True)
+    held_mps = speed_mps(ears.of(0x221)[-1])
+    rig.bright(False)
+    stop = stop_command(rig, on_s)
+    stands_s = chassis.stands_s(stop.seen_s, STANDS_WITHIN_S)
+    asked = [one.seen_s for one in ears.of(0x111, on_s) if held_mps - speed_mps(one) > _DIFFERS_MPS]
+    known_s = asked[0]  # the stop at the latest: its set-point is 0
+    chassis.switch("stuck", False)
+    rig.bright(True)
+    time.sleep(QUIET_S)
+    quiet_s = rig.mark()
+    wrong = _stayed(rig, chassis, stop, stands_s, quiet_s)
+    wrong += _named(rig, Expect("stuck", "stuck|speed stays"), on_s)
+    told_s = _told_s(ears, on_s, quiet_s)
+    recovery_s = _rearmed(rig)
+    figures = {"stands after the stop, ms": (stands_s - stop.seen_s) * 1e3}
+    return Try(told_s - known_s, recovery_s, stop.reason, wrong=wrong, figures=figures)
+
+
+def _drives(ears: CanEars) -> bool:
+    """By its reports: all is well still."""
+    recent = ears.heard[-20:]
+    return any(one.can_id == 0x221 and speed_mps(one) > _FAST_MPS for one in recent)
+
+
+def _known_s(expect: Expect, ears: CanEars, on_s: float) -> float:
+    if expect.name in _NO_FRAME_TO_SHOW_IT:
+        return max(one.seen_s for one in ears.of(0x221) if one.seen_s <= on_s)
+    heard = list(ears.heard)
+    shown = (one.seen_s for one in heard if one.seen_s > on_s and expect.shown(one))
+    known_s = next(shown, None)
+    if known_s is None:
+        raise TimeoutError(f"no frame shows {expect.name}")
+    return known_s
+
+
+def _told_s(ears: CanEars, on_s: float, until_s: float) -> float:
+    """Since when every set-point has been speed 0; the end of the window where it never was."""
+    asked = [one for one in ears.of(0x111, on_s) if one.seen_s < until_s]
+    moving = [place for place, one in enumerate(asked) if speed_mps(one) != 0.0]
+    after = asked[moving[-1] + 1 :] if moving else asked
+    return after[0].seen_s if after else until_s
+
+
+def _stayed(
+    rig: Rig, chassis: ChassisProcess, stop: CommandSeen, stands_s: float, until_s: float
+) -> list[str]:
+    assert rig.ears is not None
+    wrong = _kept_to_its_own(rig.ears)
+    if stop.reason != Event.VEHICLE.value:
+        wrong.append(f"stopped for {stop.reason}")
+    if chassis.moved_between(stands_s, until_s):
+        wrong.append("moved before it was re-armed")
+    if any(c.mode == DRIVE and stop.seen_s < c.seen_s < until_s for c in rig.timeline.commands):
+        wrong.append("was commanded to drive before it was re-armed")
+    return wrong
+
+
+def _kept_to_its_own(ears: CanEars) -> list[str]:
+    """Wrong where a frame or a set-point was on the bus that should never be."""
+    most_mps = MODELS[MODEL].max_speed_mps
+    fast = [one for one in ears.of(0x111) if abs(speed_mps(one)) > most_mps]
+    wrong = [f"0x{one.can_id:x} was on the bus" for one in ears.strange[:1]]
+    return wrong + [f"asked for {speed_mps(one):.2f} m/s" for one in fast[:1]]
+
+
+def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
+    if not any(health.vehicle_fault for health in rig.probe.health[-2:]):
+        return ["health names no fault of the vehicle"]
+    said = [text for seen_s, text in rig.timeline.named if seen_s > since_s]
+    if any(one in text for one in expect.says.split("|") for text in said):
+        return []
+    return [f"feedback says {sorted(set(said))}, not {expect.says!r}"]
+
+
+def _refuses(rig: Rig) -> list[str]:
+    return ["was re-armed while the fault lasted"] if rig.try_rearm() else []
+
+
+def _rearmed(rig: Rig) -> float:
+    """From the re-arm to the first drive command; then wait until it moves in fact."""
+    assert rig.chassis is not None
+    rig.rearm()
+    rearmed_s = rig.mark()
+    rig.wait_until_driving(ready=lambda: rig.chassis is not None and rig.chassis.moves)
+    return drive_after_s(rig, rearmed_s) - rearmed_s
+
+
+def _status(test: Callable[[bytes], bool]) -> Callable[[Heard], bool]:
+    return lambda frame: frame.can_id == 0x211 and test(frame.data)
+
+
+_EXPECTS = (
+    Expect("silent", "sends no 0x2"),
+    Expect("bus_off", "sends no 0x2"),
+    Expect("late", "sends no 0x2"),
+    Expect(
+        "lying",
+        "reports",
+        lambda frame: frame.can_id == 0x221 and speed_mps(frame) > _IMPOSSIBLE_MPS,
+    ),
+    Expect("remote", "remote control", _status(lambda data: data[1] == 2)),
+    Expect("estop", "emergency stop", _status(lambda data: data[0] == 1)),
+    *(Expect(name, bit.words, _status(lambda data: any(data[4:6]))) for name, bit in BITS.items()),
+)
+_EXPECT = "set-point 0 on the bus, vehicle_fault; stands until re-armed"
+_RIG = {"vehicle": "hunter", "model": MODEL}
+_STUCK_LIMIT_S = FOLLOWS_S + DEVIATES_S + REACTION_LIMIT_S
+
+ROWS = (
+    *(
+        Row(
+            f"hunter_{expect.name}",
+            f"Hunter: {FAULTS[expect.name]}",
+            _EXPECT,
+            "last frame in time on the bus to set-point 0"
+            if expect.name in _NO_FRAME_TO_SHOW_IT
+            else "first frame on the bus that shows it to set-point 0",
+            partial(at_fault, expect),
+            rig=_RIG,
+            policy="full",
+            flows=True,
+        )
+        for expect in _EXPECTS
+    ),
+    Row(
+        "hunter_stuck",
+        f"Hunter: {FAULTS['stuck']}",
+        _EXPECT,
+        "first set-point that it does not follow to set-point 0",
+        stuck,
+        reaction_limit_s=_STUCK_LIMIT_S,
+        rig=_RIG,
+        policy="mean",
+        flows=True,
+    ),
+)

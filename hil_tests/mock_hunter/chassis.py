@@ -1,0 +1,187 @@
+"""The chassis's state machine: (state, event, time) to state. No clock, no bus, no body.
+
+CONTROL says who drives, CONDITION whether anybody may; every transition is a row of one of them.
+The manual leaves open what follows when the remote control or the emergency stop lets go: here
+the chassis then goes back to where it was, which gives control back by itself. That is the worst
+case for whoever commands it, as its answer to frames that come back after a timeout is (and that
+one is documented).
+"""
+
+from __future__ import annotations
+
+from enum import Enum, StrEnum
+from typing import NamedTuple
+
+from hil_tests.mock_hunter.faults import BITS
+
+
+class Control(StrEnum):
+    """Who drives. ``*_OVER_CAN``: the bus had control and gets it back."""
+
+    STANDBY = "standby"
+    CAN = "can"
+    LINK_LOST = "link_lost"  # standby, for the commands stopped coming
+    REMOTE = "remote"
+    REMOTE_OVER_CAN = "remote_over_can"
+
+
+class Condition(StrEnum):
+    """Whether anybody may drive."""
+
+    OK = "ok"
+    ESTOP = "estop"
+    EXCEPTION = "exception"
+    ESTOP_AND_EXCEPTION = "estop_and_exception"
+
+
+class Event(StrEnum):
+    """What can happen. The first three are frames of the bus."""
+
+    CAN_MODE = "0x421 = 1"
+    STANDBY_MODE = "0x421 = 0"
+    COMMAND = "0x111"
+    TIMEOUT = "no 0x111 for 500 ms"
+    REMOTE_ON = "remote control takes over"
+    REMOTE_OFF = "remote control lets go"
+    ESTOP_ON = "emergency stop pressed"
+    ESTOP_OFF = "emergency stop released"
+    ERRORS = "an error that stops it"
+    ERRORS_OVER = "no error left that stops it"
+
+
+_S, _C, _L = Control.STANDBY, Control.CAN, Control.LINK_LOST
+_R, _O = Control.REMOTE, Control.REMOTE_OVER_CAN
+CONTROL: dict[tuple[Control, Event], Control] = {
+    (_S, Event.CAN_MODE): _C,
+    (_S, Event.STANDBY_MODE): _S,
+    (_S, Event.COMMAND): _S,
+    (_S, Event.TIMEOUT): _S,
+    (_S, Event.REMOTE_ON): _R,
+    (_S, Event.REMOTE_OFF): _S,
+    (_C, Event.CAN_MODE): _C,
+    (_C, Event.STANDBY_MODE): _S,
+    (_C, Event.COMMAND): _C,
+    (_C, Event.TIMEOUT): _L,
+    (_C, Event.REMOTE_ON): _O,
+    (_C, Event.REMOTE_OFF): _C,
+    (_L, Event.CAN_MODE): _C,
+    (_L, Event.STANDBY_MODE): _S,
+    (_L, Event.COMMAND): _C,  # the trap: control comes back without anyone asking for it
+    (_L, Event.TIMEOUT): _L,
+    (_L, Event.REMOTE_ON): _O,
+    (_L, Event.REMOTE_OFF): _L,
+    (_R, Event.CAN_MODE): _R,  # the remote control always outranks the bus
+    (_R, Event.STANDBY_MODE): _R,
+    (_R, Event.COMMAND): _R,
+    (_R, Event.TIMEOUT): _R,
+    (_R, Event.REMOTE_ON): _R,
+    (_R, Event.REMOTE_OFF): _S,
+    (_O, Event.CAN_MODE): _O,
+    (_O, Event.STANDBY_MODE): _R,
+    (_O, Event.COMMAND): _O,
+    (_O, Event.TIMEOUT): _O,
+    (_O, Event.REMOTE_ON): _O,
+    (_O, Event.REMOTE_OFF): _C,
+}
+
+_K, _E, _X, _B = Condition
+CONDITION: dict[tuple[Condition, Event], Condition] = {
+    (_K, Event.ESTOP_ON): _E,
+    (_K, Event.ESTOP_OFF): _K,
+    (_K, Event.ERRORS): _X,
+    (_K, Event.ERRORS_OVER): _K,
+    (_E, Event.ESTOP_ON): _E,
+    (_E, Event.ESTOP_OFF): _K,
+    (_E, Event.ERRORS): _B,
+    (_E, Event.ERRORS_OVER): _E,
+    (_X, Event.ESTOP_ON): _B,
+    (_X, Event.ESTOP_OFF): _X,
+    (_X, Event.ERRORS): _X,
+    (_X, Event.ERRORS_OVER): _K,
+    (_B, Event.ESTOP_ON): _B,
+    (_B, Event.ESTOP_OFF): _X,
+    (_B, Event.ERRORS): _B,
+    (_B, Event.ERRORS_OVER): _E,
+}
+
+
+class Chassis(NamedTuple):
+    """Where the chassis stands. Power-on: standby, brake locked, no error.
+
+    ``causes`` are the errors whose cause is there now, ``errors`` those that it shows: some stay
+    after their cause until they are cleared.
+    """
+
+    control: Control = Control.STANDBY
+    condition: Condition = Condition.OK
+    brake_locked: bool = True
+    commanded_s: float = float("-inf")
+    """When the newest 0x111 came, or CAN control was taken."""
+    causes: frozenset[str] = frozenset()
+    errors: frozenset[str] = frozenset()
+
+
+def advance(chassis: Chassis, event: Event) -> Chassis:
+    """The state after an event."""
+    if (chassis.control, event) in CONTROL:
+        return chassis._replace(control=CONTROL[chassis.control, event])
+    return chassis._replace(condition=CONDITION[chassis.condition, event])
+
+
+def take_can_mode(chassis: Chassis, now_s: float) -> Chassis:
+    """0x421 = 1. The time-out counts from the moment in which control changes hands."""
+    after = advance(chassis, Event.CAN_MODE)
+    taken = after.control is Control.CAN and chassis.control is not Control.CAN
+    return after._replace(commanded_s=now_s) if taken else after
+
+
+def take_command(chassis: Chassis, now_s: float) -> Chassis:
+    """0x111: noted whoever drives, obeyed where `obeys` says so."""
+    return advance(chassis, Event.COMMAND)._replace(commanded_s=now_s)
+
+
+def take_time(chassis: Chassis, now_s: float, timeout_s: float) -> Chassis:
+    """What time alone does: the link counts as lost after ``timeout_s`` without a command."""
+    late = now_s - chassis.commanded_s > timeout_s
+    return advance(chassis, Event.TIMEOUT) if late else chassis
+
+
+def take_cause(chassis: Chassis, name: str, present: bool) -> Chassis:
+    """The cause of an error comes or goes; an error that does not latch goes with it."""
+    causes = chassis.causes | {name} if present else chassis.causes - {name}
+    kept = {error for error in chassis.errors if BITS[error].latches or error in causes}
+    return _settle(chassis._replace(causes=causes, errors=causes | kept))
+
+
+def take_clear(chassis: Chassis) -> Chassis:
+    """0x441: forget every error whose cause is gone."""
+    return _settle(chassis._replace(errors=chassis.causes))
+
+
+def obeys(chassis: Chassis) -> bool:
+    """Whether the body follows the set-point of the bus."""
+    return (
+        chassis.control is Control.CAN
+        and chassis.condition is Condition.OK
+        and not chassis.brake_locked
+    )
+
+
+def _settle(chassis: Chassis) -> Chassis:
+    stopped = any(BITS[error].stops for error in chassis.errors)
+    return advance(chassis, Event.ERRORS if stopped else Event.ERRORS_OVER)
+
+
+def render_tables() -> str:
+    """Both tables as Markdown: a row for each event, a column for each state."""
+    return "\n\n".join((_render(CONTROL, Control), _render(CONDITION, Condition)))
+
+
+def _render(table: dict, states: type[Enum]) -> str:
+    events = list(dict.fromkeys(event for _, event in table))
+    lines = ["| event | " + " | ".join(f"in {state.value}" for state in states) + " |"]
+    lines.append("|---" * (len(states) + 1) + "|")
+    for event in events:
+        cells = (table[state, event].value for state in states)
+        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)

@@ -1,0 +1,99 @@
+"""``python -m hil_tests mock_hunter``: a Hunter on a CAN bus, as a process of its own."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import sys
+import time
+from typing import Any
+
+from edge_runtime.errors import UserError
+from edge_runtime.vehicles.hunter import multicast
+from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE, PROFILES
+from hil_tests.mock_hunter.faults import FAULTS, check_fault
+from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.parameters import MODELS, SOURCES, make_parameters
+from hil_tests.mock_hunter.process import Orders, Server
+
+
+class _AfterFault(argparse.Action):
+    """``--after-s`` belongs to the ``--fault`` before it."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
+        if not namespace.fault or namespace.fault[-1][0]:
+            parser.error("--after-s follows a --fault")
+        namespace.fault[-1] = (values, namespace.fault[-1][1])
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = (
+        "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
+        f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
+    )
+    parser.add_argument(
+        "--bus", default=multicast.SYNTAX, metavar="INTERFACE:CHANNEL", help="where it is"
+    )
+    parser.add_argument("--model", default="hunter-2.0", choices=list(MODELS))
+    parser.add_argument(
+        "--profile", default=DEFAULT_PROFILE, choices=list(PROFILES), help="firmware's fault bits"
+    )
+    parser.add_argument("--set", action="append", metavar="NAME=VALUE", help="a parameter's value")
+    parser.add_argument(
+        "--fault", action="append", type=_fault, metavar="NAME", help="from the start"
+    )
+    parser.add_argument(
+        "--after-s", action=_AfterFault, type=_seconds, metavar="S", help="that fault comes later"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Be a Hunter until a signal comes."""
+    parameters = make_parameters(arguments.model, _changes(arguments.set or []))
+    bus = open_bus(parse_bus(arguments.bus))
+    try:
+        hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
+        server = Server(hunter, bus, _tell, arguments.fault or ())
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: server.stop())
+        orders = Orders(sys.stdin, lambda line: print(line, file=sys.stderr, flush=True))
+        _tell(f"ready bus={arguments.bus} model={arguments.model}")
+        server.run(orders.newest)
+    finally:
+        bus.shutdown()
+    return 0
+
+
+def _tell(line: str) -> None:
+    print(line, flush=True)
+
+
+def _fault(text: str) -> tuple[float, str]:
+    try:
+        return 0.0, check_fault(text)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (value >= 0.0 and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no time in seconds from 0 on")
+    return value
+
+
+def _changes(settings: list[str]) -> dict[str, float]:
+    changes = {}
+    for setting in settings:
+        name, _, value = setting.partition("=")
+        try:
+            changes[name] = float(value)
+        except ValueError:
+            raise UserError(f"--set {setting!r} is not valid: use NAME=VALUE") from None
+    return changes

@@ -1,0 +1,160 @@
+"""The whole mock: frames and time in, frames out. No clock and no bus of its own.
+
+Drive it with `receive` for each frame of the bus and `due` at `next_s`; both take the time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from edge_runtime.vehicles.hunter import frames as codec
+from hil_tests.mock_hunter import chassis as rules
+from hil_tests.mock_hunter.battery import Battery
+from hil_tests.mock_hunter.body import Body, Setpoint, advance, roll
+from hil_tests.mock_hunter.chassis import Chassis, Event
+from hil_tests.mock_hunter.faults import BITS, LATE_S, check_fault
+from hil_tests.mock_hunter.feedback import Reported, fast_frames, slow_frames
+from hil_tests.mock_hunter.parameters import Parameters
+
+FAST_S = 0.02
+SLOW_EVERY = 5
+"""Frames of 100 ms go with every fifth of those of 20 ms."""
+STEP_S = 0.005
+_LONGEST_GAP_S = 10.0
+"""After a longer pause of the process it has long come to its rest."""
+
+
+class Wire(NamedTuple):
+    """A frame on the bus."""
+
+    can_id: int
+    data: bytes
+
+
+class MockHunter:
+    """A chassis that was just switched on. Not thread-safe."""
+
+    def __init__(self, parameters: Parameters, now_s: float, profile: str = "v2") -> None:
+        self.chassis = Chassis()
+        self.body = Body()
+        self.battery = Battery(parameters)
+        self.faults: set[str] = set()
+        self.next_s = now_s
+        """When `due` must be called next."""
+        self._parameters, self._profile = parameters, profile
+        self._now_s = now_s
+        self._under_way: deque[tuple[float, Setpoint]] = deque()
+        self._setpoint = Setpoint()
+        self._tick = 0
+        self._outgoing: deque[tuple[float, Wire]] = deque()
+
+    def describe(self) -> str:
+        """Where it stands in one line that only changes when something happens."""
+        return (
+            f"control={self.chassis.control.value} condition={self.chassis.condition.value}"
+            f" brake={'locked' if self.chassis.brake_locked else 'released'}"
+            f" motion={'stands' if self.body.stands else 'moves'}"
+            f" errors={','.join(sorted(self.chassis.errors)) or 'none'}"
+        )
+
+    def receive(self, can_id: int, data: bytes, now_s: float) -> None:
+        """A frame of the bus; one that the chassis does not know, or of a wrong length, is none."""
+        self.advance(now_s)
+        decoded = codec.decode(can_id, data)
+        if decoded is None or "bus_off" in self.faults:
+            return
+        self._obey(decoded.message, now_s)
+
+    def switch(self, name: str, on: bool, now_s: float) -> None:
+        """Switch a fault on or off. Raises UserError for one that is not known."""
+        check_fault(name)
+        self.advance(now_s)
+        (self.faults.add if on else self.faults.discard)(name)
+        if name == "undervoltage":
+            self.battery.empty(on)  # the battery's voltage makes the error
+        elif name in BITS:
+            self.chassis = rules.take_cause(self.chassis, name, on)
+        elif name == "remote":
+            self._apply(Event.REMOTE_ON if on else Event.REMOTE_OFF)
+        elif name == "estop":
+            self._apply(Event.ESTOP_ON if on else Event.ESTOP_OFF)
+        self.advance(now_s)
+
+    def due(self, now_s: float) -> list[Wire]:
+        """The frames to send now. After a pause one report, not one for each missed period."""
+        self.advance(now_s)
+        if now_s >= self.next_s:
+            self._report(now_s)
+            self._tick += 1
+            missed = int((now_s - self.next_s) / FAST_S)
+            self.next_s += (missed + 1) * FAST_S
+        return self._released(now_s)
+
+    def advance(self, now_s: float) -> None:
+        """Integrate up to this time."""
+        self._now_s = max(self._now_s, now_s - _LONGEST_GAP_S)
+        while now_s - self._now_s > 1e-9:
+            step_s = min(STEP_S, now_s - self._now_s)
+            self._now_s += step_s
+            self._step(step_s)
+
+    def _obey(self, message: object, now_s: float) -> None:
+        if isinstance(message, codec.MotionCommand):
+            asked = Setpoint(message.speed_mps, message.inner_steering_rad)
+            self.chassis = rules.take_command(self.chassis, now_s)
+            self._under_way.append((now_s + self._parameters.dead_time_s, asked))
+        elif isinstance(message, codec.ModeCommand):
+            if message.mode == codec.CAN_CONTROL:
+                self.chassis = rules.take_can_mode(self.chassis, now_s)
+            elif message.mode == codec.STANDBY:
+                self._apply(Event.STANDBY_MODE)
+        elif isinstance(message, codec.BrakeCommand) and message.locked in (0, 1):
+            self.chassis = self.chassis._replace(brake_locked=message.locked == 1)
+        elif isinstance(message, codec.ClearCommand):
+            self.chassis = rules.take_clear(self.chassis)
+
+    def _apply(self, event: Event) -> None:
+        self.chassis = rules.advance(self.chassis, event)
+
+    def _step(self, step_s: float) -> None:
+        timeout_s = self._parameters.command_timeout_s
+        self.chassis = rules.take_time(self.chassis, self._now_s, timeout_s)
+        if self.battery.too_low != ("undervoltage" in self.chassis.causes):
+            self.chassis = rules.take_cause(self.chassis, "undervoltage", self.battery.too_low)
+        while self._under_way and self._under_way[0][0] <= self._now_s:
+            self._setpoint = self._under_way.popleft()[1]
+        before_mps = self.body.speed_mps
+        self.body = self._move(step_s)
+        change = abs(self.body.speed_mps) - abs(before_mps)
+        self.battery.advance(self.body.speed_mps, change / step_s, step_s)
+
+    def _move(self, step_s: float) -> Body:
+        if not rules.obeys(self.chassis):
+            # Where control comes back, it does so from a stand, not with what was asked before.
+            self._setpoint = Setpoint(0.0, self.body.inner_rad)
+            return advance(self.body, None, step_s, self._parameters)
+        if "stuck" in self.faults:
+            return roll(self.body, step_s, self._parameters)
+        return advance(self.body, self._setpoint, step_s, self._parameters)
+
+    def _report(self, now_s: float) -> None:
+        reported = Reported(
+            self.chassis, self.body, self.battery.volts, self.battery.amperes,
+            self._tick // SLOW_EVERY, "lying" in self.faults,
+        )  # fmt: skip
+        frames = fast_frames(reported, self._parameters)
+        if self._tick % SLOW_EVERY == 0:
+            frames += slow_frames(reported, self._parameters, self._profile)
+        if self.faults & {"silent", "bus_off"}:
+            return
+        release_s = now_s + (LATE_S if "late" in self.faults else 0.0)
+        if self._outgoing:
+            release_s = max(release_s, self._outgoing[-1][0])  # a bus keeps their order
+        self._outgoing.extend((release_s, Wire(*frame)) for frame in frames)
+
+    def _released(self, now_s: float) -> list[Wire]:
+        found = []
+        while self._outgoing and self._outgoing[0][0] <= now_s:
+            found.append(self._outgoing.popleft()[1])
+        return found

@@ -1,0 +1,342 @@
+"""The whole mock in made-up time, spoken to in bytes that are written by hand from the facts.
+
+Only here the driver's codec is not used: the mock must not be right merely by agreeing with it.
+"""
+
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge_runtime.errors import UserError
+from hil_tests.mock_hunter.chassis import obeys
+from hil_tests.mock_hunter.faults import BITS, FAULTS, LATE_S
+from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.parameters import MODELS
+
+P = MODELS["hunter-2.0"]
+CAN_MODE, STANDBY = (0x421, b"\x01"), (0x421, b"\x00")
+RELEASE, LOCK = (0x131, b"\x00"), (0x131, b"\x01")
+CLEAR = (0x441, b"\x00")
+SLOW_AHEAD = (0x111, bytes.fromhex("00 96 00 00 00 00 00 00"))  # 0.15 m/s, golden
+FAST_AHEAD = (0x111, bytes.fromhex("03 E8 00 00 00 00 00 00"))  # 1.0 m/s
+TURNED = (0x111, bytes.fromhex("00 00 00 00 00 00 00 C8"))  # 0.2 rad, golden
+STOP = (0x111, bytes(8))
+
+FAULT_BITS = {  # byte, bit: from the facts, not from the driver
+    "steering_encoder": (4, 1),
+    "remote_lost": (4, 2),
+    "driver": (4, 6),
+    "undervoltage": (5, 0),
+    "link_steer": (5, 3),
+    "link_rear_right": (5, 4),
+    "link_rear_left": (5, 5),
+    "overtemperature": (5, 6),
+    "overcurrent": (5, 7),
+}
+LINK_LOST = (4, 4)
+
+
+class Bench:
+    """A mock with a clock of its own, polled every 5 ms."""
+
+    def __init__(self, *frames):
+        self.now_s = 100.0
+        self.hunter = MockHunter(P, self.now_s)
+        self.seen = []
+        self.send(*frames)
+
+    def send(self, *frames):
+        for can_id, data in frames:
+            self.hunter.receive(can_id, data, self.now_s)
+
+    def run(self, seconds, frame=None):
+        """Let time pass; with a frame, it is streamed at 50 Hz."""
+        steps = round(seconds / 0.005)
+        for step in range(steps):
+            if frame is not None and step % 4 == 0:
+                self.send(frame)
+            self.now_s = round(self.now_s + 0.005, 6)
+            if self.now_s >= self.hunter.next_s:
+                self.seen += [(self.now_s, *sent) for sent in self.hunter.due(self.now_s)]
+        return self
+
+    def switch(self, name, on=True):
+        self.hunter.switch(name, on, self.now_s)
+
+    def last(self, can_id):
+        return next(data for _, sent_id, data in reversed(self.seen) if sent_id == can_id)
+
+    @property
+    def speed_mps(self):
+        return self.hunter.body.speed_mps
+
+
+def enabled(frame=SLOW_AHEAD, seconds=2.0):
+    return Bench(CAN_MODE, RELEASE).run(seconds, frame)
+
+
+def mode(bench):
+    return bench.last(0x211)[1]
+
+
+def test_power_on_by_hand():
+    first = Bench().run(0.05)
+    data = first.last(0x211)
+    # ok, standby, some 28.0 V, no fault, brake locked, the first one counted.
+    assert data[:2] == b"\x00\x00"
+    assert 270 <= int.from_bytes(data[2:4], "big") <= 280
+    assert data[4:] == b"\x00\x00\x01\x00"
+    assert first.last(0x221) == bytes(8)
+
+
+def test_the_documented_start_moves_it_at_the_golden_speed():
+    bench = enabled(SLOW_AHEAD)
+    assert bench.last(0x211)[1] == 1
+    assert bench.last(0x211)[6] == 0
+    assert bench.last(0x221) == bytes.fromhex("00 96 00 00 00 00 00 00")
+
+
+def test_the_golden_angle_turns_the_inner_wheel():
+    assert enabled(TURNED).last(0x221) == bytes.fromhex("00 00 00 00 00 00 00 C8")
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        (), (CAN_MODE,), (RELEASE,), (CAN_MODE, RELEASE, LOCK), (CAN_MODE, RELEASE, STANDBY),
+        ((0x421, b"\x02"), RELEASE), ((0x421, b"\x01\x00"), RELEASE), (CAN_MODE, (0x131, b"")),
+    ],
+)  # fmt: skip
+def test_short_of_the_whole_start_nothing_moves(frames):
+    bench = Bench(*frames).run(1.0, FAST_AHEAD)
+    assert bench.hunter.body.stands
+
+
+def test_it_never_goes_faster_or_turns_further_than_it_can():
+    bench = enabled((0x111, bytes.fromhex("7F FF 00 00 00 00 7F FF")), 4.0)
+    speed, angle = struct.unpack(">h4xh", bench.last(0x221))
+    assert (speed, angle) == (1500, 576)
+
+
+def test_periods_are_kept_on_absolute_deadlines():
+    bench = enabled(SLOW_AHEAD, 2.0)
+    for can_id, period_s in [(0x211, 0.1), (0x261, 0.1), (0x262, 0.1), (0x263, 0.1)] + [
+        (one, 0.02) for one in (0x221, 0x251, 0x252, 0x253)
+    ]:
+        times = [at for at, sent_id, _ in bench.seen if sent_id == can_id]
+        assert len(times) == pytest.approx(2.0 / period_s, abs=1)
+        assert times[-1] - times[0] == pytest.approx((len(times) - 1) * period_s, abs=0.006)
+    assert {sent_id for _, sent_id, _ in bench.seen} == {
+        0x211, 0x221, 0x251, 0x252, 0x253, 0x261, 0x262, 0x263,
+    }  # fmt: skip
+    counters = [data[7] for _, sent_id, data in bench.seen if sent_id == 0x211]
+    assert counters == list(range(len(counters)))
+
+
+def test_after_a_pause_it_reports_once_and_keeps_its_grid():
+    bench = enabled()
+    grid_s = bench.hunter.next_s
+    sent = bench.hunter.due(grid_s + 1.013)
+    assert len({frame.can_id for frame in sent}) == len(sent)
+    assert bench.hunter.next_s == pytest.approx(grid_s + 1.02)
+
+
+def test_nothing_happens_within_the_dead_time():
+    bench = Bench(CAN_MODE, RELEASE)
+    bench.run(P.dead_time_s, FAST_AHEAD)
+    assert bench.speed_mps < P.acceleration_mps2 * 0.006
+    assert bench.run(0.05, FAST_AHEAD).speed_mps > 0.05
+
+
+def test_after_500_ms_without_commands_it_stands_by_and_says_so():
+    bench = enabled(FAST_AHEAD)
+    assert not bench.run(0.45).hunter.body.stands
+    bench.run(0.15)
+    assert mode(bench) == 0
+    byte, bit = LINK_LOST
+    assert bench.last(0x211)[byte] == 1 << bit
+    assert bench.run(1.0).hunter.body.stands
+
+
+def test_the_trap_it_drives_on_by_itself_when_frames_come_back():
+    bench = enabled(FAST_AHEAD).run(2.0)
+    assert bench.hunter.body.stands
+    assert bench.run(1.0, FAST_AHEAD).speed_mps > 0.8
+    assert mode(bench) == 1
+    assert bench.last(0x211)[4:6] == b"\x00\x00"
+
+
+def test_what_was_asked_before_a_stop_is_not_driven_after_it():
+    bench = enabled(FAST_AHEAD).run(2.0)
+    assert bench.run(0.5, STOP).hunter.body.stands
+    furthest_m = bench.hunter.body.right_m
+    assert bench.run(0.5, STOP).hunter.body.right_m == furthest_m
+
+
+def test_the_brake_frame_stops_it_while_it_is_commanded_on():
+    bench = enabled(FAST_AHEAD)
+    bench.send(LOCK)
+    assert bench.run(0.5, FAST_AHEAD).hunter.body.stands
+    assert bench.last(0x211)[6] == 1
+    bench.send(RELEASE)
+    assert not bench.run(0.5, FAST_AHEAD).hunter.body.stands
+
+
+@pytest.mark.parametrize("name", BITS)
+def test_each_error_by_hand(name):
+    bench = enabled(FAST_AHEAD)
+    bench.switch(name)
+    bench.run(1.0, FAST_AHEAD)
+    data, (byte, bit) = bench.last(0x211), FAULT_BITS[name]
+    assert data[byte] == 1 << bit
+    assert data[9 - byte] == 0  # the other of bytes 4 and 5
+    assert data[0] == (2 if BITS[name].stops else 0)
+    assert bench.hunter.body.stands == BITS[name].stops
+    bench.switch(name, on=False)
+    bench.send(CLEAR)
+    assert not bench.run(1.0, FAST_AHEAD).hunter.body.stands
+    assert bench.last(0x211)[4:6] == b"\x00\x00"
+
+
+def test_undervoltage_is_the_batterys_and_its_motors_say_so():
+    bench = enabled()
+    bench.switch("undervoltage")
+    bench.run(0.2, SLOW_AHEAD)
+    assert int.from_bytes(bench.last(0x211)[2:4], "big") < P.undervoltage_v * 10
+    for can_id in (0x261, 0x262, 0x263):
+        data = bench.last(can_id)
+        assert data[0:2] == bench.last(0x211)[2:4]
+        assert data[5] & 1
+
+
+def test_the_emergency_stop_gives_control_back_when_it_is_released():
+    bench = enabled(FAST_AHEAD)
+    bench.switch("estop")
+    assert bench.run(1.0, FAST_AHEAD).hunter.body.stands
+    assert bench.last(0x211)[0] == 1
+    bench.switch("estop", on=False)
+    assert not bench.run(1.0, FAST_AHEAD).hunter.body.stands
+
+
+def test_the_remote_outranks_the_bus_and_gives_it_back():
+    bench = enabled(FAST_AHEAD)
+    bench.switch("remote")
+    bench.send(CAN_MODE)
+    assert bench.run(1.0, FAST_AHEAD).hunter.body.stands
+    assert mode(bench) == 2
+    bench.switch("remote", on=False)
+    assert not bench.run(1.0, FAST_AHEAD).hunter.body.stands
+
+
+def quiet(bench, seconds, frame):
+    count = len(bench.seen)
+    bench.run(seconds, frame)
+    return len(bench.seen) == count
+
+
+def test_silent_it_obeys_and_says_nothing():
+    bench = enabled()
+    bench.switch("silent")
+    assert quiet(bench, 1.0, FAST_AHEAD)
+    assert bench.speed_mps > 0.8
+
+
+def test_off_the_bus_it_hears_nothing_either():
+    bench = enabled(FAST_AHEAD)
+    bench.switch("bus_off")
+    assert quiet(bench, 1.5, FAST_AHEAD)
+    assert bench.hunter.body.stands
+    assert bench.hunter.chassis.control == "link_lost"
+
+
+def test_back_on_the_bus_it_does_not_drive_what_it_last_heard():
+    """A multicast bus brings its own reports back to it, before the first new command."""
+    bench = enabled(FAST_AHEAD)
+    bench.switch("bus_off")
+    bench.run(1.5, STOP)
+    bench.switch("bus_off", on=False)
+    bench.send((0x221, bytes(8)), (0x211, bytes(8)))
+    bench.run(0.01)
+    where_m = bench.hunter.body.right_m
+    assert bench.run(0.5, STOP).hunter.body.right_m == where_m
+    assert mode(bench) == 1  # the trap: it has control again
+
+
+def test_stuck_it_holds_its_speed_until_it_is_braked():
+    bench = enabled(FAST_AHEAD)
+    bench.switch("stuck")
+    assert bench.run(1.0, STOP).speed_mps == pytest.approx(1.0, abs=0.01)
+    bench.send(LOCK)
+    assert bench.run(0.5, STOP).hunter.body.stands
+
+
+def test_lying_it_reports_what_it_does_not_do():
+    bench = enabled(STOP)
+    bench.switch("lying")
+    bench.run(0.1, STOP)
+    assert bench.hunter.body.stands
+    assert int.from_bytes(bench.last(0x221)[:2], "big") == 3000
+
+
+def test_late_its_reports_are_old_and_in_order():
+    bench = enabled(FAST_AHEAD)
+    bench.switch("late")
+    begun_s = bench.now_s
+    bench.run(1.0, STOP)
+    after = [at for at, can_id, _ in bench.seen if can_id == 0x221 and at > begun_s]
+    assert after[0] - begun_s == pytest.approx(LATE_S, abs=0.03)
+    bench.switch("late", on=False)
+    bench.run(1.0, STOP)
+    counters = [data[7] for _, can_id, data in bench.seen if can_id == 0x211]
+    assert counters == sorted(counters)
+
+
+def test_every_fault_has_a_test_here_and_others_are_refused():
+    behaviours = {"silent", "stuck", "lying", "late", "bus_off", "remote", "estop"}
+    assert set(FAULTS) == behaviours | set(FAULT_BITS)
+    with pytest.raises(UserError, match="no fault 'meteor'"):
+        Bench().switch("meteor")
+
+
+@given(st.integers(0, 0x7FF), st.binary(max_size=8))
+def test_no_single_frame_moves_it_out_of_standby(can_id, data):
+    bench = Bench((can_id, data))
+    assert bench.run(0.2, (can_id, data)).hunter.body.stands
+
+
+happenings = st.lists(
+    st.one_of(
+        st.sampled_from([CAN_MODE, STANDBY, RELEASE, LOCK, CLEAR, FAST_AHEAD, TURNED, STOP]),
+        st.tuples(st.sampled_from(sorted(set(FAULTS) - {"stuck"})), st.booleans()),
+        st.floats(0.005, 0.3),
+    ),
+    max_size=30,
+)
+
+
+@settings(max_examples=60)
+@given(happenings)
+def test_whatever_happens_it_keeps_its_limits_and_brakes_where_it_does_not_obey(happened):
+    bench = Bench(CAN_MODE, RELEASE, FAST_AHEAD)
+    for one in happened:
+        if isinstance(one, float):
+            bench.run(one, FAST_AHEAD)
+        elif isinstance(one[1], bool):
+            bench.switch(*one)
+        else:
+            bench.send(one)
+        assert abs(bench.speed_mps) <= P.max_speed_mps
+    bench.run(2.0)  # the commands cease
+    assert bench.hunter.body.stands
+    assert not obeys(bench.hunter.chassis)
+
+
+def test_pulses_count_the_way():
+    bench = enabled(FAST_AHEAD, 3.0)
+    for can_id, way_m in ((0x252, bench.hunter.body.right_m), (0x253, bench.hunter.body.left_m)):
+        rpm, _, pulses = struct.unpack(">hhi", bench.last(can_id))
+        per_m = P.motor_revolutions_per_m * P.pulses_per_revolution
+        assert pulses == pytest.approx(way_m * per_m, abs=0.03 * per_m)
+        assert rpm == pytest.approx(60 * P.motor_revolutions_per_m, rel=0.02)

@@ -1,0 +1,158 @@
+"""The mock on a bus: inside one process on `virtual`, and as a process of its own."""
+
+import io
+import sys
+import threading
+import time
+
+import can
+import pytest
+
+from edge_runtime.cli import run_cli
+from edge_runtime.errors import UserError
+from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+from hil_tests.__main__ import main
+from hil_tests.faults.chassis import ChassisProcess, free_bus
+from hil_tests.faults.processes import wait_until
+from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.parameters import MODELS
+from hil_tests.mock_hunter.process import Orders, Server, parse_switch
+
+PATIENCE_S = 5.0
+
+
+def frame(can_id, data, **options):
+    return can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **options})
+
+
+def status_after(bus, wanted, patience_s=PATIENCE_S):
+    """The first 0x211 for which it holds; None where none comes."""
+    end_s = time.monotonic() + patience_s
+    while time.monotonic() < end_s:
+        message = bus.recv(0.1)
+        if message and message.arbitration_id == 0x211 and wanted(message.data):
+            return bytes(message.data)
+    return None
+
+
+@pytest.fixture
+def served():
+    """A bus with a mock at its other end, which says what it is told to the list."""
+    near = can.Bus(interface="virtual", channel="test_process")
+    far = can.Bus(interface="virtual", channel="test_process")
+    said: list[str] = []
+    server = Server(MockHunter(MODELS["hunter-2.0"], time.monotonic()), far, said.append)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    yield near, said
+    server.stop()
+    thread.join()
+    near.shutdown()
+    far.shutdown()
+
+
+def test_inside_a_process_it_answers_on_a_virtual_bus(served):
+    near, said = served
+    near.send(frame(0x421, b"\x01"))
+    near.send(frame(0x131, b"\x00"))
+    assert status_after(near, lambda data: data[1] == 1 and data[6] == 0)
+    assert any("control=can condition=ok brake=released motion=stands" in line for line in said)
+
+
+@pytest.mark.parametrize(
+    "odd", [{"is_extended_id": True}, {"is_remote_frame": True, "data": None}, {"is_fd": True}]
+)
+def test_frames_of_another_kind_are_not_the_chassis(served, odd):
+    near, _ = served
+    near.send(frame(0x421, **{"data": b"\x01", **odd}))
+    assert status_after(near, lambda data: data[1] == 1, patience_s=0.3) is None
+
+
+class DeafBus(can.BusABC):
+    """A bus that takes nothing."""
+
+    def __init__(self):
+        self.channel_info, self.tries = "deaf", 0
+        super().__init__("deaf")
+
+    def send(self, msg, timeout=None):
+        self.tries += 1
+        raise can.CanOperationError("no buffer space")
+
+    def _recv_internal(self, timeout):
+        time.sleep(timeout or 0.0)
+        return None, False
+
+
+def test_a_bus_that_takes_nothing_is_said_once():
+    bus = DeafBus()
+    said: list[str] = []
+    server = Server(MockHunter(MODELS["hunter-2.0"], time.monotonic()), bus, said.append)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    wait_until(lambda: bus.tries > 20, "some frames")
+    server.stop()
+    thread.join()
+    bus.shutdown()
+    assert sum("not sent: no buffer space" in line for line in said) == 1
+
+
+def test_as_a_process_it_obeys_switches_and_ends_on_a_signal():
+    name = free_bus()
+    chassis = ChassisProcess(name, "--fault", "estop", "--after-s", "0.3")
+    bus = open_bus(parse_bus(name))
+    try:
+        assert status_after(bus, lambda data: data[0] == 1)  # the fault of the command line
+        chassis.switch("estop", False)
+        assert status_after(bus, lambda data: data[0] == 0)
+        chassis.process.tell("estop maybe")
+        chassis.process.wait_for_line("'estop maybe' is no order")
+        chassis.switch("remote", True)
+        assert status_after(bus, lambda data: data[1] == 2)
+        assert chassis.truth[-1].control == "remote"
+    finally:
+        bus.shutdown()
+        assert chassis.process.end() == 0
+
+
+@pytest.mark.parametrize("line", ["remote", "remote yes", "", "meteor on", "on remote"])
+def test_orders_that_are_none_are_refused(line):
+    with pytest.raises(UserError):
+        parse_switch(line)
+
+
+def test_orders_come_in_turn_and_bad_ones_are_told():
+    told: list[str] = []
+    orders = Orders(io.StringIO("remote on\nmeteor on\nremote off\n"), told.append)
+    found: list[tuple[str, bool]] = []
+
+    def both():
+        found.extend(orders.newest())
+        return len(found) == 2
+
+    wait_until(both, "two orders")
+    assert found == [("remote", True), ("remote", False)]
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["--bus", "can0"], "is no CAN bus"),
+        (["--bus", "udp_multicast:10.1.2.3"], "is no IPv4 multicast group"),
+        (["--fault", "meteor"], "no fault 'meteor'; choose from silent"),
+        (["--after-s", "3"], "--after-s follows a --fault"),
+        (["--fault", "silent", "--after-s", "-1"], "no time in seconds"),
+        (["--set", "wings=2"], "no parameter 'wings'"),
+        (["--set", "track_m"], "use NAME=VALUE"),
+        (["--model", "hunter-3"], "invalid choice"),
+    ],
+)
+def test_wrong_options_are_one_line_and_status_2(arguments, why, capsys):
+    # argparse ends the process itself, a UserError gives its status.
+    with pytest.raises(SystemExit) as ended:
+        sys.exit(run_cli(main, ["mock_hunter", *arguments]))
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert why in said
+    assert said.count("\n") == 1
