@@ -86,6 +86,7 @@ board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline,
 	@mkdir -p results/deploy
 	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
 	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
+	$(BIN)/python -m hil_tests board --boards systemd --out results/deploy/systemd.json
 
 fleet: $(STAMP)  ## a router with 1, 5, 10 and 20 edge runtimes: processor, memory, bandwidth each
 	@mkdir -p results/deploy

@@ -18,9 +18,10 @@ from edge_runtime.files import check_writable
 from hil_tests.board import emulation
 from hil_tests.board.proof import prove_emulated, prove_twin
 from hil_tests.board.rootfs import DEFAULT_CACHE
+from hil_tests.board.service import prove_booted, why_not_booted
 from trainer.benches.machine import processor_model
 
-BOARDS = ("aarch64", "python38")
+BOARDS = ("aarch64", "python38", "systemd")
 FIRST_COMMAND_LIMIT_S, INSTALL_LIMIT_S = 180.0, 20.0
 
 
@@ -28,7 +29,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "--boards", nargs="+", choices=BOARDS, default=list(BOARDS),
-        help="an emulated aarch64 root file system; the jetpack5 bundle's twin under Python 3.8",
+        help="an emulated aarch64 root file system; the jetpack5 bundle's twin under Python 3.8;"
+        " the same as a service of a real systemd",
     )  # fmt: skip
     parser.add_argument(
         "--cache", metavar="DIR", default=str(DEFAULT_CACHE), help="keeps debootstrap's work"
@@ -65,8 +67,10 @@ def prove(board: str, cache: Path, wheels: Path) -> dict[str, Any]:
         report = prove_emulated(cache, wheels)
         name, limit_s = "root_to_first_command_s", FIRST_COMMAND_LIMIT_S
     else:
-        report = prove_twin(str(find_python38()), wheels)
+        python = str(find_python38())
         name, limit_s = "installed_s", INSTALL_LIMIT_S
+        booted = board == "systemd"
+        report = prove_booted(python, cache, wheels) if booted else prove_twin(python, wheels)
     return {**report, "bar": {"of": name, "limit_s": limit_s, "met": report[name] < limit_s}}
 
 
@@ -76,7 +80,10 @@ def why_not(board: str) -> str:
         return emulation.why_not()
     if os.geteuid() != 0:
         return "a network of its own needs root"
-    return "" if find_python38() else "no Python 3.8 on PATH or under ~/.pyenv"
+    python = find_python38()
+    if python is None:
+        return "no Python 3.8 on PATH or under ~/.pyenv"
+    return why_not_booted(python) if board == "systemd" else ""
 
 
 def find_python38() -> str | None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import subprocess
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Self
 
 from deploy.installer.apart import before_exec
 from hil_tests.faults.processes import wait_until
@@ -31,14 +33,23 @@ class Place:
 
     Args:
         root: the root directory of what runs inside; `/` for this machine's own.
+        enter: the shell's words that make it and become its first process; they say `ready`.
+        namespaces: further ones, as `unshare` calls them.
+        control_group: a folder whose control group everything inside belongs to; None for ours.
     """
 
-    def __init__(self, root: Path = Path("/")) -> None:
+    def __init__(
+        self,
+        root: Path = Path("/"),
+        enter: str = _ENTER,
+        namespaces: Sequence[str] = (),
+        control_group: Path | None = None,
+    ) -> None:
         self.root = root
         self._unshare = subprocess.Popen(
-            ["unshare", "--mount", "--net", "--pid", "--fork", "--kill-child",
-             "sh", "-e", "-c", _ENTER, "sh", str(root)],
-            stdout=subprocess.PIPE, text=True, preexec_fn=before_exec(isolated=False, account=None),
+            ["unshare", "--mount", "--net", "--pid", *namespaces, "--fork", "--kill-child",
+             "sh", "-e", "-c", enter, "sh", str(root)],
+            stdout=subprocess.PIPE, text=True, preexec_fn=_prepare(control_group),
         )  # fmt: skip
         assert self._unshare.stdout is not None
         if self._unshare.stdout.readline() != "ready\n":
@@ -79,8 +90,20 @@ class Place:
         except FileNotFoundError:
             return True
 
-    def __enter__(self) -> Place:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _prepare(control_group: Path | None) -> Callable[[], None]:
+    """What the child does before it becomes `unshare`: it ends with us, and joins the group."""
+    end_with_us = before_exec(isolated=False, account=None)
+
+    def prepare() -> None:
+        if control_group is not None:
+            (control_group / "cgroup.procs").write_text("0")
+        end_with_us()
+
+    return prepare

@@ -16,7 +16,7 @@ from deploy.pyz import NAME, build_installer
 from edge_runtime.errors import UserError
 from hil_tests.board.emulation import emulated
 from hil_tests.board.place import Place
-from hil_tests.board.rootfs import fresh_root
+from hil_tests.board.rootfs import AARCH64, fresh_root
 from hil_tests.commands import BackgroundCommand
 from hil_tests.faults.campaign import POLICY, PUBLIC_KEY
 
@@ -39,21 +39,24 @@ class Parcel(NamedTuple):
 
 
 class Site(NamedTuple):
-    """Where on the board it is installed, and with which Python."""
+    """Where on the board it is installed, with which Python, and who runs it."""
 
     place: Place
     python: str
     opt: str
+    service: str = "process"
 
 
 def prove_emulated(cache: Path, wheels: Path) -> dict[str, Any]:
     """Install linux-aarch64 into a fresh aarch64 root file system and drive; a report for JSON."""
     with emulated(), tempfile.TemporaryDirectory(prefix="phil-board-") as folder:
         root = Path(folder) / "root"
-        bootstrap_s = fresh_root(root, cache)
+        bootstrap_s = fresh_root(AARCH64, root, cache)
         parcel = pack("linux-aarch64", Path(folder), wheels)
         with Place(root) as place:
-            report = prove(Site(place, "/usr/bin/python3", "/opt/phil"), parcel)
+            site = Site(place, "/usr/bin/python3", "/opt/phil")
+            report = prove(site, parcel)
+            report["left_after_uninstall"] = remove(site)
         return {"target": "linux-aarch64", "debootstrap_s": bootstrap_s, **report}
 
 
@@ -62,7 +65,9 @@ def prove_twin(python: str, wheels: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="phil-twin-") as folder:
         parcel = pack("linux-x86_64", Path(folder), wheels)
         with Place() as place:
-            report = prove(Site(place, python, f"{folder}/opt"), parcel)
+            site = Site(place, python, f"{folder}/opt")
+            report = prove(site, parcel)
+            report["left_after_uninstall"] = remove(site)
         return {"target": "linux-x86_64", **report}
 
 
@@ -86,7 +91,7 @@ def pack(target: str, folder: Path, wheels: Path) -> Parcel:
 
 
 def prove(site: Site, parcel: Parcel) -> dict[str, Any]:
-    """From files carried to the board to an episode driven by it, and away again.
+    """From files carried to the board to an episode driven by it.
 
     Raises:
         UserError: a step failed; its last line says why.
@@ -94,14 +99,12 @@ def prove(site: Site, parcel: Parcel) -> dict[str, Any]:
     begun_s = time.time()
     bundle, installer, trust = _carry(parcel, site.place.root)
     say = _installer(
-        site, installer, "install", bundle, "--trust", trust, "--service", "process",
+        site, installer, "install", bundle, "--trust", trust, "--service", site.service,
         "--health-limit", str(_HEALTH_LIMIT_S),
     )  # fmt: skip
     installed_s = time.time() - begun_s
     shown = json.loads(_installer(site, installer, "status", "--json"))
     episode, first_s = _drive(site.place, parcel.certificates)
-    _installer(site, installer, "uninstall")
-    left = site.place.root / site.opt.lstrip("/")
     return {
         "bundle_mb": parcel.bundle.stat().st_size / 1e6,
         "python": _version(site),
@@ -112,8 +115,13 @@ def prove(site: Site, parcel: Parcel) -> dict[str, Any]:
         "installer_said": say.strip().splitlines(),
         "status": shown,
         "episode": episode,
-        "left_after_uninstall": left.exists(),
     }  # fmt: skip
+
+
+def remove(site: Site) -> bool:
+    """Uninstall with the installer that lies there; whether anything is left."""
+    _installer(site, f"{site.opt}/current/{NAME}", "uninstall")
+    return (site.place.root / site.opt.lstrip("/")).exists()
 
 
 def _carry(parcel: Parcel, root: Path) -> list[str]:

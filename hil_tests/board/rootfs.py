@@ -1,4 +1,4 @@
-"""Debian bullseye for aarch64: the board's glibc 2.31, with Python 3.9 and nothing of ours."""
+"""Debian in a folder, by debootstrap, with nothing of ours in it."""
 
 from __future__ import annotations
 
@@ -7,20 +7,34 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 from edge_runtime.errors import UserError
 
-SUITE = "bullseye"
 DEFAULT_CACHE = Path("build/board")
-_ARCHIVE = f"{SUITE}-arm64.tar"
 _LIMIT_S = 1800.0
 _ENVIRONMENT = {"LC_ALL": "C", "PATH": os.defpath + ":/usr/sbin:/sbin"}
 
 
-def fresh_root(folder: Path, cache: Path) -> float | None:
+class Debian(NamedTuple):
+    """A release of Debian for a processor, and what is installed beside the least of it."""
+
+    suite: str
+    architecture: str
+    packages: tuple[str, ...]
+
+
+AARCH64 = Debian("bullseye", "arm64", ("python3",))
+"""The board's glibc 2.31, with Python 3.9."""
+BOOTABLE = Debian("bookworm", "amd64", ("systemd-sysv", "dbus", "iproute2", "kmod"))
+"""A systemd that this machine's processor runs by itself."""
+
+
+def fresh_root(debian: Debian, folder: Path, cache: Path) -> float | None:
     """Lay a root file system into a folder.
 
     Args:
+        debian: what is in it.
         folder: where it goes; absent or empty.
         cache: keeps the archive that debootstrap's work becomes, so that it works once.
 
@@ -30,9 +44,9 @@ def fresh_root(folder: Path, cache: Path) -> float | None:
     Raises:
         UserError: debootstrap failed, for instance without a network.
     """
-    archive, took_s = cache / _ARCHIVE, None
+    archive, took_s = cache / f"{debian.suite}-{debian.architecture}.tar", None
     if not archive.exists():
-        took_s = _build(archive)
+        took_s = _build(debian, archive)
     folder.mkdir(parents=True, exist_ok=True)
     subprocess.run(
         ["tar", "--extract", "--numeric-owner", "--file", str(archive), "--directory", str(folder)],
@@ -41,14 +55,14 @@ def fresh_root(folder: Path, cache: Path) -> float | None:
     return took_s
 
 
-def _build(archive: Path) -> float:
+def _build(debian: Debian, archive: Path) -> float:
     """Bootstrap beside the archive, and give it its name when it is whole."""
     archive.parent.mkdir(parents=True, exist_ok=True)
     draft = archive.with_name(f".{archive.name}.{os.getpid()}")
     root = draft.with_suffix(".root")
     begun_s = time.monotonic()
     try:
-        _debootstrap(root)
+        _debootstrap(debian, root)
         took_s = time.monotonic() - begun_s
         left_out = ["./dev/*", "./proc/*", "./sys/*", "./debootstrap", "./var/cache/apt/archives/*"]
         subprocess.run(
@@ -63,11 +77,12 @@ def _build(archive: Path) -> float:
     return took_s
 
 
-def _debootstrap(root: Path) -> None:
+def _debootstrap(debian: Debian, root: Path) -> None:
     """In a mount namespace of its own: what it mounts is gone with it, whatever happens."""
     done = subprocess.run(
-        ["unshare", "--mount", "--pid", "--fork", "--kill-child", "debootstrap", "--arch=arm64",
-         "--variant=minbase", "--include=python3", SUITE, str(root.resolve())],
+        ["unshare", "--mount", "--pid", "--fork", "--kill-child", "debootstrap",
+         f"--arch={debian.architecture}", "--variant=minbase",
+         f"--include={','.join(debian.packages)}", debian.suite, str(root.resolve())],
         capture_output=True, text=True, check=False, timeout=_LIMIT_S, env=_ENVIRONMENT,
     )  # fmt: skip
     if done.returncode != 0:

@@ -172,6 +172,10 @@ def _numbers(parts: Parts, before: _Look, after: _Look) -> dict[str, Any]:
     edges_cpu_s = sum(b.cpu_s - a.cpu_s for a, b in zip(before.edges, after.edges, strict=True))
     return {
         "seconds": round(took_s, 2),
+        "message_bytes": {
+            topic: parts.simulators[0].message_bytes.get(topic, 0)
+            for topic in ("state", "command", "health")
+        },
         "states_each": min(states),
         "answered_least": min(answered),
         "latency_ms": {name: round(value * 1e3, 3) for name, value in

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from edge_runtime.topics import TOPICS
+
 FLEETS = (10, 1_000, 100_000)
 CORE_SHARE = 0.5
 """Of a core that a router may use on average: the other half is for the moment all come back."""
 LINK_MBIT_S = 1000.0
 LINK_SHARE = 0.5
-KEYS = ("state", "command", "feedback", "health", "alive", "status", "rearm")
 
 
 def per_vehicle(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
@@ -34,12 +35,14 @@ def per_vehicle(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
     )
     largest = max(rows, key=lambda row: int(row["vehicles"]))
     up, down = (largest["link_of_a_simulator_kbit_s"][way] for way in ("sends", "receives"))
+    health_bytes = largest["message_bytes"]["health"]
     return {
         "router_cpu_percent_of_a_core": cpu,
         "router_resident_mb": memory,
         # States come in from the simulator and go out to the edge runtime; commands back.
         "router_in_kbit_s": up + largest["link_of_an_edge_kbit_s"]["sends"],
         "router_out_kbit_s": down + largest["link_of_an_edge_kbit_s"]["receives"],
+        "health_kbit_s": health_bytes * 8e-3 * TOPICS["health"].rate_hz,
     }
 
 
@@ -63,8 +66,9 @@ def project(each: dict[str, float], rules: Sequence[dict[str, float]]) -> list[d
                 "router_mb_for_links": held * each["router_resident_mb"],
                 "router_in_mbit_s": held * each["router_in_kbit_s"] / 1e3,
                 "all_routers_in_gbit_s": count * each["router_in_kbit_s"] / 1e6,
+                "health_of_all_mbit_s": count * each["health_kbit_s"] / 1e3,
                 "certificates": 3 * count + 1 + routers,
-                "zenoh_keys": len(KEYS) * count,
+                "zenoh_keys": len(TOPICS) * count,
                 "rules_file_mb": held * rule_bytes["file_bytes"] / rule_bytes["vehicles"] / 1e6,
             }
         )

@@ -29,6 +29,8 @@ class LightSimulator:
         """From state sent to command received, for each step that was answered, s."""
         self.foreign = 0
         """Messages of another vehicle. Each would be a hole in the access control."""
+        self.message_bytes: dict[str, int] = {}
+        """The payload of the last message, by topic."""
         self.last_command_s = 0.0
         self.step = 0
         self._name = f"fleet-{vehicle_id}"
@@ -64,6 +66,7 @@ class LightSimulator:
             final=False,
         )
         payload = wire.encode(state)
+        self.message_bytes["state"] = len(payload)
         self.sent_s[self.step] = time.monotonic()
         self._publisher.put(payload)
 
@@ -84,13 +87,16 @@ class LightSimulator:
         if isinstance(command, wire.Rejection) or command.session != self._name:
             self.foreign += 1
             return
+        self.message_bytes["command"] = len(bytes(sample.payload))
         self.last_command_s = now_s
         sent_s = self.sent_s.get(command.step)
         if command.mode == wire.DRIVE and sent_s is not None:
             self.latency_s.setdefault(command.step, now_s - sent_s)
 
     def _look(self, sample: Any) -> None:
-        self.foreign += not str(sample.key_expr).startswith(self._own)
+        key = str(sample.key_expr)
+        self.foreign += not key.startswith(self._own)
+        self.message_bytes[key.rpartition("/")[2]] = len(bytes(sample.payload))
 
 
 class Fleet:

@@ -26,6 +26,7 @@ def test_three_vehicles_drive_and_hear_only_their_own(tmp_path):
     if not why_not_counted():
         assert report["link_of_an_edge_kbit_s"]["receives"] > 0.5 * STATE_KBIT_S
         assert report["link_of_a_simulator_kbit_s"]["sends"] > 0.5 * STATE_KBIT_S
+    assert report["message_bytes"]["state"] > 7_200
     assert report["router_resident_mb"] > 1
 
 
@@ -63,6 +64,7 @@ def fleet(vehicles):
         "vehicles": vehicles,
         "router_cpu_percent_of_a_core": 1.0 + 0.5 * vehicles,
         "router_resident_mb": 30 + 0.2 * vehicles,
+        "message_bytes": {"health": 500},
         "link_of_a_simulator_kbit_s": {"sends": 600.0, "receives": 30.0},
         "link_of_an_edge_kbit_s": {"sends": 30.0, "receives": 600.0},
     }
@@ -78,6 +80,7 @@ def test_many_more_from_what_each_adds():
     assert ten["vehicles_a_router_at_most"] == 100
     assert [ten["routers"], thousand["routers"], most["routers"]] == [1, 10, 1000]
     assert ten["certificates"] == 32
+    assert most["health_of_all_mbit_s"] == pytest.approx(100_000 * 500 * 8 * 2 / 1e6)
     assert most["all_routers_in_gbit_s"] == pytest.approx(63.0)
     assert thousand["rules_file_mb"] == pytest.approx(0.5)
 
