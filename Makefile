@@ -7,11 +7,13 @@ PEERS := .venv-peers
 PEERS_STAMP := $(PEERS)/.installed
 MUTATION := .venv-mutation
 MUTATION_STAMP := $(MUTATION)/.installed
+CONTAINER := .venv-container
+CONTAINER_STAMP := $(CONTAINER)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray test-network lint format bench bench-quick bench-gpu bench-loop \
-	bench-can network vehicle recording mutate lock clean
+.PHONY: help install demo test test-ray test-network test-board lint format lint-container bench bench-quick bench-gpu \
+	bench-loop bench-can network vehicle board fleet recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -39,11 +41,22 @@ test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 test-network: $(STAMP)  ## the loop over a kernel network of two namespaces; needs root
 	$(BIN)/python -m pytest -m network hil_tests
 
+test-board: $(STAMP)  ## whole bundles installed, on an emulated board, too, with every fault; minutes, root
+	$(BIN)/python -m pytest -m board
+
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests
-	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime
+	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer
+
+$(CONTAINER_STAMP): requirements/container.txt
+	$(PYTHON) -m venv $(CONTAINER)
+	$(CONTAINER)/bin/python -m pip install --quiet --requirement requirements/container.txt
+	@touch $@
+
+lint-container: $(CONTAINER_STAMP)  ## hadolint over the Dockerfile of the edge runtime
+	$(CONTAINER)/bin/hadolint deploy/container/Dockerfile
 
 format: $(STAMP)  ## mend what ruff can
 	$(BIN)/ruff check --fix .
@@ -69,6 +82,16 @@ network: $(STAMP)  ## TCP, UDP, relay and virtual time on the same network; need
 	@mkdir -p results/network
 	$(BIN)/python -m hil_tests network --out results/network/network.json --report results/network
 	$(BIN)/python -m hil_tests.network.variants --out results/network/variants.json
+
+board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
+	@mkdir -p results/deploy
+	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
+	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
+	$(BIN)/python -m hil_tests board --boards systemd --out results/deploy/systemd.json
+
+fleet: $(STAMP)  ## a router with 1, 5, 10 and 20 edge runtimes: processor, memory, bandwidth each
+	@mkdir -p results/deploy
+	$(BIN)/python -m hil_tests fleet --out results/deploy/fleet.json
 
 bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and eight at once
 	@mkdir -p $(BENCH)
@@ -103,4 +126,4 @@ lock: $(STAMP)  ## rewrite the lock from what is installed
 	mv requirements/workstation.txt.new requirements/workstation.txt
 
 clean:  ## remove caches and the virtual environments; trained runs stay
-	rm -rf $(VENV) $(PEERS) $(MUTATION) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(PEERS) $(MUTATION) $(CONTAINER) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache

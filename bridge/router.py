@@ -6,10 +6,14 @@ import contextlib
 import threading
 from typing import Any
 
+import zenoh
+
 from bridge.arguments import add_tls
 from bridge.signals import sigterm_as_interrupt
 from edge_runtime import access
 from edge_runtime.cli import ArgumentParser
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes
 from edge_runtime.tls import tls_for
 from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, open_session
@@ -31,10 +35,21 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="a vehicle whose parties have rights here, with --tls; may be repeated"
         f" (default: {DEFAULT_VEHICLE_ID})",
     )
+    parser.add_argument(
+        "--config",
+        metavar="FILE.json5",
+        help="all settings from a file of `python -m deploy router`, and no other option",
+    )
 
 
 def router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
+    if arguments.config is not None:
+        if arguments.listen or arguments.tls or arguments.vehicle_id:
+            raise UserError("--config goes with no other option: the file says it all")
+        with contextlib.suppress(KeyboardInterrupt), sigterm_as_interrupt():
+            _route(_open(arguments.config), f"config={arguments.config}")
+        return 0
     listens = list(dict.fromkeys(arguments.listen or [DEFAULT_ENDPOINT]))
     vehicle_ids = list(map(check_vehicle_id, arguments.vehicle_id or [DEFAULT_VEHICLE_ID]))
     tls = tls_for(arguments.tls, *map(check_endpoint, listens))
@@ -44,9 +59,22 @@ def router(arguments: Any) -> int:
         rules = access.rules_for_listener(vehicle_ids)
     with contextlib.suppress(KeyboardInterrupt), sigterm_as_interrupt():
         session = open_session(listen=listens, mode="router", tls=tls, access=rules)
-        try:
-            print(f"ready listen={','.join(listens)}", flush=True)
-            threading.Event().wait()
-        finally:
-            session.close()
+        _route(session, f"listen={','.join(listens)}")
     return 0
+
+
+def _route(session: zenoh.Session, what: str) -> None:
+    try:
+        print(f"ready {what}", flush=True)
+        threading.Event().wait()
+    finally:
+        session.close()
+
+
+def _open(path: str) -> zenoh.Session:
+    """A router with the settings of a file, as zenohd would open it."""
+    read_bytes(path, "router's config file")
+    try:
+        return zenoh.open(zenoh.Config.from_file(path))
+    except zenoh.ZError as error:
+        raise UserError(f"Zenoh opens no router with {path}: {error}") from None

@@ -36,6 +36,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     public_key: Optional[str] = None
     allow_unsigned: bool = False
     armed_at_start: bool = True
+    hold: Optional[str] = None
     log_level: str = "info"
     log_format: str = "text"
     realtime_priority: int = 0

@@ -21,6 +21,7 @@ from edge_runtime import log
 from edge_runtime.board import BoardWatch
 from edge_runtime.controller import Controller, Order, Received
 from edge_runtime.flood import Flood
+from edge_runtime.hold import Hold
 from edge_runtime.inference import infer
 from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.latest import LatestState
@@ -48,12 +49,14 @@ class ControlLoop:
         link: Link,
         vehicle: Optional[VehicleRunner],
         notifier: Notifier,
+        hold: Optional[Hold] = None,
     ) -> None:
         self._policy = policy
         self._controller = controller
         self._link = link
         self._vehicle = vehicle
         self._notifier = notifier
+        self._hold = hold or Hold()
         self._board = BoardWatch()
         self._latest = LatestState()
         self._inference_window = LatencyWindow()
@@ -201,7 +204,7 @@ class ControlLoop:
             if self._vehicle is not None:
                 # What stopped it and is over ends with `enable`; the next look says if it did.
                 self._controller.vehicle_fault = self._vehicle.standing_fault(now_s)
-            refusal = self._controller.rearm(now_s)
+            refusal = self._hold.refusal() or self._controller.rearm(now_s)
             if not refusal and self._vehicle is not None:
                 self._vehicle.enable()
             log.event("info", "rearm", accepted=not refusal, detail=refusal)
@@ -221,7 +224,7 @@ class ControlLoop:
 
     def _send(self, order: Optional[Order]) -> None:
         self._log_transition()
-        if order is None:
+        if order is None or self._hold.is_on():
             return
         state = order.answers.state
         command = Command(

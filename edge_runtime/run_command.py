@@ -13,6 +13,7 @@ from typing import Any, Callable, Iterator, Optional
 from edge_runtime import access, log, presence, realtime
 from edge_runtime.config import Config, load_config
 from edge_runtime.controller import Controller
+from edge_runtime.hold import Hold
 from edge_runtime.limiter import limit_rows
 from edge_runtime.link import Link
 from edge_runtime.loop import ControlLoop
@@ -108,7 +109,7 @@ def _serve(
         try:
             link = Link(session, config.vehicle_id, policy.manifest)
             runner = _attach(vehicle, policy, link)
-            loop = ControlLoop(policy, controller, link, runner, notifier)
+            loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold))
         except BaseException:
             session.close()  # An open session would hang the process at its exit.
             raise

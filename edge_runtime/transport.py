@@ -67,7 +67,7 @@ def open_session(
     for endpoint in listens:
         _check_port_is_free(endpoint)
     try:
-        session = zenoh.open(_config(listens, connect, mode, tls, access))
+        session = zenoh.open(_config(session_rows(listens, connect, mode, tls, access)))
     except zenoh.ZError as error:
         raise UserError(_explain(str(error), listens, connect, tls)) from None
     if connect is not None and tls is not None and not session.info.routers_zid():
@@ -83,13 +83,14 @@ def _check_refusal(session: zenoh.Session, connect: str, tls: TlsFiles) -> None:
         raise UserError(refusal)
 
 
-def _config(
+def session_rows(
     listens: List[str],
     connect: Optional[str],
     mode: str,
     tls: Optional[TlsFiles],
     access: Optional[Dict[str, Any]],
-) -> zenoh.Config:
+) -> Dict[str, Any]:
+    """Zenoh's settings of such a session, by their paths, as in `scouting/gossip/enabled`."""
     rows: Dict[str, Any] = {
         "mode": mode,
         # Explicitly none: a peer would otherwise listen on every interface.
@@ -110,6 +111,10 @@ def _config(
         rows["transport/link/protocols"] = list(TLS_PROTOCOLS)
     if access is not None:
         rows["access_control"] = access
+    return rows
+
+
+def _config(rows: Dict[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
     for name, value in rows.items():
         config.insert_json5(name, json.dumps(value))

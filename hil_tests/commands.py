@@ -98,17 +98,18 @@ class BackgroundCommand:
 
     def _wait_for(self, ready: str) -> None:
         end_s = time.monotonic() + START_TIMEOUT_S
-        while ready not in self._said():
+        while ready not in self.said():
             if self._process.poll() is not None or time.monotonic() > end_s:
                 failure = self._failure()
                 self.__exit__()
                 raise failure
             time.sleep(0.02)
 
-    def _said(self) -> str:
+    def said(self) -> str:
+        """All of its output so far."""
         self._output.seek(0)
         return self._output.read()
 
     def _failure(self) -> UserError:
-        last = (self._said().strip().splitlines() or ["it said nothing"])[-1]
+        last = (self.said().strip().splitlines() or ["it said nothing"])[-1]
         return UserError(f"python -m {self.name}: {last}")

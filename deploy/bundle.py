@@ -1,0 +1,196 @@
+"""A bundle: everything that a board needs to drive one policy, in one signed archive.
+
+The same inputs give the same bytes: the archive says nothing of when, where and by whom.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+import edge_runtime
+from deploy.installer.archive import CONTEXT, END, MANIFEST, SIGNATURE, header, padding
+from deploy.installer.manifest import FileEntry, Manifest, Target, to_json
+from deploy.installer.release import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
+from deploy.pyz import NAME, build_installer
+from edge_runtime import access
+from edge_runtime.config import Config, load_config
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes
+from edge_runtime.policy import Policy, load_policy
+from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE, load_tls
+from edge_runtime.vehicles.registry import NONE
+
+UNITS = Path(__file__).parent / "systemd"
+_DIGITS = 8
+HOLD = "../../state/hold"
+"""Seen from a release's folder: what the installer locks while it judges."""
+_OF_THE_BUNDLE = ("policy", "tls", "public_key", "allow_unsigned", "hold")
+
+
+class Inputs(NamedTuple):
+    """What a bundle is made of."""
+
+    policy: Path
+    """With its signature beside it."""
+    public_key: Path
+    """Of whoever signed the policy."""
+    key: Path
+    """The private key that signs the bundle."""
+    config: Path | None
+    """Settings of `run`; None for its defaults."""
+    tls: Path | None
+    """The folder of `deploy certs` for this vehicle."""
+    wheels: list[Path]
+
+
+class Made(NamedTuple):
+    """A bundle on the disk, and what it holds: size by name, in bytes."""
+
+    path: Path
+    manifest: Manifest
+
+
+def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
+    """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, into `out`.
+
+    Raises UserError, with nothing written, for a policy that may not drive or was not signed by
+    the public key's owner, settings that do not hold, certificates of another party, and a key
+    that cannot sign.
+    """
+    key, policy, config, text = check_inputs(inputs)
+    contents = {
+        NAME: build_installer(),
+        POLICY: read_bytes(inputs.policy, "policy file"),
+        f"{POLICY}.sig": read_bytes(f"{inputs.policy}.sig", "signature"),
+        PUBLIC_KEY: read_bytes(inputs.public_key, "public key"),
+        CONFIG: text.encode(),
+        **{f"units/{path.name}": path.read_bytes() for path in sorted(UNITS.glob("*.*"))},
+        **{f"{WHEELS}{_short(path)}": path.read_bytes() for path in inputs.wheels},
+    }
+    if inputs.tls is not None:
+        contents |= _tls(inputs.tls, config.vehicle_id)
+    manifest = _manifest(contents, target, config.vehicle_id, policy.policy_id)
+    path = out / f"phil-{target.name}-{config.vehicle_id}-{manifest.version}.tar"
+    _write(path, manifest, key, contents)
+    return Made(path, manifest)
+
+
+def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str]:
+    """All but the wheels: the key, the policy, the settings, and the file that says them.
+
+    Raises UserError for what `make_bundle` would refuse.
+    """
+    key = _read_private_key(inputs.key)
+    policy = load_policy(inputs.policy, inputs.public_key)
+    config, text = _config(inputs)
+    if inputs.tls is not None:
+        _tls(inputs.tls, config.vehicle_id)
+    return key, policy, config, text
+
+
+def _manifest(contents: dict[str, bytes], target: Target, vehicle: str, policy: str) -> Manifest:
+    """The version ends with a hash of all the rest, so it always means the same bytes."""
+    files = [
+        FileEntry(path, len(data), hashlib.sha256(data).hexdigest())
+        for path, data in sorted(contents.items())
+    ]
+    draft = Manifest("draft", target, vehicle, policy, files)
+    digest = hashlib.sha256(to_json(draft)).hexdigest()
+    version = f"{edge_runtime.__version__}-{policy[:_DIGITS]}-{digest[:_DIGITS]}"
+    return draft._replace(version=version)
+
+
+def _config(inputs: Inputs) -> tuple[Config, str]:
+    """The settings, checked as `run` checks them, and the file that the board gets."""
+    given = read_bytes(inputs.config, "config file").decode() if inputs.config else ""
+    plain = load_config(inputs.config, {"policy": str(inputs.policy), **_tls_flag(inputs)})
+    keys = tomllib.loads(given).keys()
+    for name in _OF_THE_BUNDLE:
+        if name in keys:
+            raise UserError(
+                f"config file {inputs.config}: {name} is the bundle's to say; leave it out"
+            )
+    if "armed_at_start" in keys and plain.armed_at_start and plain.vehicle != NONE:
+        raise UserError(
+            f"config file {inputs.config}: armed_at_start would let a machine move the vehicle"
+            " when it starts; leave it out"
+        )
+    lines = [
+        "# Made by `deploy bundle`; paths are of the release's folder, where the service starts.",
+        f'policy = "{POLICY}"',
+        f'public_key = "{PUBLIC_KEY}"',
+        f'hold = "{HOLD}"',
+        *([f'tls = "{TLS.rstrip("/")}"'] if inputs.tls else []),
+        *([] if "armed_at_start" in keys else ["armed_at_start = false"]),
+        "",
+        given.strip(),
+    ]
+    text = "\n".join(lines).rstrip() + "\n"
+    _check_text(text)
+    return plain, text
+
+
+def _short(wheel: Path) -> str:
+    """NAME-VERSION.whl: the tags were pip's concern, and make some names too long for a tar."""
+    return "-".join(wheel.name.split("-")[:2]) + ".whl"
+
+
+def _tls_flag(inputs: Inputs) -> dict[str, str]:
+    return {"tls": str(inputs.tls)} if inputs.tls else {}
+
+
+def _check_text(text: str) -> None:
+    with tempfile.NamedTemporaryFile("w", suffix=".toml") as file:
+        file.write(text)
+        file.flush()
+        load_config(file.name, {})
+
+
+def _tls(folder: Path, vehicle_id: str) -> dict[str, bytes]:
+    """The three files of the edge runtime's party, and none that may stand beside them."""
+    files = load_tls(folder)
+    access.check_name(files.name, access.common_name(access.EDGE, vehicle_id))
+    return {
+        f"{TLS}{name}": read_bytes(folder / name, "TLS file")
+        for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE)
+    }
+
+
+def _read_private_key(path: Path) -> Ed25519PrivateKey:
+    pem = read_bytes(path, "private key")
+    try:
+        key = load_pem_private_key(pem, password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        raise UserError(f"{path} is not a private key in PEM without a password") from None
+    if not isinstance(key, Ed25519PrivateKey):
+        raise UserError(f"{path} is not an Ed25519 key; `python -m deploy keys` makes one")
+    return key
+
+
+def _write(path: Path, manifest: Manifest, key: Ed25519PrivateKey, contents: dict) -> None:
+    """Write it beside and move it there: it holds a private key, so nobody else may read it."""
+    raw = to_json(manifest)
+    members = {MANIFEST: raw, SIGNATURE: key.sign(CONTEXT + raw)}
+    members |= {entry.path: contents[entry.path] for entry in manifest.files}
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:
+            for name, data in members.items():
+                stream.write(header(name, len(data)) + data + padding(len(data)))
+            stream.write(END)
+        draft.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            draft.unlink()
+        raise UserError(f"cannot write {path}: {error.strerror}") from None

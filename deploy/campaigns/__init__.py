@@ -1,0 +1,1 @@
+"""Long proofs of the installer: each a command with a JSON result."""

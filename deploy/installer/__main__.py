@@ -1,0 +1,142 @@
+"""`python3 install.pyz install | status | rollback | uninstall | supervise` (deploy/README.md)."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+from typing import Any, NoReturn
+
+from deploy.installer import ed25519
+from deploy.installer.errors import UnhealthyError, UserError
+from deploy.installer.health import Limits
+from deploy.installer.layout import DEFAULT_ROOT, Layout
+from deploy.installer.manifest import parse_manifest
+from deploy.installer.release import MANIFEST, why_not_whole
+from deploy.installer.service import WAYS, choose
+from deploy.installer.steps import Way, install, rollback, uninstall
+from deploy.installer.supervise import supervise
+
+LIMITS = Limits()
+UNHEALTHY, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse with an error of one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())} (see {self.prog} --help)\n")
+
+
+def main(argv: list[str]) -> int:
+    """Run one command; the exit status."""
+    os.umask(0o022)  # The service's user must read the release, whatever the caller's umask.
+    try:
+        return _dispatch(_parser().parse_args(argv))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except UnhealthyError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return UNHEALTHY
+    except OSError as error:
+        print(f"error: {error.filename or 'the disk'}: {error.strerror}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("interrupted: the same command again completes it", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="install.pyz",
+        description="Installs, upgrades and undoes a release of the edge runtime on this board.",
+        epilog="example: sudo python3 install.pyz install phil-jetpack5-*.tar --trust bundle.pub",
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+    commands.required = True
+    texts = (
+        ("install", "verify a bundle, install it beside what runs, and switch when it is healthy"),
+        ("status", "what is installed here, and whether it is whole"),
+        ("rollback", "go back to the release before"),
+        ("uninstall", "stop the service and remove everything"),
+        ("supervise", "run the service without systemd, until SIGTERM"),
+    )
+    for name, text in texts:
+        command = commands.add_parser(name, help=text, description=text)
+        command.add_argument(
+            "--root", metavar="DIR", default=DEFAULT_ROOT, help=f"default: {DEFAULT_ROOT}"
+        )
+        if name != "supervise":
+            command.add_argument(
+                "--service",
+                metavar="|".join(WAYS),
+                choices=WAYS,
+                help="who runs it (default: systemd where it runs this computer, else none)",
+            )
+        if name in ("install", "rollback"):
+            for option, default, text in (
+                ("--health-limit", LIMITS.within_s, "healthy within this time, or back"),
+                ("--settle", LIMITS.settle_s, "and for so long after that"),
+            ):
+                text = f"{text}, s (default: {default:g})"
+                command.add_argument(option, metavar="S", type=float, default=default, help=text)
+        if name == "install":
+            command.add_argument("bundle", metavar="BUNDLE.tar")
+            command.add_argument(
+                "--trust", metavar="KEY.pub", help="first install: the public key to trust from now"
+            )
+        if name == "status":
+            command.add_argument("--json", action="store_true", help="print JSON")
+    return parser
+
+
+def _dispatch(arguments: argparse.Namespace) -> int:
+    layout = Layout(arguments.root)
+    if arguments.command == "supervise":
+        return supervise(layout)
+    service = choose(arguments.service, layout.root)
+    if arguments.command == "status":
+        return _status(layout, service, arguments.json)
+    if arguments.command == "uninstall":
+        uninstall(layout, Way(service, LIMITS))
+        print(f"removed from {layout.root}")
+        return 0
+    limits = Limits(arguments.health_limit, arguments.settle)
+    if not (limits.within_s > 0 and limits.settle_s >= 0):
+        raise UserError("--health-limit must be above 0, and --settle 0 or more")
+    way = Way(service, limits)
+    if arguments.command == "install":
+        version = install(arguments.bundle, arguments.trust, layout, way)
+    else:
+        version = rollback(layout, way)
+    print(f"current: {version}")
+    return 0
+
+
+def _status(layout: Layout, service: Any, as_json: bool) -> int:
+    """Print what is here; status 1 where the current release is damaged."""
+    current = layout.linked("current")
+    if current is None:
+        raise UserError(f"nothing is installed in {layout.root}")
+    manifest = parse_manifest((layout.release(current) / MANIFEST).read_bytes())
+    fault = why_not_whole(layout.release(current))
+    rows: dict[str, Any] = {
+        "current": current,
+        "whole": fault or "yes",
+        "previous": layout.linked("previous") or "none",
+        "vehicle_id": manifest.vehicle_id,
+        "policy_id": manifest.policy_id,
+        "service": service.describe(),
+        "trusts": hashlib.sha256(ed25519.parse_public_key(layout.trusted.read_bytes())).hexdigest()[
+            :16
+        ],
+    }
+    print(json.dumps(rows) if as_json else "\n".join(f"{k:<11} {v}" for k, v in rows.items()))
+    return UNHEALTHY if fault else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

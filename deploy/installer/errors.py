@@ -1,0 +1,15 @@
+"""The one exception that a user meets, as in edge_runtime, which is not there yet."""
+
+from __future__ import annotations
+
+
+class UserError(Exception):
+    """Bad input. Its text is one line: what is wrong, and what would be right."""
+
+    def __str__(self) -> str:
+        """The text on one line, whatever a file name or the system put into it."""
+        return " ".join(super().__str__().split())
+
+
+class UnhealthyError(Exception):
+    """A release that may not run here. Its text says why, on one line."""

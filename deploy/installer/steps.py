@@ -1,0 +1,207 @@
+"""Install, upgrade, roll back, uninstall: the order of things, so that no step can break a board.
+
+A release becomes `current` only when its files are whole, its policy may drive and it has passed
+its trial; `current` changes by one rename. Cut off at any moment, the board has the old release or
+the new one, and the same command again completes the work.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from deploy.installer import ed25519
+from deploy.installer.archive import Bundle, open_bundle
+from deploy.installer.errors import UnhealthyError, UserError
+from deploy.installer.fits import check_fits
+from deploy.installer.health import Limits
+from deploy.installer.layout import Layout, write_whole
+from deploy.installer.manifest import parse_manifest
+from deploy.installer.release import MANIFEST, check_policy, make_release, why_not_whole
+from deploy.installer.service import remember
+from deploy.installer.trial import try_release
+
+
+class Way(NamedTuple):
+    """How the service runs, and what is healthy."""
+
+    service: Any
+    limits: Limits
+
+
+def install(bundle_path: str, trust: str | None, layout: Layout, way: Way) -> str:
+    """Install or upgrade; return the version. Nothing is written before the bundle is verified.
+
+    Raises UserError where it may not be installed here, UnhealthyError where it was and went back.
+    """
+    pem = trusted_key(layout, trust)
+    with open_bundle(bundle_path, ed25519.parse_public_key(pem)) as bundle:
+        _say(f"verified {bundle.manifest.version} for {bundle.manifest.vehicle_id}")
+        check_fits(bundle.manifest.target)
+        with layout.locked():
+            layout.tidy()
+            if not layout.trusted.exists():
+                write_whole(layout.trusted, pem)
+            remember(way.service.name, layout.root)
+            version = bundle.manifest.version
+            _unpack(bundle, layout, way)
+            activate(version, layout, way, is_new=True)
+    return version
+
+
+def rollback(layout: Layout, way: Way) -> str:
+    """Go back to the release before; return its version."""
+    with layout.locked():
+        layout.tidy()
+        version = layout.linked("previous")
+        if version is None or version == layout.linked("current"):
+            raise UserError(f"{layout.root} holds no earlier release to go back to")
+        fault = why_not_whole(layout.release(version))
+        if fault:
+            raise UserError(f"release {version} is damaged: {fault}")
+        activate(version, layout, way, is_new=False)
+    return version
+
+
+def activate(version: str, layout: Layout, way: Way, is_new: bool) -> None:
+    """Prove a release, let the service run it, and go back by itself where it is not healthy."""
+    folder, before = layout.release(version), layout.linked("current")
+    try:
+        _prove(folder, way)
+    except UnhealthyError as error:
+        if is_new and version not in (before, layout.linked("previous")):
+            layout.remove_release(version)
+        stays = f"{before} goes on" if before else "nothing is installed"
+        raise UnhealthyError(f"release {version} may not run here, {stays}: {error}") from None
+    _switch(version, before, layout, way)
+    for other in layout.versions():
+        if other not in (layout.linked("current"), layout.linked("previous")):
+            layout.remove_release(other)
+
+
+def uninstall(layout: Layout, way: Way) -> None:
+    """Stop the service and remove all that was installed, the trusted key last."""
+    if not layout.releases.is_dir() and not layout.trusted.exists():
+        raise UserError(f"nothing is installed in {layout.root}")
+    with layout.locked():
+        way.service.remove()
+        for name in ("current", "previous"):
+            layout.unlink(name)
+        layout.tidy()
+        for path in (layout.releases, layout.state):
+            shutil.rmtree(str(path), ignore_errors=True)
+        if layout.trusted.exists():
+            layout.trusted.unlink()
+        (layout.root / ".lock").unlink()
+    try:
+        layout.root.rmdir()
+    except OSError:
+        _say(f"{layout.root} stays: it holds what is not ours")
+
+
+def trusted_key(layout: Layout, trust: str | None) -> bytes:
+    """The key that bundles must be signed with, in PEM: the board's own, or the first one named."""
+    given = _read_key(trust) if trust is not None else None
+    if not layout.trusted.exists():
+        if given is None:
+            raise UserError("this board trusts no key yet: name your public key with --trust")
+        return given
+    kept = layout.trusted.read_bytes()
+    if given is not None and ed25519.parse_public_key(given) != ed25519.parse_public_key(kept):
+        raise UserError(
+            f"this board trusts another key than {trust}; whoever owns the board may replace"
+            f" {layout.trusted}"
+        )
+    return kept
+
+
+def _read_key(path: str) -> bytes:
+    try:
+        pem = Path(path).read_bytes()
+    except OSError as error:
+        raise UserError(f"public key {path} cannot be read: {error.strerror}") from None
+    try:
+        ed25519.parse_public_key(pem)
+    except UserError as error:
+        raise UserError(f"public key {path}: {error}") from None
+    return pem
+
+
+def _unpack(bundle: Bundle, layout: Layout, way: Way) -> None:
+    version = bundle.manifest.version
+    if layout.release(version).is_dir():
+        fault = why_not_whole(layout.release(version))
+        if not fault:
+            _say(f"{version} lies here already, whole")
+            return
+        _say(f"{version} lies here damaged ({fault}): made again")
+        if layout.linked("current") == version:
+            way.service.stop()
+        layout.remove_release(version)
+    account = way.service.account()
+    folder = make_release(bundle, layout, account.gid if account else None)
+    _say(f"unpacked {folder}")
+
+
+def _prove(folder: Path, way: Way) -> None:
+    check_policy(folder)
+    _say("edge_runtime check: the policy may drive")
+    if way.service.name != "none":
+        policy_id = parse_manifest((folder / MANIFEST).read_bytes()).policy_id
+        how = try_release(folder, policy_id, way.service.account(), way.limits)
+        _say(f"trial: healthy, kept apart {how}")
+
+
+def _switch(version: str, before: str | None, layout: Layout, way: Way) -> None:
+    earlier = layout.linked("previous")
+    way.service.stop()
+    if before is not None and before != version:
+        layout.link("previous", before)
+    layout.link("current", version)
+    try:
+        _start(version, layout, way)
+    except UnhealthyError as error:
+        _say(f"{version} is not healthy: {error}")
+        # Cut off between the rename and here, `current` is this very release already.
+        good = before if before != version else earlier
+        _go_back(version, good, earlier, layout, way)
+        raise UnhealthyError(
+            f"release {version} was not healthy as a service,"
+            f" {f'went back to {good}' if good else 'nothing is installed'}: {error}"
+        ) from None
+
+
+def _start(version: str, layout: Layout, way: Way) -> None:
+    """Let the service run; the vehicle hears nothing of it until it is healthy."""
+    with layout.holding():
+        try:
+            way.service.start(layout.release(version))
+            way.service.watch(way.limits)
+        except UnhealthyError:
+            way.service.stop()
+            raise
+
+
+def _go_back(version: str, good: str | None, earlier: str | None, layout: Layout, way: Way) -> None:
+    way.service.stop()
+    if good is None:
+        layout.unlink("current")
+        layout.remove_release(version)
+        return
+    layout.link("current", good)
+    if earlier is not None and earlier not in (good, version):
+        layout.link("previous", earlier)
+    else:
+        layout.unlink("previous")
+    layout.remove_release(version)
+    try:
+        _start(good, layout, way)
+    except UnhealthyError as error:
+        raise UnhealthyError(f"{version} was not healthy, nor is {good} again: {error}") from None
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+    sys.stdout.flush()

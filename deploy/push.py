@@ -1,0 +1,138 @@
+"""``python -m deploy push HOST``: a bundle onto a board, over the system's ssh and scp.
+
+The installer that runs there is this workstation's own, not the bundle's: what verifies the bundle
+must not come out of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from deploy.installer import ed25519
+from deploy.installer import errors as installer_errors
+from deploy.installer.archive import open_bundle
+from deploy.installer.layout import DEFAULT_ROOT
+from deploy.installer.manifest import Manifest
+from deploy.pyz import NAME, build_installer
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes
+from edge_runtime.signature import DEFAULT_PUBLIC_KEY
+
+SSH, SCP = ("ssh", "-o", "BatchMode=yes"), ("scp", "-q", "-p", "-o", "BatchMode=yes")
+"""BatchMode: a password asked for in the middle would hang a script; use ssh's keys."""
+_HOST = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]*@)?[A-Za-z0-9\[][A-Za-z0-9_.:\]-]*")
+_TRUST = "trust.pub"
+
+
+class Step(NamedTuple):
+    """One command on the workstation, and what it is for."""
+
+    why: str
+    command: list[str]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("host", metavar="HOST", help="[user@]name, as ssh knows it")
+    parser.add_argument("bundle", metavar="BUNDLE.tar", help="of `python -m deploy bundle`")
+    parser.add_argument(
+        "--trust",
+        metavar="KEY.pub",
+        default=str(DEFAULT_PUBLIC_KEY),
+        help="public half of the key that signed the bundle; a new board will trust it",
+    )
+    parser.add_argument("--root", metavar="DIR", default=DEFAULT_ROOT, help="where on the board")
+    parser.add_argument(
+        "--service", metavar="WAY", choices=("systemd", "process", "none"), help="who runs it there"
+    )
+    parser.add_argument("--no-sudo", action="store_true", help="the user there needs no sudo")
+    parser.add_argument("--dry-run", action="store_true", help="print each step and do nothing")
+
+
+def push(arguments: argparse.Namespace) -> int:
+    """Copy, install, and clean up; the installer's exit status."""
+    if not _HOST.fullmatch(arguments.host):
+        raise UserError(f"host {arguments.host!r} is not valid: write name or user@name")
+    manifest = _verify(arguments)
+    with tempfile.TemporaryDirectory() as place:
+        files = [Path(place) / NAME, Path(place) / _TRUST, Path(arguments.bundle)]
+        files[0].write_bytes(build_installer())
+        files[1].write_bytes(read_bytes(arguments.trust, "public key"))
+        before, install, after = steps(arguments, manifest, files)
+        if arguments.dry_run:
+            for step in (*before, install, after):
+                print(f"# {step.why}\n{shlex.join(step.command)}")
+            return 0
+        return _run(before, install, after)
+
+
+def steps(
+    arguments: argparse.Namespace, manifest: Manifest, files: list[Path]
+) -> tuple[list[Step], Step, Step]:
+    """What comes before the installation, the installation, and what is done in any case."""
+    host, target = arguments.host, manifest.target
+    folder = f"phil-push-{manifest.version}"
+    python = f"python{target.python}"
+    probe = (
+        f"{python} -c 'import platform, sys;"
+        f' sys.exit(platform.machine() != "{target.machine}" and'
+        f' "this board is " + platform.machine() + ", the bundle is for {target.machine}")\''
+    )
+    sudo = [] if arguments.no_sudo else ["sudo", "-n"]
+    remote = [f"{folder}/{path.name}" for path in files]
+    install = [
+        *sudo, python, remote[0], "install", remote[2], "--trust", remote[1],
+        "--root", arguments.root, *(["--service", arguments.service] if arguments.service else []),
+    ]  # fmt: skip
+    before = [
+        Step(f"has it Python {target.python} on {target.machine}?", [*SSH, host, probe]),
+        Step("a folder of its own there", [*SSH, host, f"umask 077 && mkdir -p {folder}"]),
+        Step(
+            "the installer, the key to trust, the bundle",
+            [*SCP, *map(str, files), f"{host}:{folder}/"],
+        ),
+    ]
+    return (
+        before,
+        Step("install", [*SSH, host, shlex.join(install)]),
+        Step("leave nothing behind", [*SSH, host, f"rm -r {folder}"]),
+    )
+
+
+def _verify(arguments: argparse.Namespace) -> Manifest:
+    """The bundle's manifest: what the board would refuse is not sent."""
+    pem = read_bytes(arguments.trust, "public key")
+    try:
+        key = ed25519.parse_public_key(pem)
+    except installer_errors.UserError as error:
+        raise UserError(f"public key {arguments.trust}: {error}") from None
+    try:
+        with open_bundle(arguments.bundle, key) as bundle:
+            return bundle.manifest
+    except installer_errors.UserError as error:
+        raise UserError(str(error)) from None
+
+
+def _run(before: list[Step], install: Step, after: Step) -> int:
+    for step in before:
+        status = _call(step)
+        if status != 0:
+            raise UserError(f"{step.command[0]} ended with status {status}: {step.why}")
+    try:
+        return _call(install)
+    finally:
+        _call(after)
+
+
+def _call(step: Step) -> int:
+    print(f"# {step.why}", flush=True)
+    try:
+        return subprocess.run(step.command, stdin=subprocess.DEVNULL, check=False).returncode
+    except FileNotFoundError:
+        raise UserError(f"{step.command[0]} is not installed here") from None

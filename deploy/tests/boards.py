@@ -1,0 +1,115 @@
+"""Boards for the tests: a folder, the real installer as a process, the real edge runtime in it.
+
+The bundle's wheels are the edge runtime's own and one of a single line, which points at the
+libraries of the Python that runs the tests: nothing is downloaded and little is unpacked.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+from deploy.bundle import Inputs, Made, make_bundle
+from deploy.campaigns.light import HERE, host_wheel
+from deploy.keys import write_key_pair
+from deploy.pyz import NAME, build_installer
+from edge_runtime.tests.policies import public_pem, write_policy
+from edge_runtime.transport import free_endpoint
+
+QUICK = ("--settle", "0.2")
+
+
+def changed_wheel(wheel: Path, out: Path, member: str, old: str, new: str) -> Path:
+    """The wheel with a text replaced in one file: a release with a fault."""
+    changed = io.BytesIO()
+    with zipfile.ZipFile(wheel) as source, zipfile.ZipFile(changed, "w") as target:
+        for info in source.infolist():
+            data = source.read(info)
+            if info.filename == member:
+                assert old in data.decode()
+                data = data.decode().replace(old, new).encode()
+            target.writestr(info, data)
+    out.mkdir(exist_ok=True)
+    path = out / wheel.name
+    path.write_bytes(changed.getvalue())
+    return path
+
+
+class Workshop:
+    """Makes bundles: one key, one endpoint, a policy for each value."""
+
+    def __init__(self, folder: Path, edge_wheel: Path) -> None:
+        self.folder = folder
+        self.edge_wheel = edge_wheel
+        self.key, self.public_key = write_key_pair(folder / "keys")
+        self.host = host_wheel(folder)
+        self.endpoint = free_endpoint()
+        (folder / NAME).write_bytes(build_installer())
+
+    def inputs(self, value: float = 0.1, **changes: object) -> Inputs:
+        """What a good bundle is made of; the policy always answers `value`."""
+        policy, public = self.folder / f"{value}.onnx", self.folder / f"{value}.pub"
+        if not policy.exists():
+            from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+            key = Ed25519PrivateKey.generate()
+            public.write_bytes(public_pem(key))
+            write_policy(policy, "constant", value=value, key=key)
+        config = self.folder / "config.toml"
+        config.write_text(f'connect = "{self.endpoint}"\n')
+        wheels = [self.edge_wheel, self.host]
+        inputs = Inputs(policy, public, self.key, config, None, wheels)
+        return inputs._replace(**changes)  # type: ignore[arg-type]
+
+    def make(self, value: float = 0.1, **changes: object) -> Made:
+        """A bundle for this computer."""
+        return make_bundle(self.inputs(value, **changes), HERE, self.folder / "bundles")
+
+
+class Board:
+    """A root of its own on this computer."""
+
+    def __init__(self, root: Path, workshop: Workshop) -> None:
+        self.root = root
+        self.workshop = workshop
+
+    def command(self, command: str, *arguments: object) -> list[str]:
+        """The installer's command line."""
+        installer = str(self.workshop.folder / NAME)
+        head = [sys.executable, "-I", installer, command, "--root", str(self.root)]
+        return [*head, *map(str, arguments)]
+
+    def run(self, command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+        """The installer as a process."""
+        return subprocess.run(
+            self.command(command, *arguments),
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+
+    def install(
+        self, bundle: Path, service: str = "none", *more: str
+    ) -> subprocess.CompletedProcess[str]:
+        """Install with the workshop's key and a short settling time."""
+        trust = ("--trust", str(self.workshop.public_key))
+        return self.run("install", bundle, *trust, "--service", service, *QUICK, *more)
+
+    def status(self) -> dict:
+        """What `status --json` says."""
+        done = self.run("status", "--json")
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    def fingerprint(self) -> list[tuple]:
+        """Every path with size and time: equal where nothing was written."""
+        found = []
+        for place, folders, names in os.walk(self.root):
+            for name in [*folders, *names]:
+                path = Path(place, name)
+                stat = path.lstat()
+                found.append((str(path), stat.st_size, stat.st_mtime_ns))
+        return sorted(found)

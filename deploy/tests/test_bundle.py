@@ -1,0 +1,155 @@
+"""What goes into a bundle, what may not, and that it is the same again."""
+
+from __future__ import annotations
+
+import stat
+import tarfile
+
+import pytest
+
+from deploy.__main__ import main
+from deploy.bundle import make_bundle
+from deploy.campaigns.light import HERE
+from deploy.pyz import build_installer
+from deploy.wheelhouse import build_edge_wheel
+from edge_runtime.cli import run_cli
+from edge_runtime.config import load_config
+from edge_runtime.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def party(tmp_path_factory):
+    """A vehicle's TLS folder, and another vehicle's."""
+    folder = tmp_path_factory.mktemp("tls") / "certs"
+    assert run_cli(main, ["certs", "--out", str(folder), "--vehicle-id", "hunter01",
+                          "--vehicle-id", "other"]) == 0  # fmt: skip
+    (folder / "edge-hunter01" / "ca.key.pem").write_text("never to leave the workstation")
+    return folder
+
+
+def read(made) -> dict[str, bytes]:
+    with tarfile.open(made.path) as tar:
+        return {m.name: tar.extractfile(m).read() for m in tar}  # type: ignore[union-attr]
+
+
+def test_the_same_inputs_give_the_same_bytes(workshop, tmp_path):
+    again = build_edge_wheel(tmp_path)
+    assert again.read_bytes() == workshop.edge_wheel.read_bytes()
+    inputs = workshop.inputs()
+    one = make_bundle(inputs, HERE, tmp_path / "one")
+    two = make_bundle(inputs._replace(wheels=[again, workshop.host]), HERE, tmp_path / "two")
+    assert one.path.name == two.path.name
+    assert one.path.read_bytes() == two.path.read_bytes()
+    assert build_installer() == build_installer()
+
+
+def test_other_bytes_are_another_version(workshop):
+    versions = {workshop.make(value).manifest.version for value in (0.1, 0.2)}
+    versions.add(workshop.make(0.1, wheels=[workshop.edge_wheel]).manifest.version)
+    assert len(versions) == 3
+
+
+def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_path):
+    config = tmp_path / "c.toml"
+    config.write_text('connect = "tls/10.0.0.1:7447"\nvehicle = "mock"\n')
+    made = workshop.make(tls=party / "edge-hunter01", config=config)
+    contents = read(made)
+    assert stat.S_IMODE(made.path.stat().st_mode) == 0o600
+    assert {name for name in contents if not name.startswith("units/")} == {
+        "manifest.json", "manifest.sig", "install.pyz", "config.toml", "policy.onnx",
+        "policy.onnx.sig", "policy.pub", "tls/ca.pem", "tls/cert.pem", "tls/key.pem",
+        "wheels/phil_edge_runtime-0.1.0.whl", "wheels/host-1.0.whl",
+    }  # fmt: skip
+    assert "units/phil-edge.service" in contents
+    assert b"never to leave" not in b"".join(contents.values())
+    assert workshop.key.read_bytes() not in contents.values()
+    settings = tmp_path / "board.toml"
+    settings.write_bytes(contents["config.toml"])
+    read_back = load_config(settings, {})
+    assert (read_back.connect, read_back.vehicle) == ("tls/10.0.0.1:7447", "mock")
+    assert (read_back.policy, read_back.tls, read_back.hold) == (
+        "policy.onnx", "tls", "../../state/hold",
+    )  # fmt: skip
+    assert not read_back.armed_at_start
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ('policy = "other.onnx"', "policy is the bundle's to say"),
+        ('hold = "x"', "hold is the bundle's to say"),
+        ("allow_unsigned = true", "allow_unsigned is the bundle's to say"),
+        ('vehicle = "mock"\narmed_at_start = true', "armed_at_start would let a machine move"),
+        ('connect = "tls/10.0.0.1:7447"', "needs certificates"),
+        ('vehicle = "tank"', "choose from"),
+        ("no toml", "is no TOML"),
+    ],
+)
+def test_settings_that_do_not_hold_are_refused(workshop, tmp_path, text, match):
+    config = tmp_path / "c.toml"
+    config.write_text(text)
+    with pytest.raises(UserError, match=match):
+        workshop.make(config=config)
+
+
+def test_a_policy_of_somebody_else_or_unsigned_is_refused(workshop, tmp_path):
+    other = workshop.inputs(0.2)
+    with pytest.raises(UserError, match="does not fit the policy file and public key"):
+        workshop.make(0.1, public_key=other.public_key)
+    unsigned = tmp_path / "unsigned.onnx"
+    unsigned.write_bytes(other.policy.read_bytes())
+    with pytest.raises(UserError, match="is not signed"):
+        workshop.make(policy=unsigned)
+
+
+def test_the_certificates_must_be_this_vehicles(workshop, party, tmp_path):
+    config = tmp_path / "c.toml"
+    config.write_text('connect = "tls/10.0.0.1:7447"\n')
+    for name in ("edge-other", "simulator-hunter01", "ca"):
+        with pytest.raises(UserError):
+            workshop.make(tls=party / name, config=config)
+
+
+def test_without_a_private_key_nothing_is_signed(workshop, tmp_path):
+    for key, match in (
+        (tmp_path / "missing.key", "does not exist"),
+        (workshop.public_key, "is not a private key"),
+    ):
+        with pytest.raises(UserError, match=match):
+            workshop.make(key=key)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["--target", "toaster"],
+        ["--target", "jetpack5", "--policy", "missing.onnx"],
+        ["--target", "jetpack5", "--key", "missing.key"],
+        ["--target", "jetpack5", "--tls", "nowhere"],
+        ["--target", "jetpack5", "--wheels", "/dev/null/wheels"],
+    ],
+)
+def test_a_mistake_is_one_line_before_anything_is_downloaded(
+    workshop, tmp_path, capsys, monkeypatch, arguments
+):
+    monkeypatch.chdir(tmp_path)
+    inputs = workshop.inputs()
+    good = ["--policy", inputs.policy, "--public-key", inputs.public_key, "--key", inputs.key]
+    status = run_one(["bundle", *map(str, good), *arguments])
+    said = capsys.readouterr().err.strip().splitlines()
+    assert (status, len(said)) == (2, 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def run_one(argv: list[str]) -> int:
+    try:
+        return run_cli(main, argv)
+    except SystemExit as error:
+        return int(error.code or 0)
+
+
+def test_an_out_that_is_a_file_is_said(workshop, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write"):
+        make_bundle(workshop.inputs(), HERE, tmp_path / "file")

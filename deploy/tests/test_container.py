@@ -1,0 +1,70 @@
+"""The Dockerfile: linted where the linter is there, and its health check run as it stands."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCKERFILE = ROOT / "deploy" / "container" / "Dockerfile"
+LINTER = ROOT / ".venv-container" / "bin" / "hadolint"
+
+
+def instructions() -> list[tuple[str, str]]:
+    """(INSTRUCTION, arguments), with continued lines joined and comments left out."""
+    lines = [line for line in DOCKERFILE.read_text().splitlines() if not line.startswith("#")]
+    joined = re.sub(r"\\\n\s*", " ", "\n".join(lines))
+    return [
+        (word, rest.strip()) for word, _, rest in (x.partition(" ") for x in joined.split("\n"))
+    ]
+
+
+def last_stage() -> list[tuple[str, str]]:
+    everything = instructions()
+    begin = max(i for i, (word, _) in enumerate(everything) if word == "FROM")
+    return everything[begin:]
+
+
+def only(word: str) -> str:
+    (found,) = [rest for each, rest in last_stage() if each == word]
+    return found
+
+
+def test_the_linter_finds_nothing():
+    linter = shutil.which("hadolint") or (str(LINTER) if LINTER.exists() else None)
+    if linter is None:
+        pytest.skip("no hadolint: `make lint-container` installs and runs it")
+    done = subprocess.run(
+        [linter, str(DOCKERFILE)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_it_runs_without_rights_and_asks_no_index():
+    assert only("USER") == "10001:10001"
+    assert not re.search(r"\b(pip|apt-get|curl|wget|ADD)\b", DOCKERFILE.read_text())
+    copied = [rest for word, rest in instructions() if word == "COPY"]
+    assert copied == ["--from=install /opt/phil /opt/phil"]  # no bundle, so no private key
+    (made,) = [rest for word, rest in instructions() if word == "RUN" and "install.pyz" in rest]
+    assert made.startswith("--mount=type=bind")
+    assert made.index("install.pyz") < made.index("rm -r /opt/phil/releases/*/tls")
+
+
+@pytest.mark.parametrize(
+    ("shown", "healthy"),
+    [({"ready": True}, True), ({"ready": False}, False), ({}, False), (None, False)],
+)
+def test_the_health_check(tmp_path, shown, healthy):
+    command = json.loads(only("HEALTHCHECK").partition(" CMD ")[2])
+    if shown is not None:
+        (tmp_path / "service.json").write_text(json.dumps(shown))
+    command = [sys.executable if word == "python3" else word for word in command]
+    command[-1] = command[-1].replace("/opt/phil/state", str(tmp_path))
+    done = subprocess.run(command, capture_output=True, timeout=60, check=False)
+    assert (done.returncode == 0) == healthy

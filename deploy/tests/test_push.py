@@ -1,0 +1,133 @@
+"""`deploy push` with stand-ins for ssh and scp: real processes that work on this computer."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from deploy.__main__ import main
+from edge_runtime.cli import run_cli
+
+SSH = """\
+#!{python}
+import os, subprocess, sys
+assert sys.argv[1:3] == ["-o", "BatchMode=yes"], sys.argv
+host, command = sys.argv[3:]
+with open({log!r}, "a") as log:
+    log.write(f"ssh {{host}} {{command}}\\n")
+if host == "nowhere":
+    sys.exit("ssh: Could not resolve hostname nowhere")
+sys.exit(subprocess.run(["sh", "-c", command], cwd={home!r}).returncode)
+"""
+SCP = """\
+#!{python}
+import shutil, sys
+*files, target = [a for a in sys.argv[1:] if a not in ("-q", "-p", "-o", "BatchMode=yes")]
+host, _, folder = target.partition(":")
+with open({log!r}, "a") as log:
+    log.write(f"scp {{host}} {{folder}}\\n")
+for file in files:
+    shutil.copy2(file, {home!r} + "/" + folder)
+"""
+
+
+@pytest.fixture
+def far(tmp_path, monkeypatch):
+    """A far computer: its home is a folder here. Its log says what was asked of it."""
+    home, programs = tmp_path / "home", tmp_path / "programs"
+    for folder in (home, programs):
+        folder.mkdir()
+    log = tmp_path / "log"
+    log.touch()
+    names = {"python": sys.executable, "log": str(log), "home": str(home)}
+    for name, text in (("ssh", SSH), ("scp", SCP)):
+        (programs / name).write_text(text.format(**names))
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
+    return tmp_path
+
+
+def push(board, workshop, *arguments: object) -> int:
+    options = ["--trust", workshop.public_key, "--root", board.root, "--no-sudo"]
+    return run_cli(main, ["push", *map(str, [*arguments, *options])])
+
+
+def test_a_push_installs_and_leaves_nothing_behind(far, board, workshop, capfd):
+    made = workshop.make(0.1)
+    assert push(board, workshop, "phil@board", made.path, "--service", "none") == 0
+    assert f"current: {made.manifest.version}" in capfd.readouterr().out
+    assert board.status()["current"] == made.manifest.version
+    assert list((far / "home").iterdir()) == []
+    log = (far / "log").read_text().splitlines()
+    assert [line.split()[0] for line in log] == ["ssh", "ssh", "scp", "ssh", "ssh"]
+
+
+def test_a_dry_run_says_each_step_and_does_none(far, board, workshop, capsys):
+    made = workshop.make(0.1)
+    assert push(board, workshop, "board", made.path, "--dry-run") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in said] == ["#", "ssh", "#", "ssh", "#", "scp", "#", "ssh",
+                                                  "#", "ssh"]  # fmt: skip
+    assert str(made.path) in said[5]
+    assert "install" in said[7]
+    assert not (far / "log").read_text()
+    assert not board.root.exists()
+
+
+def test_an_installer_that_refuses_is_told_and_cleaned_up(far, board, workshop, tmp_path, capfd):
+    """The board trusts somebody else's key already."""
+    from deploy.keys import write_key_pair
+
+    _, other = write_key_pair(tmp_path / "other")
+    made = workshop.make(0.1)
+    board.root.mkdir()
+    (board.root / "trusted.pub").write_bytes(other.read_bytes())
+    assert push(board, workshop, "board", made.path, "--service", "none") == 2
+    assert "trusts another key" in capfd.readouterr().err
+    assert list((far / "home").iterdir()) == []
+    assert [p.name for p in board.root.iterdir()] == ["trusted.pub"]
+
+
+def test_a_host_that_is_not_there_ends_it_at_once(far, board, workshop, capfd):
+    made = workshop.make(0.1)
+    assert push(board, workshop, "nowhere", made.path) == 2
+    assert "ssh ended with status 1: has it Python" in capfd.readouterr().err
+    assert len((far / "log").read_text().splitlines()) == 1
+
+
+def test_a_board_of_another_kind_is_not_touched(far, board, workshop, capfd, tmp_path):
+    from deploy.bundle import make_bundle
+    from deploy.campaigns.light import HERE
+
+    made = make_bundle(workshop.inputs(), HERE._replace(machine="riscv64"), tmp_path / "b")
+    assert push(board, workshop, "board", made.path) == 2
+    assert "the bundle is for riscv64" in capfd.readouterr().err
+    assert not board.root.exists()
+
+
+@pytest.mark.parametrize("host", ["-oProxyCommand=touch x", "a b", "", "a;b", "$(id)", "user@"])
+def test_a_host_that_would_be_an_option_or_a_command_is_refused(far, board, workshop, host, capsys):
+    made = workshop.make(0.1)
+    try:
+        status = push(board, workshop, "--", host, made.path) if host[:1] == "-" else push(
+            board, workshop, host, made.path
+        )  # fmt: skip
+    except SystemExit as error:
+        status = int(error.code or 0)
+    assert status == 2
+    assert not (far / "log").read_text()
+
+
+def test_a_bundle_that_the_board_would_refuse_is_not_sent(far, board, workshop, capsys):
+    made = workshop.make(0.1)
+    changed = far / "changed.tar"
+    data = bytearray(made.path.read_bytes())
+    data[-2000] ^= 1
+    changed.write_bytes(data)
+    assert push(board, workshop, "board", changed) == 2
+    assert "is refused" in capsys.readouterr().err
+    assert push(board, workshop, "board", Path("missing.tar")) == 2
+    assert not (far / "log").read_text()

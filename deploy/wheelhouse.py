@@ -1,0 +1,124 @@
+"""The wheels of a target: those that its lock names by hash, and the edge runtime's own.
+
+A folder keeps them between runs; a bundle made from a full folder needs no network.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from deploy.installer.manifest import Target
+from deploy.targets import ROOT
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes
+
+DEFAULT_FOLDER = "build/wheels"
+_MANYLINUX = (5, 12, 17, 24, 26, 27, 28, 31)
+"""The minor versions of glibc 2 that wheels are tagged with, up to the boards' own."""
+_PATCH = 2
+"""pip takes 3.9 for 3.9.0, which cryptography shuns; Debian bullseye has 3.9.2."""
+_LINE = re.compile(r"([A-Za-z0-9._-]+)==([A-Za-z0-9._+!-]+) --hash=sha256:([0-9a-f]{64})")
+_SETUPTOOLS = 75  # as edge_runtime/pyproject.toml asks
+_EPOCH_S = 315532800
+"""1980-01-01, the first day that a ZIP file knows: the built wheel's files bear it."""
+
+
+class Pin(NamedTuple):
+    """One line of a lock; `sha256` in hex, of the one wheel that fits the target."""
+
+    name: str
+    version: str
+    sha256: str
+
+
+def read_lock(path: Path) -> list[Pin]:
+    """The pins of a lock: `NAME==VERSION --hash=sha256:HEX`, one wheel a line."""
+    pins = []
+    for line in read_bytes(path, "lock").decode().splitlines():
+        if line.strip() and not line.startswith("#"):
+            found = _LINE.fullmatch(line.strip())
+            if found is None:
+                raise UserError(f"lock {path}: not NAME==VERSION --hash=sha256:HEX: {line}")
+            pins.append(Pin(*found.groups()))
+    return pins
+
+
+def gather(target: Target, lock: Path, folder: Path) -> list[Path]:
+    """The lock's wheels in `folder`, in the lock's order; pip fetches what is missing."""
+    pins = read_lock(lock)
+    found = _by_hash(folder)
+    if any(pin.sha256 not in found for pin in pins):
+        download(target, ["--require-hashes", "--requirement", str(lock)], folder)
+        found = _by_hash(folder)
+    missing = [pin.name for pin in pins if pin.sha256 not in found]
+    if missing:
+        raise UserError(f"no wheel with the lock's hash in {folder} for {', '.join(missing)}")
+    return [found[pin.sha256] for pin in pins]
+
+
+def download(target: Target, wanted: list[str], folder: Path) -> None:
+    """`pip download` of wheels for another computer. Raises UserError with pip's own line."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot keep wheels in {folder}: {error.strerror}") from None
+    platforms = [
+        f"--platform=manylinux_2_{minor}_{target.machine}"
+        for minor in _MANYLINUX
+        if minor <= int(target.glibc.split(".")[1])
+    ]
+    aliases = [f"--platform=manylinux{year}_{target.machine}" for year in (1, 2010, 2014)]
+    python = f"--python-version={target.python}.{_PATCH}"
+    pip(
+        "download", "--only-binary=:all:", "--no-deps", python,
+        *platforms, *aliases, "--dest", str(folder), *wanted,
+    )  # fmt: skip
+
+
+def build_edge_wheel(folder: Path) -> Path:
+    """The edge runtime's wheel, the same bytes from the same sources and the same setuptools."""
+    with tempfile.TemporaryDirectory() as place:
+        # Of a copy: building writes into its source folder.
+        source = Path(place) / "edge_runtime"
+        ignored = shutil.ignore_patterns("__pycache__", "build", "*.egg-info", "tests")
+        shutil.copytree(ROOT / "edge_runtime", source, ignore=ignored)
+        for path in source.rglob("*"):
+            path.chmod(0o755 if path.is_dir() else 0o644)  # the umask of whoever cloned it
+        made = Path(place) / "made"
+        pip("wheel", "--no-deps", *_isolation(), "--wheel-dir", str(made), str(source))
+        wheel = next(made.glob("*.whl"))
+        folder.mkdir(parents=True, exist_ok=True)
+        return Path(shutil.move(str(wheel), str(folder / wheel.name)))
+
+
+def pip(*arguments: str) -> None:
+    """Run pip. Raises UserError with the last line that begins with ERROR."""
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments]
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": str(_EPOCH_S)}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.splitlines() if line.startswith("ERROR")]
+        raise UserError(f"pip {arguments[0]}: {(lines or ['failed'])[-1]}")
+
+
+def _isolation() -> list[str]:
+    """Build with the setuptools that is here, if it is new enough: no index is asked then."""
+    try:
+        major = int(importlib.metadata.version("setuptools").split(".")[0])
+    except (importlib.metadata.PackageNotFoundError, ValueError):
+        return []
+    return ["--no-build-isolation"] if major >= _SETUPTOOLS else []
+
+
+def _by_hash(folder: Path) -> dict[str, Path]:
+    wheels = sorted(folder.glob("*.whl")) if folder.is_dir() else []
+    return {hashlib.sha256(path.read_bytes()).hexdigest(): path for path in wheels}
