@@ -452,6 +452,26 @@ def test_a_bus_that_takes_nothing_for_five_frames_stops_it():
     assert bench.core.standing(bench.now_s) == []
 
 
+def test_a_bus_that_failed_before_it_was_enabled_works_once_it_is_heard_again():
+    bench = Bench()
+    for now_s in (bench.now_s, bench.now_s + 1.0):
+        bench.core.bus_failed("Network is down", now_s)
+    assert bench.core.standing(bench.now_s)[-1] == "the CAN bus fails: Network is down"
+    bench.step(5)  # nothing is sent that the bus could take
+    assert bench.sent == []
+    assert bench.core.standing(bench.now_s) == []
+    bench.core.bus_failed("a frame lost, an hour later", bench.now_s + 3600.0)
+    assert bench.core.report(bench.now_s).standing == []
+
+
+def test_hearing_does_not_hide_that_the_bus_takes_nothing():
+    bench = Bench().driving()
+    for _ in range(8):
+        bench.core.bus_failed("Transmit buffer full", bench.now_s)
+        bench.step(1, {"pedal": 1.0})
+    assert bench.words == ["the CAN bus fails: Transmit buffer full"]
+
+
 def test_a_frame_that_was_not_taken_now_and_then_is_no_fault():
     bench = Bench().driving()
     for _ in range(50):

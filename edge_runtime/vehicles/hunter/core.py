@@ -89,6 +89,8 @@ class HunterCore:
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
         """A frame of the bus, whoever sent it; never raises."""
+        if self.state is State.DISABLED:
+            self.bus_works()  # nothing is sent then that it could take
         if self.is_command(can_id):
             self._apply(Finding(Event.FOREIGN, f"somebody else sends 0x{can_id:x}"), now_s)
             return
@@ -109,7 +111,7 @@ class HunterCore:
             self._apply(Finding(Event.BUS, self._bus_words), now_s)
 
     def bus_works(self) -> None:
-        """The bus took a frame."""
+        """The bus took a frame, or (while none is sent) gave one."""
         self._bus_failed_s, self._bus_words = None, ""
 
     def tick(self, now_s: float) -> List[Sent]:
@@ -146,7 +148,7 @@ class HunterCore:
     @staticmethod
     def is_command(can_id: int) -> bool:
         """Whether it is for the chassis, so that only we should send it."""
-        return can_id in _OF_COMMANDS
+        return any(can_id == frame.can_id for frame in frames.COMMANDS)
 
     def is_at_rest(self, now_s: float) -> bool:
         """Whether the vehicle is known to stand, or nobody here can do more about it."""
@@ -242,9 +244,6 @@ class HunterCore:
         motion = self.reports.motion
         inner_rad = motion.inner_steering_rad if motion else 0.0
         return steering_of(inner_rad, self._spec, self._similarity)
-
-
-_OF_COMMANDS = frozenset(frame.can_id for frame in frames.COMMANDS)
 
 
 def _sent(frame: frames.Frame, message: object) -> Sent:
