@@ -247,6 +247,11 @@ def test_what_is_no_name_of_a_bus(text):
         parse_bus(text)
 
 
+def test_socketcan_has_its_bit_rate_from_elsewhere():
+    with pytest.raises(UserError, match="'socketcan:can0:500000'.*ip link.*write socketcan:can0$"):
+        parse_bus("socketcan:can0:500000")
+
+
 def test_buses_that_cannot_be_opened_are_one_line(caplog):
     for text, words in (
         ("socketcan:can97", "bus socketcan:can97 cannot be opened"),
