@@ -143,7 +143,8 @@ class HunterVehicle(Vehicle):
 
     def _send_due(self) -> None:
         with self._lock:
-            parts = self._core.tick(time.monotonic())
+            ticked_s = time.monotonic()
+            parts = self._core.tick(ticked_s)
         try:
             for part in parts:
                 self._gate.send(*part)
@@ -152,6 +153,10 @@ class HunterVehicle(Vehicle):
             return
         if parts:
             self._note_sent()
+        if time.monotonic() - ticked_s > STREAM_PERIOD_S:
+            # A process that was stopped in between has said what was asked for before it was. The
+            # chassis cannot tell, and may have control again: the next frame does not wait.
+            self._wake.set()
 
     def _note_sent(self) -> None:
         now_s = time.monotonic()
