@@ -144,6 +144,18 @@ def test_commands_that_cease_end_in_a_latched_stop(chassis, vehicle):
     wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
 
 
+def test_its_own_stop_does_not_wait_for_the_next_period(chassis, vehicle, monkeypatch):
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    drive(vehicle, lambda: chassis.speeds[-1] > 0.1, "speed")
+    monkeypatch.setattr(vehicles, "STREAM_PERIOD_S", 3.0)
+    time.sleep(0.05)  # one more period of before
+    commanded_s = time.monotonic()
+    vehicle.command({"pedal": 1.0}, commanded_s)
+    wait_until(lambda: chassis.speeds[-1] == 0.0, "its own stop")
+    assert time.monotonic() - commanded_s < 1.5
+
+
 def test_the_remote_control_is_reported_and_the_chassis_that_comes_back_is_not_believed(
     chassis, vehicle
 ):

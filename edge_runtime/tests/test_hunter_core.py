@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 import edge_runtime
 from edge_runtime.vehicles.hunter import core as rules
 from edge_runtime.vehicles.hunter import frames
-from edge_runtime.vehicles.hunter.core import HunterCore, Sent
+from edge_runtime.vehicles.hunter.core import HunterCore
+from edge_runtime.vehicles.hunter.frames import Sent
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.hunter.states import TRANSITIONS, Event, State, render_table
 from edge_runtime.vehicles.similarity import CARS, similarity_to
@@ -326,8 +327,10 @@ def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch():
 def test_without_a_fresh_command_it_stops_within_the_promise_and_latches():
     bench = Bench().driving()
     last_s = bench.core._wished_s
+    assert bench.core.late_at_s == last_s + 0.24 < last_s + 0.25  # vehicle.py ticks then, too
     count = len(bench.sent)
     bench.step(100)
+    assert bench.core.late_at_s == float("inf")
     stopped_s = next(
         time_s
         for time_s, part in bench.sent[count:]
