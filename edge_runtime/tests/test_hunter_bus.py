@@ -175,7 +175,7 @@ def test_a_frame_that_was_held_up_is_followed_at_once_by_one_of_now(chassis, veh
     vehicle.enable(time.monotonic())
     wait_until(lambda: is_enabled(vehicle), "the confirmation")
     drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed")
-    sent = []
+    sent: list = []
     send = vehicle._bus.send
 
     def stopped_in_between(message, timeout=None):

@@ -173,7 +173,7 @@ def test_a_message_that_was_held_up_is_followed_at_once_by_one_of_now(monkeypatc
     endpoint = free_endpoint()
     vehicle = make_vehicle(listen=endpoint)
     vehicle.enable(time.monotonic())
-    sent = []
+    sent: list = []
 
     def stopped_in_between(motion):
         if not sent and motion.speed_mps > 0.1:
