@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, Optional, Sequence
+from typing import Any, Dict, List, Optional, Sequence, Type
 
 import msgspec
 
@@ -20,7 +20,7 @@ from edge_runtime.vehicles.hunter.faults import PROFILES
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.registry import NONE, VEHICLE_NAMES
 from edge_runtime.vehicles.ros2.settings import Ros2Settings, check_settings
-from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
+from edge_runtime.vehicles.settings import CarSettings, HunterSettings, SimilaritySettings
 
 MAX_PRIORITY = 99  # of SCHED_FIFO
 
@@ -46,6 +46,15 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     hunter: HunterSettings = msgspec.field(default_factory=HunterSettings)
     similarity: SimilaritySettings = msgspec.field(default_factory=SimilaritySettings)
     ros2: Ros2Settings = msgspec.field(default_factory=Ros2Settings)
+
+
+_TABLES: Dict[str, Type[msgspec.Struct]] = {
+    "": Config,
+    "hunter": HunterSettings,
+    "similarity": SimilaritySettings,
+    "similarity.car": CarSettings,
+    "ros2": Ros2Settings,
+}
 
 
 def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
@@ -85,7 +94,7 @@ def _explain(text: str) -> str:
     sentence, _, place = text.partition(" - at ")
     table = place.strip("`").replace("$.", "")
     if "unknown field" in text:
-        known = getattr(Config(), table, None) if table else Config()
+        known = _TABLES.get(table)
         sentence += f"; known are {', '.join(known.__struct_fields__)}" if known else ""
     return f"{table}: {sentence}" if table else sentence
 
@@ -128,7 +137,12 @@ def _check_similarity(settings: SimilaritySettings) -> None:
         # To the right, the full angle is below 0.
         size = abs(value) if name == "full_steering_rad" else value
         if not 0.0 < size < float("inf") or (name == "full_steering_rad" and size >= 1.5):
-            raise UserError(f"similarity: {name} {value} is not valid: it must be above 0")
+            raise UserError(f"similarity: {name} {value} is not valid: it must be {_range(name)}")
+
+
+def _range(name: str) -> str:
+    angle = name == "full_steering_rad"
+    return "above 0 and below 1.5 rad, or below 0 and above -1.5" if angle else "above 0"
 
 
 def _check_choice(key: str, value: str, known: Sequence[str]) -> None:

@@ -23,10 +23,13 @@ def check_ros2_endpoint(endpoint: Optional[str]) -> None:
         )
 
 
-def open_ros2_session(listen: Optional[str], connect: Optional[str]) -> zenoh.Session:
+def open_ros2_session(
+    listen: Optional[str], connect: Optional[str], option: str = "--ros2-listen"
+) -> zenoh.Session:
     """Listen as a router (the default, on loopback), or go on connecting to a bridge as a peer.
 
-    Raises UserError for a malformed endpoint and for a busy port.
+    Raises UserError for a malformed endpoint and for a busy port; `option` is where the user has
+    set `listen`.
     """
     check_ros2_endpoint(listen)
     check_ros2_endpoint(connect)
@@ -35,4 +38,4 @@ def open_ros2_session(listen: Optional[str], connect: Optional[str]) -> zenoh.Se
     try:
         return open_session(listen=listen or DEFAULT_ROS2_ENDPOINT, mode="router")
     except UserError as error:
-        raise UserError(str(error).replace("--listen", "--ros2-listen")) from None
+        raise UserError(str(error).replace("--listen", option)) from None

@@ -104,6 +104,12 @@ def test_status_with_a_simulator_but_no_edge():
         ("[similarity]\nscale = 0.0", "scale 0.0.*above 0"),
         ("[similarity]\nscale = nan", "scale nan.*above 0"),
         ("[similarity.car]\nthrottle_mps2 = 1.0", "brake_mps2"),
+        ("[similarity.car]\nthrottle = 1.0", "unknown field `throttle`; known are throttle_mps2"),
+        (
+            "[similarity.car]\nthrottle_mps2 = 3.0\nbrake_mps2 = 4.0\nmax_speed_mps = 6.0\n"
+            "full_steering_rad = 2.0\nwheelbase_m = 5.0",
+            "full_steering_rad 2.0 is not valid: it must be above 0 and below 1.5 rad, or below 0",
+        ),
     ],
 )
 def test_wrong_config_files(tmp_path, text, match):

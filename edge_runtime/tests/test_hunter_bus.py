@@ -13,6 +13,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.vehicles.hunter import bus as buses
 from edge_runtime.vehicles.hunter import frames
+from edge_runtime.vehicles.hunter import vehicle as vehicles
 from edge_runtime.vehicles.hunter.bus import BusName, Gate, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.hunter.states import State
@@ -143,6 +144,18 @@ def test_commands_that_cease_end_in_a_latched_stop(chassis, vehicle):
     wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
 
 
+def test_its_own_stop_does_not_wait_for_the_next_period(chassis, vehicle, monkeypatch):
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    drive(vehicle, lambda: chassis.speeds[-1] > 0.1, "speed")
+    monkeypatch.setattr(vehicles, "STREAM_PERIOD_S", 3.0)
+    time.sleep(0.05)  # one more period of before
+    commanded_s = time.monotonic()
+    vehicle.command({"pedal": 1.0}, commanded_s)
+    wait_until(lambda: chassis.speeds[-1] == 0.0, "its own stop")
+    assert time.monotonic() - commanded_s < 1.5
+
+
 def test_the_remote_control_is_reported_and_the_chassis_that_comes_back_is_not_believed(
     chassis, vehicle
 ):
@@ -156,6 +169,28 @@ def test_the_remote_control_is_reported_and_the_chassis_that_comes_back_is_not_b
     wait_until(lambda: not vehicle.feedback(time.monotonic()).standing, "control back")
     drive(vehicle, lambda: len(chassis.speeds) > 30, "the stream")
     assert set(chassis.speeds[-10:]) == {0.0}
+
+
+def test_a_frame_that_was_held_up_is_followed_at_once_by_one_of_now(chassis, vehicle, monkeypatch):
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed")
+    sent: list = []
+    send = vehicle._bus.send
+
+    def stopped_in_between(message, timeout=None):
+        if not sent and vehicle.state is State.ENABLED:
+            monkeypatch.setattr(vehicles, "STREAM_PERIOD_S", 0.4)
+            time.sleep(0.5)  # the whole process, as far as the frame can tell
+        send(message, timeout=timeout)
+        sent.append((time.monotonic(), told_by(message.arbitration_id, message.data).speed_mps))
+
+    monkeypatch.setattr(vehicle._bus, "send", stopped_in_between)
+    wait_until(lambda: len(sent) > 1, "the next frame")
+    (held_s, held_mps), (next_s, next_mps) = sent[:2]
+    assert held_mps > 0.2
+    assert next_mps == 0.0
+    assert next_s - held_s < 0.15
 
 
 def test_without_a_chassis_it_says_so(channel, vehicle):
@@ -245,6 +280,11 @@ def test_names_of_buses(text, name):
 def test_what_is_no_name_of_a_bus(text):
     with pytest.raises(UserError, match="write it as INTERFACE:CHANNEL"):
         parse_bus(text)
+
+
+def test_socketcan_has_its_bit_rate_from_elsewhere():
+    with pytest.raises(UserError, match=r"'socketcan:can0:500000'.*ip link.*write socketcan:can0$"):
+        parse_bus("socketcan:can0:500000")
 
 
 def test_buses_that_cannot_be_opened_are_one_line(caplog):

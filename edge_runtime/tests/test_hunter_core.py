@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 import edge_runtime
 from edge_runtime.vehicles.hunter import core as rules
 from edge_runtime.vehicles.hunter import frames
-from edge_runtime.vehicles.hunter.core import HunterCore, Sent
+from edge_runtime.vehicles.hunter.core import HunterCore
+from edge_runtime.vehicles.hunter.frames import Sent
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.hunter.states import TRANSITIONS, Event, State, render_table
 from edge_runtime.vehicles.similarity import CARS, similarity_to
@@ -326,8 +327,10 @@ def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch():
 def test_without_a_fresh_command_it_stops_within_the_promise_and_latches():
     bench = Bench().driving()
     last_s = bench.core._wished_s
+    assert bench.core.late_at_s == last_s + 0.24 < last_s + 0.25  # vehicle.py ticks then, too
     count = len(bench.sent)
     bench.step(100)
+    assert bench.core.late_at_s == float("inf")
     stopped_s = next(
         time_s
         for time_s, part in bench.sent[count:]
@@ -450,6 +453,26 @@ def test_a_bus_that_takes_nothing_for_five_frames_stops_it():
     assert bench.words == ["the CAN bus fails: Transmit buffer full"]
     bench.core.bus_works()
     assert bench.core.standing(bench.now_s) == []
+
+
+def test_a_bus_that_failed_before_it_was_enabled_works_once_it_is_heard_again():
+    bench = Bench()
+    for now_s in (bench.now_s, bench.now_s + 1.0):
+        bench.core.bus_failed("Network is down", now_s)
+    assert bench.core.standing(bench.now_s)[-1] == "the CAN bus fails: Network is down"
+    bench.step(5)  # nothing is sent that the bus could take
+    assert bench.sent == []
+    assert bench.core.standing(bench.now_s) == []
+    bench.core.bus_failed("a frame lost, an hour later", bench.now_s + 3600.0)
+    assert bench.core.report(bench.now_s).standing == []
+
+
+def test_hearing_does_not_hide_that_the_bus_takes_nothing():
+    bench = Bench().driving()
+    for _ in range(8):
+        bench.core.bus_failed("Transmit buffer full", bench.now_s)
+        bench.step(1, {"pedal": 1.0})
+    assert bench.words == ["the CAN bus fails: Transmit buffer full"]
 
 
 def test_a_frame_that_was_not_taken_now_and_then_is_no_fault():

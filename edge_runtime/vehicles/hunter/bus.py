@@ -41,6 +41,11 @@ def parse_bus(text: str) -> BusName:
     interface, _, channel = text.partition(":")
     if interface == "udp_multicast":
         return _parse_multicast(text, channel)
+    if interface == "socketcan" and ":" in channel:
+        raise UserError(
+            f"bus {text!r} has its bit rate from `ip link`:"
+            f" write {interface}:{channel.partition(':')[0]}"
+        )
     if interface in _WITHOUT_BITRATE:
         if interface and channel:
             return BusName(interface, channel, None)

@@ -7,11 +7,12 @@ every frame of the bus, and sends what `tick` returns, 50 times a second.
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Optional
+from typing import Dict, List, Optional
 
 from edge_runtime.safety import SILENCE_S
 from edge_runtime.vehicles import mapping
 from edge_runtime.vehicles.hunter import frames
+from edge_runtime.vehicles.hunter.frames import Sent
 from edge_runtime.vehicles.hunter.reports import Finding, Reports
 from edge_runtime.vehicles.hunter.set_point import SetPoint, SpeedWatch, Wish, steering_of, wish_of
 from edge_runtime.vehicles.hunter.specs import HunterSpec
@@ -27,13 +28,6 @@ ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
 STOP_TAKES_S = 1.0  # what is then not known to stand gets the parking brake
 BUS_PATIENCE_S = 0.1  # five frames of the stream
 _STOPS_AT_ONCE = (Event.STUCK,)  # no set-point will stop it: the brake must
-
-
-class Sent(NamedTuple):
-    """A frame to be sent."""
-
-    frame: frames.Frame
-    data: bytes
 
 
 class HunterCore:
@@ -89,6 +83,8 @@ class HunterCore:
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
         """A frame of the bus, whoever sent it; never raises."""
+        if self.state is State.DISABLED:
+            self.bus_works()  # nothing is sent then that it could take
         if self.is_command(can_id):
             self._apply(Finding(Event.FOREIGN, f"somebody else sends 0x{can_id:x}"), now_s)
             return
@@ -109,8 +105,13 @@ class HunterCore:
             self._apply(Finding(Event.BUS, self._bus_words), now_s)
 
     def bus_works(self) -> None:
-        """The bus took a frame."""
+        """The bus took a frame, or (while none is sent) gave one."""
         self._bus_failed_s, self._bus_words = None, ""
+
+    @property
+    def late_at_s(self) -> float:
+        """After which moment its newest command is too old to be obeyed; inf where it has none."""
+        return math.inf if self._wish is None else self._wished_s + COMMAND_TIMEOUT_S
 
     def tick(self, now_s: float) -> List[Sent]:
         """The frames to send now; none while DISABLED."""
@@ -146,7 +147,7 @@ class HunterCore:
     @staticmethod
     def is_command(can_id: int) -> bool:
         """Whether it is for the chassis, so that only we should send it."""
-        return can_id in _OF_COMMANDS
+        return any(can_id == frame.can_id for frame in frames.COMMANDS)
 
     def is_at_rest(self, now_s: float) -> bool:
         """Whether the vehicle is known to stand, or nobody here can do more about it."""
@@ -242,9 +243,6 @@ class HunterCore:
         motion = self.reports.motion
         inner_rad = motion.inner_steering_rad if motion else 0.0
         return steering_of(inner_rad, self._spec, self._similarity)
-
-
-_OF_COMMANDS = frozenset(frame.can_id for frame in frames.COMMANDS)
 
 
 def _sent(frame: frames.Frame, message: object) -> Sent:

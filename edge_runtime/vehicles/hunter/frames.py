@@ -140,6 +140,13 @@ MOTOR_OF_SLOW: Dict[int, str] = {
 }
 
 
+class Sent(NamedTuple):
+    """A frame to be sent."""
+
+    frame: Frame
+    data: bytes
+
+
 class Decoded(NamedTuple):
     """A frame that was understood: its row and its message."""
 

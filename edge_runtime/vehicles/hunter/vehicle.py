@@ -1,8 +1,8 @@
 """The driver of a Hunter: two threads and a bus around core.py.
 
 - The stream's thread sends what `tick` gives, 50 times a second at absolute deadlines, and at
-  once when somebody brakes or the chassis says what stops it. It is the only one that sends, until
-  `close` has joined it.
+  once when somebody brakes, no command came in time, or the chassis says what stops it. It is
+  the only one that sends, until `close` has joined it.
 - The listener's thread hands every frame to `hear`.
 Both inherit the priority that `realtime` gave the process. All calls of the core hold one lock;
 the bus is called outside of it, so that nobody waits for a bus.
@@ -139,11 +139,14 @@ class HunterVehicle(Vehicle):
                 # After a pause one frame, not one for each missed period.
                 missed = int((now_s - next_s) / STREAM_PERIOD_S)
                 next_s += (missed + 1) * STREAM_PERIOD_S
-            self._wake.wait(max(0.0, next_s - time.monotonic()))
+            with self._lock:
+                due_s = min(next_s, self._core.late_at_s)
+            self._wake.wait(max(0.0, due_s - time.monotonic()))
 
     def _send_due(self) -> None:
         with self._lock:
-            parts = self._core.tick(time.monotonic())
+            ticked_s = time.monotonic()
+            parts = self._core.tick(ticked_s)
         try:
             for part in parts:
                 self._gate.send(*part)
@@ -152,6 +155,10 @@ class HunterVehicle(Vehicle):
             return
         if parts:
             self._note_sent()
+        if time.monotonic() - ticked_s > STREAM_PERIOD_S:
+            # A process that was stopped in between has said what was asked for before it was. The
+            # chassis cannot tell, and may have control again: the next frame does not wait.
+            self._wake.set()
 
     def _note_sent(self) -> None:
         now_s = time.monotonic()

@@ -57,7 +57,7 @@ class Ros2Vehicle(Vehicle):
         self._gaps = LatencyWindow()
         self._publish: List[Callable[[Motion], None]] = []
         self._thread = threading.Thread(target=self._stream, name="ros2-stream", daemon=True)
-        self._session = open_ros2_session(settings.listen, settings.connect)
+        self._session = open_ros2_session(settings.listen, settings.connect, "[ros2] listen")
         try:
             self._node = Ros2Node(self._session, settings.namespace)
             self._declare()
@@ -167,7 +167,8 @@ class Ros2Vehicle(Vehicle):
 
     def _send_due(self) -> None:
         with self._lock:
-            motion = self._core.tick(time.monotonic())
+            ticked_s = time.monotonic()
+            motion = self._core.tick(ticked_s)
         if motion is None:
             return
         try:
@@ -180,6 +181,10 @@ class Ros2Vehicle(Vehicle):
             return
         self._failing = False
         now_s = time.monotonic()
+        if now_s - ticked_s > STREAM_PERIOD_S:
+            # A process that was stopped in between has said what was asked for before it was: the
+            # next message does not wait.
+            self._wake.set()
         if self._sent_s is not None:
             self._gaps.add(int((now_s - self._sent_s) * 1e9))
         self._sent_s = now_s

@@ -12,6 +12,7 @@ from edge_runtime.ros2.tests import second
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.transport import free_endpoint
 from edge_runtime.vehicles.hunter.specs import SPECS
+from edge_runtime.vehicles.ros2 import vehicle as vehicles
 from edge_runtime.vehicles.ros2.settings import Ros2Settings
 from edge_runtime.vehicles.ros2.states import Event, State
 from edge_runtime.vehicles.ros2.tests.ros_hunter import RosHunter
@@ -168,6 +169,29 @@ def test_silence_stops_it_and_only_an_enable_leads_out():
         vehicle.close()
 
 
+def test_a_message_that_was_held_up_is_followed_at_once_by_one_of_now(monkeypatch):
+    endpoint = free_endpoint()
+    vehicle = make_vehicle(listen=endpoint)
+    vehicle.enable(time.monotonic())
+    sent: list = []
+
+    def stopped_in_between(motion):
+        if not sent and motion.speed_mps > 0.1:
+            monkeypatch.setattr(vehicles, "STREAM_PERIOD_S", 0.4)
+            time.sleep(0.5)  # the whole process, as far as the message can tell
+        if sent or motion.speed_mps > 0.1:
+            sent.append((time.monotonic(), motion.speed_mps))
+
+    vehicle._publish.append(stopped_in_between)
+    with RosHunter(connect=endpoint):
+        enable(vehicle)
+        with Commands(vehicle, {"pedal": 1.0}):
+            wait_until(lambda: sent, "a message")
+        wait_until(lambda: len(sent) > 1, "the next message")
+    vehicle.close()
+    assert sent[1][0] - sent[0][0] < 0.15
+
+
 def test_the_stream_goes_on_with_zeros_while_stopped():
     """The chassis is never left to its own time-out, after which any frame gives control back."""
     endpoint = free_endpoint()
@@ -223,6 +247,16 @@ def test_it_closes_twice_and_without_having_been_enabled():
         if enables:
             vehicle.enable(time.monotonic())
         vehicle.close()
+        vehicle.close()
+
+
+def test_a_busy_port_is_told_by_the_settings_name():
+    endpoint = free_endpoint()
+    vehicle = make_vehicle(listen=endpoint)
+    try:
+        with pytest.raises(UserError, match=r"in use; choose another with \[ros2\] listen$"):
+            make_vehicle(listen=endpoint)
+    finally:
         vehicle.close()
 
 
