@@ -26,7 +26,7 @@ _SIZES = (1, 5, 10, 20)
 _RULES = (10, 100, 1_000)
 _TRIES = 3
 _UNDISTURBED = 0.9
-"""Of its states, each vehicle has an answer to at least this share; else others used the machine."""
+"""Each vehicle has an answer to this share of its states at least; else the machine was busy."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
