@@ -50,7 +50,7 @@ def campaign(board: Board, tries: int, seed: int, out: str | None = None) -> dic
     choice = random.Random(seed)
     tally = Tally(seed, {kind: _measure(board, kind) for kind in ("install", "upgrade")})
     for number in range(tries):
-        kind = "install" if number % 20 < 10 else "upgrade"
+        kind = ("install", "upgrade")[number % 2]
         moment_s = choice.uniform(0.0, SLACK * tally.durations_s[kind])
         tally.add(kind, *_try(board, kind, moment_s))
         if (number + 1) % 10 == 0 or number + 1 == tries:
@@ -99,8 +99,7 @@ def _try(board: Board, kind: str, moment_s: float) -> tuple[str, str, str, str]:
     if kind == "install":
         _clear(board)
     before = board.current()
-    # Upgrades go to and fro between the two bundles.
-    bundle = board.kit.old if before == _version(board.kit.new) else board.kit.new
+    bundle = _next(board.kit.bundles, before)
     process = board.start_install(bundle)
     time.sleep(moment_s)
     phase = board.cut_power(process)
@@ -112,6 +111,12 @@ def _try(board: Board, kind: str, moment_s: float) -> tuple[str, str, str, str]:
     if not stuck and board.current() != _version(bundle):
         stuck = f"{board.current()} is current"
     return phase, _which(current, before), fault, stuck
+
+
+def _next(bundles: list[Path], current: str) -> Path:
+    """Upgrades go round: of three, the next is neither current nor previous, so it is unpacked."""
+    versions = [_version(bundle) for bundle in bundles]
+    return bundles[(versions.index(current) + 1) % len(bundles)] if current else bundles[0]
 
 
 def _which(current: str, before: str) -> str:
@@ -142,7 +147,7 @@ def _measure(board: Board, kind: str) -> float:
     if kind == "install":
         _clear(board)
     begin_s = time.monotonic()
-    said = _complete(board, board.kit.old if kind == "install" else board.kit.new)
+    said = _complete(board, _next(board.kit.bundles, board.current()))
     if said:
         raise UserError(f"the bundle does not install here: {said}")
     return time.monotonic() - begin_s
@@ -158,8 +163,8 @@ def _version(bundle: Path) -> str:
 def _kit(arguments: argparse.Namespace, folder: Path) -> Kit:
     if arguments.bundles is None:
         return make_kit(folder)
-    old, new = map(Path, arguments.bundles)
-    return kit_of(old, new, Path(arguments.trust), arguments.python, folder)
+    bundles = [Path(bundle) for bundle in arguments.bundles]
+    return kit_of(bundles, Path(arguments.trust), arguments.python, folder)
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
@@ -169,8 +174,8 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--out", metavar="FILE.json", help="write the report here")
     parser.add_argument(
         "--bundles",
-        nargs=2,
-        metavar=("OLD.tar", "NEW.tar"),
+        nargs=3,
+        metavar=("ONE.tar", "TWO.tar", "THREE.tar"),
         help="of `deploy bundle`; without them, light ones for this computer are made",
     )
     parser.add_argument("--trust", metavar="KEY.pub", default="keys/policy.pub")

@@ -29,10 +29,9 @@ _ATTEMPTS = 20
 
 
 class Kit(NamedTuple):
-    """Two bundles that differ, the key to trust, and the Python that installs them."""
+    """Bundles that differ, the key to trust, and the Python that installs them."""
 
-    old: Path
-    new: Path
+    bundles: list[Path]
     trust: Path
     python: str
     installer: Path
@@ -43,19 +42,19 @@ def make_kit(folder: Path) -> Kit:
     private, public = write_key_pair(folder / "keys")
     wheels = [build_edge_wheel(folder / "wheels"), host_wheel(folder)]
     paths = []
-    for name in ("old", "new"):
+    for name in ("one", "two", "three"):
         config = folder / f"{name}.toml"
         config.write_text(f'connect = "{free_endpoint()}"\nlog_level = "warning"\n')
         inputs = Inputs(_POLICY, _POLICY.with_name("policy.pub"), private, config, None, wheels)
         paths.append(make_bundle(inputs, HERE, folder / name).path)
-    return kit_of(paths[0], paths[1], public, sys.executable, folder)
+    return kit_of(paths, public, sys.executable, folder)
 
 
-def kit_of(old: Path, new: Path, trust: Path, python: str, folder: Path) -> Kit:
+def kit_of(bundles: list[Path], trust: Path, python: str, folder: Path) -> Kit:
     """Bundles that are there already, with this checkout's installer."""
     installer = folder / NAME
     installer.write_bytes(build_installer())
-    return Kit(old, new, trust, python, installer)
+    return Kit(bundles, trust, python, installer)
 
 
 def unless_busy(attempt: Callable[[], str]) -> str:

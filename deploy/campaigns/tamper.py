@@ -41,11 +41,11 @@ def campaign(kit: Kit, folder: Path, arguments: argparse.Namespace) -> dict:
     """Change one byte `tries` times; the report."""
     choice = random.Random(arguments.seed)
     empty, full = Board(folder / "empty", kit), Board(folder / "full", kit)
-    status, said = _install(full, kit.old)
+    status, said = _install(full, kit.bundles[0])
     if status != 0:
-        raise UserError(f"{kit.old} does not install here: {said}")
+        raise UserError(f"{kit.bundles[0]} does not install here: {said}")
     changed = folder / "changed.tar"
-    shutil.copyfile(kit.new, changed)
+    shutil.copyfile(kit.bundles[-1], changed)
     size, before = changed.stat().st_size, _fingerprint(full.root)
     faults: list[str] = []
     words: Counter[str] = Counter()
@@ -89,7 +89,7 @@ def _kit(arguments: argparse.Namespace, folder: Path) -> Kit:
     if arguments.bundle is None:
         return make_kit(folder)
     bundle = Path(arguments.bundle)
-    return kit_of(bundle, bundle, Path(arguments.trust), arguments.python, folder)
+    return kit_of([bundle], Path(arguments.trust), arguments.python, folder)
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:

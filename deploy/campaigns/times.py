@@ -24,7 +24,7 @@ def main(argv: list[str]) -> int:
     arguments = _parse(argv)
     bundle = Path(arguments.bundle)
     with tempfile.TemporaryDirectory() as place:
-        kit = kit_of(bundle, bundle, Path(arguments.trust), arguments.python, Path(place))
+        kit = kit_of([bundle], Path(arguments.trust), arguments.python, Path(place))
         board = Board(Path(place) / "board", kit)
         seconds, installed_bytes = [], 0
         for _ in range(arguments.tries):
@@ -50,11 +50,11 @@ def _install_s(board: Board) -> float:
     begin_s = time.monotonic()
     trust = ("--trust", board.kit.trust)
     status, said = board.run(
-        "install", board.kit.new, *trust, "--service", "process", prefix=_alone()
+        "install", board.kit.bundles[0], *trust, "--service", "process", prefix=_alone()
     )
     if status != 0:
         board.run("uninstall")
-        raise UserError(f"{board.kit.new} does not install here: {said}")
+        raise UserError(f"{board.kit.bundles[0]} does not install here: {said}")
     return time.monotonic() - begin_s
 
 

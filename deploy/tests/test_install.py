@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
 import queue
+import signal
 import threading
 from collections import Counter
 
@@ -54,9 +57,14 @@ def test_install_upgrade_back_and_away(board: Board):
         assert drives(2) == 0.2
         shown = board.status()
         assert (shown["current"], shown["previous"]) == (two.manifest.version, one.manifest.version)
-        assert shown["service"].startswith("active")
+        assert shown["service"] == "active restarts=0"
+        # It ends, as by a fault of its own: the supervisor starts it again.
+        state = board.root / "state" / "service.json"
+        os.kill(json.loads(state.read_bytes())["pid"], signal.SIGKILL)
+        wait_until(lambda: board.status()["service"] == "active restarts=1", "a new start")
+        assert drives(3) == 0.2
         assert board.run("rollback", "--settle", "0.2").returncode == 0
-        assert drives(3) == 0.1
+        assert drives(4) == 0.1
     assert board.status()["current"] == one.manifest.version
     assert board.run("uninstall").returncode == 0
     assert not board.root.exists()
