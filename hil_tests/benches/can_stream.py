@@ -81,7 +81,9 @@ def measure(seconds: float, busy: int, priority: int = 0) -> dict[str, Any]:
         policy = Path(work) / "steady.onnx"
         write_steady(policy)
         flags = ["--policy", str(policy), "--allow-unsigned"]
-        flags += ["--realtime-priority", str(priority)]
+        config = Path(work) / "edge.toml"
+        config.write_text(f"realtime_priority = {priority}\n")
+        flags += ["--config", str(config)]
         with (
             Rig(flags, Path(work), vehicle="hunter", model="hunter-2.0") as rig,
             _floor(priority) as floor,
@@ -99,7 +101,8 @@ def _wait_for_a_drive(rig: Rig) -> None:
     try:
         rig.wait_until_driving()
     except TimeoutError as error:
-        raise UserError(f"no drive to measure, the machine is too busy: {error}") from None
+        last = rig.edge.lines[-1][1] if rig.edge.lines else "nothing"
+        raise UserError(f"no drive to measure: {error}; the edge runtime said: {last}") from None
 
 
 def _report(rig: Rig, floor: CanEars, begin_s: float, end_s: float) -> dict[str, Any]:

@@ -19,8 +19,11 @@ ARROWS = {
 EDGE_LIBRARIES = {
     "numpy", "onnxruntime", "zenoh", "msgspec", "cryptography", "tomli", "typing_extensions",
 }  # fmt: skip
-CAN_DOOR = Path("edge_runtime/vehicles/hunter/bus.py")
-"""Where alone the edge runtime may load python-can, which a board without a CAN vehicle lacks."""
+DOORS = {
+    "can": ROOT / "edge_runtime/vehicles/hunter/bus.py",
+    "pycdr2": ROOT / "edge_runtime/ros2/library.py",
+}
+"""Where alone the edge runtime may load a library that only one kind of vehicle needs."""
 ONLY_IN = {"torch": {"trainer"}, "highway_env": {"trainer"}, "onnx": {"trainer"}}
 """Heavy libraries and the only folders that may load them."""
 
@@ -53,12 +56,13 @@ def test_a_folder_imports_only_what_stands_below_it(folder):
 def test_the_edge_runtime_uses_only_libraries_that_a_board_has():
     for path in sources("edge_runtime"):
         foreign = imported(path) - set(sys.stdlib_module_names) - {"edge_runtime"}
-        allowed = EDGE_LIBRARIES | ({"can"} if path == ROOT / CAN_DOOR else set())
-        assert foreign <= allowed, path
+        behind_it = {library for library, door in DOORS.items() if path == door}
+        assert foreign <= EDGE_LIBRARIES | behind_it, path
 
 
-def test_python_can_is_loaded_only_with_a_bus():
-    code = "import sys, edge_runtime.run_command; assert 'can' not in sys.modules"
+@pytest.mark.parametrize("library", DOORS)
+def test_a_vehicles_library_is_loaded_only_with_the_vehicle(library):
+    code = f"import sys, edge_runtime.run_command; assert {library!r} not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 

@@ -102,7 +102,7 @@ def test_the_table_shows_lags_that_were_not_told_as_such():
         "rows": rows, "runs": 20, "budget": None,
         "lag_budget": lag_budget(list(rows.values()), 0.95),
     }  # fmt: skip
-    text = render_sweep(sweep, {"lag": "r_lag.png"})
+    text = render_sweep(sweep, {"table": "r_table.png"})
     assert "| 100 | 100% (90) | - |" in text
     assert "| 200 | - | 50%* (-) |" in text
 
@@ -176,7 +176,7 @@ def test_the_sweep_as_a_command(tmp_path):
     assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 0
     sweep = json.loads(out.read_text())["sweep"]
     assert sweep["rows"]["dead=50ms,constant=100ms"]["outcomes"] == {"goal": 2}
-    assert (tmp_path / sweep["figures"]["lag"]).stat().st_size > 5000
+    assert (tmp_path / sweep["figures"]["table"]).stat().st_size > 5000
     (kept,) = (tmp_path / "r_rows").iterdir()
     row = json.loads(kept.read_text())
     kept.write_text(json.dumps({**row, "outcomes": {"kept": 2}}))

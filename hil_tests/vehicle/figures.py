@@ -16,9 +16,9 @@ from hil_tests.campaign.figures import write_figures as write_lines
 
 def write_figures(out: Path, sweep: Mapping[str, Any]) -> dict[str, str]:
     """Write the pictures beside ``out``; their names by figure."""
-    path = out.with_name(f"{out.stem}_lag.png")
+    path = out.with_name(f"{out.stem}_table.png")
     write_atomic(path, _draw_table(sweep))
-    return {"lag": path.name, **(write_lines(out, sweep, {}) if sweep["axes"] else {})}
+    return {"table": path.name, **(write_lines(out, sweep, {}) if sweep["axes"] else {})}
 
 
 def _draw_table(sweep: Mapping[str, Any]) -> bytes:
@@ -33,9 +33,11 @@ def _draw_table(sweep: Mapping[str, Any]) -> bytes:
     figure = Figure(figsize=(0.8 * len(dead) + 2.5, 0.55 * len(constant) + 2.0))
     figure.set_layout_engine("constrained")
     panel = figure.subplots()
-    image = panel.imshow(success, origin="lower", aspect="auto", vmin=0, vmax=1, cmap="RdYlGn")
+    image = panel.imshow(success, origin="lower", aspect="auto", vmin=0.5, vmax=1, cmap="RdYlGn")
     for y, line in enumerate(success):
         for x, value in enumerate(line):
+            if np.isnan(value):
+                continue  # not asked for
             weight = "bold" if value >= target else "normal"
             panel.text(x, y, f"{value:.0%}", ha="center", va="center", fontsize=8, weight=weight)
     panel.set_xticks(range(len(dead)), [str(value) for value in dead])
