@@ -11,9 +11,9 @@ import pytest
 
 from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import wait_until
+from edge_runtime.vehicles import stream
 from edge_runtime.vehicles.hunter import bus as buses
 from edge_runtime.vehicles.hunter import frames
-from edge_runtime.vehicles.hunter import vehicle as vehicles
 from edge_runtime.vehicles.hunter.bus import BusName, Gate, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.hunter.states import State
@@ -109,6 +109,10 @@ def is_enabled(vehicle):
     return vehicle.state is State.ENABLED
 
 
+def test_the_stream_keeps_the_manuals_period():
+    assert frames.MOTION_COMMAND.period_s == stream.PERIOD_S
+
+
 def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     time.sleep(0.1)
     assert chassis.heard == []
@@ -148,7 +152,7 @@ def test_its_own_stop_does_not_wait_for_the_next_period(chassis, vehicle, monkey
     vehicle.enable(time.monotonic())
     wait_until(lambda: is_enabled(vehicle), "the confirmation")
     drive(vehicle, lambda: chassis.speeds[-1] > 0.1, "speed")
-    monkeypatch.setattr(vehicles, "STREAM_PERIOD_S", 3.0)
+    monkeypatch.setattr(stream, "PERIOD_S", 3.0)
     time.sleep(0.05)  # one more period of before
     commanded_s = time.monotonic()
     vehicle.command({"pedal": 1.0}, commanded_s)
@@ -180,7 +184,7 @@ def test_a_frame_that_was_held_up_is_followed_at_once_by_one_of_now(chassis, veh
 
     def stopped_in_between(message, timeout=None):
         if not sent and vehicle.state is State.ENABLED:
-            monkeypatch.setattr(vehicles, "STREAM_PERIOD_S", 0.4)
+            monkeypatch.setattr(stream, "PERIOD_S", 0.4)
             time.sleep(0.5)  # the whole process, as far as the frame can tell
         send(message, timeout=timeout)
         sent.append((time.monotonic(), told_by(message.arbitration_id, message.data).speed_mps))
@@ -234,8 +238,8 @@ def test_random_frames_on_the_bus_never_move_it(chassis, vehicle):
         junk.shutdown()
     count = len(vehicle.feedback(time.monotonic()).faults)
     assert count <= 3
-    assert vehicle._threads[0].is_alive()
-    assert vehicle._threads[1].is_alive()
+    assert vehicle._stream.is_alive()
+    assert vehicle._listener.is_alive()
     assert set(chassis.speeds) == {0.0}
 
 

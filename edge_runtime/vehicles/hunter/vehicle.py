@@ -15,18 +15,15 @@ import time
 from typing import Any, ClassVar, Dict, Optional
 
 from edge_runtime import log
-from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.vehicles.hunter.bus import BusName, Gate, is_bus_off, open_bus
 from edge_runtime.vehicles.hunter.core import STOP_TAKES_S, HunterCore
-from edge_runtime.vehicles.hunter.frames import MOTION_COMMAND
 from edge_runtime.vehicles.hunter.set_point import inner_of
 from edge_runtime.vehicles.hunter.specs import HunterSpec
 from edge_runtime.vehicles.hunter.states import State
 from edge_runtime.vehicles.interface import ActionLimit, Vehicle, VehicleReport
 from edge_runtime.vehicles.similarity import Similarity
+from edge_runtime.vehicles.stream import PERIOD_S, Stream
 
-assert MOTION_COMMAND.period_s is not None
-STREAM_PERIOD_S = MOTION_COMMAND.period_s
 _LISTEN_S = 0.1
 _JOIN_S = 0.5
 # A pedal is integrated to a speed, so that any leap of it is a ramp: 2.0 in T = 0.1 s.
@@ -47,16 +44,11 @@ class HunterVehicle(Vehicle):
         self._core = HunterCore(spec, profile, similarity)
         self.limits: Dict[str, ActionLimit] = _limits(spec, similarity)
         self._lock = threading.Lock()
-        self._wake = threading.Event()
-        self._stopping = False
         self._closed = False
+        self._stopping = False
         self._logged = ""
-        self._sent_s: Optional[float] = None
-        self._gaps = LatencyWindow()
-        self._threads = [
-            threading.Thread(target=work, name=f"hunter-{name}", daemon=True)
-            for name, work in (("stream", self._stream), ("listener", self._listen))
-        ]
+        self._stream = Stream("hunter-stream", self._send_due, self._late_at_s)
+        self._listener = threading.Thread(target=self._listen, name="hunter-listener", daemon=True)
 
     @property
     def state(self) -> State:
@@ -64,12 +56,14 @@ class HunterVehicle(Vehicle):
         return self._core.state
 
     def enable(self, now_s: float) -> None:
-        """Ask the chassis for control; `feedback` tells whether it came."""
+        """Ask the chassis for control; `feedback` tells whether it came. Nothing once closed."""
+        if self._closed:
+            return
         with self._lock:
             self._core.enable(now_s)
             self._gate.open()
         self._start()
-        self._wake.set()
+        self._stream.wake()
 
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
@@ -82,7 +76,7 @@ class HunterVehicle(Vehicle):
         """Speed 0 leaves at once, not with the next period."""
         with self._lock:
             self._core.brake(now_s, latch)
-        self._wake.set()
+        self._stream.wake()
 
     def feedback(self, now_s: float) -> VehicleReport:
         """From the newest frames of the chassis, which it listens to before `enable`, too."""
@@ -98,12 +92,11 @@ class HunterVehicle(Vehicle):
             return
         self._closed = True
         self.brake(time.monotonic())
-        self._wait_for_a_stand()
+        self._stream.run_until(self._is_at_rest, STOP_TAKES_S)
+        self._stream.stop()
         self._stopping = True
-        self._wake.set()
-        for thread in self._threads:
-            if thread.ident is not None:
-                thread.join(_JOIN_S)
+        if self._listener.ident is not None:
+            self._listener.join(_JOIN_S)
         with self._lock:
             parts = self._core.close(time.monotonic())
         try:
@@ -112,61 +105,38 @@ class HunterVehicle(Vehicle):
         except Exception as error:  # the chassis stops by itself, and the bus must be freed
             log.event("warning", "hunter_not_parked", detail=error)
         self._bus.shutdown()
-        if self._sent_s is not None:
-            log.event("info", "hunter_stream", **_rounded(self._gaps.summary_ms()))
+        gaps_ms = self._stream.gaps_ms()
+        if gaps_ms:
+            log.event("info", "hunter_stream", **gaps_ms)
 
     def _start(self) -> None:
-        if not self._closed:
-            for thread in self._threads:
-                if thread.ident is None:
-                    thread.start()
+        if self._closed:
+            return
+        self._stream.start()
+        if self._listener.ident is None:
+            self._listener.start()
 
-    def _wait_for_a_stand(self) -> None:
-        end_s = time.monotonic() + STOP_TAKES_S
-        while self._threads[0].is_alive() and time.monotonic() < end_s:
-            with self._lock:
-                if self._core.is_at_rest(time.monotonic()):
-                    return
-            time.sleep(STREAM_PERIOD_S)
-
-    def _stream(self) -> None:
-        next_s = time.monotonic()
-        while not self._stopping:
-            self._wake.clear()
-            self._send_due()
-            now_s = time.monotonic()
-            if now_s >= next_s:
-                # After a pause one frame, not one for each missed period.
-                missed = int((now_s - next_s) / STREAM_PERIOD_S)
-                next_s += (missed + 1) * STREAM_PERIOD_S
-            with self._lock:
-                due_s = min(next_s, self._core.late_at_s)
-            self._wake.wait(max(0.0, due_s - time.monotonic()))
-
-    def _send_due(self) -> None:
+    def _is_at_rest(self) -> bool:
         with self._lock:
-            ticked_s = time.monotonic()
-            parts = self._core.tick(ticked_s)
+            return self._core.is_at_rest(time.monotonic())
+
+    def _late_at_s(self) -> float:
+        with self._lock:
+            return self._core.late_at_s
+
+    def _send_due(self) -> bool:
+        with self._lock:
+            parts = self._core.tick(time.monotonic())
         try:
             for part in parts:
                 self._gate.send(*part)
         except Exception as error:  # CanError, OSError, or what else a backend raises
             self._note_bus(error)
-            return
+            return False
         if parts:
-            self._note_sent()
-        if time.monotonic() - ticked_s > STREAM_PERIOD_S:
-            # A process that was stopped in between has said what was asked for before it was. The
-            # chassis cannot tell, and may have control again: the next frame does not wait.
-            self._wake.set()
-
-    def _note_sent(self) -> None:
-        now_s = time.monotonic()
-        with self._lock:
-            self._core.bus_works()
-        if self._sent_s is not None:
-            self._gaps.add(int((now_s - self._sent_s) * 1e9))
-        self._sent_s = now_s
+            with self._lock:
+                self._core.bus_works()
+        return bool(parts)
 
     def _listen(self) -> None:
         while not self._stopping:
@@ -174,7 +144,7 @@ class HunterVehicle(Vehicle):
                 message = self._bus.recv(_LISTEN_S)
             except Exception as error:  # as in _send_due; it may raise at once, again and again
                 self._note_bus(error)
-                time.sleep(STREAM_PERIOD_S)
+                time.sleep(PERIOD_S)
                 continue
             if message is not None:
                 self._hear(message)
@@ -193,7 +163,7 @@ class HunterVehicle(Vehicle):
             self._core.hear(message.arbitration_id, bytes(message.data), time.monotonic())
             stopped = self._core.state is State.STOPPED and was is not State.STOPPED
         if stopped:
-            self._wake.set()
+            self._stream.wake()
 
     def _note_bus(self, error: object, fatal: bool = False) -> None:
         words = " ".join(str(error).split()) or type(error).__name__
@@ -218,7 +188,3 @@ def _limits(spec: HunterSpec, similarity: Similarity) -> Dict[str, ActionLimit]:
         "pedal": ActionLimit(-1.0, 1.0, _PEDAL_SLEW_PER_S),
         "steering": ActionLimit(-1.0, 1.0, spec.max_steering_rate_radps / full_rad),
     }
-
-
-def _rounded(summary_ms: Dict[str, float]) -> Dict[str, float]:
-    return {f"gap_{name}_ms": round(value, 2) for name, value in summary_ms.items()}

@@ -86,6 +86,11 @@ class Ros2Core:
         elif self.state is State.ENABLING:
             self._apply(Event.CONFIRMED, "", now_s)
 
+    @property
+    def late_at_s(self) -> float:
+        """After which moment its newest command is too old to be obeyed; inf where it has none."""
+        return math.inf if self._wish is None else self._wished_s + COMMAND_TIMEOUT_S
+
     def tick(self, now_s: float) -> Optional[Motion]:
         """What to publish now; None while DISABLED."""
         self._watch(now_s)

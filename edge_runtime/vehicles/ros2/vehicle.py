@@ -13,7 +13,6 @@ import time
 from typing import Callable, ClassVar, Dict, List, Optional
 
 from edge_runtime import log
-from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.ros2 import messages as ros
 from edge_runtime.ros2.endpoint import open_ros2_session
 from edge_runtime.ros2.node import Ros2Node
@@ -25,11 +24,9 @@ from edge_runtime.vehicles.ros2.core import Motion, Ros2Core
 from edge_runtime.vehicles.ros2.settings import Ros2Settings, check_settings
 from edge_runtime.vehicles.ros2.states import State
 from edge_runtime.vehicles.similarity import Similarity
+from edge_runtime.vehicles.stream import Stream
 
-# The Hunter's own: its ROS driver makes a frame of each message, and has no stream of its own.
-STREAM_PERIOD_S = 0.02
 STOP_TAKES_S = 1.0  # zeros go out for so long at the end, unless it is known to stand before
-_JOIN_S = 0.5
 # A pedal is integrated to a speed, so that any leap of it is a ramp: 2.0 in T = 0.1 s.
 _PEDAL_SLEW_PER_S = 20.0
 
@@ -48,15 +45,12 @@ class Ros2Vehicle(Vehicle):
         self._core = Ros2Core(settings, spec, similarity)
         self.limits: Dict[str, ActionLimit] = _limits(spec, similarity)
         self._lock = threading.Lock()
-        self._wake = threading.Event()
-        self._stopping = False
         self._closed = False
         self._logged = ""
         self._failing = False
-        self._sent_s: Optional[float] = None
-        self._gaps = LatencyWindow()
         self._publish: List[Callable[[Motion], None]] = []
-        self._thread = threading.Thread(target=self._stream, name="ros2-stream", daemon=True)
+        # Needed: the vehicle's ROS driver makes a frame of each message, and has none of its own.
+        self._stream = Stream("ros2-stream", self._send_due, self._late_at_s)
         self._session = open_ros2_session(settings.listen, settings.connect, "[ros2] listen")
         try:
             self._node = Ros2Node(self._session, settings.namespace)
@@ -80,11 +74,12 @@ class Ros2Vehicle(Vehicle):
 
     def enable(self, now_s: float) -> None:
         """Publish speed 0, and drive once odometry comes; `feedback` tells whether it does."""
+        if self._closed:
+            return
         with self._lock:
             self._core.enable(now_s)
-        if self._thread.ident is None:
-            self._thread.start()
-        self._wake.set()
+        self._stream.start()
+        self._stream.wake()
 
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
@@ -97,7 +92,7 @@ class Ros2Vehicle(Vehicle):
         """Speed 0 leaves at once, not with the next period. ROS 2 has no message for a brake."""
         with self._lock:
             self._core.brake(now_s, latch)
-        self._wake.set()
+        self._stream.wake()
 
     def feedback(self, now_s: float) -> VehicleReport:
         """From the newest odometry."""
@@ -112,17 +107,14 @@ class Ros2Vehicle(Vehicle):
             return
         self._closed = True
         self.brake(time.monotonic())
-        self._wait_for_a_stand()
-        self._stopping = True
-        self._wake.set()
-        if self._thread.ident is not None:
-            self._thread.join(_JOIN_S)
+        self._stream.run_until(self._is_at_rest, STOP_TAKES_S)
+        self._stream.stop()
         try:
             if self.rejected:
                 log.event("info", "ros2_odometry_rejected", **self.rejected)
-            if self._sent_s is not None:
-                gaps = self._gaps.summary_ms().items()
-                log.event("info", "ros2_stream", **{f"gap_{k}_ms": round(v, 2) for k, v in gaps})
+            gaps_ms = self._stream.gaps_ms()
+            if gaps_ms:
+                log.event("info", "ros2_stream", **gaps_ms)
             self._node.close()
         finally:
             with self._lock:
@@ -145,32 +137,19 @@ class Ros2Vehicle(Vehicle):
 
         node.subscribe(settings.odometry_topic, ros.Odometry, hear)
 
-    def _wait_for_a_stand(self) -> None:
-        end_s = time.monotonic() + STOP_TAKES_S
-        while self._thread.is_alive() and time.monotonic() < end_s:
-            with self._lock:
-                if self._core.is_at_rest(time.monotonic()):
-                    return
-            time.sleep(STREAM_PERIOD_S)
-
-    def _stream(self) -> None:
-        next_s = time.monotonic()
-        while not self._stopping:
-            self._wake.clear()
-            self._send_due()
-            now_s = time.monotonic()
-            if now_s >= next_s:
-                # After a pause one message, not one for each missed period.
-                missed = int((now_s - next_s) / STREAM_PERIOD_S)
-                next_s += (missed + 1) * STREAM_PERIOD_S
-            self._wake.wait(max(0.0, next_s - time.monotonic()))
-
-    def _send_due(self) -> None:
+    def _is_at_rest(self) -> bool:
         with self._lock:
-            ticked_s = time.monotonic()
-            motion = self._core.tick(ticked_s)
+            return self._core.is_at_rest(time.monotonic())
+
+    def _late_at_s(self) -> float:
+        with self._lock:
+            return self._core.late_at_s
+
+    def _send_due(self) -> bool:
+        with self._lock:
+            motion = self._core.tick(time.monotonic())
         if motion is None:
-            return
+            return False
         try:
             for publish in self._publish:
                 publish(motion)
@@ -178,16 +157,9 @@ class Ros2Vehicle(Vehicle):
             if not self._failing:
                 log.event("error", "ros2_not_sent", detail=error)
             self._failing = True
-            return
+            return False
         self._failing = False
-        now_s = time.monotonic()
-        if now_s - ticked_s > STREAM_PERIOD_S:
-            # A process that was stopped in between has said what was asked for before it was: the
-            # next message does not wait.
-            self._wake.set()
-        if self._sent_s is not None:
-            self._gaps.add(int((now_s - self._sent_s) * 1e9))
-        self._sent_s = now_s
+        return True
 
     def _log_state(self) -> None:
         """Each state once, when feedback is asked for: never from the stream's thread."""

@@ -11,8 +11,8 @@ from edge_runtime.errors import UserError
 from edge_runtime.ros2.tests import second
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.transport import free_endpoint
+from edge_runtime.vehicles import stream
 from edge_runtime.vehicles.hunter.specs import SPECS
-from edge_runtime.vehicles.ros2 import vehicle as vehicles
 from edge_runtime.vehicles.ros2.settings import Ros2Settings
 from edge_runtime.vehicles.ros2.states import Event, State
 from edge_runtime.vehicles.ros2.tests.ros_hunter import RosHunter
@@ -22,9 +22,21 @@ from edge_runtime.vehicles.similarity import CARS, similarity_to
 SPEC = SPECS["2.0"]
 
 
+made = []
+
+
+@pytest.fixture(autouse=True)
+def all_closed():
+    """An open session would hang the process of a test that fails."""
+    yield
+    while made:
+        made.pop().close()
+
+
 def make_vehicle(scenario="left_turn", **changes):
     similarity = similarity_to(CARS[scenario], SPEC.max_speed_mps)
-    return Ros2Vehicle(Ros2Settings(**changes), SPEC, similarity)
+    made.append(Ros2Vehicle(Ros2Settings(**changes), SPEC, similarity))
+    return made[-1]
 
 
 class Commands:
@@ -177,7 +189,7 @@ def test_a_message_that_was_held_up_is_followed_at_once_by_one_of_now(monkeypatc
 
     def stopped_in_between(motion):
         if not sent and motion.speed_mps > 0.1:
-            monkeypatch.setattr(vehicles, "STREAM_PERIOD_S", 0.4)
+            monkeypatch.setattr(stream, "PERIOD_S", 0.4)
             time.sleep(0.5)  # the whole process, as far as the message can tell
         if sent or motion.speed_mps > 0.1:
             sent.append((time.monotonic(), motion.speed_mps))

@@ -1,0 +1,96 @@
+"""The stream's thread: periods, a command that gets too old, a wake, a process that was held up."""
+
+import math
+import threading
+import time
+
+import pytest
+
+from edge_runtime.tests.harness import wait_until
+from edge_runtime.vehicles import stream
+from edge_runtime.vehicles.stream import Stream
+
+
+@pytest.fixture
+def started():
+    """Makes a stream that notes when it sent; ended with the test."""
+    streams = []
+
+    def make(late_at_s=lambda: math.inf, during=lambda: None):
+        sent = []
+
+        def send():
+            sent.append(time.monotonic())
+            during()
+            return True
+
+        streams.append(Stream("test", send, late_at_s))
+        streams[-1].start()
+        return streams[-1], sent
+
+    yield make
+    for each in streams:
+        each.stop()
+
+
+def test_it_sends_fifty_times_a_second(started):
+    running, sent = started()
+    wait_until(lambda: len(sent) > 50, "a second of sending")
+    # A machine that pauses loses periods; nothing may make it send more often than asked.
+    assert sent[50] - sent[0] > 0.9
+    assert set(running.gaps_ms()) >= {"gap_p50_ms", "gap_p99_ms", "gap_max_ms"}
+
+
+def test_a_stop_does_not_wait_for_the_period(started, monkeypatch):
+    monkeypatch.setattr(stream, "PERIOD_S", 60.0)
+    running, sent = started()
+    wait_until(lambda: sent, "the first")
+    running.wake()
+    wait_until(lambda: len(sent) == 2, "one more, woken")
+
+
+def test_a_command_that_gets_too_old_does_not_wait_for_the_period(started, monkeypatch):
+    monkeypatch.setattr(stream, "PERIOD_S", 60.0)
+    late_s = time.monotonic() + 0.3
+    _, sent = started(late_at_s=lambda: late_s if time.monotonic() < late_s else math.inf)
+    wait_until(lambda: len(sent) == 2, "one more, at the command's end")
+    assert sent[1] >= late_s
+
+
+def test_what_was_held_up_is_followed_at_once(started, monkeypatch):
+    monkeypatch.setattr(stream, "PERIOD_S", 2.0)
+    held = threading.Event()
+
+    def hold():
+        if not held.is_set():
+            held.set()
+            time.sleep(2.5)
+
+    _, sent = started(during=hold)
+    wait_until(lambda: len(sent) >= 2, "the next")
+    assert sent[1] - sent[0] < 3.9  # the next period would have come 4 s after the first
+
+
+def test_after_a_pause_it_sends_once_and_not_for_each_missed_period(started):
+    held = threading.Event()
+
+    def hold():
+        if not held.is_set():
+            held.set()
+            time.sleep(0.5)
+
+    _, sent = started(during=hold)
+    wait_until(lambda: len(sent) > 10, "ten more")
+    assert sent[10] - sent[1] > 0.12
+
+
+def test_it_streams_until_the_condition_holds_and_never_longer_than_the_limit(started):
+    running, sent = started()
+    running.run_until(lambda: len(sent) > 5, limit_s=60.0)
+    assert len(sent) > 5
+    running.run_until(lambda: False, limit_s=0.05)
+    running.stop()
+    assert not running.is_alive()
+    began_s = time.monotonic()
+    running.run_until(lambda: False, limit_s=60.0)
+    assert time.monotonic() - began_s < 30.0
