@@ -22,7 +22,7 @@ from edge_runtime.vehicles.similarity import CARS, similarity_to
 SPEC = SPECS["2.0"]
 
 
-made = []
+made: list[Ros2Vehicle] = []
 
 
 @pytest.fixture(autouse=True)
