@@ -24,6 +24,9 @@ from trainer.commands.options import positive
 
 _SIZES = (1, 5, 10, 20)
 _RULES = (10, 100, 1_000)
+_TRIES = 3
+_UNDISTURBED = 0.9
+"""Each vehicle has an answer to this share of its states at least; else the machine was busy."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -69,9 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _measure(arguments: argparse.Namespace, console: Console) -> dict[str, Any]:
     rows = []
     for count in sorted(set(arguments.vehicles)):
-        with tempfile.TemporaryDirectory() as folder:
-            rows.append(measure(count, arguments.seconds, Path(folder)))
-        console.print(f"{count} vehicles: done")
+        rows.append(_undisturbed(count, arguments.seconds))
+        console.print(f"{count} vehicles: done, {rows[-1]['tries']} tries")
     with tempfile.TemporaryDirectory() as folder:
         rules = measure_rules(sorted(set(arguments.rules)), Path(folder))
     each = per_vehicle(rows)
@@ -82,6 +84,15 @@ def _measure(arguments: argparse.Namespace, console: Console) -> dict[str, Any]:
         "per_vehicle": each,
         "projected": project(each, rules),
     }
+
+
+def _undisturbed(count: int, seconds: int) -> dict[str, Any]:
+    """A fleet's report; where the machine had no time for it, that of the best of three tries."""
+    tries: list[dict[str, Any]] = []
+    while len(tries) < _TRIES and not (tries and tries[-1]["answered_least"] >= _UNDISTURBED):
+        with tempfile.TemporaryDirectory() as folder:
+            tries.append(measure(count, seconds, Path(folder)))
+    return {**max(tries, key=lambda row: float(row["answered_least"])), "tries": len(tries)}
 
 
 def _show(report: dict[str, Any], console: Console) -> None:
