@@ -129,6 +129,9 @@ class SupervisedProcess(NoService):
 
 def choose(way: str | None, root: Path) -> Any:
     """The service of a way; without one, that of the last install here, or what is there."""
+    if way == "systemd" and not systemctl.is_there():
+        # Before it makes a user and unpacks for a start that cannot come.
+        raise UserError("--service systemd: no systemd runs this computer; use process or none")
     if way is None:
         way = _remembered(root) or ("systemd" if systemctl.is_there() else "none")
     if way == "systemd":

@@ -11,6 +11,7 @@ import pytest
 from deploy.bundle import make_bundle
 from deploy.campaigns.light import HERE
 from deploy.installer import release as release_module
+from deploy.installer import systemctl
 from deploy.installer.layout import Layout, sync_all
 from deploy.keys import write_key_pair
 from deploy.tests.boards import Board, changed_wheel
@@ -158,6 +159,12 @@ def test_all_is_on_the_disk_before_a_release_has_its_name(workshop, tmp_path, mo
     assert [row[0] for row in order] == ["synced", "named"]
     assert folder == layout.release(version)
     assert release_module.why_not_whole(folder) == ""
+
+
+@pytest.mark.skipif(systemctl.is_there(), reason="systemd runs this computer")
+def test_a_systemd_that_does_not_run_is_said_before_anything_is_made(board: Board, workshop):
+    refused(board.install(workshop.make(0.1).path, "systemd"), "no systemd runs this computer")
+    assert not board.root.exists()
 
 
 @pytest.mark.parametrize(
