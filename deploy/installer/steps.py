@@ -8,7 +8,9 @@ the new one, and the same command again completes the work.
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -207,6 +209,10 @@ def _go_back(version: str, good: str | None, earlier: str | None, layout: Layout
 
 
 def _say(text: str) -> None:
-    # A reader that is gone, as an ssh link that broke, must not keep us from going back.
-    with contextlib.suppress(OSError):
+    try:
         print(text, flush=True)
+    except OSError:
+        # A reader that is gone, as an ssh link that broke, must not keep us from going back. What
+        # is left of the line would fail again at the next flush.
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

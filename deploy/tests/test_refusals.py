@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import platform
+import subprocess
 
 import pytest
 
@@ -83,6 +84,17 @@ def test_a_damaged_release_is_said_and_made_again(board: Board, workshop):
     assert done.returncode == 0
     assert "damaged" in done.stdout
     assert board.status()["whole"] == "yes"
+
+
+def test_it_installs_to_the_end_where_nobody_reads_what_it_says(board: Board, workshop):
+    """An ssh link that broke: its pipe has no reader."""
+    made = workshop.make(0.1)
+    line = board.command("install", made.path, "--trust", workshop.public_key)
+    with subprocess.Popen([*line, "--service", "none"], stdout=subprocess.PIPE) as run:
+        assert run.stdout is not None
+        run.stdout.close()
+    assert run.returncode == 0
+    assert board.status()["current"] == made.manifest.version
 
 
 def test_one_installer_at_a_time(board: Board, workshop):
@@ -178,8 +190,6 @@ def test_a_systemd_that_does_not_run_is_said_before_anything_is_made(board: Boar
 def test_a_mistake_is_one_line(board: Board, arguments):
     command, *rest = arguments or [""]
     line = board.command(command, *rest) if arguments else board.command("status")[:3]
-    import subprocess
-
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert (done.returncode, len(done.stderr.strip().splitlines())) == (2, 1), done.stderr
     assert not board.root.exists()
