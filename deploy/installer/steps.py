@@ -197,11 +197,14 @@ def _go_back(version: str, good: str | None, earlier: str | None, layout: Layout
         layout.remove_release(version)
         return
     layout.link("current", good)
-    if earlier is not None and earlier not in (good, version):
+    if earlier is not None and earlier != good:
         layout.link("previous", earlier)
     else:
         layout.unlink("previous")
-    layout.remove_release(version)
+    if (
+        version != earlier
+    ):  # A release that has served before stays, for a roll-back at another time.
+        layout.remove_release(version)
     try:
         _start(good, layout, way)
     except UnhealthyError as error:

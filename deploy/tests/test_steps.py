@@ -90,6 +90,14 @@ def _broken(text: str) -> int:
     raise BrokenPipeError(32, "Broken pipe")
 
 
+def test_a_roll_back_that_is_interrupted_can_be_tried_again(layout):
+    layout.link("previous", NEW)
+    service = Service(layout, KeyboardInterrupt())
+    with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
+        steps.activate(NEW, layout, steps.Way(service, Limits()), is_new=False)
+    assert (layout.linked("current"), layout.linked("previous"), service.runs) == (OLD, NEW, OLD)
+
+
 def test_a_stop_that_is_interrupted_starts_the_old_release_again(layout):
     service = Service(layout, KeyboardInterrupt())
     stops = [KeyboardInterrupt]
