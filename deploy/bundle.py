@@ -91,6 +91,12 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
     Raises UserError for what `make_bundle` would refuse.
     """
     key = _read_private_key(inputs.key)
+    if inputs.policy.is_file() and not Path(f"{inputs.policy}.sig").exists():
+        # Here, because load_policy would name a flag that no bundle has.
+        raise UserError(
+            f"policy {inputs.policy} is not signed ({inputs.policy.name}.sig is missing);"
+            " `python -m trainer export ... --key KEY` signs it"
+        )
     policy = load_policy(inputs.policy, inputs.public_key)
     config, text = _config(inputs)
     if inputs.tls is not None:
@@ -112,8 +118,8 @@ def _manifest(contents: dict[str, bytes], target: Target, vehicle: str, policy: 
 
 def _config(inputs: Inputs) -> tuple[Config, str]:
     """The settings, checked as `run` checks them, and the file that the board gets."""
-    given = read_bytes(inputs.config, "config file").decode() if inputs.config else ""
     plain = load_config(inputs.config, {"policy": str(inputs.policy), **_tls_flag(inputs)})
+    given = read_bytes(inputs.config, "config file").decode() if inputs.config else ""
     keys = tomllib.loads(given).keys()
     for name in _OF_THE_BUNDLE:
         if name in keys:
@@ -167,6 +173,8 @@ def _tls(folder: Path, vehicle_id: str) -> dict[str, bytes]:
 
 
 def _read_private_key(path: Path) -> Ed25519PrivateKey:
+    if not path.exists():
+        raise UserError(f"private key {path} does not exist; `python -m deploy keys` makes one")
     pem = read_bytes(path, "private key")
     try:
         key = load_pem_private_key(pem, password=None)
@@ -191,6 +199,7 @@ def _write(path: Path, manifest: Manifest, key: Ed25519PrivateKey, contents: dic
             stream.write(END)
         draft.replace(path)
     except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from None
+    finally:  # ^C, too: half a bundle holds a private key as well
         with contextlib.suppress(OSError):
             draft.unlink()
-        raise UserError(f"cannot write {path}: {error.strerror}") from None

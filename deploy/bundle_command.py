@@ -11,6 +11,7 @@ from deploy.bundle import Inputs, Made, check_inputs, make_bundle
 from deploy.installer.release import WHEELS
 from deploy.targets import TARGETS, find_target, lock_path
 from deploy.wheelhouse import DEFAULT_FOLDER, build_edge_wheel, gather
+from edge_runtime.errors import UserError
 from edge_runtime.signature import DEFAULT_PUBLIC_KEY
 
 DEFAULT_OUT = "build/bundles"
@@ -61,11 +62,20 @@ def bundle(arguments: argparse.Namespace) -> int:
             wheels=[],
         )
         check_inputs(inputs)  # Before minutes of downloads.
+        _check_out(Path(arguments.out))
         wheels = gather(target, lock_path(target), Path(arguments.wheels) / target.name)
         inputs = inputs._replace(wheels=[*wheels, build_edge_wheel(Path(place))])
         made = make_bundle(inputs, target, Path(arguments.out))
     print("\n".join(_lines(made)))
     return 0
+
+
+def _check_out(out: Path) -> None:
+    """Raise UserError where the folder cannot be made, without making it."""
+    whole = out.absolute()
+    there = next(place for place in (whole, *whole.parents) if place.exists())
+    if not there.is_dir():
+        raise UserError(f"--out {out}: {there} is a file, not a directory")
 
 
 def _lines(made: Made) -> list[str]:

@@ -28,6 +28,8 @@ SSH, SCP = ("ssh", "-o", "BatchMode=yes"), ("scp", "-q", "-p", "-o", "BatchMode=
 """BatchMode: a password asked for in the middle would hang a script; use ssh's keys."""
 _HOST = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]*@)?[A-Za-z0-9\[][A-Za-z0-9_.:\]-]*")
 _TRUST = "trust.pub"
+_SSH_FAILED = 255
+"""ssh's own status; any other is that of the command over there."""
 
 
 class Step(NamedTuple):
@@ -61,7 +63,8 @@ def push(arguments: argparse.Namespace) -> int:
         raise UserError(f"host {arguments.host!r} is not valid: write name or user@name")
     manifest = _verify(arguments)
     with tempfile.TemporaryDirectory() as place:
-        files = [Path(place) / NAME, Path(place) / _TRUST, Path(arguments.bundle)]
+        # Absolute: scp would take "a:b" for a file of the host a.
+        files = [Path(place) / NAME, Path(place) / _TRUST, Path(arguments.bundle).absolute()]
         files[0].write_bytes(build_installer())
         files[1].write_bytes(read_bytes(arguments.trust, "public key"))
         before, install, after = steps(arguments, manifest, files)
@@ -101,7 +104,7 @@ def steps(
     return (
         before,
         Step("install", [*SSH, host, shlex.join(install)]),
-        Step("leave nothing behind", [*SSH, host, f"rm -r {folder}"]),
+        Step("leave nothing behind", [*SSH, host, f"rm -rf {folder}"]),
     )
 
 
@@ -120,14 +123,23 @@ def _verify(arguments: argparse.Namespace) -> Manifest:
 
 
 def _run(before: list[Step], install: Step, after: Step) -> int:
-    for step in before:
-        status = _call(step)
-        if status != 0:
-            raise UserError(f"{step.command[0]} ended with status {status}: {step.why}")
+    probe, *copying = before
+    _expect(probe)
     try:
+        for step in copying:
+            _expect(step)
         return _call(install)
     finally:
+        # Whatever came of it: half a bundle may hold the vehicle's private key, too.
         _call(after)
+
+
+def _expect(step: Step) -> None:
+    status = _call(step)
+    if status == _SSH_FAILED:
+        raise UserError(f"{step.command[0]} does not reach the board; its own line above says why")
+    if status != 0:
+        raise UserError(f"{step.command[0]} ended with status {status}: {step.why}")
 
 
 def _call(step: Step) -> int:

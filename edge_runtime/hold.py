@@ -9,17 +9,24 @@ from __future__ import annotations
 import fcntl
 from typing import Optional, TextIO
 
+from edge_runtime.errors import UserError
+
 
 class Hold:
-    """`path` is the file; None, or one that is not there, holds nothing."""
+    """`path` is the file; None, or one that is not there, holds nothing.
+
+    Raises UserError for one that cannot be read: nobody could say whether it holds.
+    """
 
     def __init__(self, path: Optional[str] = None) -> None:
         self._stream: Optional[TextIO] = None
         if path is not None:
             try:
                 self._stream = open(path)  # noqa: SIM115 - kept until it is free
-            except OSError:
+            except FileNotFoundError:
                 return
+            except OSError as error:
+                raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
 
     def is_on(self) -> bool:
         """Whether commands must stay here. Never waits."""

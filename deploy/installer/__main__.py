@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import json
 import os
+import signal
 import sys
 from typing import Any, NoReturn
 
@@ -104,6 +105,9 @@ def _dispatch(arguments: argparse.Namespace) -> int:
         uninstall(layout, Way(service, LIMITS))
         print(f"removed from {layout.root}")
         return 0
+    # A link that breaks must not end it between two releases; whoever ends it makes it go back.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     limits = Limits(arguments.health_limit, arguments.settle)
     if not (limits.within_s > 0 and limits.settle_s >= 0):
         raise UserError("--health-limit must be above 0, and --settle 0 or more")

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Iterator
 
 from deploy.installer import systemctl
 from deploy.installer.apart import Account
@@ -22,6 +22,7 @@ from deploy.installer.layout import write_whole
 WAYS = ("systemd", "process", "none")
 _STOP_LIMIT_S = 10.0
 _WAY = "way"
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 
 class NoService:
@@ -77,12 +78,20 @@ class SupervisedProcess(NoService):
         """Start a supervisor of whatever `current` names."""
         with contextlib.suppress(FileNotFoundError):
             (self._state / "service.json").unlink()
-        with open(str(self._state / "service.log"), "ab") as log:
-            subprocess.Popen(
+        with open(str(self._state / "service.log"), "ab") as log, _uninterrupted():
+            process = subprocess.Popen(
                 [sys.executable, "-I", str(release / "install.pyz"), "supervise",
                  "--root", str(self._root)],
                 cwd="/", stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+                preexec_fn=_interruptible,
             )  # fmt: skip
+            # `stop` finds it by its lock: until it has that, nobody could end it. Its name comes
+            # after the lock, which to ask for would be in its way.
+            end_s = time.monotonic() + _STOP_LIMIT_S
+            while self._named() != process.pid and process.poll() is None:
+                if time.monotonic() > end_s:
+                    break
+                time.sleep(0.02)
 
     def watch(self, limits: Limits) -> None:
         """Raise UnhealthyError unless it is ready within the limit and stays so for a while."""
@@ -114,6 +123,13 @@ class SupervisedProcess(NoService):
             return {}
         return value if isinstance(value, dict) else {}
 
+    def _named(self) -> int | None:
+        """The id in the supervisor's file, whether or not that still lives."""
+        try:
+            return int((self._state / "supervisor.pid").read_text())
+        except (OSError, ValueError):
+            return None
+
     def _pid(self) -> int | None:
         """The supervisor's id while it lives: it holds a lock, so no other process is mistaken."""
         try:
@@ -127,8 +143,25 @@ class SupervisedProcess(NoService):
         return None
 
 
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """^C and SIGTERM wait until the end."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
+    try:
+        yield
+    finally:
+        _interruptible()
+
+
+def _interruptible() -> None:
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _INTERRUPTS)
+
+
 def choose(way: str | None, root: Path) -> Any:
     """The service of a way; without one, that of the last install here, or what is there."""
+    if way == "systemd" and not systemctl.is_there():
+        # Before it makes a user and unpacks for a start that cannot come.
+        raise UserError("--service systemd: no systemd runs this computer; use process or none")
     if way is None:
         way = _remembered(root) or ("systemd" if systemctl.is_there() else "none")
     if way == "systemd":

@@ -7,6 +7,8 @@ the new one, and the same command again completes the work.
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -22,6 +24,9 @@ from deploy.installer.manifest import parse_manifest
 from deploy.installer.release import MANIFEST, check_policy, make_release, why_not_whole
 from deploy.installer.service import remember
 from deploy.installer.trial import try_release
+
+_ENDS_A_SWITCH = (UnhealthyError, UserError, OSError, KeyboardInterrupt)
+"""The old service is stopped then, so whatever goes wrong, somebody must start it again."""
 
 
 class Way(NamedTuple):
@@ -156,20 +161,21 @@ def _prove(folder: Path, way: Way) -> None:
 
 def _switch(version: str, before: str | None, layout: Layout, way: Way) -> None:
     earlier = layout.linked("previous")
-    way.service.stop()
-    if before is not None and before != version:
-        layout.link("previous", before)
-    layout.link("current", version)
     try:
+        way.service.stop()
+        if before is not None and before != version:
+            layout.link("previous", before)
+        layout.link("current", version)
         _start(version, layout, way)
-    except UnhealthyError as error:
-        _say(f"{version} is not healthy: {error}")
+    except _ENDS_A_SWITCH as error:
+        why = str(error) or "interrupted"
+        _say(f"{version} is not healthy: {why}")
         # Cut off between the rename and here, `current` is this very release already.
         good = before if before != version else earlier
         _go_back(version, good, earlier, layout, way)
         raise UnhealthyError(
             f"release {version} was not healthy as a service,"
-            f" {f'went back to {good}' if good else 'nothing is installed'}: {error}"
+            f" {f'went back to {good}' if good else 'nothing is installed'}: {why}"
         ) from None
 
 
@@ -179,7 +185,7 @@ def _start(version: str, layout: Layout, way: Way) -> None:
         try:
             way.service.start(layout.release(version))
             way.service.watch(way.limits)
-        except UnhealthyError:
+        except BaseException:  # while the hold lasts, so that nothing unproven is ever heard
             way.service.stop()
             raise
 
@@ -191,11 +197,14 @@ def _go_back(version: str, good: str | None, earlier: str | None, layout: Layout
         layout.remove_release(version)
         return
     layout.link("current", good)
-    if earlier is not None and earlier not in (good, version):
+    if earlier is not None and earlier != good:
         layout.link("previous", earlier)
     else:
         layout.unlink("previous")
-    layout.remove_release(version)
+    if (
+        version != earlier
+    ):  # A release that has served before stays, for a roll-back at another time.
+        layout.remove_release(version)
     try:
         _start(good, layout, way)
     except UnhealthyError as error:
@@ -203,5 +212,10 @@ def _go_back(version: str, good: str | None, earlier: str | None, layout: Layout
 
 
 def _say(text: str) -> None:
-    print(text, flush=True)
-    sys.stdout.flush()
+    try:
+        print(text, flush=True)
+    except OSError:
+        # A reader that is gone, as an ssh link that broke, must not keep us from going back. What
+        # is left of the line would fail again at the next flush.
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import stat
 import tarfile
 
 import pytest
 
+from deploy import bundle_command
 from deploy.__main__ import main
 from deploy.bundle import make_bundle
 from deploy.campaigns.light import HERE
@@ -83,11 +85,12 @@ def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_pat
         ('connect = "tls/10.0.0.1:7447"', "needs certificates"),
         ('vehicle = "tank"', "choose from"),
         ("no toml", "is no TOML"),
+        ("\udcff", "is no TOML"),
     ],
 )
 def test_settings_that_do_not_hold_are_refused(workshop, tmp_path, text, match):
     config = tmp_path / "c.toml"
-    config.write_text(text)
+    config.write_bytes(os.fsencode(text))
     with pytest.raises(UserError, match=match):
         workshop.make(config=config)
 
@@ -98,8 +101,9 @@ def test_a_policy_of_somebody_else_or_unsigned_is_refused(workshop, tmp_path):
         workshop.make(0.1, public_key=other.public_key)
     unsigned = tmp_path / "unsigned.onnx"
     unsigned.write_bytes(other.policy.read_bytes())
-    with pytest.raises(UserError, match="is not signed"):
+    with pytest.raises(UserError, match="is not signed") as caught:
         workshop.make(policy=unsigned)
+    assert "--allow-unsigned" not in str(caught.value)  # no bundle has that
 
 
 def test_the_certificates_must_be_this_vehicles(workshop, party, tmp_path):
@@ -128,12 +132,15 @@ def test_without_a_private_key_nothing_is_signed(workshop, tmp_path):
         ["--target", "jetpack5", "--key", "missing.key"],
         ["--target", "jetpack5", "--tls", "nowhere"],
         ["--target", "jetpack5", "--wheels", "/dev/null/wheels"],
+        ["--target", "jetpack5", "--out", "/dev/null/bundles"],
     ],
 )
 def test_a_mistake_is_one_line_before_anything_is_downloaded(
     workshop, tmp_path, capsys, monkeypatch, arguments
 ):
     monkeypatch.chdir(tmp_path)
+    if "--wheels" not in arguments:
+        monkeypatch.setattr(bundle_command, "gather", lambda *_: pytest.fail("downloads"))
     inputs = workshop.inputs()
     good = ["--policy", inputs.policy, "--public-key", inputs.public_key, "--key", inputs.key]
     status = run_one(["bundle", *map(str, good), *arguments])
@@ -153,3 +160,13 @@ def test_an_out_that_is_a_file_is_said(workshop, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot write"):
         make_bundle(workshop.inputs(), HERE, tmp_path / "file")
+
+
+def test_a_bundle_that_is_interrupted_leaves_no_key_behind(workshop, tmp_path, monkeypatch):
+    def interrupted(size: int) -> bytes:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("deploy.bundle.padding", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make_bundle(workshop.inputs(), HERE, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []

@@ -51,9 +51,28 @@ def test_it_runs_without_rights_and_asks_no_index():
     assert not re.search(r"\b(pip|apt-get|curl|wget|ADD)\b", DOCKERFILE.read_text())
     copied = [rest for word, rest in instructions() if word == "COPY"]
     assert copied == ["--from=install /opt/phil /opt/phil"]  # no bundle, so no private key
+    assert installation().startswith("--mount=type=bind")
+
+
+def installation() -> str:
     (made,) = [rest for word, rest in instructions() if word == "RUN" and "install.pyz" in rest]
-    assert made.startswith("--mount=type=bind")
-    assert made.index("install.pyz") < made.index("rm -r /opt/phil/releases/*/tls")
+    return made
+
+
+def test_no_private_key_is_left_and_its_folder_is_there_to_be_mounted(tmp_path):
+    """What comes after the installer in the same layer, as its shell runs it."""
+    release = tmp_path / "releases" / "1"
+    (release / "tls").mkdir(parents=True)
+    (release / "tls" / "key.pem").write_text("private")
+    (tmp_path / "current").symlink_to("releases/1")
+    installer, _, after = installation().partition(" && ")
+    assert "install.pyz" in installer
+    done = subprocess.run(
+        ["sh", "-c", after.replace("/opt/phil", str(tmp_path))],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert list((release / "tls").iterdir()) == []
 
 
 @pytest.mark.parametrize(

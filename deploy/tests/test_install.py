@@ -6,6 +6,7 @@ import json
 import os
 import queue
 import signal
+import subprocess
 import threading
 from collections import Counter
 
@@ -146,3 +147,22 @@ def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(
         assert heard | set(listener.by_policy) == {good.manifest.policy_id}
         # The mock's feedback names the command it took last: never one, for it never ran.
         assert {f.step for f in listener.simulator.feedback} <= {-1}
+
+
+@pytest.mark.board
+def test_ended_in_the_middle_of_a_switch_it_goes_back_and_a_link_that_breaks_does_not_end_it(
+    board: Board,
+):
+    old, new = board.workshop.make(0.1), board.workshop.make(0.2)
+    assert board.install(old.path, "process").returncode == 0
+    line = board.command("install", new.path, "--service", "process", "--settle", "2")
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
+        wait_until(lambda: board.status()["current"] == new.manifest.version, "the switch", 60.0)
+        run.send_signal(signal.SIGHUP)
+        assert run.poll() is None
+        run.send_signal(signal.SIGTERM)
+        _, said = run.communicate(timeout=60)
+    assert (run.returncode, len(lines(said))) == (1, 1), said
+    assert f"went back to {old.manifest.version}: interrupted" in said
+    shown = board.status()
+    assert (shown["current"], shown["service"]) == (old.manifest.version, "active restarts=0")

@@ -19,7 +19,8 @@ host, command = sys.argv[3:]
 with open({log!r}, "a") as log:
     log.write(f"ssh {{host}} {{command}}\\n")
 if host == "nowhere":
-    sys.exit("ssh: Could not resolve hostname nowhere")
+    print("ssh: Could not resolve hostname nowhere", file=sys.stderr)
+    sys.exit(255)
 sys.exit(subprocess.run(["sh", "-c", command], cwd={home!r}).returncode)
 """
 SCP = """\
@@ -29,7 +30,10 @@ import shutil, sys
 host, _, folder = target.partition(":")
 with open({log!r}, "a") as log:
     log.write(f"scp {{host}} {{folder}}\\n")
+assert all(file.startswith("/") for file in files), files  # or scp would look for a host
 for file in files:
+    if host == "full" and file.endswith(".tar"):
+        sys.exit("scp: write remote: No space left on device")
     shutil.copy2(file, {home!r} + "/" + folder)
 """
 
@@ -94,8 +98,18 @@ def test_an_installer_that_refuses_is_told_and_cleaned_up(far, board, workshop, 
 def test_a_host_that_is_not_there_ends_it_at_once(far, board, workshop, capfd):
     made = workshop.make(0.1)
     assert push(board, workshop, "nowhere", made.path) == 2
-    assert "ssh ended with status 1: has it Python" in capfd.readouterr().err
+    assert "ssh does not reach the board" in capfd.readouterr().err
     assert len((far / "log").read_text().splitlines()) == 1
+
+
+def test_a_copy_that_fails_leaves_nothing_behind(far, board, workshop, monkeypatch, capfd):
+    """What has come so far may hold the vehicle's private key."""
+    made = workshop.make(0.1)
+    monkeypatch.chdir(made.path.parent)
+    assert push(board, workshop, "full", made.path.name) == 2
+    assert "scp ended with status 1" in capfd.readouterr().err
+    assert list((far / "home").iterdir()) == []
+    assert not board.root.exists()
 
 
 def test_a_board_of_another_kind_is_not_touched(far, board, workshop, capfd, tmp_path):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import fcntl
 import os
 import platform
+import subprocess
 
 import pytest
 
 from deploy.bundle import make_bundle
 from deploy.campaigns.light import HERE
 from deploy.installer import release as release_module
+from deploy.installer import systemctl
 from deploy.installer.layout import Layout, sync_all
 from deploy.keys import write_key_pair
 from deploy.tests.boards import Board, changed_wheel
@@ -82,6 +84,17 @@ def test_a_damaged_release_is_said_and_made_again(board: Board, workshop):
     assert done.returncode == 0
     assert "damaged" in done.stdout
     assert board.status()["whole"] == "yes"
+
+
+def test_it_installs_to_the_end_where_nobody_reads_what_it_says(board: Board, workshop):
+    """An ssh link that broke: its pipe has no reader."""
+    made = workshop.make(0.1)
+    line = board.command("install", made.path, "--trust", workshop.public_key)
+    with subprocess.Popen([*line, "--service", "none"], stdout=subprocess.PIPE) as run:
+        assert run.stdout is not None
+        run.stdout.close()
+    assert run.returncode == 0
+    assert board.status()["current"] == made.manifest.version
 
 
 def test_one_installer_at_a_time(board: Board, workshop):
@@ -160,6 +173,12 @@ def test_all_is_on_the_disk_before_a_release_has_its_name(workshop, tmp_path, mo
     assert release_module.why_not_whole(folder) == ""
 
 
+@pytest.mark.skipif(systemctl.is_there(), reason="systemd runs this computer")
+def test_a_systemd_that_does_not_run_is_said_before_anything_is_made(board: Board, workshop):
+    refused(board.install(workshop.make(0.1).path, "systemd"), "no systemd runs this computer")
+    assert not board.root.exists()
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -171,8 +190,6 @@ def test_all_is_on_the_disk_before_a_release_has_its_name(workshop, tmp_path, mo
 def test_a_mistake_is_one_line(board: Board, arguments):
     command, *rest = arguments or [""]
     line = board.command(command, *rest) if arguments else board.command("status")[:3]
-    import subprocess
-
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert (done.returncode, len(done.stderr.strip().splitlines())) == (2, 1), done.stderr
     assert not board.root.exists()

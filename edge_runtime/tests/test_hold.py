@@ -5,6 +5,9 @@ from __future__ import annotations
 import fcntl
 import time
 
+import pytest
+
+from edge_runtime.errors import UserError
 from edge_runtime.hold import Hold
 from edge_runtime.operator_commands import ask
 from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state, wait_until
@@ -17,6 +20,11 @@ def test_without_a_lock_nothing_is_held(tmp_path):
     assert not Hold(str(file)).is_on()
     file.touch()
     assert not Hold(str(file)).is_on()
+
+
+def test_one_that_cannot_be_read_is_not_taken_for_free(tmp_path):
+    with pytest.raises(UserError, match="cannot be read: Is a directory"):
+        Hold(str(tmp_path))
 
 
 def test_it_is_free_when_the_lock_is_and_stays_so(tmp_path):
