@@ -38,7 +38,10 @@ def _at_fault(rig: Rig, number: int, word: str) -> Try:
     begin_s = rig.mark()
     rig.switch(SWITCH, word)
     stop = stop_command(rig, begin_s)
-    last_s = max(s for s in rig.timeline.feedback_s if s < begin_s)
+    # A silent vehicle may still speak between the mark and the switch, and what it says counts.
+    # What another says after the switch is no good any more.
+    end_s = stop.seen_s if word == "silent" else begin_s
+    last_s = max(s for s in rig.timeline.feedback_s if s < end_s)
     time.sleep(max(0.0, begin_s + FAULT_S - time.monotonic()))
     said = any(f"vehicle_{word}" in line for seen_s, line in rig.edge.lines if seen_s > begin_s)
     rig.switch(SWITCH, None)

@@ -123,7 +123,7 @@ def _run_cells(
         task = bar.add_task("cells", total=len(cells))
         try:
             for future in as_completed(futures):
-                console.print(_line(futures[future], future.result()), soft_wrap=True)
+                console.print(show(futures[future], future.result()), soft_wrap=True)
                 bar.advance(task)
         except BaseException:
             ending.set()
@@ -149,13 +149,18 @@ def _names(cell: Cell) -> dict[str, str]:
     return {"row": cell.row, "latency_spec": str(cell.spec), "transport": cell.transport}
 
 
-def _line(cell: Cell, found: dict[str, Any]) -> str:
+def show(cell: Cell, found: dict[str, Any]) -> str:
+    """A cell's result in a line."""
     if "round_trip_ms" not in found:
         return f"{cell.row:8} {cell.transport:10} never started: {found['failed_starts'][-1]}"
     times = found["round_trip_ms"]
+    # None where no state was answered: a link that came up half dead.
+    shown = "  ".join(
+        f"{name} {'-' if times[name] is None else format(times[name], '.1f'):>6}"
+        for name in ("p50", "p90", "p99")
+    )
     return (
-        f"{cell.row:8} {cell.transport:10} p50 {times['p50']:6.1f}  p90 {times['p90']:6.1f}"
-        f"  p99 {times['p99']:6.1f} ms  unanswered {found['unanswered_percent']:5.2f} %"
-        f"  safe stops {found['safe_stops']}  success {found['success_rate']:.0%}"
+        f"{cell.row:8} {cell.transport:10} {shown} ms"
+        f"  unanswered {found['unanswered_percent']:5.2f} %  safe stops {found['safe_stops']}  success {found['success_rate']:.0%}"
         f"  failed starts {len(found['failed_starts'])}"
     )

@@ -48,6 +48,11 @@ def _cells(row: dict[str, Any]) -> list[str]:
     ]
 
 
+def _has_times(row: dict[str, Any]) -> bool:
+    """Whether any state was answered: a loop may never start, and a link may come up half dead."""
+    return row.get("round_trip_ms", {}).get("p50") is not None
+
+
 def draw(result: dict[str, Any], path: Path) -> None:
     """Median to p99 of every cell, grouped by network."""
     import matplotlib
@@ -59,7 +64,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     ways = list(dict.fromkeys(row["transport"] for row in result["rows"]))
     figure, axes = plt.subplots(figsize=(9, 4.2), layout="constrained")
     for number, way in enumerate(ways):
-        rows = [row for row in result["rows"] if row["transport"] == way and "round_trip_ms" in row]
+        rows = [row for row in result["rows"] if row["transport"] == way and _has_times(row)]
         places = [networks.index(row["latency_spec"]) + 0.15 * number for row in rows]
         p50, p90, p99 = (
             [row["round_trip_ms"][name] for row in rows] for name in ("p50", "p90", "p99")

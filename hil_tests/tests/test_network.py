@@ -12,7 +12,7 @@ from edge_runtime.latency.model import parse_spec
 from hil_tests.commands import BackgroundCommand
 from hil_tests.network import cells
 from hil_tests.network.cells import Cell, Drive, run_cell, summary
-from hil_tests.network.command import POLICY, PUBLIC_KEY
+from hil_tests.network.command import POLICY, PUBLIC_KEY, show
 from hil_tests.network.kernel import kernel_network
 from hil_tests.network.namespaces import why_not
 from hil_tests.network.netem import netem_arguments
@@ -74,6 +74,8 @@ def test_the_table_and_the_picture_show_every_cell(tmp_path):
     ]
     dead = {"latency_spec": "loss=50%", "transport": "udp", "failed_starts": ["no"] * 3}
     rows.append({"row": "dead", **dead})
+    mute = {**summary(REPORT), "round_trip_ms": dict.fromkeys(("p50", "p90", "p99", "max"))}
+    rows.append({**rows[0], **mute, "row": "half dead"})
     write_report({"rows": rows}, tmp_path)
     lines = (tmp_path / "table.md").read_text().splitlines()
     assert len(lines) == 2 + len(rows)
@@ -82,6 +84,14 @@ def test_the_table_and_the_picture_show_every_cell(tmp_path):
     )
     assert (tmp_path / "quantiles.png").read_bytes().startswith(b"\x89PNG")
     assert table({"rows": []}).count("\n") == 2
+
+
+def test_a_cell_without_an_answer_has_its_line():
+    cell = Cell("clean", "udp", parse_spec("delay=25ms"))
+    mute = {**summary(REPORT), "round_trip_ms": dict.fromkeys(("p50", "p90", "p99", "max"))}
+    assert "p99      - ms" in show(cell, {**mute, "failed_starts": []})
+    assert "p99  250.0 ms" in show(cell, {**summary(REPORT), "failed_starts": []})
+    assert "never started: no" in show(cell, {"failed_starts": ["no"]})
 
 
 def devices_and_namespaces():
