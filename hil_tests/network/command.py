@@ -161,6 +161,7 @@ def show(cell: Cell, found: dict[str, Any]) -> str:
     )
     return (
         f"{cell.row:8} {cell.transport:10} {shown} ms"
-        f"  unanswered {found['unanswered_percent']:5.2f} %  safe stops {found['safe_stops']}  success {found['success_rate']:.0%}"
+        f"  unanswered {found['unanswered_percent']:5.2f} %"
+        f"  safe stops {found['safe_stops']}  success {found['success_rate']:.0%}"
         f"  failed starts {len(found['failed_starts'])}"
     )
