@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
-import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ from hil_tests.campaign.axes import AXES, Axis
 from hil_tests.campaign.figures import write_figures
 from hil_tests.campaign.latency import run_latency
 from hil_tests.campaign.render import render_latency
+from hil_tests.options import several, share, this_command
 from trainer.commands.options import add_scenario, not_negative, positive
 from trainer.parallel import cores
 from trainer.progress import ProgressBar
@@ -54,7 +52,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         f"{NO_ROWS}: only what --check-realtime asks for",
     )
     parser.add_argument(
-        "--runs", type=_several, default=100, help="episodes of each latency row, the same seeds"
+        "--runs", type=several, default=100, help="episodes of each latency row, the same seeds"
     )
     parser.add_argument("--seed", type=not_negative, default=0, help="of each row's first episode")
     parser.add_argument(
@@ -64,7 +62,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="of the latency rows: virtual time, or the wall clock (slow)",
     )
     parser.add_argument(
-        "--target", type=_share, default=0.98, help="success that the latency budget asks for"
+        "--target", type=share, default=0.98, help="success that the latency budget asks for"
     )
     parser.add_argument(
         "--jobs",
@@ -82,7 +80,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="drive these networks in real time, too, and say whether success agrees",
     )
     parser.add_argument(
-        "--realtime-runs", type=_several, default=40, help="episodes of each of those"
+        "--realtime-runs", type=several, default=40, help="episodes of each of those"
     )
     parser.add_argument(
         "--realtime-jobs", type=positive, default=4, metavar="N", help="vehicles at once in those"
@@ -107,8 +105,8 @@ def run(arguments: argparse.Namespace) -> int:
         parse_spec(spec)
     axes, faults = _choose(arguments)
     others = dict(_other(text) for text in arguments.against)
-    report: dict[str, Any] = {"command": _command()}
-    text = [f"# Campaign: {policy.name}, {arguments.scenario}", "", f"`{_command()}`", ""]
+    report: dict[str, Any] = {"command": this_command()}
+    text = [f"# Campaign: {policy.name}, {arguments.scenario}", "", f"`{this_command()}`", ""]
     if axes or arguments.check_realtime:
         with sigterm_as_interrupt():  # Whoever ends a campaign ends its processes.
             latency = run_latency(arguments, policy, axes, out.with_name(f"{out.stem}_rows"))
@@ -175,24 +173,6 @@ def _other(text: str) -> tuple[str, dict[str, Any]]:
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is no report of a latency campaign") from None
     return name, latency
-
-
-def _several(text: str) -> int:
-    count = positive(text)
-    if count < 2:
-        raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
-    return count
-
-
-def _share(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value <= 1.0 or math.isnan(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a share above 0 and at most 1")
-    return value
-
-
-def _command() -> str:
-    return "python -m hil_tests " + shlex.join(sys.argv[1:])
 
 
 def _conclude(out: Path, report: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
 from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.faults import FAULTS, check_fault
 from hil_tests.mock_hunter.hunter import MockHunter
-from hil_tests.mock_hunter.parameters import MODELS, SOURCES, make_parameters
+from hil_tests.mock_hunter.parameters import MODELS, SOURCES, make_parameters, read_changes
 from hil_tests.mock_hunter.process import Orders, Server
 
 
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Be a Hunter until a signal comes."""
-    parameters = make_parameters(arguments.model, _changes(arguments.set or []))
+    parameters = make_parameters(arguments.model, read_changes(arguments.set or []))
     bus = open_bus(parse_bus(arguments.bus))
     try:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
@@ -86,14 +86,3 @@ def _seconds(text: str) -> float:
     if not (value >= 0.0 and math.isfinite(value)):
         raise argparse.ArgumentTypeError(f"{text!r} is no time in seconds from 0 on")
     return value
-
-
-def _changes(settings: list[str]) -> dict[str, float]:
-    changes = {}
-    for setting in settings:
-        name, _, value = setting.partition("=")
-        try:
-            changes[name] = float(value)
-        except ValueError:
-            raise UserError(f"--set {setting!r} is not valid: use NAME=VALUE") from None
-    return changes

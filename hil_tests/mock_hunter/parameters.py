@@ -82,3 +82,15 @@ def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> P
         if not (value > 0.0 or (name == "dead_time_s" and value == 0.0)) or value == float("inf"):
             raise UserError(f"parameter {name} must be above 0, not {value}")
     return replace(MODELS[model], **(changes or {}))
+
+
+def read_changes(texts: list[str]) -> dict[str, float]:
+    """Read the values of `--set NAME=VALUE`; UserError for one that is none."""
+    changes = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            changes[name] = float(value)
+        except ValueError:
+            raise UserError(f"--set {text!r} is not valid: use NAME=VALUE") from None
+    return changes

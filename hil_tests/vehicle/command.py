@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,8 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.policy import load_policy
 from hil_tests.commands import end_children
-from hil_tests.mock_hunter.parameters import make_parameters
+from hil_tests.mock_hunter.parameters import make_parameters, read_changes
+from hil_tests.options import several, share, this_command
 from hil_tests.vehicle.comparison import PART_EPISODES, run_comparison
 from hil_tests.vehicle.figures import write_figures
 from hil_tests.vehicle.kept import KeptPoints
@@ -49,11 +48,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--only", choices=PARTS, help="one part (default: both)")
     parser.add_argument(
-        "--runs", type=_several, default=50, help="episodes of each loop and of each lag"
+        "--runs", type=several, default=50, help="episodes of each loop and of each lag"
     )
     parser.add_argument("--seed", type=not_negative, default=0, help="of the first episode")
     parser.add_argument(
-        "--target", type=_share, default=0.95, help="success that is asked of the vehicle"
+        "--target", type=share, default=0.95, help="success that is asked of the vehicle"
     )
     parser.add_argument(
         "--rigs",
@@ -90,10 +89,15 @@ def run(arguments: argparse.Namespace) -> int:
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
     # The edge runtime checks signatures where it matters; here the loop is measured.
     policy_id = load_policy(str(policy), allow_unsigned=True).policy_id
-    changes = _changes(arguments.set)
+    changes = read_changes(arguments.set)
+    make_parameters(MODEL, changes)  # refuses what the mock does not know, before anything runs
     lags = _lags(arguments.lags)
-    report: dict[str, Any] = {"command": _command(), "policy_id": policy_id}
-    text = [f"# Vehicle in the loop: {policy.name}, {arguments.scenario}", "", f"`{_command()}`"]
+    report: dict[str, Any] = {"command": this_command(), "policy_id": policy_id}
+    text = [
+        f"# Vehicle in the loop: {policy.name}, {arguments.scenario}",
+        "",
+        f"`{this_command()}`",
+    ]
     with sigterm_as_interrupt():  # Whoever ends it ends its processes.
         if arguments.only != "sweep":
             report["comparison"] = _compare(arguments, policy, changes)
@@ -170,33 +174,3 @@ def _lags(text: str | None) -> list[Lag]:
             raise UserError(f"--lags {point!r} is no lag: write DEAD+CONSTANT in ms, as in 50+100")
         lags.append(Lag(int(dead), int(constant)))
     return list(dict.fromkeys(lags))
-
-
-def _changes(settings: list[str]) -> dict[str, float]:
-    changes = {}
-    for setting in settings:
-        name, _, value = setting.partition("=")
-        try:
-            changes[name] = float(value)
-        except ValueError:
-            raise UserError(f"--set {setting!r} is not valid: use NAME=VALUE") from None
-    make_parameters(MODEL, changes)
-    return changes
-
-
-def _several(text: str) -> int:
-    count = positive(text)
-    if count < 2:
-        raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
-    return count
-
-
-def _share(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value <= 1.0:
-        raise argparse.ArgumentTypeError(f"{text} is not a share above 0 and at most 1")
-    return value
-
-
-def _command() -> str:
-    return "python -m hil_tests " + shlex.join(sys.argv[1:])
