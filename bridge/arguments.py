@@ -45,6 +45,23 @@ def add_vehicle_id(parser: ArgumentParser, what: str) -> None:
     parser.add_argument("--vehicle-id", metavar="ID", default=DEFAULT_VEHICLE_ID, help=what)
 
 
+def add_span(parser: ArgumentParser) -> None:
+    """Declare ``--wait-s`` and ``--duration-s`` of a command that listens while simulators run."""
+    parser.add_argument(
+        "--wait-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        default=10.0,
+        help="how long to wait for a simulator, in seconds",
+    )
+    parser.add_argument(
+        "--duration-s",
+        metavar="SECONDS",
+        type=non_negative_seconds,
+        help="stop after this many seconds (otherwise when no simulator is left)",
+    )
+
+
 def add_wait_edge(parser: ArgumentParser) -> None:
     """Declare ``--wait-edge-s`` of a command that plays the simulator."""
     parser.add_argument(

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bridge.arguments import add_connect, add_tls, non_negative_seconds
+from bridge.arguments import add_connect, add_span, add_tls, non_negative_seconds
 from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
 from bridge.recording.writer import RecordingWriter
 from bridge.signals import sigterm_as_interrupt
@@ -35,19 +35,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--vehicle-id", metavar="ID", help="record this vehicle only (otherwise all)"
     )
-    parser.add_argument(
-        "--wait-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        default=10.0,
-        help="how long to wait for a simulator, in seconds",
-    )
-    parser.add_argument(
-        "--duration-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        help="stop after this many seconds (otherwise when the simulators have gone)",
-    )
+    add_span(parser)
     parser.add_argument(
         "--linger-s",
         metavar="SECONDS",

@@ -12,7 +12,7 @@ import functools
 import time
 from typing import Any
 
-from bridge.arguments import add_connect, add_tls, add_vehicle_id, non_negative_seconds
+from bridge.arguments import add_connect, add_span, add_tls, add_vehicle_id
 from bridge.feed import Feed, open_feed
 from bridge.signals import sigterm_as_interrupt
 from bridge.to_ros2.outlet import Outlet
@@ -75,19 +75,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=MAX_RATE_HZ,
         help="most messages a second on each topic; more are left out",
     )
-    parser.add_argument(
-        "--wait-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        default=10.0,
-        help="how long to wait for the simulator, in seconds",
-    )
-    parser.add_argument(
-        "--duration-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        help="stop after this many seconds (otherwise when the simulator has gone)",
-    )
+    add_span(parser)
     parser.add_argument("--out", metavar="R.json", help="write the counts to this file at the end")
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import rerun as rr
 
-from bridge.arguments import add_connect, add_tls, add_vehicle_id, non_negative_seconds
+from bridge.arguments import add_connect, add_span, add_tls, add_vehicle_id
 from bridge.feed import Feed, Heard, open_feed
 from bridge.scene import decode_scene
 from bridge.signals import sigterm_as_interrupt
@@ -45,19 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_connect(parser)
     add_tls(parser)
     add_vehicle_id(parser, "the vehicle to watch")
-    parser.add_argument(
-        "--wait-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        default=10.0,
-        help="how long to wait for the simulator, in seconds",
-    )
-    parser.add_argument(
-        "--duration-s",
-        metavar="SECONDS",
-        type=non_negative_seconds,
-        help="stop after this many seconds (otherwise when the simulator has gone)",
-    )
+    add_span(parser)
 
 
 def view(arguments: Any) -> int:
