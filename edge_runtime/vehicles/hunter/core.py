@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from typing import Dict, List, Optional
 
-from edge_runtime.safety import SILENCE_S
 from edge_runtime.vehicles import mapping
 from edge_runtime.vehicles.hunter import frames
 from edge_runtime.vehicles.hunter.frames import Sent
@@ -19,22 +18,19 @@ from edge_runtime.vehicles.hunter.specs import HunterSpec
 from edge_runtime.vehicles.hunter.states import TRANSITIONS, Event, State
 from edge_runtime.vehicles.interface import VehicleReport
 from edge_runtime.vehicles.similarity import Similarity
+from edge_runtime.vehicles.streamed import COMMAND_TIMEOUT_S, STOP_TAKES_S, Core
 
-# A beat later than the runtime's own silence rule, which then tells the reason; still within
-# the promise of 2 T + 50 ms, and less than half of the chassis's 500 ms.
-COMMAND_TIMEOUT_S = SILENCE_S + 0.02
 ENABLE_TIMEOUT_S = 1.0
 ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
-STOP_TAKES_S = 1.0  # what is then not known to stand gets the parking brake
 BUS_PATIENCE_S = 0.1  # five frames of the stream
 _STOPS_AT_ONCE = (Event.STUCK,)  # no set-point will stop it: the brake must
 
 
-class HunterCore:
+class HunterCore(Core):
     """The state machine, what was heard, and what is asked for."""
 
     def __init__(self, spec: HunterSpec, profile: str, similarity: Similarity) -> None:
-        self.state = State.DISABLED
+        self.state: State = State.DISABLED
         self.cause: Optional[Event] = None  # what stopped it
         self.reports = Reports(spec, profile)
         self.set_point = SetPoint(spec, similarity)

@@ -8,10 +8,13 @@ from typing import Deque, Dict, NamedTuple, Optional, Tuple
 
 from edge_runtime.vehicles import mapping
 from edge_runtime.vehicles.hunter.specs import HunterSpec
+from edge_runtime.vehicles.interface import ActionLimit
 from edge_runtime.vehicles.similarity import Similarity
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 _LONGEST_STEP_S = CONTROL_PERIOD_S  # after a pause of the process the pedal was not held for it
+# A pedal is integrated to a speed, so that any leap of it is a ramp: 2.0 in T = 0.1 s.
+_PEDAL_SLEW_PER_S = 20.0
 
 FOLLOWS_S = 10 * CONTROL_PERIOD_S  # a drive may still follow a set-point of this age
 DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
@@ -82,6 +85,15 @@ def inner_of(steering: float, spec: HunterSpec, similarity: Similarity) -> float
     return mapping.centre_to_inner(
         centre_rad, spec.wheelbase_m, spec.track_m, spec.max_inner_steering_rad
     )
+
+
+def limits_of(spec: HunterSpec, similarity: Similarity) -> Dict[str, ActionLimit]:
+    """Ranges and slew rates of the actions: the steering's is that of the wheels."""
+    full_rad = abs(inner_of(1.0, spec, similarity))
+    return {
+        "pedal": ActionLimit(-1.0, 1.0, _PEDAL_SLEW_PER_S),
+        "steering": ActionLimit(-1.0, 1.0, spec.max_steering_rate_radps / full_rad),
+    }
 
 
 def steering_of(inner_rad: float, spec: HunterSpec, similarity: Similarity) -> float:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from typing import Dict, List, NamedTuple, Optional
 
-from edge_runtime.safety import SILENCE_S
 from edge_runtime.vehicles import mapping
 from edge_runtime.vehicles.hunter.set_point import SetPoint, SpeedWatch, Wish, steering_of, wish_of
 from edge_runtime.vehicles.hunter.specs import HunterSpec
@@ -18,11 +17,10 @@ from edge_runtime.vehicles.ros2.odometry import Measured, OdometryReports
 from edge_runtime.vehicles.ros2.settings import Ros2Settings
 from edge_runtime.vehicles.ros2.states import LEADS_TO, Event, State
 from edge_runtime.vehicles.similarity import Similarity
+from edge_runtime.vehicles.streamed import COMMAND_TIMEOUT_S, Core
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 ODOMETRY_SILENCE_S = 2 * CONTROL_PERIOD_S
-# A beat later than the runtime's own silence rule, which then tells the reason.
-COMMAND_TIMEOUT_S = SILENCE_S + 0.02
 ENABLE_TIMEOUT_S = 1.0
 
 
@@ -33,11 +31,11 @@ class Motion(NamedTuple):
     centre_rad: float
 
 
-class Ros2Core:
+class Ros2Core(Core):
     """The state machine, what was heard, and what is asked for."""
 
     def __init__(self, settings: Ros2Settings, spec: HunterSpec, similarity: Similarity) -> None:
-        self.state = State.DISABLED
+        self.state: State = State.DISABLED
         self.cause: Optional[Event] = None  # what stopped it
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.odometry = OdometryReports(settings, spec)
