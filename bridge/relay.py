@@ -7,13 +7,12 @@ re-arm queries and the liveliness tokens pass at once: they observe the loop, an
 
 from __future__ import annotations
 
-import threading
 import time
 from typing import Any
 
 from bridge.arguments import add_vehicle_id, non_negative_int
 from bridge.relay_ends import Relay, open_relay
-from bridge.signals import sigterm_as_interrupt
+from bridge.signals import sigterm_as_interrupt, wait_to_be_told
 from edge_runtime.cli import ArgumentParser, UserError, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
@@ -73,7 +72,7 @@ def _carry(arguments: Any, spec: LatencySpec, running: Relay) -> None:
             f" connect={arguments.connect} latency={spec}",
             flush=True,
         )
-        threading.Event().wait()
+        wait_to_be_told()
     except KeyboardInterrupt:
         return
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from typing import Any
 
 import zenoh
 
 from bridge.arguments import add_tls
-from bridge.signals import sigterm_as_interrupt
+from bridge.signals import sigterm_as_interrupt, wait_to_be_told
 from edge_runtime import access
 from edge_runtime.cli import ArgumentParser
 from edge_runtime.errors import UserError
@@ -66,7 +65,7 @@ def router(arguments: Any) -> int:
 def _route(session: zenoh.Session, what: str) -> None:
     try:
         print(f"ready {what}", flush=True)
-        threading.Event().wait()
+        wait_to_be_told()
     finally:
         session.close()
 

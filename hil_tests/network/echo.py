@@ -13,14 +13,13 @@ import json
 import os
 import struct
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from bridge.signals import sigterm_as_interrupt
+from bridge.signals import sigterm_as_interrupt, wait_to_be_told
 from edge_runtime.cli import ArgumentParser, UserError, run_cli
 from edge_runtime.topics import CONTROL_PERIOD_S
 
@@ -69,7 +68,7 @@ def answer(session: zenoh.Session, arguments: argparse.Namespace) -> None:
     subscriber = session.declare_subscriber(THERE, came)
     print(READY, flush=True)
     try:
-        threading.Event().wait()
+        wait_to_be_told()
     finally:
         subscriber.undeclare()
         publisher.undeclare()
