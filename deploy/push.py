@@ -24,8 +24,9 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.signature import DEFAULT_PUBLIC_KEY
 
-SSH, SCP = ("ssh", "-o", "BatchMode=yes"), ("scp", "-q", "-p", "-o", "BatchMode=yes")
-"""BatchMode: a password asked for in the middle would hang a script; use ssh's keys."""
+_UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
+"""A password asked for in the middle would hang a script, and so would a board without power."""
+SSH, SCP = ("ssh", *_UNATTENDED), ("scp", "-q", "-p", *_UNATTENDED)
 _HOST = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]*@)?[A-Za-z0-9\[][A-Za-z0-9_.:\]-]*")
 _TRUST = "trust.pub"
 _SSH_FAILED = 255

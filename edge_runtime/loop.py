@@ -183,6 +183,9 @@ class ControlLoop:
                     self._command_window.add(int(took_s * 1e9))
 
     def _is_hung(self, now_s: float) -> bool:
+        """Whether policy or driver keep their thread: a new process may help, and nothing else."""
+        if self._vehicle is not None and self._vehicle.busy_s(now_s) > _HUNG_S:
+            return True
         return self._busy_since_s is not None and now_s - self._busy_since_s > _HUNG_S
 
     def _look_at_vehicle(self, now_s: float) -> None:

@@ -98,9 +98,10 @@ def _dispatch(arguments: argparse.Namespace) -> int:
     layout = Layout(arguments.root)
     if arguments.command == "supervise":
         return supervise(layout)
-    service = choose(arguments.service, layout.root)
     if arguments.command == "status":
+        service = choose(arguments.service, layout.root, only_look=True)
         return _status(layout, service, arguments.json)
+    service = choose(arguments.service, layout.root)
     if arguments.command == "uninstall":
         uninstall(layout, Way(service, LIMITS))
         print(f"removed from {layout.root}")
@@ -126,10 +127,14 @@ def _status(layout: Layout, service: Any, as_json: bool) -> int:
     if current is None:
         raise UserError(f"nothing is installed in {layout.root}")
     manifest = parse_manifest((layout.release(current) / MANIFEST).read_bytes())
-    fault = why_not_whole(layout.release(current))
+    fault, whole = "", "yes"
+    try:
+        fault = why_not_whole(layout.release(current))
+    except PermissionError:  # the vehicle's private key is in it
+        whole = "not known: this user may not read all of it"
     rows: dict[str, Any] = {
         "current": current,
-        "whole": fault or "yes",
+        "whole": fault or whole,
         "previous": layout.linked("previous") or "none",
         "vehicle_id": manifest.vehicle_id,
         "policy_id": manifest.policy_id,

@@ -15,14 +15,17 @@ import ctypes
 import fcntl
 import os
 import shutil
+import time
 from pathlib import Path
-from typing import Iterator
+from typing import Iterator, TextIO
 
 from deploy.installer.errors import UserError
 
 DEFAULT_ROOT = "/opt/phil"
 _MAKING = ".making-"
 _LINKS = ("current", "previous")
+_HOLD_LIMIT_S = 2.0
+"""A runtime that asks whether it may send has the lock for microseconds."""
 
 
 class Layout:
@@ -90,13 +93,15 @@ class Layout:
                 remove_tree(path)
 
     @contextlib.contextmanager
-    def holding(self) -> Iterator[None]:
+    def holding(self, gid: int | None = None) -> Iterator[None]:
         """Keep the service from sending any command (`hold` in its settings).
 
-        A lock, not a file's existence: it ends with this process, whatever ends that.
+        A lock, not a file's existence: it ends with this process, whatever ends that. Whoever may
+        read the file could lock it, too: only the service's group `gid` may. UserError where
+        somebody does.
         """
-        with open(str(self.hold), "w") as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX)
+        with self._open_lock(self.hold, gid) as stream:
+            _lock_within(stream, _HOLD_LIMIT_S)
             yield
 
     @contextlib.contextmanager
@@ -104,7 +109,7 @@ class Layout:
         """Make the root and be the only installer in it. The lock goes with the process."""
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            stream = open(str(self.root / ".lock"), "w")  # noqa: SIM115 - closed below
+            stream = self._open_lock(self.root / ".lock")
         except OSError as error:
             raise UserError(f"cannot write to {self.root}: {error.strerror}") from None
         with stream:
@@ -115,6 +120,26 @@ class Layout:
             for folder in (self.releases, self.state):
                 folder.mkdir(exist_ok=True)
             yield
+
+    @staticmethod
+    def _open_lock(path: Path, gid: int | None = None) -> TextIO:
+        """Open a file to lock that nobody else can read, but for the group `gid`."""
+        stream = open(str(path), "w")  # noqa: SIM115 - whoever locks it closes it
+        os.fchmod(stream.fileno(), 0o600 if gid is None else 0o640)
+        if gid is not None:
+            os.fchown(stream.fileno(), -1, gid)
+        return stream
+
+
+def _lock_within(stream: TextIO, limit_s: float) -> None:
+    end_s = time.monotonic() + limit_s
+    while True:
+        try:
+            return fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > end_s:
+                raise UserError(f"another process holds {stream.name} locked") from None
+            time.sleep(0.02)
 
 
 def write_whole(path: Path, data: bytes, mode: int = 0o644) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,6 +23,8 @@ from deploy.installer.layout import write_whole
 WAYS = ("systemd", "process", "none")
 _STOP_LIMIT_S = 10.0
 _WAY = "way"
+_FITS_A_UNIT = re.compile(r"[A-Za-z0-9._+@/-]+")
+"""Spaces would cut a unit's line in two, and a % would be a specifier (systemd.unit(5))."""
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -157,16 +160,21 @@ def _interruptible() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _INTERRUPTS)
 
 
-def choose(way: str | None, root: Path) -> Any:
-    """The service of a way; without one, that of the last install here, or what is there."""
+def choose(way: str | None, root: Path, only_look: bool = False) -> Any:
+    """The service of a way; without one, that of the last install here, or what is there.
+
+    Raises UserError where it cannot be run by this user; whoever may `only_look` needs no right.
+    """
     if way == "systemd" and not systemctl.is_there():
         # Before it makes a user and unpacks for a start that cannot come.
         raise UserError("--service systemd: no systemd runs this computer; use process or none")
     if way is None:
         way = _remembered(root) or ("systemd" if systemctl.is_there() else "none")
     if way == "systemd":
-        if os.geteuid() != 0:
+        if os.geteuid() != 0 and not only_look:
             raise UserError("--service systemd needs root: use sudo, or --service none")
+        if not _FITS_A_UNIT.fullmatch(str(root)):
+            raise UserError(f"--root {root}: in a unit only letters, digits and ._+@/- are taken")
         return systemctl.Systemd(root)
     return SupervisedProcess(root) if way == "process" else NoService()
 

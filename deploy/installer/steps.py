@@ -181,7 +181,10 @@ def _switch(version: str, before: str | None, layout: Layout, way: Way) -> None:
 
 def _start(version: str, layout: Layout, way: Way) -> None:
     """Let the service run; the vehicle hears nothing of it until it is healthy."""
-    with layout.holding():
+    if way.service.name == "none":
+        return  # Whoever runs it could not be watched, and might not be allowed to read the hold.
+    account = way.service.account()
+    with layout.holding(account.gid if account else None):
         try:
             way.service.start(layout.release(version))
             way.service.watch(way.limits)

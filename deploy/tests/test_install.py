@@ -113,10 +113,10 @@ class Listener:
 @pytest.mark.parametrize(
     "faults",
     [
-        dict([*list(IN_TRIAL.items())[:1], *list(AS_SERVICE.items())[:1]]),
+        dict(list(AS_SERVICE.items())[:1]),
         pytest.param(IN_TRIAL | AS_SERVICE, marks=pytest.mark.board),
     ],
-    ids=["two faults", "all faults"],
+    ids=["one fault", "all faults"],
 )
 def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(
     board: Board, tmp_path, faults

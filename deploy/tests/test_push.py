@@ -14,8 +14,8 @@ from edge_runtime.cli import run_cli
 SSH = """\
 #!{python}
 import os, subprocess, sys
-assert sys.argv[1:3] == ["-o", "BatchMode=yes"], sys.argv
-host, command = sys.argv[3:]
+assert sys.argv[1:5] == ["-o", "BatchMode=yes", "-o", "ConnectTimeout=10"], sys.argv
+host, command = sys.argv[5:]
 with open({log!r}, "a") as log:
     log.write(f"ssh {{host}} {{command}}\\n")
 if host == "nowhere":
@@ -26,7 +26,8 @@ sys.exit(subprocess.run(["sh", "-c", command], cwd={home!r}).returncode)
 SCP = """\
 #!{python}
 import shutil, sys
-*files, target = [a for a in sys.argv[1:] if a not in ("-q", "-p", "-o", "BatchMode=yes")]
+assert sys.argv[1:7] == ["-q", "-p", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10"], sys.argv
+*files, target = sys.argv[7:]
 host, _, folder = target.partition(":")
 with open({log!r}, "a") as log:
     log.write(f"scp {{host}} {{folder}}\\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import os
 import platform
 import subprocess
 
@@ -125,27 +124,6 @@ def test_uninstall_takes_only_what_is_ours(board: Board, workshop):
     assert [p.name for p in board.root.iterdir()] == ["diary.txt"]
     (board.root / "diary.txt").unlink()
     board.root.rmdir()
-
-
-def test_the_secret_is_the_owners_alone(board: Board, workshop, tmp_path):
-    from deploy.__main__ import main
-
-    assert main(["certs", "--out", str(tmp_path / "certs")]) == 0
-    config = tmp_path / "c.toml"
-    config.write_text('connect = "tls/127.0.0.1:9"\n')
-    made = workshop.make(tls=tmp_path / "certs" / "edge-hunter01", config=config)
-    before = os.umask(0o077)  # the caller's must not lock the service's user out
-    try:
-        assert board.install(made.path, "process").returncode == 0
-    finally:
-        os.umask(before)
-    folder = board.root / "current"
-    modes = {
-        str(path.relative_to(folder)): path.stat().st_mode & 0o777
-        for path in [folder / "tls/key.pem", folder / "config.toml", folder / "bin/phil-edge"]
-    }
-    assert modes == {"tls/key.pem": 0o600, "config.toml": 0o644, "bin/phil-edge": 0o755}
-    assert (folder / "site-packages/edge_runtime").stat().st_mode & 0o777 == 0o755
 
 
 def test_all_is_on_the_disk_before_a_release_has_its_name(workshop, tmp_path, monkeypatch):

@@ -222,6 +222,16 @@ def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle
         crowd.shutdown()
 
 
+def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle):
+    for _ in range(100):
+        chassis.send(frames.MOTION_STATUS, frames.MotionStatus(1.0, 0.0))
+    vehicle.feedback(time.monotonic())  # from now on it listens
+    time.sleep(0.2)
+    assert vehicle.feedback(time.monotonic()).speed_mps == 0.0
+    chassis.send(frames.MOTION_STATUS, frames.MotionStatus(0.5, 0.0))
+    wait_until(lambda: vehicle.feedback(time.monotonic()).speed_mps == 0.5, "what comes now")
+
+
 def test_random_frames_on_the_bus_never_move_it(chassis, vehicle):
     vehicle.enable(time.monotonic())
     wait_until(lambda: is_enabled(vehicle), "the confirmation")

@@ -24,7 +24,9 @@ from edge_runtime.loop import ControlLoop
 from edge_runtime.sd_notify import Notifier
 from edge_runtime.tests.harness import EdgeProcess, make_state, wait_until
 from edge_runtime.tests.policies import PEDAL
+from edge_runtime.tests.test_vehicle_runner import BrokenVehicle
 from edge_runtime.transport import free_endpoint
+from edge_runtime.vehicles.runner import VehicleRunner
 from edge_runtime.wire import encode
 
 
@@ -136,11 +138,11 @@ def running():
     """A loop with its real threads between a fake policy and a fake link."""
     started: list = []
 
-    def start(notifier: Any) -> Any:
+    def start(notifier: Any, vehicle: Any = None) -> Any:
         policy: Any = FakePolicy()
         link: Any = FakeLink()
         controller = Controller(limit_rows([PEDAL], {}), needs_rearm=False)
-        control = ControlLoop(policy, controller, link, None, notifier)
+        control = ControlLoop(policy, controller, link, vehicle, notifier)
         control.start()
         main = threading.Thread(target=control.run)
         main.start()
@@ -168,6 +170,25 @@ def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     assert link.sent["command"] > before  # the safe stops go on
     policy.free.set()
     assert systemd.next() == "WATCHDOG=1"
+
+
+def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):
+    monkeypatch.setattr(loop, "_HUNG_S", 0.2)
+    vehicle = BrokenVehicle()
+    runner = VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
+    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
+    running(notifier, runner)
+    runner.start()
+    try:
+        assert systemd.next() == "WATCHDOG=1"
+        vehicle.broken = "hang"
+        wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message for a while")
+        vehicle.broken = ""
+        vehicle.released.set()
+        assert systemd.until("WATCHDOG")[-1] == "WATCHDOG=1"
+    finally:
+        vehicle.released.set()
+        runner.close()
 
 
 def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):

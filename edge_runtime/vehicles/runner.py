@@ -49,6 +49,7 @@ class VehicleRunner:
         self._report_seen: Optional[VehicleReport] = None
         self._enable_due = False
         self._stopping = False
+        self._busy_since_s: Optional[float] = None  # its thread is in the driver
         self._due = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
 
@@ -61,6 +62,11 @@ class VehicleRunner:
     def silent_at_s(self) -> float:
         """When the vehicle counts as silent if nothing more is heard of it (monotonic)."""
         return self._watch.silent_at_s
+
+    def busy_s(self, now_s: float) -> float:
+        """For how long the driver has kept its thread; 0 while that waits. Waits for nobody."""
+        since_s = self._busy_since_s
+        return 0.0 if since_s is None else now_s - since_s
 
     def fault(self, now_s: float) -> str:
         """What is wrong with the vehicle, empty if nothing. Waits for nobody."""
@@ -125,6 +131,7 @@ class VehicleRunner:
         next_s = time.monotonic()
         while not self._stopping:
             enables, task = self._wait(next_s)
+            self._busy_since_s = time.monotonic()
             if enables:
                 self._enable()
             if task is not None:
@@ -134,6 +141,7 @@ class VehicleRunner:
                 # Absolute deadlines; after a long pause one report, not one for each missed period.
                 next_s = max(next_s + _PERIOD_S, now_s)
                 self._report()
+            self._busy_since_s = None
 
     def _wait(self, until_s: float) -> Tuple[bool, Optional[_Task]]:
         """Whether to enable, and then the newest command; as soon as there is one, or at a time."""

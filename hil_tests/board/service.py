@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import shutil
 import subprocess
 import tempfile
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from deploy.installer.systemctl import MAIN_UNIT
+from edge_runtime.errors import UserError
 from hil_tests.board.booted import BootedPlace, control_group
 from hil_tests.board.proof import Site, pack, prove, remove
 from hil_tests.board.rootfs import BOOTABLE, fresh_root
@@ -20,6 +22,7 @@ CAN_UNIT = "phil-can.service"
 _OPT, _PREFIX = "/opt/phil", "usr/local/python38"
 _FACTS = ("Uid", "CapBnd", "CapEff", "NoNewPrivs", "Seccomp", "Cpus_allowed_list")
 _BACK_LIMIT_S = 60.0
+_EXPOSURE = re.compile(r"exposure level for \S+: ([0-9.]+)")
 _FORBIDDEN = ("/etc/passwd", f"{_OPT}/current/policy.onnx", "/usr/bin/new", "/var/lib/new")
 
 
@@ -32,7 +35,7 @@ def prove_booted(python: str, cache: Path, wheels: Path) -> dict[str, Any]:
         wheels: keeps the bundle's wheels.
 
     Raises:
-        UserError: debootstrap or the installer failed.
+        UserError: debootstrap, the installer or `systemd-analyze` failed.
         TimeoutError: the service did not come back.
     """
     with tempfile.TemporaryDirectory(prefix="phil-systemd-") as folder:
@@ -47,6 +50,7 @@ def prove_booted(python: str, cache: Path, wheels: Path) -> dict[str, Any]:
             report["process"] = _facts(place)
             report["written"] = _written(place)
             report["can_unit"] = place.show(CAN_UNIT, "Result")
+            report["exposure"] = {name: _exposure(place, name) for name in (MAIN_UNIT, CAN_UNIT)}
             report["hung_to_active_s"] = _hang(place)
         begun_s = time.monotonic()
         with BootedPlace(root) as place:
@@ -93,6 +97,15 @@ def _written(place: BootedPlace) -> list[str]:
     """Files that even root could write where the service lives: there should be none."""
     pid = _main_pid(place)
     return [path for path in _FORBIDDEN if place.of_service(pid, "touch", path).returncode == 0]
+
+
+def _exposure(place: BootedPlace, unit: str) -> float:
+    """`systemd-analyze security`: 10 is no protection at all."""
+    said = place.run("systemd-analyze", "security", "--no-pager", unit).stdout
+    found = _EXPOSURE.search(said)
+    if found is None:
+        raise UserError(f"systemd-analyze says no exposure level of {unit}")
+    return float(found.group(1))
 
 
 def _hang(place: BootedPlace) -> float:

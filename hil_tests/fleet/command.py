@@ -16,7 +16,7 @@ from edge_runtime.cli import ArgumentParser, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from hil_tests.fleet.drive import measure
-from hil_tests.fleet.rules import measure_rules
+from hil_tests.fleet.rules import certificates_ms, measure_rules
 from hil_tests.fleet.scale import per_vehicle, project
 from hil_tests.fleet.usage import why_not_counted
 from trainer.benches.machine import processor_model
@@ -24,6 +24,7 @@ from trainer.commands.options import positive
 
 _SIZES = (1, 5, 10, 20)
 _RULES = (10, 100, 1_000)
+_CERTIFIED = 100
 _TRIES = 3
 _UNDISTURBED = 0.9
 """Each vehicle has an answer to this share of its states at least; else the machine was busy."""
@@ -76,11 +77,13 @@ def _measure(arguments: argparse.Namespace, console: Console) -> dict[str, Any]:
         console.print(f"{count} vehicles: done, {rows[-1]['tries']} tries")
     with tempfile.TemporaryDirectory() as folder:
         rules = measure_rules(sorted(set(arguments.rules)), Path(folder))
+        making_ms = certificates_ms(_CERTIFIED, Path(folder) / "many")
     each = per_vehicle(rows)
     return {
         "machine": {"processor": processor_model(), "cores": os.cpu_count()},
         "fleets": rows,
         "rules": rules,
+        "certificates_ms_a_vehicle": making_ms,
         "per_vehicle": each,
         "projected": project(each, rules),
     }

@@ -73,17 +73,31 @@ def measure(count: int, seconds: float, folder: Path, restart: bool = True) -> d
         return report
 
 
+def write_certificates(vehicle_ids: list[str], folder: Path) -> Path:
+    """Certificates of all parties, as a person would make them; their folder."""
+    certificates = folder / "certs"
+    _deploy(["certs", "--out", str(certificates), *_named(vehicle_ids)])
+    return certificates
+
+
 def write_router_config(vehicle_ids: list[str], endpoint: str, folder: Path) -> Path:
-    """Certificates of all parties, and the router's file, as a person would make them."""
-    certificates, config = folder / "certs", folder / "router.json5"
-    named = [word for each in vehicle_ids for word in ("--vehicle-id", each)]
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        deploy(["certs", "--out", str(certificates), *named])
-        deploy(
-            ["router", "--listen", endpoint, "--tls", str(certificates / access.ROUTER),
-             "--out", str(config), *named]
-        )  # fmt: skip
+    """Certificates of all parties, and the router's file."""
+    certificates, config = write_certificates(vehicle_ids, folder), folder / "router.json5"
+    router = str(certificates / access.ROUTER)
+    _deploy(
+        ["router", "--listen", endpoint, "--tls", router, "--out", str(config),
+         *_named(vehicle_ids)]
+    )  # fmt: skip
     return config
+
+
+def _named(vehicle_ids: list[str]) -> list[str]:
+    return [word for each in vehicle_ids for word in ("--vehicle-id", each)]
+
+
+def _deploy(arguments: list[str]) -> None:
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        deploy(arguments)
 
 
 def _start(stack: contextlib.ExitStack, vehicle_ids: list[str], folder: Path) -> Parts:

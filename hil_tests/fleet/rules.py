@@ -1,4 +1,4 @@
-"""What the access control of many vehicles costs a router before the first of them comes."""
+"""What many vehicles cost before the first of them comes: certificates, a router's rules."""
 
 from __future__ import annotations
 
@@ -12,8 +12,15 @@ from edge_runtime import access
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint
 from hil_tests.faults.processes import Process
-from hil_tests.fleet.drive import write_router_config
+from hil_tests.fleet.drive import write_certificates, write_router_config
 from hil_tests.fleet.usage import usage
+
+
+def certificates_ms(count: int, folder: Path) -> float:
+    """Processor time that a vehicle's certificates take, of `count` made at once."""
+    begun_s = time.process_time()
+    write_certificates([f"vehicle{i:06d}" for i in range(count)], folder)
+    return round(1e3 * (time.process_time() - begun_s) / count, 1)
 
 
 def measure_rules(counts: Sequence[int], folder: Path) -> list[dict[str, float]]:

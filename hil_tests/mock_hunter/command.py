@@ -11,7 +11,7 @@ from typing import Any
 
 from edge_runtime.errors import UserError
 from edge_runtime.vehicles.hunter import multicast
-from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+from edge_runtime.vehicles.hunter.bus import BusName, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.faults import FAULTS, check_fault
 from hil_tests.mock_hunter.hunter import MockHunter
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Be a Hunter until a signal comes."""
     parameters = make_parameters(arguments.model, read_changes(arguments.set or []))
-    bus = open_bus(parse_bus(arguments.bus))
+    bus = open_bus(_check_reachable(arguments.bus))
     try:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
         server = Server(hunter, bus, _tell, arguments.fault or ())
@@ -65,6 +65,16 @@ def run(arguments: argparse.Namespace) -> int:
     finally:
         bus.shutdown()
     return 0
+
+
+def _check_reachable(text: str) -> BusName:
+    bus = parse_bus(text)
+    if bus.interface == "virtual":
+        raise UserError(
+            f"--bus {text}: a virtual bus ends with its process, and nobody could reach the mock;"
+            f" use {multicast.SYNTAX} or socketcan:vcan0"
+        )
+    return bus
 
 
 def _tell(line: str) -> None:

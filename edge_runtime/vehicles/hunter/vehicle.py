@@ -106,6 +106,7 @@ class HunterVehicle(StreamedVehicle):
         return bool(parts)
 
     def _listen(self) -> None:
+        self._skip_the_past()
         while not self._stopping:
             try:
                 message = self._bus.recv(_LISTEN_S)
@@ -115,6 +116,15 @@ class HunterVehicle(StreamedVehicle):
                 continue
             if message is not None:
                 self._hear(message)
+
+    def _skip_the_past(self) -> None:
+        """Drop what waited in the bus since it was opened: it would be taken for fresh."""
+        end_s = time.monotonic() + PERIOD_S  # of a flood some will be left
+        try:
+            while time.monotonic() < end_s and self._bus.recv(0.0) is not None:
+                pass
+        except Exception as error:  # as in _send_due
+            self._note_bus(error)
 
     def _hear(self, message: Any) -> None:
         if message.is_error_frame:
