@@ -18,6 +18,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 import edge_runtime
+from deploy.installer import errors as installer_errors
 from deploy.installer.archive import CONTEXT, END, MANIFEST, SIGNATURE, header, padding
 from deploy.installer.manifest import FileEntry, Manifest, Target, to_json
 from deploy.installer.release import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
@@ -200,6 +201,8 @@ def _write(path: Path, manifest: Manifest, key: Ed25519PrivateKey, contents: dic
         draft.replace(path)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from None
+    except installer_errors.UserError as error:  # a name that no archive takes
+        raise UserError(str(error)) from None
     finally:  # ^C, too: half a bundle holds a private key as well
         with contextlib.suppress(OSError):
             draft.unlink()

@@ -162,6 +162,14 @@ def test_an_out_that_is_a_file_is_said(workshop, tmp_path):
         make_bundle(workshop.inputs(), HERE, tmp_path / "file")
 
 
+def test_a_name_that_no_archive_takes_is_said(workshop, tmp_path):
+    long = tmp_path / f"{'a' * 90}-1-py3-none-any.whl"
+    long.write_bytes(workshop.host.read_bytes())
+    inputs = workshop.inputs(wheels=[workshop.edge_wheel, long])
+    with pytest.raises(UserError, match="too long for a bundle"):
+        make_bundle(inputs, HERE, tmp_path / "out")
+
+
 def test_a_bundle_that_is_interrupted_leaves_no_key_behind(workshop, tmp_path, monkeypatch):
     def interrupted(size: int) -> bytes:
         raise KeyboardInterrupt
