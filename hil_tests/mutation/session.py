@@ -30,14 +30,15 @@ _EXCLUDED = (
     "core/ReplaceComparisonOperator_(Lt|LtE|Gt|GtE|Eq|NotEq)_(Is|IsNot)$",
 )
 
+_HUNTER = ("test_hunter_enable", "test_hunter_stops", "test_hunter_drive", "test_hunter_table")
 # Each module with the tests that must notice a change of it, the quick ones first.
 TARGETS = {
     "safety": ("test_safety", "test_controller", "test_controller_properties"),
     "latest": ("test_latest",),
     "wire": ("test_wire",),
     "controller": ("test_controller", "test_controller_properties"),
-    "vehicles/hunter/states": ("test_hunter_core",),
-    "vehicles/hunter/core": ("test_hunter_core",),
+    "vehicles/hunter/states": _HUNTER,
+    "vehicles/hunter/core": _HUNTER,
 }
 
 
