@@ -18,7 +18,7 @@ from bridge.signals import sigterm_as_interrupt
 from bridge.viewer import sinks
 from bridge.viewer.wire_log import WireLog
 from edge_runtime import wire
-from edge_runtime.cli import ArgumentParser
+from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.files import check_writable
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import check_endpoint
@@ -32,6 +32,11 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
     "health": wire.decode_health,
     "scene": decode_scene,
 }
+
+EXAMPLE = examples(
+    "python -m bridge view --serve",
+    "python -m bridge view --save drive.rrd --wait-s 60",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

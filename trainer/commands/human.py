@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from edge_runtime.cli import write_json_out
+from edge_runtime.cli import examples, write_json_out
 from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
 from trainer.drivers import make_environment
 from trainer.files import make_directory
@@ -14,7 +14,10 @@ from trainer.human.dagger import HumanTraining
 from trainer.human.model import HumanModelConfig
 from trainer.progress import ProgressBar
 
-EXAMPLE = "example: python -m trainer human --scenario left_turn --out runs/human"
+EXAMPLE = examples(
+    "python -m trainer human --scenario left_turn --out runs/human",
+    "python -m trainer human --scenario congestion --frames 2 --out runs/human_congestion",
+)
 DEFAULTS = HumanModelConfig()
 
 

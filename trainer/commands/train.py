@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from edge_runtime.cli import examples
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.latency.model import parse_spec
@@ -34,9 +35,11 @@ from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import CONFIG_FILE, TrainingRun
 
-EXAMPLE = (
-    "example: python -m trainer train --scenario left_turn --algorithm phil_td3 --seed 1 "
-    "--episodes 120 --out runs/phil_1"
+EXAMPLE = examples(
+    "python -m trainer train --scenario left_turn --episodes 120 --out runs/phil_1",
+    "python -m trainer train --episodes 240 --out runs/phil_1 --resume",
+    "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
+    "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
 )
 DEFAULTS = RunConfig()
 
