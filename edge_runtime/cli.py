@@ -9,7 +9,8 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import Any, Callable, List, NoReturn, Optional
+from importlib import import_module
+from typing import Any, Callable, Dict, List, NoReturn, Optional, Tuple
 
 from edge_runtime import files
 from edge_runtime.errors import UserError
@@ -22,6 +23,7 @@ __all__ = [
     "UserError",
     "examples",
     "run_cli",
+    "run_command",
     "write_json_out",
 ]
 
@@ -69,6 +71,28 @@ class ArgumentParser(argparse.ArgumentParser):
 def examples(*commands: str) -> str:
     """A parser's epilog: commands as a person would type them, continued after a backslash."""
     return "\n".join(["examples:", *("  " + text.replace("\n", "\n  ") for text in commands)])
+
+
+def run_command(
+    parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv: List[str]
+) -> int:
+    """Parse and run one of many commands; its exit status.
+
+    `commands` has for each name a module and one line on what it does. Such a module has EXAMPLE,
+    `add_arguments(parser)` and `run(arguments)`. Only that of the command that is asked for is
+    loaded: a mock of a chassis need not wait for torch.
+    """
+    parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, (module, summary) in commands.items():
+        one = parsers.add_parser(
+            name, help=summary, description=f"{summary[0].upper()}{summary[1:]}."
+        )
+        if name in argv[:1]:
+            chosen = import_module(module)
+            one.epilog = chosen.EXAMPLE
+            chosen.add_arguments(one)
+    arguments = parser.parse_args(argv)
+    return int(import_module(commands[arguments.command][0]).run(arguments))
 
 
 def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli
+from edge_runtime.cli import ArgumentParser, examples, run_cli, run_command
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
@@ -40,17 +39,7 @@ def main(argv: list[str]) -> int:
         description="Proves the loop.",
         epilog=examples("python -m hil_tests doctor", "python -m hil_tests demo"),
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, (module, summary) in COMMANDS.items():
-        command = commands.add_parser(name, help=summary, description=summary)
-        # Only what is asked for is loaded: a mock of a chassis need not wait for torch.
-        if name in argv[:1]:
-            chosen = import_module(module)
-            command.epilog = chosen.EXAMPLE
-            chosen.add_arguments(command)
-    arguments = parser.parse_args(argv)
-    status: int = import_module(COMMANDS[arguments.command][0]).run(arguments)
-    return status
+    return run_command(parser, COMMANDS, argv)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli
-from trainer.commands import COMMANDS
+from edge_runtime.cli import ArgumentParser, examples, run_cli, run_command
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "train": ("trainer.commands.train", "train a policy with human guidance"),
+    "human": ("trainer.commands.human", "train the DAgger human model from interventions"),
+    "evaluate": ("trainer.commands.evaluate", "drive test episodes and report how well it does"),
+    "export": ("trainer.commands.export", "write a run's actor as the file that a board drives"),
+    "plot": ("trainer.commands.plot", "draw the learning curve of a run"),
+    "picture": ("trainer.commands.picture", "draw a moment of an episode, from above"),
+    "bench": ("trainer.commands.bench", "measure learner, environment, training, replay, memory"),
+    "experiment": ("trainer.commands.experiment", "run the paper's experiments, judge its claims"),
+}
 
 
 def main(argv: list[str]) -> int:
@@ -18,13 +28,7 @@ def main(argv: list[str]) -> int:
             "python -m trainer evaluate runs/phil_1 --runs 50",
         ),
     )
-    parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, command in COMMANDS.items():
-        summary = (command.__doc__ or "").strip().splitlines()[0]
-        sub = parsers.add_parser(name, help=summary, description=summary, epilog=command.EXAMPLE)
-        command.add_arguments(sub)
-    arguments = parser.parse_args(argv)
-    return COMMANDS[arguments.command].run(arguments)
+    return run_command(parser, COMMANDS, argv)
 
 
 if __name__ == "__main__":

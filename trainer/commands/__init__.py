@@ -1,17 +1,1 @@
 """The commands of ``python -m trainer``, one module each."""
-
-from types import ModuleType
-
-from trainer.commands import bench, evaluate, experiment, export, human, picture, plot, train
-
-COMMANDS: dict[str, ModuleType] = {
-    "train": train,
-    "human": human,
-    "evaluate": evaluate,
-    "export": export,
-    "plot": plot,
-    "picture": picture,
-    "bench": bench,
-    "experiment": experiment,
-}
-"""Name -> module with ``add_arguments(parser)``, ``run(arguments)`` and ``EXAMPLE``."""

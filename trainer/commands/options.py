@@ -8,8 +8,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.latency.model import GRAMMAR
@@ -47,6 +45,8 @@ def add_latency(parser: argparse.ArgumentParser, what: str) -> None:
 def set_threads(count: int) -> None:
     """Limit torch's threads; 0 leaves them as they are."""
     if count:
+        import torch  # takes two seconds, which whoever asks for help need not wait
+
         torch.set_num_threads(count)
 
 

@@ -6,7 +6,6 @@ import pytest
 
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
-from trainer.commands import COMMANDS
 from trainer.files import save_torch
 
 
@@ -68,13 +67,6 @@ def test_bad_input_gets_one_line_and_status_2(arguments, capsys, tmp_path):
     assert len(err.strip().splitlines()) == 1
     assert "Traceback" not in err
     assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help_with_an_example(command, capsys):
-    status, out, _ = call(capsys, command, "--help")
-    assert status == 0
-    assert "example: python -m trainer" in " ".join(out.split())
 
 
 def test_evaluate_reports_what_the_contract_asks_for(capsys, tmp_path):
