@@ -205,6 +205,7 @@ def _report_row(row: Row, outcome: Outcome) -> dict[str, Any]:
         "reasons": dict(Counter(t.reason for t in outcome.tries if t.reason)),
         "rejected": dict(rejected),
         "figures": {name: max(values) for name, values in figures.items()},
+        "notes": [text for t in outcome.tries for text in t.notes],
         "wrong": wrong,
         "unsafe": outcome.unsafe,
         "crashes": outcome.crashes,

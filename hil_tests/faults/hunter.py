@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -34,6 +35,8 @@ QUIET_S = 0.5
 """So long it must stand when the fault is over: the mock takes set-points up again within 20 ms."""
 STANDS_WITHIN_S = 2.0
 """After the fault: our reaction, the chassis's own 0.5 s where it hears nothing, the braking."""
+_SAID_BEFORE_S = 0.1
+"""Feedback that left before the driver took the re-arm comes so much after it at most."""
 _FAST_MPS = 0.9 * MODELS[MODEL].max_speed_mps
 _IMPOSSIBLE_MPS = 1.2 * MODELS[MODEL].max_speed_mps
 _DIFFERS_MPS = 0.15
@@ -73,9 +76,9 @@ def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
     wrong += _stayed(rig, chassis, stop, stands_s, quiet_s)
     wrong += _named(rig, expect, on_s)
     told_s = _told_s(ears, on_s, quiet_s)
-    recovery_s = _rearmed(rig)
     figures = {"stands, ms": (stands_s - on_s) * 1e3, "safe_stop, ms": (stop.seen_s - on_s) * 1e3}
-    return Try(told_s - known_s, recovery_s, stop.reason, wrong=wrong, figures=figures)
+    done = Try(told_s - known_s, None, stop.reason, wrong=wrong, figures=figures)
+    return _rearmed(rig, done)
 
 
 def stuck(rig: Rig, number: int) -> Try:
@@ -100,9 +103,9 @@ def stuck(rig: Rig, number: int) -> Try:
     wrong = _stayed(rig, chassis, stop, stands_s, quiet_s)
     wrong += _named(rig, Expect("stuck", "stuck|speed stays"), on_s)
     told_s = _told_s(ears, on_s, quiet_s)
-    recovery_s = _rearmed(rig)
     figures = {"stands after the stop, ms": (stands_s - stop.seen_s) * 1e3}
-    return Try(told_s - known_s, recovery_s, stop.reason, wrong=wrong, figures=figures)
+    done = Try(told_s - known_s, None, stop.reason, wrong=wrong, figures=figures)
+    return _rearmed(rig, done)
 
 
 def _drives(ears: CanEars) -> bool:
@@ -165,13 +168,17 @@ def _refuses(rig: Rig) -> list[str]:
     return ["was re-armed while the fault lasted"] if rig.try_rearm() else []
 
 
-def _rearmed(rig: Rig) -> float:
-    """From the re-arm to the first drive command; then wait until it moves in fact."""
+def _rearmed(rig: Rig, done: Try) -> Try:
+    """Re-arm, and wait until it moves in fact; the recovery lasts to the first drive command."""
     assert rig.chassis is not None
     rig.rearm()
     rearmed_s = rig.mark()
     rig.wait_until_driving(ready=lambda: rig.chassis is not None and rig.chassis.moves)
-    return drive_after_s(rig, rearmed_s) - rearmed_s
+    drove_s = drive_after_s(rig, rearmed_s)
+    # Between a re-arm and the first drive feedback has nothing to say, or it was stopped again.
+    said = {w for s, w in list(rig.timeline.named) if rearmed_s + _SAID_BEFORE_S < s < drove_s}
+    notes = [f"after the re-arm: {', '.join(sorted(said))}"] if said else []
+    return replace(done, recovery_s=drove_s - rearmed_s, notes=notes)
 
 
 def _status(test: Callable[[bytes], bool]) -> Callable[[Heard], bool]:
