@@ -86,9 +86,17 @@ class Device(Protocol):
         """What to press for what, one short line each."""
         ...
 
+    @property
+    def present(self) -> bool:
+        """Whether a person can act: a browser has the wheel, a gamepad is plugged in. Before an
+        episode the loop waits for it; within one, somebody absent has let go.
+        """
+        ...
+
     def poll(self, now_s: float) -> Reading:
         """What the person does at ``now_s`` (``time.monotonic``). Never blocks, never raises: a
-        device that is gone reads ``LET_GO``."""
+        device that is gone reads ``LET_GO``.
+        """
         ...
 
     def close(self) -> None:
