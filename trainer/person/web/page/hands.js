@@ -1,0 +1,131 @@
+// Keyboard and sliding pad. A held key or finger takes over; letting go gives back.
+
+const FIRST = 0.35; // of full action at the press of a key; it grows while the key is held
+const PER_SECOND = 3.0;
+export const KEYS = {
+  left_turn: { plus: ["ArrowUp", "KeyW"], minus: ["ArrowDown", "KeyS"] },
+  congestion: { plus: ["ArrowRight", "KeyD"], minus: ["ArrowLeft", "KeyA"] },
+};
+const HOLD = "Space";
+const WISHES = { KeyP: "pause", KeyR: "restart", KeyQ: "quit" };
+
+const clip = (value) => Math.min(Math.max(value, -1), 1);
+
+export class Keyboard {
+  constructor(changed, wish) {
+    this.scenario = "left_turn";
+    this.held = new Set();
+    this.action = 0;
+    this.changed = changed;
+    addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.altKey || event.metaKey || typing(event.target)) return;
+      if (event.code in WISHES && !event.repeat) return wish(WISHES[event.code]);
+      if (!this.drives(event.code)) return;
+      event.preventDefault(); // neither scroll, nor press the button that was clicked last
+      if (event.repeat) return;
+      this.held.add(event.code);
+      const way = this.way();
+      if (way && this.action * way < FIRST) this.action = FIRST * way;
+      changed();
+    });
+    addEventListener("keyup", (event) => {
+      if (this.drives(event.code) && !typing(event.target)) event.preventDefault();
+      if (this.held.delete(event.code)) this.settle();
+    });
+    // A page that is not looked at hears no key come up.
+    for (const gone of ["blur", "pagehide"]) addEventListener(gone, () => this.release());
+    addEventListener("visibilitychange", () => document.hidden && this.release());
+  }
+
+  drives(code) {
+    const keys = KEYS[this.scenario];
+    return code === HOLD || keys.plus.includes(code) || keys.minus.includes(code);
+  }
+
+  way() {
+    const keys = KEYS[this.scenario];
+    const any = (codes) => (codes.some((code) => this.held.has(code)) ? 1 : 0);
+    return any(keys.plus) - any(keys.minus);
+  }
+
+  // Grow towards what is held, fall back to nothing without.
+  step(seconds) {
+    if (!this.held.size) return;
+    const by = PER_SECOND * seconds;
+    const target = this.way();
+    const next = clip(this.action + Math.min(Math.max(target - this.action, -by), by));
+    if (next !== this.action) {
+      this.action = next;
+      this.changed();
+    }
+  }
+
+  settle() {
+    if (!this.held.size) this.action = 0;
+    this.changed();
+  }
+
+  release() {
+    this.held.clear();
+    this.settle();
+  }
+
+  now() {
+    return { action: this.action, engaged: this.held.size > 0, by_moving: false };
+  }
+}
+
+export class Pad {
+  constructor(element, knob, changed) {
+    this.scenario = "left_turn";
+    this.element = element;
+    this.knob = knob;
+    this.finger = null;
+    this.action = 0;
+    this.changed = changed;
+    element.addEventListener("pointerdown", (event) => {
+      if (this.finger !== null) return;
+      this.finger = event.pointerId;
+      element.setPointerCapture(event.pointerId);
+      this.move(event);
+      event.preventDefault();
+    });
+    element.addEventListener("pointermove", (event) => this.move(event));
+    for (const up of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      element.addEventListener(up, (event) => event.pointerId === this.finger && this.release());
+    }
+    for (const gone of ["blur", "pagehide"]) addEventListener(gone, () => this.release());
+  }
+
+  move(event) {
+    if (event.pointerId !== this.finger) return;
+    const box = this.element.getBoundingClientRect();
+    const upright = this.scenario === "left_turn";
+    const share = upright
+      ? 1 - (2 * (event.clientY - box.top)) / box.height
+      : (2 * (event.clientX - box.left)) / box.width - 1;
+    // The outer tenth is full action: a thumb need not find the edge.
+    this.action = clip(share / 0.9);
+    this.changed();
+  }
+
+  release() {
+    if (this.finger === null) return;
+    this.finger = null;
+    this.action = 0;
+    this.changed();
+  }
+
+  draw() {
+    const upright = this.scenario === "left_turn";
+    this.knob.style.left = `${upright ? 50 : 50 + 40 * this.action}%`;
+    this.knob.style.top = `${upright ? 50 - 40 * this.action : 50}%`;
+    this.element.classList.toggle("held", this.finger !== null);
+  }
+
+  now() {
+    return { action: this.action, engaged: this.finger !== null, by_moving: false };
+  }
+}
+
+const typing = (target) => ["INPUT", "SELECT", "TEXTAREA"].includes(target?.tagName);
