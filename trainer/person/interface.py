@@ -34,12 +34,25 @@ class Reading:
     wishes: frozenset[Wish] = frozenset()
     """What was asked for since the last reading; each press is reported once."""
     by_moving: bool = False
-    """Whether moving ``action`` away from rest takes over, too, as a steering wheel does; the
-    threshold and the rest are the take-over's business (``takeover.py``)."""
+    """Whether moving ``action`` away from rest takes over, too, as a steering wheel does
+    (``Moving``)."""
 
 
 LET_GO = Reading()
 """Nobody there."""
+
+
+@dataclass(frozen=True)
+class Moving:
+    """When moving a wheel or a pedal takes over, and when its resting gives back."""
+
+    threshold: float = 0.15
+    """How far from rest ``Reading.action`` must be to take over."""
+    rest: float = 0.05
+    """Below this it rests. Less than ``threshold``, so that a hand that trembles there does not
+    take over time and again."""
+    rest_s: float = 0.6
+    """How long it must rest to give back: a wheel passes its middle in every bend."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +132,7 @@ class Person:
 
     device: Device
     display: Display
+    moving: Moving = Moving()
 
     def close(self) -> None:
         """Close both."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from trainer.person.interface import Control, Reading
+from trainer.person.interface import Control, Moving, Reading
 
 MAX_SLEW = 0.5
 """The most that the action changes in a control period of a hand-over. From full throttle to full
@@ -104,14 +104,11 @@ class Intent:
     """Whether the person wants control: holds something, or has moved the wheel.
 
     Args:
-        threshold: how far from rest ``Reading.action`` must be to take over by moving.
-        rest: below this the wheel counts as resting; less than ``threshold``, so that a hand that
-            trembles at the threshold does not take over time and again.
-        rest_s: how long it must rest to give back; a wheel passes its middle in every bend.
+        moving: what counts as moving and as resting.
     """
 
-    def __init__(self, threshold: float = 0.15, rest: float = 0.05, rest_s: float = 0.6) -> None:
-        self.threshold, self.rest, self.rest_s = threshold, rest, rest_s
+    def __init__(self, moving: Moving = Moving()) -> None:
+        self.moving = moving
         self.reset()
 
     def reset(self) -> None:
@@ -128,11 +125,11 @@ class Intent:
         return reading.engaged or self._moved
 
     def _watch_wheel(self, away: float, now_s: float) -> None:
-        if away > self.threshold:
+        if away > self.moving.threshold:
             self._moved = True
-        if away > self.rest:
+        if away > self.moving.rest:
             self._resting_since_s = None
         elif self._resting_since_s is None:
             self._resting_since_s = now_s
-        elif now_s - self._resting_since_s >= self.rest_s:
+        elif now_s - self._resting_since_s >= self.moving.rest_s:
             self._moved = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.person.interface import Reading
+from trainer.person.interface import Moving, Reading
 from trainer.person.takeover import MAX_SLEW, NEXT, Intent, TakeOver
 
 ACTION = st.floats(-1.0, 1.0)
@@ -91,7 +91,7 @@ def wheel(action, engaged=False):
 
 
 def test_moving_the_wheel_takes_over_and_resting_gives_back():
-    intent = Intent(threshold=0.15, rest=0.05, rest_s=0.6)
+    intent = Intent(Moving(threshold=0.15, rest=0.05, rest_s=0.6))
     assert not intent.update(wheel(0.1), 0.0)
     assert intent.update(wheel(0.2), 0.1)
     assert intent.update(wheel(0.1), 0.2)
