@@ -22,10 +22,14 @@ if TYPE_CHECKING:
 
 TOKEN_BYTES = 16
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
+KEYS = {
+    "left_turn": "Up / W: throttle    Down / S: brake",
+    "congestion": "Left / A, Right / D: steer",
+}
 HELP = (
-    "hold an arrow key: take over (up/down the pedal, left/right the steering)",
-    "hold Space: take over with hands off",
-    "P pause   R restart the episode   Q quit",
+    "Space: take over without driving",
+    "or slide on the pad, or use a gamepad or wheel",
+    "P: pause    R: restart the episode    Q: quit",
 )
 
 
@@ -37,14 +41,14 @@ class Cockpit:
     Args:
         host: where to listen.
         port: at which port; 0: any free one.
+        scenario: decides the keys.
 
     Raises:
         UserError: the address cannot be listened on.
     """
 
-    help = HELP
-
-    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
+        self.help = (f"hold to take over    {KEYS[scenario]}", *HELP)
         self.seat = Seat()
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
@@ -110,7 +114,7 @@ def open_cockpit(options: PersonOptions) -> Person:
             "wheel; safer: leave it out, and ssh -L PORT:127.0.0.1:PORT from the browser's machine",
             file=sys.stderr,
         )
-    cockpit = Cockpit(options.host, options.port)
+    cockpit = Cockpit(options.host, options.port, options.scenario)
     print(f"cockpit: open {cockpit.url}", flush=True)
     return Person(cockpit, cockpit)
 

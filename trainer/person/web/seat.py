@@ -26,6 +26,8 @@ class Seat:
         self._lock = threading.Lock()
         self._pages: list[int] = []
         self._said = LET_GO
+        self._tap: Reading | None = None
+        """Pressed since the last poll: a tap shorter than a control period counts for one."""
         self._heard_s = float("-inf")
         self._hands_were_off = False
         self._wishes: set[Wish] = set()
@@ -62,7 +64,10 @@ class Seat:
             self._heard_s = now_s
             self._hands_were_off |= not said.engaged
             held = said.engaged and self._hands_were_off
+            pressed = held and not self._said.engaged
             self._said = Reading(said.action, held, by_moving=said.by_moving)
+            if pressed:
+                self._tap = self._said
             self._wishes |= set(said.wishes)
             return held
 
@@ -72,9 +77,12 @@ class Seat:
             wishes = frozenset(self._wishes)
             self._wishes.clear()
             said = self._said if now_s - self._heard_s <= SILENCE_S else LET_GO
+            if said is not LET_GO and not said.engaged and self._tap is not None:
+                said = self._tap
+            self._tap = None
             return Reading(said.action, said.engaged, wishes, said.by_moving)
 
     def _let_go(self) -> None:
-        self._said = LET_GO
+        self._said, self._tap = LET_GO, None
         self._hands_were_off = False
         self._heard_s = float("-inf")

@@ -27,7 +27,7 @@ const changed = () => link?.changed();
 const keyboard = new Keyboard(changed, (word) => wish(word));
 const touch = new Pad(byId("pad"), byId("knob"), changed);
 const gamepads = new Gamepads(
-  { ...Object.fromEntries(["plus", "minus", "dead", "invert", "hold"].map((id) => [id, byId(id)])),
+  { ...Object.fromEntries(["plus", "minus", "dead", "full", "invert", "hold"].map((id) => [id, byId(id)])),
     name: byId("pad-name") },
   changed,
 );

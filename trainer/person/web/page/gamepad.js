@@ -15,20 +15,21 @@ const SOURCES = {
 };
 
 export function preset(pad, scenario) {
+  const common = { dead: 0.05, full: 1, invert: false, hold: "button 5" };
   if (pad.mapping === "standard") {
     return scenario === "left_turn"
-      ? { plus: "button 7", minus: "button 6", dead: 0.05, invert: false, hold: "button 5" }
-      : { plus: "axis 0", minus: "", dead: 0.12, invert: false, hold: "button 5" };
+      ? { ...common, plus: "button 7", minus: "button 6" }
+      : { ...common, plus: "axis 0", minus: "", dead: 0.15 };
   }
   // A wheel: axis 0 turns, the next ones are pedals (a G29's throttle and brake).
   return scenario === "left_turn"
-    ? { plus: "pedal 2", minus: "pedal 3", dead: 0.05, invert: false, hold: "button 5" }
-    : { plus: "axis 0", minus: "", dead: 0.03, invert: false, hold: MOVING };
+    ? { ...common, plus: "pedal 2", minus: "pedal 3", hold: MOVING }
+    : { ...common, plus: "axis 0", minus: "", dead: 0.02, full: 0.25, hold: MOVING };
 }
 
 export function read(pad, choice) {
-  const { plus, minus, dead, invert, hold } = choice;
-  const raw = (value(pad, plus) - value(pad, minus)) * (invert ? -1 : 1);
+  const { plus, minus, dead, full, invert, hold } = choice;
+  const raw = ((value(pad, plus) - value(pad, minus)) * (invert ? -1 : 1)) / full;
   const size = Math.max(0, Math.abs(raw) - dead) / (1 - dead); // no jump at the zone's edge
   const action = Math.sign(raw) * Math.min(size, 1);
   const by_moving = hold === MOVING;
@@ -48,7 +49,7 @@ export class Gamepads {
     this.scenario = "left_turn";
     this.pad = null;
     this.said = { action: 0, engaged: false, by_moving: false };
-    for (const name of ["plus", "minus", "dead", "invert", "hold"]) {
+    for (const name of ["plus", "minus", "dead", "full", "invert", "hold"]) {
       form[name].addEventListener("input", () => this.choose());
     }
   }
@@ -87,16 +88,18 @@ export class Gamepads {
     options(this.form.minus, ["", ...pedals, ...buttons], this.choice.minus);
     options(this.form.hold, [MOVING, ...buttons], this.choice.hold);
     this.form.dead.value = this.choice.dead;
+    this.form.full.value = this.choice.full;
     this.form.invert.checked = this.choice.invert;
   }
 
   choose() {
     if (!this.pad) return;
-    const { plus, minus, dead, invert, hold } = this.form;
+    const { plus, minus, dead, full, invert, hold } = this.form;
     this.choice = {
       plus: plus.value,
       minus: minus.value,
       dead: Number(dead.value),
+      full: Number(full.value),
       invert: invert.checked,
       hold: hold.value,
     };

@@ -1,11 +1,11 @@
 // Keyboard and sliding pad. A held key or finger takes over; letting go gives back.
 
-const FIRST = 0.35; // of full action at the press of a key; it grows while the key is held
-const PER_SECOND = 3.0;
-export const KEYS = {
-  left_turn: { plus: ["ArrowUp", "KeyW"], minus: ["ArrowDown", "KeyS"] },
-  congestion: { plus: ["ArrowRight", "KeyD"], minus: ["ArrowLeft", "KeyA"] },
+// A pedal is down in 0.2 s; a wheel is turned by a tap, not thrown. As in trainer/person/hands.py.
+const KEYS = {
+  left_turn: { plus: ["ArrowUp", "KeyW"], minus: ["ArrowDown", "KeyS"], perSecond: 5.0 },
+  congestion: { plus: ["ArrowRight", "KeyD"], minus: ["ArrowLeft", "KeyA"], perSecond: 2.5 },
 };
+const FIRST_S = 0.1; // what a press is worth at once
 const HOLD = "Space";
 const WISHES = { KeyP: "pause", KeyR: "restart", KeyQ: "quit" };
 
@@ -24,8 +24,9 @@ export class Keyboard {
       event.preventDefault(); // neither scroll, nor press the button that was clicked last
       if (event.repeat) return;
       this.held.add(event.code);
-      const way = this.way();
-      if (way && this.action * way < FIRST) this.action = FIRST * way;
+      const first = this.way() * KEYS[this.scenario].perSecond * FIRST_S;
+      // Who turns round does not first undo.
+      if (this.action * first < 0 || Math.abs(this.action) < Math.abs(first)) this.action = first;
       changed();
     });
     addEventListener("keyup", (event) => {
@@ -51,7 +52,7 @@ export class Keyboard {
   // Grow towards what is held, fall back to nothing without.
   step(seconds) {
     if (!this.held.size) return;
-    const by = PER_SECOND * seconds;
+    const by = KEYS[this.scenario].perSecond * seconds;
     const target = this.way();
     const next = clip(this.action + Math.min(Math.max(target - this.action, -by), by));
     if (next !== this.action) {

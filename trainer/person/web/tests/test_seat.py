@@ -71,6 +71,28 @@ def test_a_watcher_going_changes_nothing(seat):
     assert seat.poll(0.0).engaged
 
 
+def test_a_tap_between_two_polls_counts_for_one(seat):
+    take_over(seat)
+    seat.hear(1, OFF, 0.05)
+    assert seat.poll(0.1).action == 0.8
+    assert not seat.poll(0.2).engaged
+
+
+def test_a_hold_that_was_polled_ends_with_its_release(seat):
+    take_over(seat)
+    assert seat.poll(0.0).engaged
+    seat.hear(1, HOLD, 0.05)
+    seat.hear(1, OFF, 0.06)
+    assert not seat.poll(0.1).engaged
+
+
+def test_a_tap_before_a_lost_connection_is_lost_with_it(seat):
+    take_over(seat)
+    seat.hear(1, OFF, 0.05)
+    seat.get_up(1)
+    assert seat.poll(0.1) == LET_GO
+
+
 def test_a_wish_outlives_its_page_and_is_told_once(seat):
     seat.hear(1, Input(at_ms=0.0, action=0.0, engaged=False, wishes=("quit",)), 0.0)
     seat.get_up(1)
