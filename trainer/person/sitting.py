@@ -7,7 +7,6 @@ environment's steps, and ``rest`` after an episode.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -50,6 +49,7 @@ class Sitting:
         self.progress = ""
         self.episodes = self.interventions = self.human_steps = 0
         self._take_over, self._intent = TakeOver(), Intent(person.moving)
+        self._paused = self._closed = False
         self._forget(0, 0)
 
     def begin(self, observation: Observation, episode: int, seed: int) -> None:
@@ -110,11 +110,11 @@ class Sitting:
         self._number += 1
         return truncated, outcome
 
-    def rest(self, outcome: str, until: Callable[[], bool] = lambda: True) -> None:
-        """Show how the episode ended, for a moment and until ``until`` is true."""
+    def rest(self, outcome: str) -> None:
+        """Show for a moment how the episode ended."""
         self.episodes += 1
         end_s = time.monotonic() + REST_S * self.pacer.period_s / self.env.config.control_period_s
-        while not self.stop and (time.monotonic() < end_s or not until()):
+        while not self.stop and time.monotonic() < end_s:
             self._idle(f"episode ended: {outcome}")
 
     def announce(self, message: str) -> None:
@@ -122,9 +122,11 @@ class Sitting:
         self._show(message)
 
     def close(self) -> None:
-        """Close the person's devices and the recording."""
-        self.person.close()
-        self.recorder.close()
+        """Close the person's devices and the recording; twice is once."""
+        if not self._closed:
+            self._closed = True
+            self.person.close()
+            self.recorder.close()
 
     def _forget(self, episode: int, seed: int) -> None:
         """Nothing of an episode has happened yet."""
@@ -134,7 +136,7 @@ class Sitting:
         self._reading: Reading = LET_GO
         self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
         self._policy_action: float | None = None
-        self._paused = self._restart = False
+        self._restart = False
         self._frames: Observation = self.env.frames
 
     def _weigh(self, policy_action: float | None) -> Applied:
@@ -166,7 +168,8 @@ class Sitting:
         self._read()
 
     def _show(self, message: str = "") -> None:
-        self.person.display.show(self._view(message))
+        if not self._closed:
+            self.person.display.show(self._view(message))
 
     def _view(self, message: str) -> View:
         env = self.env

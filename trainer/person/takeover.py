@@ -104,11 +104,11 @@ class Intent:
     """Whether the person wants control: holds something, or has moved the wheel.
 
     Args:
-        moving: what counts as moving and as resting.
+        moving: what counts as moving and as resting; None: the defaults.
     """
 
-    def __init__(self, moving: Moving = Moving()) -> None:
-        self.moving = moving
+    def __init__(self, moving: Moving | None = None) -> None:
+        self.moving = moving or Moving()
         self.reset()
 
     def reset(self) -> None:
