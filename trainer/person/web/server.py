@@ -117,29 +117,28 @@ class Server:
         self._seat.sit_down(page.number)
         sender = asyncio.create_task(self._send_views(page))
         try:
-            await self._listen(page)
+            why = await self._listen(page)
         finally:
+            # Before the good-byes, which take their time.
             self._seat.get_up(page.number)
             del self._pages[page.number]
             sender.cancel()
+        await socket.close(code=why)
         return socket
 
-    async def _listen(self, page: Page) -> None:
+    async def _listen(self, page: Page) -> WSCloseCode:
         """Hear a page until it goes, falls silent, or says what no page of ours says."""
         while True:
             try:
                 message = await page.socket.receive(timeout=GONE_S)
             except TimeoutError:
-                await page.socket.close(code=WSCloseCode.GOING_AWAY, message=b"not heard")
-                return
+                return WSCloseCode.GOING_AWAY
             if message.type is not WSMsgType.TEXT:
-                await page.socket.close(code=WSCloseCode.UNSUPPORTED_DATA)
-                return
+                return WSCloseCode.UNSUPPORTED_DATA
             try:
                 said = decode_input(message.data)
             except msgspec.MsgspecError:
-                await page.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"no input")
-                return
+                return WSCloseCode.POLICY_VIOLATION
             held = self._seat.hear(page.number, said, time.monotonic())
             page.seen = min(max(page.seen, said.seen), page.sent)
             page.wake.set()

@@ -56,7 +56,8 @@ export class Gamepads {
 
   // Look at the device; once an animation frame or so.
   step() {
-    const pads = [...navigator.getGamepads()].filter((pad) => pad?.connected);
+    // Absent where the page came over plain http from another machine.
+    const pads = [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad?.connected);
     // Whoever was there first stays, and so does who drives.
     const pad = pads.find((other) => other.index === this.pad?.index) ?? pads[0] ?? null;
     if (pad?.id !== this.pad?.id || (pad && this.chosenFor !== this.scenario)) this.take(pad);
