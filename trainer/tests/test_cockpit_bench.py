@@ -7,7 +7,7 @@ from trainer.person.recording import Step
 
 
 def steps(marks):
-    """Steps 100 ms apart: ``.`` the policy's, ``F`` an intervention's first, ``E`` an episode's end."""
+    """Steps every 100 ms: ``.`` the policy's, ``F`` an intervention's first, ``E`` an end."""
     return [step(number, mark) for number, mark in enumerate(marks)]
 
 

@@ -60,17 +60,16 @@ def encode_view(view: View, number: int, shown_s: float) -> str:
     return _ENCODER.encode({**place, **fields}).decode()
 
 
-def encode_echo(at_ms: float, driving: bool, held: bool) -> str:
+def encode_echo(at_ms: float, driving: bool, refused: bool) -> str:
     """The answer to an input: its own clock, and what came of it.
 
     Args:
         at_ms: the page's clock in the input.
         driving: whether this page has the wheel; others watch.
-        held: whether its hold counts: not after a silence, until the page has let go once.
+        refused: the driver's hold does not count: the hands must be off once.
     """
-    return _ENCODER.encode(
-        {"kind": "echo", "at_ms": at_ms, "driving": driving, "held": held}
-    ).decode()
+    echo = {"kind": "echo", "at_ms": at_ms, "driving": driving, "refused": refused}
+    return _ENCODER.encode(echo).decode()
 
 
 END = _ENCODER.encode({"kind": "end"}).decode()

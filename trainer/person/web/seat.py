@@ -65,7 +65,8 @@ class Seat:
             self._hands_were_off |= not said.engaged
             held = said.engaged and self._hands_were_off
             pressed = held and not self._said.engaged
-            self._said = Reading(said.action, held, by_moving=said.by_moving)
+            refused = said.engaged and not held
+            self._said = LET_GO if refused else Reading(said.action, held, by_moving=said.by_moving)
             if pressed:
                 self._tap = self._said
             self._wishes |= set(said.wishes)

@@ -143,7 +143,8 @@ class Server:
             page.seen = min(max(page.seen, said.seen), page.sent)
             page.wake.set()
             driving = self._seat.is_driver(page.number)
-            await page.socket.send_str(encode_echo(said.at_ms, driving, held))
+            refused = driving and said.engaged and not held
+            await page.socket.send_str(encode_echo(said.at_ms, driving, refused))
 
     async def _send_views(self, page: Page) -> None:
         page.wake.set()

@@ -22,15 +22,13 @@ const LINK = { connecting: "connecting", live: "connected", lost: "connection lo
 
 let view = null;
 let viewMs = 0;
-let driving = true;
+let driving = true; // and not watching
+let refused = false; // held since before the connection was lost
 const changed = () => link?.changed();
 const keyboard = new Keyboard(changed, (word) => wish(word));
 const touch = new Pad(byId("pad"), byId("knob"), changed);
-const gamepads = new Gamepads(
-  { ...Object.fromEntries(["plus", "minus", "dead", "full", "invert", "hold"].map((id) => [id, byId(id)])),
-    name: byId("pad-name") },
-  changed,
-);
+const choices = ["plus", "minus", "dead", "full", "invert", "hold"].map((id) => [id, byId(id)]);
+const gamepads = new Gamepads({ ...Object.fromEntries(choices), name: byId("pad-name") }, changed);
 // A finger goes before a key, a key before a device that may only lie there.
 const hands = {
   now: () => [touch, keyboard, gamepads].map((hand) => hand.now()).find((said) => said.engaged)
@@ -71,6 +69,7 @@ function enter(scenario) {
   byId("pad-plus").textContent = words.plus;
   byId("pad-minus").textContent = words.minus;
   byId("pad").className = scenario === "left_turn" ? "upright" : "level";
+  changed(); // a key may be down already
 }
 
 function draw() {
@@ -96,11 +95,14 @@ function draw() {
 }
 
 function showWho() {
-  let [who, why] = WHO[view?.control ?? "policy"];
-  if (view?.policy_action === null && view.control === "policy") who = "Nobody drives";
-  if (!driving) [who, why] = [who.replace("You drive", "Another page drives"), "you watch: another page has the wheel"];
+  const control = document.body.dataset.control;
+  let [who, why] = WHO[control];
+  if (view?.policy_action === null && control === "policy") who = "Nobody drives";
+  if (!driving) why = "you watch: another page has the wheel";
+  if (!driving && control === "human") who = "Another page drives";
+  if (refused) why = "the connection was lost: let go, and press again";
   byId("who").textContent = who;
-  byId("why").textContent = refused ? "the connection was lost: let go, and press again" : why;
+  byId("why").textContent = why;
 }
 
 function bar(name, action) {
@@ -113,13 +115,11 @@ function bar(name, action) {
   element.querySelector("output").textContent = known ? value.toFixed(2) : "–";
 }
 
-let refused = false;
 function hearEcho(echo) {
-  driving = echo.driving;
-  refused = echo.driving && hands.now().engaged && !echo.held && refused;
-  if (echo.driving && hands.now().engaged && !echo.held) refused = true;
+  ({ driving, refused } = echo);
   document.body.classList.toggle("watching", !driving);
   byId("trip").textContent = `${link.tripMs().toFixed(link.tripMs() < 10 ? 1 : 0)} ms`;
+  showWho();
 }
 
 function showState(state) {

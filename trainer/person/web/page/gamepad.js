@@ -46,7 +46,7 @@ export class Gamepads {
   constructor(form, changed) {
     this.form = form;
     this.changed = changed;
-    this.scenario = "left_turn";
+    this.scenario = null;
     this.pad = null;
     this.said = { action: 0, engaged: false, by_moving: false };
     for (const name of ["plus", "minus", "dead", "full", "invert", "hold"]) {
@@ -56,6 +56,7 @@ export class Gamepads {
 
   // Look at the device; once an animation frame or so.
   step() {
+    if (!this.scenario) return;
     // Absent where the page came over plain http from another machine.
     const pads = [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad?.connected);
     // Whoever was there first stays, and so does who drives.

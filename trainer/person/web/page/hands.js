@@ -7,53 +7,60 @@ const KEYS = {
 };
 const FIRST_S = 0.1; // what a press is worth at once
 const HOLD = "Space";
+const DRIVING = new Set([HOLD, ...Object.values(KEYS).flatMap((keys) => [...keys.plus, ...keys.minus])]);
 const WISHES = { KeyP: "pause", KeyR: "restart", KeyQ: "quit" };
 
 const clip = (value) => Math.min(Math.max(value, -1), 1);
 
 export class Keyboard {
   constructor(changed, wish) {
-    this.scenario = "left_turn";
-    this.held = new Set();
+    this.scenario = null; // until the first view: nothing is driven
+    this.down = new Set();
     this.action = 0;
     this.changed = changed;
     addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.altKey || event.metaKey || typing(event.target)) return;
       if (event.code in WISHES && !event.repeat) return wish(WISHES[event.code]);
-      if (!this.drives(event.code)) return;
+      if (!DRIVING.has(event.code)) return;
       event.preventDefault(); // neither scroll, nor press the button that was clicked last
       if (event.repeat) return;
-      this.held.add(event.code);
-      const first = this.way() * KEYS[this.scenario].perSecond * FIRST_S;
+      this.down.add(event.code);
+      const first = this.way() * this.perSecond() * FIRST_S;
       // Who turns round does not first undo.
       if (this.action * first < 0 || Math.abs(this.action) < Math.abs(first)) this.action = first;
       changed();
     });
     addEventListener("keyup", (event) => {
-      if (this.drives(event.code) && !typing(event.target)) event.preventDefault();
-      if (this.held.delete(event.code)) this.settle();
+      if (DRIVING.has(event.code) && !typing(event.target)) event.preventDefault();
+      if (this.down.delete(event.code)) this.settle();
     });
     // A page that is not looked at hears no key come up.
     for (const gone of ["blur", "pagehide"]) addEventListener(gone, () => this.release());
     addEventListener("visibilitychange", () => document.hidden && this.release());
   }
 
-  drives(code) {
-    const keys = KEYS[this.scenario];
-    return code === HOLD || keys.plus.includes(code) || keys.minus.includes(code);
+  isDown(codes) {
+    return codes.some((code) => this.down.has(code));
   }
 
   way() {
     const keys = KEYS[this.scenario];
-    const any = (codes) => (codes.some((code) => this.held.has(code)) ? 1 : 0);
-    return any(keys.plus) - any(keys.minus);
+    return keys ? this.isDown(keys.plus) - this.isDown(keys.minus) : 0;
+  }
+
+  perSecond() {
+    return KEYS[this.scenario]?.perSecond ?? 0;
+  }
+
+  engaged() {
+    const keys = KEYS[this.scenario];
+    return Boolean(keys) && this.isDown([HOLD, ...keys.plus, ...keys.minus]);
   }
 
   // Grow towards what is held, fall back to nothing without.
   step(seconds) {
-    if (!this.held.size) return;
-    const by = KEYS[this.scenario].perSecond * seconds;
-    const target = this.way();
+    const by = this.perSecond() * seconds;
+    const target = this.engaged() ? this.way() : 0;
     const next = clip(this.action + Math.min(Math.max(target - this.action, -by), by));
     if (next !== this.action) {
       this.action = next;
@@ -62,23 +69,23 @@ export class Keyboard {
   }
 
   settle() {
-    if (!this.held.size) this.action = 0;
+    if (!this.engaged()) this.action = 0;
     this.changed();
   }
 
   release() {
-    this.held.clear();
+    this.down.clear();
     this.settle();
   }
 
   now() {
-    return { action: this.action, engaged: this.held.size > 0, by_moving: false };
+    return { action: this.action, engaged: this.engaged(), by_moving: false };
   }
 }
 
 export class Pad {
   constructor(element, knob, changed) {
-    this.scenario = "left_turn";
+    this.scenario = null;
     this.element = element;
     this.knob = knob;
     this.finger = null;
@@ -125,7 +132,8 @@ export class Pad {
   }
 
   now() {
-    return { action: this.action, engaged: this.finger !== null, by_moving: false };
+    const engaged = this.finger !== null && this.scenario !== null;
+    return { action: this.action, engaged, by_moving: false };
   }
 }
 

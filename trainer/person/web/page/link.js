@@ -4,6 +4,7 @@ const HEARTBEAT_MS = 100;
 const LEAST_MS = 1000 / 60; // between two inputs
 const SILENCE_MS = 500; // the trainer counts this as letting go, and so does the page
 const RETRY_MS = 500;
+const GONE_MS = 2000; // a socket that long silent is given up for a new one
 
 export class Link {
   // hands: what says(); on: {view, echo, state} are called back.
@@ -36,6 +37,13 @@ export class Link {
     };
   }
 
+  // Closing waits for an answer that will not come: what the old socket says is heard no more.
+  abandon() {
+    this.socket.onopen = this.socket.onmessage = this.socket.onclose = null;
+    this.socket.close();
+    this.open();
+  }
+
   hear(message) {
     const now = performance.now();
     this.heardMs = now;
@@ -65,7 +73,9 @@ export class Link {
 
   beat() {
     const now = performance.now();
-    if (now - this.heardMs > SILENCE_MS && !this.over) this.on.state("lost");
+    const silentMs = now - this.heardMs;
+    if (silentMs > SILENCE_MS && !this.over) this.on.state("lost");
+    if (silentMs > GONE_MS && !this.over) this.abandon();
     if (this.dirty || now - this.saidMs >= HEARTBEAT_MS) this.say(false);
   }
 

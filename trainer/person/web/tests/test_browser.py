@@ -18,6 +18,7 @@ pytestmark = pytest.mark.skipif(
 WAIT_S = 10.0
 LIVE = "document.body.dataset.link === 'live'"
 READY = f"{LIVE} && document.getElementById('scenario').textContent"
+TWO_HEARTBEATS = "new Promise((done) => setTimeout(done, 200))"
 YOU = "document.querySelector('.bar.human output').textContent"
 
 FAKE_PADS = """
@@ -104,8 +105,9 @@ def test_in_the_congestion_left_and_right_steer(runner, browser, cockpit):
         await browser.key("ArrowLeft", True)
         await reads(cockpit, lambda r: r.action == -1.0)
         await browser.key("ArrowLeft", False)
+        await reads(cockpit, lambda r: r == LET_GO)
         await browser.key("ArrowUp", True)
-        await browser.until("true")
+        await browser.value(TWO_HEARTBEATS)
         assert not poll(cockpit).engaged
         await browser.key("ArrowUp", False)
 

@@ -42,7 +42,7 @@ def test_after_a_silence_the_hands_must_be_off_once(seat):
     take_over(seat)
     late_s = SILENCE_S + 0.1
     assert not seat.hear(1, HOLD, late_s)
-    assert not seat.poll(late_s).engaged
+    assert seat.poll(late_s) == LET_GO
     seat.hear(1, OFF, late_s + 0.1)
     assert seat.hear(1, HOLD, late_s + 0.2)
     assert seat.poll(late_s + 0.2).engaged

@@ -115,9 +115,9 @@ def test_what_a_page_holds_is_polled_and_its_closing_is_letting_go(cockpit):
         async with page(cockpit) as link:
             assert not cockpit.present
             echo = await say(link)
-            assert echo == {"kind": "echo", "at_ms": 12.5, "driving": True, "held": False}
+            assert echo == {"kind": "echo", "at_ms": 12.5, "driving": True, "refused": False}
             assert cockpit.present
-            assert (await say(link, True, -0.75))["held"]
+            assert not (await say(link, True, -0.75))["refused"]
             reading = poll(cockpit)
             assert (reading.engaged, reading.action) == (True, -0.75)
         await until(lambda: not poll(cockpit).engaged)
