@@ -7,13 +7,14 @@ const RETRY_MS = 500;
 const GONE_MS = 2000; // a socket that long silent is given up for a new one
 
 export class Link {
-  // hands: what says(); on: {view, echo, state} are called back.
+  // hands: now() says what they do; on: {view, echo, state} are called back.
   constructor(hands, on) {
     this.hands = hands;
     this.on = on;
     this.wishes = [];
     this.seen = 0;
     this.saidMs = 0;
+    this.saidEngaged = false;
     this.trips = [];
     this.over = false;
     this.opened = false;
@@ -67,10 +68,11 @@ export class Link {
     this.changed();
   }
 
-  // The hands moved: say so now, or as soon as the 60 a second allow.
+  // The hands moved: say so now, or as soon as the 60 a second allow; taking and letting go at once.
   changed() {
     this.dirty = true;
-    if (performance.now() - this.saidMs >= LEAST_MS) this.say();
+    const edge = this.hands.now().engaged !== this.saidEngaged;
+    if (edge || performance.now() - this.saidMs >= LEAST_MS) this.say();
   }
 
   beat() {
@@ -95,6 +97,7 @@ export class Link {
   send({ action, engaged, by_moving }) {
     if (this.socket.readyState !== WebSocket.OPEN) return;
     this.saidMs = performance.now();
+    this.saidEngaged = engaged;
     this.dirty = false;
     const wishes = [...new Set(this.wishes)];
     this.wishes = [];
