@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.person.interface import LET_GO, Person, Reading, View
+from trainer.person.interface import LET_GO, Person, View
 from trainer.person.pacing import Pacer
 from trainer.person.recording import Recorder, Step
 from trainer.person.takeover import Applied, Intent, TakeOver
@@ -133,7 +133,7 @@ class Sitting:
         self._episode, self._seed, self._number = episode, seed, 0
         self._take_over.reset()
         self._intent.reset()
-        self._reading: Reading = LET_GO
+        self._reading, self._read_ns = LET_GO, 0
         self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
         self._policy_action: float | None = None
         self._restart = False
@@ -147,6 +147,7 @@ class Sitting:
 
     def _read(self) -> None:
         """Ask the hands, and heed what they wish."""
+        self._read_ns = time.time_ns()
         self._reading = self.person.device.poll(time.monotonic())
         wishes = self._reading.wishes
         self.stop = self.stop or "quit" in wishes
@@ -211,7 +212,7 @@ class Sitting:
             seed=self._seed,
             episode=self._episode,
             step=self._number,
-            time_ns=time.time_ns(),
+            time_ns=self._read_ns,
             time_s=self._number * env.config.control_period_s,
             frames=self._frames.tobytes(),
             next_frame=next_observation[1].tobytes(),
