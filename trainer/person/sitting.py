@@ -50,6 +50,8 @@ class Sitting:
         self.episodes = self.interventions = self.human_steps = 0
         self._take_over, self._intent = TakeOver(), Intent(person.moving)
         self._paused = self._closed = False
+        self._policy_action: float | None = None
+        self._frames: Observation = env.frames
         self._forget(0, 0)
 
     def begin(self, observation: Observation, episode: int, seed: int) -> None:
@@ -135,9 +137,8 @@ class Sitting:
         self._intent.reset()
         self._reading, self._read_ns = LET_GO, 0
         self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
-        self._policy_action: float | None = None
+        self._policy_action = None
         self._restart = False
-        self._frames: Observation = self.env.frames
 
     def _weigh(self, policy_action: float | None) -> Applied:
         if policy_action is None:

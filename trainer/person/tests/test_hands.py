@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+import msgspec
 import pytest
 
 from trainer.person.devices import WindowDevice, pygame
@@ -123,7 +124,5 @@ def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
 
 
 def test_another_device_is_not_taken_for_the_profiles(wheel):
-    class Other:
-        match, take_over, name = "Thrustmaster", "moving", "other"
-
-    assert not JoystickHands(Other(), "left_turn").present
+    other = msgspec.structs.replace(G29, match="Thrustmaster")
+    assert not JoystickHands(other, "left_turn").present
