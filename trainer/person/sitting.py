@@ -49,7 +49,9 @@ class Sitting:
         self.progress = ""
         self.episodes = self.interventions = self.human_steps = 0
         self._take_over, self._intent = TakeOver(), Intent(person.moving)
-        self._paused = self._closed = False
+        self._paused = False
+        self._visible = False
+        """There is something to show: not before the first episode."""
         self._policy_action: float | None = None
         self._frames: Observation = env.frames
         self._forget(0, 0)
@@ -61,7 +63,7 @@ class Sitting:
             SittingOver: the person quits instead.
         """
         self._forget(episode, seed)
-        self._frames = observation
+        self._frames, self._visible = observation, True
         while not self.person.device.present and not self.stop:
             self._idle("waiting for the person's device")
         if self.stop:
@@ -125,10 +127,9 @@ class Sitting:
 
     def close(self) -> None:
         """Close the person's devices and the recording; twice is once."""
-        if not self._closed:
-            self._closed = True
-            self.person.close()
-            self.recorder.close()
+        self._visible = False
+        self.person.close()
+        self.recorder.close()
 
     def _forget(self, episode: int, seed: int) -> None:
         """Nothing of an episode has happened yet."""
@@ -170,7 +171,7 @@ class Sitting:
         self._read()
 
     def _show(self, message: str = "") -> None:
-        if not self._closed:
+        if self._visible:
             self.person.display.show(self._view(message))
 
     def _view(self, message: str) -> View:
