@@ -8,6 +8,10 @@ from importlib import import_module
 from edge_runtime.cli import ArgumentParser, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
+    "doctor": (
+        "hil_tests.doctor.command",
+        "what this machine can and cannot do, and how to get the rest",
+    ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
     "campaign": ("hil_tests.campaign.command", "every fault, every latency row, one report"),
     "mock_hunter": (
