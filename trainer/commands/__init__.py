@@ -2,10 +2,21 @@
 
 from types import ModuleType
 
-from trainer.commands import bench, evaluate, experiment, export, human, picture, plot, train
+from trainer.commands import (
+    bench,
+    drive,
+    evaluate,
+    experiment,
+    export,
+    human,
+    picture,
+    plot,
+    train,
+)
 
 COMMANDS: dict[str, ModuleType] = {
     "train": train,
+    "drive": drive,
     "human": human,
     "evaluate": evaluate,
     "export": export,
