@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.commands.options import not_negative, positive_float
@@ -137,7 +137,7 @@ def main(argv: list[str]) -> int:
     parser = ArgumentParser(
         prog="python -m trainer.benches.killed_sitting",
         description=(__doc__ or "").split("\n\n")[0],
-        epilog="example: python -m trainer.benches.killed_sitting --minutes 30 --out killed.json",
+        epilog=examples("python -m trainer.benches.killed_sitting --minutes 5 --out killed.json"),
     )
     _add_arguments(parser)
     arguments = parser.parse_args(argv)
