@@ -12,7 +12,7 @@ from bridge.arguments import add_connect, add_span, add_tls, non_negative_second
 from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
 from bridge.recording.writer import RecordingWriter
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, UserError
+from edge_runtime.cli import ArgumentParser, UserError, examples
 from edge_runtime.files import check_writable
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
@@ -23,6 +23,11 @@ FLUSH_S = 0.5
 """A kill loses at most this much, and what waits in the queue."""
 NOT_WRITTEN = 1
 """Exit status where the disk did not take the recording to its end."""
+
+EXAMPLE = examples(
+    "python -m bridge record --out drive.mcap",
+    "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -13,12 +13,17 @@ from typing import Any
 from bridge.arguments import add_vehicle_id, non_negative_int
 from bridge.relay_ends import Relay, open_relay
 from bridge.signals import sigterm_as_interrupt, wait_to_be_told
-from edge_runtime.cli import ArgumentParser, UserError, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.tls import is_tls
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
+
+EXAMPLE = examples(
+    "python -m bridge relay --listen tcp/127.0.0.1:7448 --connect tcp/127.0.0.1:7447 \\\n"
+    "    --latency 50ms+-10ms,loss=1% --out relay.json",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -10,8 +10,13 @@ from mcap.writer import CompressionType, Writer
 
 from bridge.recording.reader import Recording
 from bridge.recording.writer import CHUNK_BYTES, METADATA
-from edge_runtime.cli import ArgumentParser, UserError
+from edge_runtime.cli import ArgumentParser, UserError, examples
 from edge_runtime.files import check_writable, write_atomic
+
+EXAMPLE = examples(
+    "python -m bridge repair drive.mcap",
+    "python -m bridge repair drive.mcap --out whole.mcap",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from bridge.replaying.comparison import compare
 from bridge.replaying.in_process import Answers, replay_in_process
 from bridge.replaying.live import replay_live
 from bridge.replaying.recorded import RecordedDrive, key_of
-from edge_runtime.cli import ArgumentParser, UserError, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.policy import load_policy
 from edge_runtime.tls import tls_for
@@ -24,6 +24,12 @@ DEFAULT_TOLERANCE = 1e-5
 """Two processors round differently; a graph of the same weights stays far below this."""
 DIFFERENT = 1
 """Exit status where at least one command differs."""
+
+EXAMPLE = examples(
+    "python -m bridge replay hil_tests/recordings/left_turn.mcap \\\n"
+    "    --policy results/policies/left_turn.onnx --public-key results/policies/policy.pub",
+    "python -m bridge replay drive.mcap --listen tcp/127.0.0.1:7447 --out replay.json",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

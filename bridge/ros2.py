@@ -17,7 +17,7 @@ from bridge.feed import Feed, open_feed
 from bridge.signals import sigterm_as_interrupt
 from bridge.to_ros2.outlet import Outlet
 from bridge.to_ros2.policies import Policies
-from edge_runtime.cli import ArgumentParser, HelpFormatter, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.operator_commands import ask
 from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT, check_ros2_endpoint, open_ros2_session
@@ -29,28 +29,27 @@ from edge_runtime.wire import check_vehicle_id
 
 POLL_S = 0.1
 MAX_RATE_HZ = 20.0
-EXAMPLES = """\
-examples:
-  python -m bridge ros2 --vehicle-id hunter01
-      then on the same machine: zenoh-bridge-ros2dds -l tcp/127.0.0.1:7449 -e {endpoint}
-      and in a ROS 2 shell:     ros2 topic echo /hunter01/odom
-  python -m bridge ros2 --connect tls/10.0.0.2:7447 --tls certs/viewer --namespace /test/car
-  python -m bridge ros2 --ros2-connect tcp/127.0.0.1:7449 --duration-s 60 --out ros2.json
+_TOPICS = """
 
 topics below the namespace: image_raw (sensor_msgs/Image), odom (nav_msgs/Odometry, dead reckoning),
 command/ackermann (ackermann_msgs/AckermannDriveStamped), command/twist (geometry_msgs/Twist);
 the last two show what is commanded: no driver listens there.
 """
-
-
-class _Formatter(HelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Defaults for the options, and the examples' lines as they stand."""
+EXAMPLE = (
+    examples(
+        "python -m bridge ros2 --vehicle-id hunter01\n"
+        "    then on the same machine: zenoh-bridge-ros2dds -l tcp/127.0.0.1:7449"
+        f" -e {DEFAULT_ROS2_ENDPOINT}\n"
+        "    and in a ROS 2 shell:     ros2 topic echo /hunter01/odom",
+        "python -m bridge ros2 --connect tls/10.0.0.2:7447 --tls certs/viewer --namespace /car",
+        "python -m bridge ros2 --ros2-connect tcp/127.0.0.1:7449 --duration-s 60 --out ros2.json",
+    )
+    + _TOPICS
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.formatter_class = _Formatter
-    parser.epilog = EXAMPLES.format(endpoint=DEFAULT_ROS2_ENDPOINT)
     add_connect(parser)
     add_tls(parser)
     add_vehicle_id(parser, "the vehicle to show")

@@ -10,12 +10,18 @@ import zenoh
 from bridge.arguments import add_tls
 from bridge.signals import sigterm_as_interrupt, wait_to_be_told
 from edge_runtime import access
-from edge_runtime.cli import ArgumentParser
+from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.tls import tls_for
 from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, open_session
+
+EXAMPLE = examples(
+    "python -m bridge router --listen tcp/127.0.0.1:7447",
+    "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+    "    --vehicle-id hunter01 --vehicle-id hunter02",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -31,7 +31,7 @@ from bridge.report import make_report, rejections, summary_line
 from bridge.signals import sigterm_as_interrupt
 from bridge.vehicle_clock import VehicleClock
 from bridge.vehicle_loop import VehicleInLoop
-from edge_runtime.cli import ArgumentParser, UserError, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.tls import TlsFiles, tls_for
@@ -58,6 +58,14 @@ class SimulateSettings:
     seed: int
     wait_edge_s: float
     out: str | None
+
+
+EXAMPLE = examples(
+    "python -m bridge simulate --env left_turn --episodes 5 --clock realtime --latency 50ms+-10ms",
+    "python -m bridge simulate --env congestion --condition variant --episodes 20 --out r.json",
+    "python -m bridge simulate --env left_turn --clock realtime --loop vehicle \\\n"
+    "    --connect tcp/127.0.0.1:7447 --vehicle-id car-a",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -186,6 +194,8 @@ def _drive(
         bar.tick,
         apply=vehicle.apply if vehicle else policy_action,
         standing=settings.standing,
+        # Copies, made at once: other threads go on counting.
+        rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
     )
     results = []
     port.note_edge_counts()

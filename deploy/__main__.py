@@ -8,7 +8,7 @@ from typing import Any
 
 from deploy import bundle_command, certs_command, push, router_command
 from deploy.keys import DEFAULT_DIRECTORY, write_key_pair
-from edge_runtime.cli import ArgumentParser, run_cli
+from edge_runtime.cli import ArgumentParser, examples, run_cli
 
 
 def main(argv: list[str]) -> int:
@@ -28,23 +28,35 @@ def build_parser() -> ArgumentParser:
     parser = ArgumentParser(
         prog="python -m deploy",
         description="Prepares what goes onto the board, and brings it there.",
-        epilog="example: python -m deploy bundle --policy POLICY.onnx --target jetpack5",
+        epilog=examples(
+            "python -m deploy keys --out keys",
+            "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
+            "    --public-key results/policies/policy.pub --target jetpack5",
+        ),
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    keys = commands.add_parser("keys", help="make a key pair that signs policies and bundles")
+
+    def add(name: str, text: str, example: str) -> ArgumentParser:
+        added: ArgumentParser = commands.add_parser(
+            name, help=text, description=text, epilog=example
+        )
+        return added
+
+    keys = add(
+        "keys",
+        "make a key pair that signs policies and bundles",
+        examples("python -m deploy keys --out keys"),
+    )
     keys.add_argument(
         "--out", default=DEFAULT_DIRECTORY, help="directory for policy.key and policy.pub"
     )
-    certs_command.add_arguments(
-        commands.add_parser("certs", help="make an authority and certificates for TLS")
-    )
-    bundle_command.add_arguments(
-        commands.add_parser("bundle", help="make one signed archive for one board and vehicle")
-    )
-    push.add_arguments(commands.add_parser("push", help="bring a bundle to a board and install it"))
-    router_command.add_arguments(
-        commands.add_parser("router", help="write a fleet's router settings, for zenohd")
-    )
+    for name, module, text in (
+        ("certs", certs_command, "make an authority and certificates for TLS"),
+        ("bundle", bundle_command, "make one signed archive for one board and vehicle"),
+        ("push", push, "bring a bundle to a board and install it"),
+        ("router", router_command, "write a fleet's router settings, for zenohd"),
+    ):
+        module.add_arguments(add(name, text, module.EXAMPLE))
     return parser
 
 

@@ -11,11 +11,18 @@ from deploy.bundle import Inputs, Made, check_inputs, make_bundle
 from deploy.installer.release import WHEELS
 from deploy.targets import TARGETS, find_target, lock_path
 from deploy.wheelhouse import DEFAULT_FOLDER, build_edge_wheel, gather
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.signature import DEFAULT_PUBLIC_KEY
 
 DEFAULT_OUT = "build/bundles"
 DEFAULT_KEY = f"{keys.DEFAULT_DIRECTORY}/policy.key"
+
+EXAMPLE = examples(
+    "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
+    "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
+    "    --config edge.toml --tls certs/edge-hunter01",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -27,6 +27,7 @@ from deploy.certs import (
     party_roles,
     read_authority,
 )
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
@@ -48,6 +49,11 @@ class Request(NamedTuple):
     vehicle_ids: list[str]
     hosts: list[str]
     days: int
+
+
+EXAMPLE = examples(
+    "python -m deploy certs --vehicle-id hunter01 --host workstation.local --out certs",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,13 +9,17 @@ from pathlib import Path
 
 from deploy.targets import TARGETS, find_target, lock_path
 from deploy.wheelhouse import download
-from edge_runtime.cli import ArgumentParser, run_cli
+from edge_runtime.cli import ArgumentParser, examples, run_cli
 from edge_runtime.files import read_bytes, write_atomic
 
 
 def main(argv: list[str]) -> int:
     """Download each `NAME==VERSION` of the lock and write the hash of what came beside it."""
-    parser = ArgumentParser(prog="python -m deploy.lock", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m deploy.lock",
+        description=__doc__,
+        epilog=examples("python -m deploy.lock jetpack5"),
+    )
     parser.add_argument("target", metavar="|".join(TARGETS))
     target = find_target(parser.parse_args(argv).target)
     path = lock_path(target)

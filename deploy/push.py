@@ -20,6 +20,7 @@ from deploy.installer.archive import open_bundle
 from deploy.installer.layout import DEFAULT_ROOT
 from deploy.installer.manifest import Manifest
 from deploy.pyz import NAME, build_installer
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.signature import DEFAULT_PUBLIC_KEY
@@ -37,6 +38,12 @@ class Step(NamedTuple):
 
     why: str
     command: list[str]
+
+
+EXAMPLE = examples(
+    "python -m deploy push user@board phil-jetpack5-1.tar --trust keys/policy.pub --dry-run",
+    "python -m deploy push root@10.0.0.7 phil-jetpack5-1.tar --no-sudo --service systemd",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

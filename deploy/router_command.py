@@ -6,10 +6,18 @@ import argparse
 from pathlib import Path
 
 from deploy.router_config import router_config
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, read_bytes, write_json
 from edge_runtime.tls import check_fits, load_tls
 from edge_runtime.transport import check_endpoint
+
+EXAMPLE = examples(
+    "python -m deploy router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+    "    --vehicle-id hunter01 --vehicle-id hunter02 --out router.json5",
+    "python -m deploy router --listen tls/0.0.0.0:7447 --tls certs/router --vehicles fleet.txt \\\n"
+    "    --out router.json5",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

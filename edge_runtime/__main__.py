@@ -7,11 +7,34 @@ import sys
 from typing import List
 
 from edge_runtime import __version__, log
-from edge_runtime.cli import ArgumentParser, run_cli
+from edge_runtime.cli import ArgumentParser, examples, run_cli
 from edge_runtime.config import Config
 from edge_runtime.vehicles.registry import VEHICLE_NAMES
 
 _DEFAULTS = Config()
+_TRUSTED = "results/policies/left_turn.onnx \\\n    --public-key results/policies/policy.pub"
+_EXAMPLES = {
+    "check": (
+        f"python -m edge_runtime check {_TRUSTED}",
+        "python -m edge_runtime check my.onnx --allow-unsigned --out check.json",
+    ),
+    "run": (
+        f"python -m edge_runtime run --policy {_TRUSTED}",
+        "python -m edge_runtime run --policy my.onnx --vehicle hunter --bus socketcan:can0 \\\n"
+        "    --connect tls/10.0.0.2:7447 --tls certs/edge-hunter01 --vehicle-id hunter01",
+        "python -m edge_runtime run --config edge.toml --log-format json",
+    ),
+    "status": (
+        "python -m edge_runtime status",
+        "python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01 --json",
+    ),
+    "rearm": (
+        "python -m edge_runtime rearm",
+        "python -m edge_runtime rearm --connect tls/10.0.0.2:7447 \\\n"
+        "    --tls certs/operator-hunter01 --vehicle-id hunter01",
+    ),
+}
+"""Of each command; the first one works in a fresh clone."""
 
 
 def main() -> None:
@@ -38,16 +61,20 @@ def build_parser() -> ArgumentParser:
     parser = ArgumentParser(
         prog="python -m edge_runtime",
         description="Drives a verified policy over Zenoh, and stops safely when in doubt.",
+        epilog=examples(*(commands[0] for commands in _EXAMPLES.values())),
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_check(commands.add_parser("check", help="may this policy drive, and how fast is it here"))
-    _add_run(commands.add_parser("run", help="answer states with commands until SIGTERM or ^C"))
-    for name, text in (
-        ("status", "print how a running edge runtime is"),
-        ("rearm", "let a vehicle drive again after a safe stop"),
-    ):
-        _add_operator(commands.add_parser(name, help=text), with_out=name == "status")
+
+    def add(name: str, text: str) -> ArgumentParser:
+        shown = examples(*_EXAMPLES[name])
+        added: ArgumentParser = commands.add_parser(name, help=text, description=text, epilog=shown)
+        return added
+
+    _add_check(add("check", "may this policy drive, and how fast is it here"))
+    _add_run(add("run", "answer states with commands until SIGTERM or ^C"))
+    _add_operator(add("status", "print how a running edge runtime is"), with_out=True)
+    _add_operator(add("rearm", "let a vehicle drive again after a safe stop"), with_out=False)
     return parser
 
 

@@ -1,4 +1,5 @@
-"""What every command of the repository shares: one-line errors, `--help` with defaults, JSON out.
+"""What every command of the repository shares: one-line errors, `--help` with defaults and
+examples, JSON out.
 
 UserError is re-exported here, so that a command needs this module only.
 """
@@ -19,6 +20,7 @@ __all__ = [
     "ArgumentParser",
     "HelpFormatter",
     "UserError",
+    "examples",
     "run_cli",
     "write_json_out",
 ]
@@ -29,7 +31,16 @@ _WITHOUT_DEFAULT = (None, False, argparse.SUPPRESS)
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Shows the default of every option that has one."""
+    """Shows the default of every option that has one, and keeps paragraphs and examples."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        # Examples are copied into a shell: their lines stay as they are.
+        return "\n\n".join(
+            paragraph
+            if paragraph.startswith("example")
+            else super(HelpFormatter, self)._fill_text(paragraph, width, indent)
+            for paragraph in text.strip().split("\n\n")
+        )
 
     def _get_help_string(self, action: argparse.Action) -> Optional[str]:
         text = action.help or ""
@@ -53,6 +64,11 @@ class ArgumentParser(argparse.ArgumentParser):
         """Print "prog: what is wrong (see prog --help)" and exit with status 2."""
         line = " ".join(message.split())
         self.exit(BAD_INPUT, f"{self.prog}: {line} (see {self.prog} --help)\n")
+
+
+def examples(*commands: str) -> str:
+    """A parser's epilog: commands as a person would type them, continued after a backslash."""
+    return "\n".join(["examples:", *("  " + text.replace("\n", "\n  ") for text in commands)])
 
 
 def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:

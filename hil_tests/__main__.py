@@ -5,9 +5,13 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-from edge_runtime.cli import ArgumentParser, run_cli
+from edge_runtime.cli import ArgumentParser, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
+    "doctor": (
+        "hil_tests.doctor.command",
+        "what this machine can and cannot do, and how to get the rest",
+    ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
     "campaign": ("hil_tests.campaign.command", "every fault, every latency row, one report"),
     "mock_hunter": (
@@ -35,13 +39,19 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 def main(argv: list[str]) -> int:
     """Run one command; the exit status."""
-    parser = ArgumentParser(prog="python -m hil_tests", description="Proves the loop.")
+    parser = ArgumentParser(
+        prog="python -m hil_tests",
+        description="Proves the loop.",
+        epilog=examples("python -m hil_tests doctor", "python -m hil_tests demo"),
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (module, summary) in COMMANDS.items():
         command = commands.add_parser(name, help=summary, description=summary)
         # Only what is asked for is loaded: a mock of a chassis need not wait for torch.
         if name in argv[:1]:
-            import_module(module).add_arguments(command)
+            chosen = import_module(module)
+            command.epilog = chosen.EXAMPLE
+            chosen.add_arguments(command)
     arguments = parser.parse_args(argv)
     status: int = import_module(COMMANDS[arguments.command][0]).run(arguments)
     return status

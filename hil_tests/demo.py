@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from edge_runtime.cli import ArgumentParser
+from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.transport import free_endpoint
@@ -34,6 +34,11 @@ RECORDED_RUNS = 2
 TRAINING_EPISODES = 150
 TRAINING_MINUTES = 4.5
 COLUMNS = ("drive", "success", "distance, m", "p50, ms", "p99, ms", "safe stops")
+
+EXAMPLE = examples(
+    "python -m hil_tests demo",
+    "python -m hil_tests demo --fresh --minutes 10 --out runs/demo",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, run_cli
+from edge_runtime.cli import ArgumentParser, examples, run_cli
 from trainer.commands import COMMANDS
 
 
@@ -13,6 +13,10 @@ def main(argv: list[str]) -> int:
     parser = ArgumentParser(
         prog="python -m trainer",
         description="Trains driving policies with human guidance, evaluates and exports them.",
+        epilog=examples(
+            "python -m trainer train --scenario left_turn --episodes 120 --out runs/phil_1",
+            "python -m trainer evaluate runs/phil_1 --runs 50",
+        ),
     )
     parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():

@@ -20,7 +20,7 @@ from pathlib import Path
 from deploy.campaigns.rig import Board, Kit, kit_of, make_kit, unless_busy
 from deploy.installer.archive import MANIFEST
 from deploy.installer.manifest import parse_manifest
-from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 
 SLACK = 1.1
@@ -168,7 +168,11 @@ def _kit(arguments: argparse.Namespace, folder: Path) -> Kit:
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
-    parser = ArgumentParser(prog="python -m deploy.campaigns.kills", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m deploy.campaigns.kills",
+        description=__doc__,
+        epilog=examples("python -m deploy.campaigns.kills --tries 20 --out runs/kills.json"),
+    )
     parser.add_argument("--tries", metavar="N", type=int, default=200, help="kills")
     parser.add_argument("--seed", metavar="N", type=int, default=1, help="of the moments")
     parser.add_argument("--out", metavar="FILE.json", help="write the report here")

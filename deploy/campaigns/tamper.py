@@ -18,7 +18,7 @@ from pathlib import Path
 
 from deploy.campaigns.rig import Board, Kit, kit_of, make_kit
 from deploy.installer.archive import BLOCK
-from edge_runtime.cli import ArgumentParser, UserError, run_cli
+from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
 from edge_runtime.files import check_writable, write_json
 
 REFUSED = 2
@@ -93,7 +93,11 @@ def _kit(arguments: argparse.Namespace, folder: Path) -> Kit:
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
-    parser = ArgumentParser(prog="python -m deploy.campaigns.tamper", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m deploy.campaigns.tamper",
+        description=__doc__,
+        epilog=examples("python -m deploy.campaigns.tamper --tries 100 --out runs/tamper.json"),
+    )
     parser.add_argument("--tries", metavar="N", type=int, default=1000, help="changed bundles")
     parser.add_argument("--seed", metavar="N", type=int, default=1, help="of the places")
     parser.add_argument("--out", metavar="FILE.json", help="write the report here")

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from deploy.campaigns.rig import Board, kit_of
-from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 
 
 def main(argv: list[str]) -> int:
@@ -68,7 +68,13 @@ def _size(root: Path) -> int:
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
-    parser = ArgumentParser(prog="python -m deploy.campaigns.times", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m deploy.campaigns.times",
+        description=__doc__,
+        epilog=examples(
+            "python -m deploy.campaigns.times phil-jetpack5-1.tar --out runs/times.json"
+        ),
+    )
     parser.add_argument("bundle", metavar="BUNDLE.tar", help="of `deploy bundle`, for this machine")
     parser.add_argument("--tries", metavar="N", type=int, default=3, help="installations")
     parser.add_argument("--out", metavar="FILE.json", help="write the report here")

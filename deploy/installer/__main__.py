@@ -21,6 +21,13 @@ from deploy.installer.steps import Way, install, rollback, uninstall
 from deploy.installer.supervise import supervise
 
 LIMITS = Limits()
+EXAMPLES = {
+    "install": "install phil-jetpack5-*.tar --trust bundle.pub",
+    "status": "status --json",
+    "rollback": "rollback --health-limit 20",
+    "uninstall": "uninstall",
+    "supervise": "supervise --root /opt/phil",
+}
 UNHEALTHY, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
@@ -54,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="install.pyz",
         description="Installs, upgrades and undoes a release of the edge runtime on this board.",
-        epilog="example: sudo python3 install.pyz install phil-jetpack5-*.tar --trust bundle.pub",
+        epilog=_example("install"),
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     commands.required = True
@@ -66,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
         ("supervise", "run the service without systemd, until SIGTERM"),
     )
     for name, text in texts:
-        command = commands.add_parser(name, help=text, description=text)
+        command = commands.add_parser(name, help=text, description=text, epilog=_example(name))
         command.add_argument(
             "--root", metavar="DIR", default=DEFAULT_ROOT, help=f"default: {DEFAULT_ROOT}"
         )
@@ -92,6 +99,10 @@ def _parser() -> argparse.ArgumentParser:
         if name == "status":
             command.add_argument("--json", action="store_true", help="print JSON")
     return parser
+
+
+def _example(name: str) -> str:
+    return f"example: sudo python3 install.pyz {EXAMPLES[name]}"
 
 
 def _dispatch(arguments: argparse.Namespace) -> int:

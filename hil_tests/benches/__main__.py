@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from edge_runtime import wire
-from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.transport import free_endpoint, open_session
 from hil_tests.benches.contenders import Floor, Ours, answer, rouse, start_floor, start_ours
@@ -32,7 +32,11 @@ FLOOR_STEPS = 10_000
 
 def main(argv: list[str]) -> int:
     """Measure, print the table, and write the JSON. Bars are shown, never enforced."""
-    parser = ArgumentParser(prog="python -m hil_tests.benches", description="The loop's bench.")
+    parser = ArgumentParser(
+        prog="python -m hil_tests.benches",
+        description="The loop's bench.",
+        epilog=examples("python -m hil_tests.benches --blocks 5 --out runs/loop.json"),
+    )
     parser.add_argument("--policy", default=str(POLICY), help="policy file")
     parser.add_argument("--public-key", default=str(PUBLIC_KEY), help="of the policy's signature")
     parser.add_argument("--blocks", type=positive, default=20, help="of each contender")

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.wire import SAFE_STOP
@@ -45,7 +45,11 @@ _TELL_EVERY_S = 5.0
 
 def main(argv: list[str]) -> int:
     """Measure, print the table, and write the JSON. Bars are shown, never enforced."""
-    parser = ArgumentParser(prog="python -m hil_tests.benches.can_stream", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m hil_tests.benches.can_stream",
+        description=__doc__,
+        epilog=examples("python -m hil_tests.benches.can_stream --minutes 1 --out runs/can.json"),
+    )
     parser.add_argument("--minutes", type=float, default=10.0, help="of streaming")
     parser.add_argument(
         "--busy", type=positive, default=os.cpu_count() or 1, help="processes that never wait"

@@ -21,7 +21,7 @@ import numpy as np
 from deploy.certs_command import add_arguments, certs
 from edge_runtime import wire
 from edge_runtime.access import rules_for_listener
-from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.signature import SIGNATURE_SUFFIX
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint, open_session
@@ -141,7 +141,11 @@ def quantiles(values: list[float]) -> dict[str, float]:
 
 def main(argv: list[str]) -> int:
     """Measure, print a line for each link, and write the result."""
-    parser = ArgumentParser(prog="python -m hil_tests.benches.tls_cost", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m hil_tests.benches.tls_cost",
+        description=__doc__,
+        epilog=examples("python -m hil_tests.benches.tls_cost --out runs/tls.json"),
+    )
     parser.add_argument(
         "--policy", default="results/policies/left_turn.onnx", help="the policy that answers"
     )

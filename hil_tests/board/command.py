@@ -12,7 +12,7 @@ from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
 from deploy.wheelhouse import DEFAULT_FOLDER
-from edge_runtime.cli import ArgumentParser, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from hil_tests.board import emulation
@@ -23,6 +23,8 @@ from trainer.benches.machine import processor_model
 
 BOARDS = ("aarch64", "python38", "systemd")
 FIRST_COMMAND_LIMIT_S, INSTALL_LIMIT_S = 180.0, 20.0
+
+EXAMPLE = examples("python -m hil_tests board --boards python38 --out runs/board.json")
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, read_bytes, write_atomic
 from edge_runtime.latency.model import parse_spec
@@ -24,7 +24,11 @@ from trainer.progress import ProgressBar
 PARTS = ("latency", "faults")
 NO_ROWS = "none"
 """``--rows none``: nothing but what ``--check-realtime`` asks for."""
-EXAMPLE = "python -m hil_tests campaign --only latency --runs 100 --out results/latency/r.json"
+EXAMPLE = examples(
+    "python -m hil_tests campaign --only latency --runs 100 --out runs/latency.json",
+    "python -m hil_tests campaign --only latency --rows none --check-realtime 50ms,loss=1% \\\n"
+    "    --out runs/realtime.json",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

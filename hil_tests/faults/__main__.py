@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from hil_tests.faults import render_faults, run_faults
 from trainer.commands.options import positive
@@ -13,7 +13,13 @@ from trainer.commands.options import positive
 
 def main(argv: list[str]) -> int:
     """Run rows of the table and print it; 0 where every limit was kept, else 1."""
-    parser = ArgumentParser(prog="python -m hil_tests.faults", description="The fault campaign.")
+    parser = ArgumentParser(
+        prog="python -m hil_tests.faults",
+        description="The fault campaign.",
+        epilog=examples(
+            "python -m hil_tests.faults --rows 'hunter_*' --tries 10 --out runs/faults.json"
+        ),
+    )
     parser.add_argument("--tries", type=positive, default=3, help="of each fault")
     parser.add_argument("--rows", help="names or patterns (hunter_*), commas between")
     parser.add_argument("--policy", type=Path, help="policy file (the left turn's if not given)")

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from hil_tests.fleet.drive import measure
@@ -27,6 +27,8 @@ _RULES = (10, 100, 1_000)
 _TRIES = 3
 _UNDISTURBED = 0.9
 """Each vehicle has an answer to this share of its states at least; else the machine was busy."""
+
+EXAMPLE = examples("python -m hil_tests fleet --vehicles 1 5 --seconds 10 --out runs/fleet.json")
 
 
 def add_arguments(parser: ArgumentParser) -> None:

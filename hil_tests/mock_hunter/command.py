@@ -9,6 +9,7 @@ import sys
 import time
 from typing import Any
 
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.vehicles.hunter import multicast
 from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
@@ -28,9 +29,16 @@ class _AfterFault(argparse.Action):
         namespace.fault[-1] = (values, namespace.fault[-1][1])
 
 
+EXAMPLE = examples(
+    "python -m hil_tests mock_hunter",
+    "python -m hil_tests mock_hunter --bus socketcan:vcan0 --fault link_steer --after-s 20",
+)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = (
+    parser.description = (
+        f"{parser.description}. "
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
         f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from edge_runtime.cli import ArgumentParser, run_cli
+from edge_runtime.cli import ArgumentParser, examples, run_cli
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic, write_json
 from hil_tests.mutation.report import judge, read_accepted, render
@@ -17,7 +17,11 @@ from hil_tests.mutation.session import TARGETS, run_targets
 
 def main(argv: list[str]) -> int:
     """Exit status 0 where every mutant is killed or accepted with a reason, else 1."""
-    parser = ArgumentParser(prog="python -m hil_tests.mutation", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m hil_tests.mutation",
+        description=__doc__,
+        epilog=examples("python -m hil_tests.mutation --only safety --out runs/mutation"),
+    )
     parser.add_argument(
         "--out", metavar="DIR", default="results/mutation", help="report.md and report.json"
     )

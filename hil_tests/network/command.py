@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
@@ -34,6 +34,11 @@ SPECS = {
 ATTEMPTS = 3
 POLICY = Path("results/policies/left_turn.onnx")
 PUBLIC_KEY = Path("results/policies/policy.pub")
+
+EXAMPLE = examples(
+    "python -m hil_tests network --out runs/network.json --report runs",
+    "python -m hil_tests network --transports tcp udp --episodes 4 --jobs 2",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

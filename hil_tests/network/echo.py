@@ -20,7 +20,7 @@ from typing import Any
 import zenoh
 
 from bridge.signals import sigterm_as_interrupt, wait_to_be_told
-from edge_runtime.cli import ArgumentParser, UserError, run_cli
+from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
 from edge_runtime.topics import CONTROL_PERIOD_S
 
 STATE_BYTES, COMMAND_BYTES = 7_322, 217
@@ -34,7 +34,11 @@ _NUMBER = struct.Struct("<I")
 
 def main(argv: list[str]) -> int:
     """Run one end."""
-    parser = ArgumentParser(prog="python -m hil_tests.network.echo", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m hil_tests.network.echo",
+        description=__doc__,
+        epilog=examples("python -m hil_tests.network.echo ask --config zenoh.json5 --messages 100"),
+    )
     parser.add_argument("role", choices=("answer", "ask"), help="which end this is")
     parser.add_argument("--config", required=True, help="Zenoh's configuration, JSON")
     parser.add_argument(

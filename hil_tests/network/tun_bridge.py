@@ -21,7 +21,7 @@ import time
 from typing import NamedTuple
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, run_cli
+from edge_runtime.cli import ArgumentParser, examples, run_cli
 from edge_runtime.latency.event_heap import EventHeap
 from edge_runtime.latency.model import LatencyModel, make_link, parse_spec
 from hil_tests.network.namespaces import TUN_DEVICE, ip
@@ -100,7 +100,11 @@ def _write(device: int, packet: bytes) -> None:
 
 def main(argv: list[str]) -> int:
     """Run the bridge; prints its counts as JSON at the end."""
-    parser = ArgumentParser(prog="python -m hil_tests.network.tun_bridge", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m hil_tests.network.tun_bridge",
+        description=__doc__,
+        epilog=examples("python -m hil_tests.network.tun_bridge --simulator ns1 --edge ns2"),
+    )
     parser.add_argument("--simulator", required=True, help="namespace of the simulator")
     parser.add_argument("--edge", required=True, help="namespace of the edge runtime")
     parser.add_argument("--latency", default="none", help="as of bridge simulate")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bridge.report import quantiles
-from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
 from hil_tests.commands import BackgroundCommand
@@ -59,7 +59,11 @@ VARIANTS = {
 
 def main(argv: list[str]) -> int:
     """Measure all variants and print one line for each."""
-    parser = ArgumentParser(prog="python -m hil_tests.network.variants", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m hil_tests.network.variants",
+        description=__doc__,
+        epilog=examples("python -m hil_tests.network.variants --messages 100 --out runs/v.json"),
+    )
     parser.add_argument("--latency", default="25ms+-5ms,loss=1%", help="as of bridge simulate")
     parser.add_argument("--messages", type=positive, default=600, help="to send, one each 0.1 s")
     parser.add_argument("--repeats", type=positive, default=1, help="new connections of each")

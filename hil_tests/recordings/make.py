@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.recording.reader import Recording
-from edge_runtime.cli import ArgumentParser, UserError, run_cli
+from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
 from edge_runtime.files import check_writable, read_bytes, write_atomic
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand, run_command
@@ -31,7 +31,11 @@ PATIENCE_S = 60.0
 
 def main(argv: list[str]) -> int:
     """Make the recording anew; the old one stays where anything goes wrong."""
-    parser = ArgumentParser(prog="python -m hil_tests.recordings.make", description=__doc__)
+    parser = ArgumentParser(
+        prog="python -m hil_tests.recordings.make",
+        description=__doc__,
+        epilog=examples("python -m hil_tests.recordings.make --out runs/left_turn.mcap"),
+    )
     parser.add_argument("--policy", metavar="POLICY.onnx", default=POLICY, help="who drives")
     parser.add_argument(
         "--public-key", metavar="FILE", default=PUBLIC_KEY, help="Ed25519 public key, PEM"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.policy import load_policy
@@ -27,6 +27,11 @@ from trainer.parallel import cores
 from trainer.progress import ProgressBar
 
 PARTS = ("compare", "sweep")
+
+EXAMPLE = examples(
+    "python -m hil_tests vehicle --out runs/vehicle.json",
+    "python -m hil_tests vehicle --only sweep --lags 50+100,200+300 --runs 20 --out runs/lags.json",
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:

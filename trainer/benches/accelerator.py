@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from trainer.benches.machine import about
 from trainer.commands.options import positive
@@ -144,7 +144,7 @@ def main(argv: list[str]) -> int:
     parser = ArgumentParser(
         prog="python -m trainer.benches.accelerator",
         description="Measures PHIL-TD3 in the left turn on a GPU.",
-        epilog="example: python -m trainer.benches.accelerator --runs 8 --out accelerator.json",
+        epilog=examples("python -m trainer.benches.accelerator --runs 8 --out accelerator.json"),
     )
     parser.add_argument("--runs", type=positive, default=8, metavar="N", help="runs at once")
     parser.add_argument("--out", metavar="F.json", help="also write the figures to this file")

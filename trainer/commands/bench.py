@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.cli import UserError, write_json_out
+from edge_runtime.cli import UserError, examples, write_json_out
 from edge_runtime.files import check_writable
 from trainer.benches.effort import FULL, QUICK, Effort
 from trainer.benches.environment import measure_environment
@@ -23,7 +23,10 @@ from trainer.commands.options import add_threads, set_threads
 from trainer.progress import ProgressBar
 from trainer.scenarios import SCENARIOS
 
-EXAMPLE = "example: python -m trainer bench --threads 2 --peers .venv-peers/bin/python --out b.json"
+EXAMPLE = examples(
+    "python -m trainer bench --quick --threads 1",
+    "python -m trainer bench --threads 2 --peers .venv-peers/bin/python --out b.json",
+)
 
 ROUNDS: dict[str, Callable[[Effort], int]] = {
     "learner": lambda effort: effort.learner_rounds,

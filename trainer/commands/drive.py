@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
 from trainer.drivers import load_driver, make_environment
@@ -14,9 +15,11 @@ from trainer.person.registry import HUMANS
 from trainer.person.signals import quit_on_signals
 from trainer.person.sitting import Sitting
 
-EXAMPLE = (
-    "example: python -m trainer drive --scenario left_turn --policy runs/phil_1 --human keyboard "
-    "--out runs/drives; then: python -m trainer human --from runs/drives --out runs/me"
+EXAMPLE = examples(
+    "python -m trainer drive --human keyboard --out runs/drives",
+    "python -m trainer drive --policy runs/phil_1 --human wheel --profile my.toml \\\n"
+    "    --out runs/drives",
+    "python -m trainer drive --human wheel --calibrate my.toml",
 )
 
 

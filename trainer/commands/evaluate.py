@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from edge_runtime.cli import write_json_out
+from edge_runtime.cli import examples, write_json_out
 from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
@@ -21,7 +21,11 @@ from trainer.evaluation import CONDITIONS, drive_episodes
 from trainer.parallel import WORTH_STARTING, choose_jobs, drive_episodes_in_parallel
 from trainer.progress import ProgressBar
 
-EXAMPLE = "example: python -m trainer evaluate runs/phil_1 --runs 50 --out result.json"
+EXAMPLE = examples(
+    "python -m trainer evaluate expert --runs 20",
+    "python -m trainer evaluate runs/phil_1 --runs 50 --out result.json",
+    "python -m trainer evaluate runs/phil_1 --condition variant --latency 50ms+-10ms,loss=1%",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from trainer.commands.options import not_negative, positive, positive_float
 from trainer.experiments.catalogue import NAMES, TIME, units_of
@@ -28,7 +29,10 @@ from trainer.experiments.units import Unit
 from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task
 from trainer.parallel import cores
 
-EXAMPLE = "example: python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60"
+EXAMPLE = examples(
+    "python -m trainer experiment status",
+    "python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60",
+)
 ALL, STATUS, SUMMARY = "all", "status", "summary"
 DEFAULT_SEEDS = 3
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from trainer.commands.options import existing_directory, read_json
@@ -12,7 +13,9 @@ from trainer.drivers import load_actor
 from trainer.export import export_policy, load_private_key, write_policy
 from trainer.training.run import CONFIG_FILE
 
-EXAMPLE = "example: python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key"
+EXAMPLE = examples(
+    "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.cli import UserError, write_json_out
+from edge_runtime.cli import UserError, examples, write_json_out
 from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
 from trainer.drivers import make_environment
 from trainer.files import make_directory
@@ -17,9 +17,10 @@ from trainer.person.imitation import demonstrate
 from trainer.person.recording import find_recordings
 from trainer.progress import ProgressBar
 
-EXAMPLE = (
-    "example: python -m trainer human --scenario left_turn --out runs/human; from your own "
-    "driving: python -m trainer human --from runs/drives --out runs/me"
+EXAMPLE = examples(
+    "python -m trainer human --scenario left_turn --out runs/human",
+    "python -m trainer human --scenario congestion --frames 2 --out runs/human_congestion",
+    "python -m trainer human --from runs/drives --out runs/me",
 )
 DEFAULTS = HumanModelConfig()
 

@@ -7,12 +7,13 @@ import io
 
 from PIL import Image
 
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
 from trainer.commands.options import add_scenario, not_negative, positive_float
 from trainer.drivers import load_driver, make_environment
 
-EXAMPLE = "example: python -m trainer picture expert --seed 3 --time 2.5 --out scene.png"
+EXAMPLE = examples("python -m trainer picture expert --seed 8 --time 3.4 --out scene.png")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

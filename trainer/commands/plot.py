@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 
+from edge_runtime.cli import examples
 from trainer.commands.options import existing_directory
 from trainer.plots import write_learning_curve
 
-EXAMPLE = "example: python -m trainer plot runs/phil_1"
+EXAMPLE = examples("python -m trainer plot runs/phil_1")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

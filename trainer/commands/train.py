@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from edge_runtime.cli import examples
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.latency.model import parse_spec
@@ -38,9 +39,12 @@ from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import CONFIG_FILE, TrainingRun
 
-EXAMPLE = (
-    "example: python -m trainer train --scenario left_turn --algorithm phil_td3 --seed 1 "
-    "--episodes 120 --out runs/phil_1; with you at the wheel: add --human keyboard"
+EXAMPLE = examples(
+    "python -m trainer train --scenario left_turn --episodes 120 --out runs/phil_1",
+    "python -m trainer train --episodes 240 --out runs/phil_1 --resume",
+    "python -m trainer train --human keyboard --rerun mine.rrd --out runs/mine",
+    "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
+    "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
 )
 DEFAULTS = RunConfig()
 
@@ -80,6 +84,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help=f"change a setting: {', '.join(_settings())}",
     )
+    parser.add_argument(
+        "--rerun",
+        metavar="spawn|serve|F.rrd",
+        help="show the run in rerun: in a window, on a page on this machine, or into a file",
+    )
     add_threads(parser)
 
 
@@ -91,12 +100,16 @@ def run(arguments: argparse.Namespace) -> int:
     config = _config(arguments)
     run_dir = Path(arguments.out)
     _check_directory(run_dir, config, arguments.resume)
+    sink = _sink(arguments.rerun)
     with _training(arguments, config, run_dir) as training:
         deadline_s = (
             time.monotonic() + 60.0 * arguments.max_minutes if arguments.max_minutes else None
         )
-        with ProgressBar("training", config.episodes, training.episode) as bar:
-            training.train(_Reporter(bar), deadline_s)
+        with (
+            ProgressBar("training", config.episodes, training.episode) as bar,
+            _watched(training, sink) as watch,
+        ):
+            training.train(_both(_Reporter(bar), watch), deadline_s)
     write_learning_curve(run_dir)
     print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
     return 0
@@ -110,13 +123,44 @@ def _training(
     if arguments.human in HUMANS:
         from trainer.person.command import training_with_person
 
-        with training_with_person(arguments, config, run_dir) as training:
-            yield training
+        with training_with_person(arguments, config, run_dir) as guided:
+            yield guided
     else:
         check_no_person(arguments)
         training = TrainingRun(config, run_dir, arguments.resume)
         make_directory(run_dir)
         yield training
+
+
+def _sink(word: str | None) -> Any:
+    """Where ``--rerun`` shows the run; None, and nothing imported, where it is not asked for."""
+    if word is None:
+        return None
+    from trainer.viewer.command import check_word
+
+    return check_word(word)
+
+
+@contextmanager
+def _watched(training: TrainingRun, sink: Any) -> Iterator[Callable[[EpisodeMetrics], None] | None]:
+    if sink is None:
+        yield None
+        return
+    from trainer.viewer.command import watched
+
+    with watched(training, sink) as on_episode:
+        yield on_episode
+
+
+def _both(
+    first: Callable[[EpisodeMetrics], None], second: Callable[[EpisodeMetrics], None] | None
+) -> Callable[[EpisodeMetrics], None]:
+    def on_episode(metrics: EpisodeMetrics) -> None:
+        first(metrics)
+        if second is not None:
+            second(metrics)
+
+    return on_episode
 
 
 class _Reporter:

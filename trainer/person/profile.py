@@ -16,6 +16,8 @@ SHIPPED = Path(__file__).parent / "profiles"
 Number = Annotated[int, msgspec.Meta(ge=0, le=63)]
 Place = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 """Where an axis is; SDL's go from -1 to 1."""
+SHORTEST = 0.02
+"""The least way of a wheel or pedal: its noise must not be a full action."""
 DeadZone = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 Share = Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)]
 
@@ -35,6 +37,8 @@ class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not (self.left < self.centre < self.right or self.left > self.centre > self.right):
             raise ValueError("centre is not between left and right")
+        if min(abs(self.left - self.centre), abs(self.right - self.centre)) < SHORTEST:
+            raise ValueError(f"left and right are not {SHORTEST} from centre")
 
     def action(self, place: float) -> float:
         """The steering in [-1, 1] for the axis' place; no jump at the dead zone's edge."""
@@ -52,8 +56,8 @@ class Pedal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dead_zone: DeadZone = 0.05
 
     def __post_init__(self) -> None:
-        if self.released == self.pressed:
-            raise ValueError("released and pressed are the same place")
+        if abs(self.released - self.pressed) < SHORTEST:
+            raise ValueError(f"released and pressed are not {SHORTEST} apart")
 
     def action(self, place: float) -> float:
         """How far it is pressed, in [0, 1]."""

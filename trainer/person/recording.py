@@ -56,7 +56,7 @@ class Step(msgspec.Struct, frozen=True):
     step: int
     """In the episode, from 0."""
     time_ns: int
-    """Wall time, ns since 1970."""
+    """When the hands were asked: wall time, ns since 1970."""
     time_s: float
     """Simulated, since the episode's start."""
     frames: bytes

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.person.interface import LET_GO, Person, Reading, View
+from trainer.person.interface import LET_GO, Person, View
 from trainer.person.pacing import Pacer
 from trainer.person.recording import Recorder, Step
 from trainer.person.takeover import Applied, Intent, TakeOver
@@ -49,7 +49,11 @@ class Sitting:
         self.progress = ""
         self.episodes = self.interventions = self.human_steps = 0
         self._take_over, self._intent = TakeOver(), Intent(person.moving)
-        self._paused = self._closed = False
+        self._paused = False
+        self._visible = False
+        """There is something to show: not before the first episode."""
+        self._policy_action: float | None = None
+        self._frames: Observation = env.frames
         self._forget(0, 0)
 
     def begin(self, observation: Observation, episode: int, seed: int) -> None:
@@ -59,7 +63,7 @@ class Sitting:
             SittingOver: the person quits instead.
         """
         self._forget(episode, seed)
-        self._frames = observation
+        self._frames, self._visible = observation, True
         while not self.person.device.present and not self.stop:
             self._idle("waiting for the person's device")
         if self.stop:
@@ -123,21 +127,19 @@ class Sitting:
 
     def close(self) -> None:
         """Close the person's devices and the recording; twice is once."""
-        if not self._closed:
-            self._closed = True
-            self.person.close()
-            self.recorder.close()
+        self._visible = False
+        self.person.close()
+        self.recorder.close()
 
     def _forget(self, episode: int, seed: int) -> None:
         """Nothing of an episode has happened yet."""
         self._episode, self._seed, self._number = episode, seed, 0
         self._take_over.reset()
         self._intent.reset()
-        self._reading: Reading = LET_GO
+        self._reading, self._read_ns = LET_GO, 0
         self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
-        self._policy_action: float | None = None
+        self._policy_action = None
         self._restart = False
-        self._frames: Observation = self.env.frames
 
     def _weigh(self, policy_action: float | None) -> Applied:
         if policy_action is None:
@@ -147,6 +149,7 @@ class Sitting:
 
     def _read(self) -> None:
         """Ask the hands, and heed what they wish."""
+        self._read_ns = time.time_ns()
         self._reading = self.person.device.poll(time.monotonic())
         wishes = self._reading.wishes
         self.stop = self.stop or "quit" in wishes
@@ -168,7 +171,7 @@ class Sitting:
         self._read()
 
     def _show(self, message: str = "") -> None:
-        if not self._closed:
+        if self._visible:
             self.person.display.show(self._view(message))
 
     def _view(self, message: str) -> View:
@@ -211,7 +214,7 @@ class Sitting:
             seed=self._seed,
             episode=self._episode,
             step=self._number,
-            time_ns=time.time_ns(),
+            time_ns=self._read_ns,
             time_s=self._number * env.config.control_period_s,
             frames=self._frames.tobytes(),
             next_frame=next_observation[1].tobytes(),

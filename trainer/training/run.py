@@ -34,6 +34,7 @@ from trainer.training.config import RunConfig
 from trainer.training.learning import Learning, LearningDriver
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 from trainer.training.placement import make_learning
+from trainer.training.seen import OnStep, Seen
 from trainer.training.tally import Tally
 from trainer.training.wheel import Ends, make_wheel
 
@@ -62,6 +63,8 @@ class TrainingRun:
         self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
         self.guidance = seeds.stream(config.seed, seeds.GUIDANCE)
         self.episode = 0
+        self.on_step: OnStep | None = None
+        """Called at the end of each control period, if anybody looks on."""
         self.best_validation = (-1.0, -1.0)
         if resume:
             self._load()
@@ -197,6 +200,9 @@ class TrainingRun:
         tally.acting_s += acted_s - began_s
         tally.environment_s += moved_s - begun_s
         tally.storing_s += begun_s - acted_s + stored_s - moved_s - waited_s
+        if self.on_step is not None:
+            speed_mps = float(info["speed_mps"])
+            self.on_step(Seen(observation, policy_action, intervention, action, speed_mps))
         return next_observation, terminated or truncated, info
 
     def _spoil(self, intervention: Intervention | None) -> Intervention | None:

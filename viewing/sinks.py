@@ -9,28 +9,78 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import quote
 
 import rerun as rr
+import rerun.blueprint as rrb
 
-from bridge.viewer.blueprint import make_blueprint
-from edge_runtime.cli import UserError
+from edge_runtime.errors import UserError
+from edge_runtime.files import check_writable
 
 LOOPBACK = "127.0.0.1"
 GRPC_PORT = 9876
 WEB_PORT = 9090
-APPLICATION = "phil_hil"
+SPAWN, SERVE = "spawn", "serve"
+SUFFIX = ".rrd"
+
+
+class Sink(NamedTuple):
+    """``spawn`` (a window), ``serve`` (a page on loopback), or the file's path."""
+
+    kind: str
+    path: str = ""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether somebody looks while it is made."""
+        return not self.path
+
+
+def read_sink(word: str) -> Sink:
+    """The sink that a word names: ``spawn``, ``serve``, or a path that ends in .rrd.
+
+    Raises:
+        UserError: it names none.
+    """
+    if word in (SPAWN, SERVE):
+        return Sink(word)
+    if not word.endswith(SUFFIX):
+        raise UserError(f"{word!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
+    return Sink("save", word)
+
+
+def check_sink(sink: Sink) -> None:
+    """Say at once, not after long work, that nothing could be shown: UserError."""
+    if sink.path:
+        check_writable(sink.path)
+    elif sink.kind == SERVE:
+        check_ports()
+    else:
+        check_display()
+
+
+def open_sink(
+    sink: Sink, application: str, blueprint: rrb.Blueprint
+) -> AbstractContextManager[rr.RecordingStream]:
+    """A recording that goes there; ``application`` keeps layouts of different kinds apart."""
+    recording = rr.RecordingStream(application)
+    if sink.path:
+        return save_to(recording, sink.path, blueprint)
+    return (serve_page if sink.kind == SERVE else spawn_window)(recording, blueprint)
 
 
 @contextlib.contextmanager
-def save_to(path: str) -> Iterator[rr.RecordingStream]:
+def save_to(
+    recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
     """Record into a file that appears under its name when it is complete."""
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        recording = rr.RecordingStream(APPLICATION)
-        recording.save(temporary, default_blueprint=make_blueprint(None))
+        recording.save(temporary, default_blueprint=blueprint)
         try:
             yield recording
         finally:
@@ -45,14 +95,15 @@ def check_display() -> None:
     """Raise UserError where no window could open."""
     displays = (os.environ.get("DISPLAY"), os.environ.get("WAYLAND_DISPLAY"))
     if sys.platform.startswith("linux") and not any(displays):
-        raise UserError("no display for a window here; use --serve or --save FILE.rrd")
+        raise UserError("no display for a window here")
 
 
 @contextlib.contextmanager
-def spawn_window() -> Iterator[rr.RecordingStream]:
+def spawn_window(
+    recording: rr.RecordingStream, blueprint: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
     """Show in rerun's own window, which stays open afterwards."""
-    recording = rr.RecordingStream(APPLICATION)
-    recording.spawn(default_blueprint=make_blueprint(None))
+    recording.spawn(default_blueprint=blueprint)
     with _disconnected(recording):
         yield recording
 
@@ -69,12 +120,13 @@ def check_ports() -> None:
 
 
 @contextlib.contextmanager
-def serve_page() -> Iterator[rr.RecordingStream]:
+def serve_page(
+    recording: rr.RecordingStream, blueprint: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
     """Show in a browser on this machine only: rerun's own server would bind all interfaces."""
     with _web_server():
-        recording = rr.RecordingStream(APPLICATION)
         url = f"rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy"
-        recording.connect_grpc(url, default_blueprint=make_blueprint(None))
+        recording.connect_grpc(url, default_blueprint=blueprint)
         print(f"open http://{LOOPBACK}:{WEB_PORT}/?url={quote(url, safe='')}", flush=True)
         with _disconnected(recording):
             yield recording

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from bridge.scene import Scene, SceneVehicle
+from viewing.scene import Car, Scene
 
 Point = tuple[float, float]
 
@@ -12,20 +12,20 @@ MARGIN_M = (10.0, 5.0)
 """Ground shown beyond the path: along x, along y."""
 
 
-def outline(car: SceneVehicle) -> list[Point]:
+def outline(car: Car) -> list[Point]:
     """Return the closed outline of the oriented box (five points)."""
     ahead, aside = car.length_m / 2, car.width_m / 2
     signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
     return [_place(car, sx * ahead, sy * aside) for sx, sy in signs]
 
 
-def body(car: SceneVehicle) -> list[Point]:
+def body(car: Car) -> list[Point]:
     """Return the axis which, drawn as wide as the car, fills its outline (with round ends)."""
     reach = max(0.0, (car.length_m - car.width_m) / 2)
     return [_place(car, -reach, 0.0), _place(car, reach, 0.0)]
 
 
-def windscreen(car: SceneVehicle) -> list[Point]:
+def windscreen(car: Car) -> list[Point]:
     """Return a bar across the car, before its middle, that tells front from back."""
     ahead, aside = 0.2 * car.length_m, 0.35 * car.width_m
     return [_place(car, ahead, -aside), _place(car, ahead, aside)]
@@ -33,7 +33,7 @@ def windscreen(car: SceneVehicle) -> list[Point]:
 
 def view_bounds(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the x and y ranges (m) that show the path, and the cars at the start."""
-    points = [tuple(point) for point in scene.path]
+    points = [(point[0], point[1]) for point in scene.path]
     points += [(car.x, car.y) for car in scene.vehicles]
     if not points:
         points = [(0.0, 0.0)]
@@ -44,6 +44,6 @@ def view_bounds(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]
     return ranges[0], ranges[1]
 
 
-def _place(car: SceneVehicle, ahead_m: float, aside_m: float) -> Point:
+def _place(car: Car, ahead_m: float, aside_m: float) -> Point:
     cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
     return car.x + ahead_m * cos - aside_m * sin, car.y + ahead_m * sin + aside_m * cos

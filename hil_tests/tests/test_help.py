@@ -1,0 +1,117 @@
+"""Every command has ``--help`` with examples, and its own parser takes each of them."""
+
+import argparse
+import importlib
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from deploy.installer import __main__ as installer
+from edge_runtime.cli import ArgumentParser, examples
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("edge_runtime", "bridge", "trainer", "deploy", "hil_tests")
+
+
+def find_programs():
+    """Every module with a parser of its own, as ``python -m`` names it."""
+    sources = [path for folder in PACKAGES for path in (ROOT / folder).rglob("*.py")]
+    texts = [path.read_text() for path in sources if "tests" not in path.parts]
+    return sorted({name for text in texts for name in re.findall(r'prog="python -m (\S+)"', text)})
+
+
+PROGRAMS = find_programs()
+
+
+class ParsedError(Exception):
+    """The arguments are good; what they ask for is not done."""
+
+
+@pytest.fixture
+def only_parse(monkeypatch):
+    """Parsers end once they have read their arguments, and keep what help they print."""
+    helps = []
+
+    def parse(parser, arguments):
+        argparse.ArgumentParser.parse_args(parser, arguments)
+        raise ParsedError
+
+    monkeypatch.setattr(ArgumentParser, "parse_args", parse)
+    monkeypatch.setattr(ArgumentParser, "_print_message", lambda _, text, *__: helps.append(text))
+    return helps
+
+
+def main_of(program):
+    spec = importlib.util.find_spec(program)
+    is_package = spec.submodule_search_locations is not None
+    module = importlib.import_module(f"{program}.__main__" if is_package else program)
+    # The edge runtime's main is the entry point of an installed script, and takes no arguments.
+    return module.dispatch if program == "edge_runtime" else module.main
+
+
+def help_of(program, words, helps):
+    helps.clear()
+    with pytest.raises(SystemExit) as ended:
+        main_of(program)([*words, "--help"])
+    assert ended.value.code == 0
+    return helps[-1]
+
+
+def subcommands_in(text):
+    """The names below COMMAND in the help of a package."""
+    _, _, below = text.partition("\n  COMMAND\n")
+    return re.findall(r"^ {4}(\w+)", below.partition("\n\n")[0], re.M)
+
+
+def examples_in(text):
+    """The words of each example's command line, without ``python -m``."""
+    _, _, below = text.replace("\\\n", " ").partition("\nexample")
+    lines = re.findall(r"^(?:.*: | +)python -m (.+)$", below, re.M)
+    return [shlex.split(line, comments=True) for line in lines]
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_command_shows_examples_that_it_takes(program, only_parse):
+    shown = help_of(program, [], only_parse)
+    commands = [[name] for name in subcommands_in(shown)]
+    assert bool(commands) == (program in PACKAGES)
+    for words in [[], *commands]:
+        found = examples_in(help_of(program, words, only_parse))
+        assert found, f"python -m {program} {' '.join(words)} --help has no example"
+        for example in found:
+            assert example[: 1 + len(words)] == [program, *words]
+            with pytest.raises(ParsedError):
+                main_of(program)(example[1:])
+
+
+def test_a_wrong_example_is_found_out(only_parse):
+    parser = ArgumentParser(prog="x", epilog=examples("python -m x --runs \\\n    two # runs"))
+    parser.add_argument("--runs", type=int)
+    (example,) = examples_in(parser.format_help())
+    assert example == ["x", "--runs", "two"]
+    with pytest.raises(SystemExit) as ended:
+        parser.parse_args(example[1:])
+    assert ended.value.code == 2
+
+
+def test_the_installer_shows_examples_that_it_takes():
+    parser = installer._parser()
+    (commands,) = (
+        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+    )
+    for one in [parser, *commands.choices.values()]:
+        text = " ".join(one.format_help().split())
+        _, _, example = text.partition("example: sudo python3 install.pyz ")
+        parser.parse_args(shlex.split(example))
+
+
+def test_examples_and_paragraphs_keep_their_lines():
+    parser = ArgumentParser(
+        prog="x", description="One.\n\nTwo\nlines.", epilog=examples("a \\\n    b") + "\n\nAnd\nso."
+    )
+    text = parser.format_help()
+    assert "One.\n\nTwo lines." in text
+    assert text.endswith("examples:\n  a \\\n      b\n\nAnd so.\n")
