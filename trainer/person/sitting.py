@@ -158,7 +158,7 @@ class Sitting:
         self._paused = self._paused != ("pause" in wishes)
 
     def _pause(self) -> None:
-        """Stand still until the person goes on, and then for a control period more."""
+        """Stand still until the person goes on, quits or begins anew."""
         while self._paused and not self.stop and not self._restart:
             self._idle("")
         self._paused = False
