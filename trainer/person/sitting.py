@@ -50,8 +50,9 @@ class Sitting:
         self.episodes = self.interventions = self.human_steps = 0
         self._take_over, self._intent = TakeOver(), Intent(person.moving)
         self._paused = False
-        self._visible = False
-        """There is something to show: not before the first episode."""
+        self.closed = False
+        self._begun = False
+        """There is something to show."""
         self._policy_action: float | None = None
         self._frames: Observation = env.frames
         self._forget(0, 0)
@@ -63,7 +64,7 @@ class Sitting:
             SittingOver: the person quits instead.
         """
         self._forget(episode, seed)
-        self._frames, self._visible = observation, True
+        self._frames, self._begun = observation, True
         while not self.person.device.present and not self.stop:
             self._idle("waiting for the person's device")
         if self.stop:
@@ -127,7 +128,7 @@ class Sitting:
 
     def close(self) -> None:
         """Close the person's devices and the recording; twice is once."""
-        self._visible = False
+        self.closed = True
         self.person.close()
         self.recorder.close()
 
@@ -157,7 +158,7 @@ class Sitting:
         self._paused = self._paused != ("pause" in wishes)
 
     def _pause(self) -> None:
-        """Stand still until the person goes on, and then for a control period more."""
+        """Stand still until the person goes on, quits or begins anew."""
         while self._paused and not self.stop and not self._restart:
             self._idle("")
         self._paused = False
@@ -171,7 +172,7 @@ class Sitting:
         self._read()
 
     def _show(self, message: str = "") -> None:
-        if self._visible:
+        if self._begun and not self.closed:
             self.person.display.show(self._view(message))
 
     def _view(self, message: str) -> View:

@@ -112,9 +112,9 @@ def test_the_person_sees_what_is_applied(tmp_path):
     np.testing.assert_array_equal(driven[0].frames, steps[0].observation)
 
 
-def test_without_the_person_no_episode_begins(tmp_path):
+def test_without_the_person_no_episode_begins(tmp_path, monkeypatch):
     sitting, eyes = make_sitting(tmp_path, [LET_GO] * 5, then=QUIT)
-    sitting.person.device.present = False
+    monkeypatch.setattr(sitting.person.device, "present", False)
     assert not drive(sitting, Steady(0.0), 0, None)
     sitting.close()
     assert {view.message for view in eyes.views} == {"waiting for the person's device"}
