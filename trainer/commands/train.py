@@ -123,8 +123,8 @@ def _training(
     if arguments.human in HUMANS:
         from trainer.person.command import training_with_person
 
-        with training_with_person(arguments, config, run_dir) as training:
-            yield training
+        with training_with_person(arguments, config, run_dir) as guided:
+            yield guided
     else:
         check_no_person(arguments)
         training = TrainingRun(config, run_dir, arguments.resume)

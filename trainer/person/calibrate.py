@@ -16,6 +16,8 @@ MOVED = 0.2
 """How far an axis must go to be the one that was asked for."""
 STEADY, STEADY_S = 0.02, 0.7
 """How still it must then be held, and for how long."""
+FIRST_S = 2.0
+"""For pressing and turning everything once."""
 LOOK_S = 0.02
 PATIENCE_S = 60.0
 """How long a question is asked."""
@@ -45,7 +47,8 @@ class Questions:
     def at_rest(self) -> list[float]:
         """Where all axes are when nobody touches them."""
         self._say("Press every pedal and turn the wheel once, then let go of everything.")
-        self._until(lambda: self._still() or None, first_s=2.0)
+        time.sleep(FIRST_S)
+        self._until(lambda: self._still() or None)
         return self._places()
 
     def axis(self, rest: list[float], what: str) -> Found:
@@ -89,9 +92,8 @@ class Questions:
         self._pump()
         return [self._joystick.get_axis(axis) for axis in range(self._joystick.get_numaxes())]
 
-    def _until(self, answer: Callable[[], Any], first_s: float = 0.0) -> Any:
-        """The first answer that is not None, after ``first_s``."""
-        time.sleep(first_s)
+    def _until(self, answer: Callable[[], Any]) -> Any:
+        """The first answer that is not None."""
         end_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < end_s:
             self._pump()

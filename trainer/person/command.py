@@ -44,6 +44,6 @@ def summary(training: PersonRun) -> str:
     sitting = training.sitting
     return (
         f"{sitting.episodes} episodes, {sitting.interventions} interventions, "
-        f"{sitting.human_steps} steps yours; {sitting.pacer.late} control periods late: "
-        f"{sitting.recorder.path}"
+        f"{sitting.human_steps} steps yours; {sitting.pacer.late} control periods late, "
+        f"checkpoints in {training.longest_save_s:.2f} s at most: {sitting.recorder.path}"
     )

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import pygame
 
-from trainer.person.interface import LET_GO, Reading, Wish
+from trainer.person.interface import LET_GO, WISHES, Reading, Wish
 from trainer.person.profile import Profile
 
 PERIOD_S = 0.1
@@ -156,14 +156,7 @@ class JoystickHands:
                 return
 
     def _press(self, button: int) -> None:
-        buttons = self._profile.buttons
-        for wish, numbers in (
-            ("pause", buttons.pause),
-            ("restart", buttons.restart),
-            ("quit", buttons.quit),
-        ):
-            if button in numbers:
-                self._wishes.add(wish)
+        self._wishes |= {wish for wish in WISHES if button in getattr(self._profile.buttons, wish)}
 
     def _buttons(self, what: str) -> list[int]:
         """The profile's numbers that this device has; asking for another is an error in SDL."""

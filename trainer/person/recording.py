@@ -132,9 +132,12 @@ class Recorder:
         if self._file.closed:
             return
         try:
-            self._mcap.finish()
-        finally:
-            self._file.close()
+            try:
+                self._mcap.finish()
+            finally:
+                self._file.close()
+        except OSError as error:
+            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
         if self.index == 0:
             self.path.unlink()
 

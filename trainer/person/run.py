@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,8 @@ class PersonRun(TrainingRun):
     ) -> None:
         check_settings(config)
         self._resumed = resume
+        self.longest_save_s = 0.0
+        """The longest that a checkpoint has kept the person between two episodes."""
         self.recovered = (0, 0)
         """Steps, and the person's among them, that a kill had kept from the checkpoint."""
         super().__init__(config, run_dir, resume)
@@ -86,7 +89,9 @@ class PersonRun(TrainingRun):
     def save(self) -> None:
         """Write the checkpoint, which the person sees."""
         self.sitting.announce("saving")
+        began_s = time.perf_counter()
         super().save()
+        self.longest_save_s = max(self.longest_save_s, time.perf_counter() - began_s)
 
     def _make_learning(self, action_size: int) -> Learning:
         learning = super()._make_learning(action_size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,13 +15,18 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def quit_on_signals(sitting: Sitting) -> Iterator[None]:
-    """Let the first signal ask the sitting to stop; a second one ends the process as ever."""
+    """Let the first signal ask the sitting to stop.
+
+    A second one, or one when it is over, ends the process as ever.
+    """
     before = {number: signal.getsignal(number) for number in SIGNALS}
 
     def stop(number: int, frame: Any) -> None:
-        sitting.stop = True
         for name, handler in before.items():
             signal.signal(name, handler)
+        if sitting.closed:
+            os.kill(os.getpid(), number)
+        sitting.stop = True
 
     for number in SIGNALS:
         signal.signal(number, stop)

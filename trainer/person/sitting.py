@@ -49,7 +49,12 @@ class Sitting:
         self.progress = ""
         self.episodes = self.interventions = self.human_steps = 0
         self._take_over, self._intent = TakeOver(), Intent(person.moving)
-        self._paused = self._closed = False
+        self._paused = False
+        self.closed = False
+        self._begun = False
+        """There is something to show."""
+        self._policy_action: float | None = None
+        self._frames: Observation = env.frames
         self._forget(0, 0)
 
     def begin(self, observation: Observation, episode: int, seed: int) -> None:
@@ -59,7 +64,7 @@ class Sitting:
             SittingOver: the person quits instead.
         """
         self._forget(episode, seed)
-        self._frames = observation
+        self._frames, self._begun = observation, True
         while not self.person.device.present and not self.stop:
             self._idle("waiting for the person's device")
         if self.stop:
@@ -123,10 +128,9 @@ class Sitting:
 
     def close(self) -> None:
         """Close the person's devices and the recording; twice is once."""
-        if not self._closed:
-            self._closed = True
-            self.person.close()
-            self.recorder.close()
+        self.closed = True
+        self.person.close()
+        self.recorder.close()
 
     def _forget(self, episode: int, seed: int) -> None:
         """Nothing of an episode has happened yet."""
@@ -135,9 +139,8 @@ class Sitting:
         self._intent.reset()
         self._reading, self._read_ns = LET_GO, 0
         self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
-        self._policy_action: float | None = None
+        self._policy_action = None
         self._restart = False
-        self._frames: Observation = self.env.frames
 
     def _weigh(self, policy_action: float | None) -> Applied:
         if policy_action is None:
@@ -155,7 +158,7 @@ class Sitting:
         self._paused = self._paused != ("pause" in wishes)
 
     def _pause(self) -> None:
-        """Stand still until the person goes on, and then for a control period more."""
+        """Stand still until the person goes on, quits or begins anew."""
         while self._paused and not self.stop and not self._restart:
             self._idle("")
         self._paused = False
@@ -169,7 +172,7 @@ class Sitting:
         self._read()
 
     def _show(self, message: str = "") -> None:
-        if not self._closed:
+        if self._begun and not self.closed:
             self.person.display.show(self._view(message))
 
     def _view(self, message: str) -> View:

@@ -11,6 +11,9 @@ A run with a person is not repeatable anyway; all others learn as before.
 from __future__ import annotations
 
 import copy
+import os
+import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -21,6 +24,8 @@ import torch
 from trainer.learner.td3 import TD3Learner
 from trainer.training.learning import Action, EpisodeLearning, Observation, ProcessorLearning
 
+NICENESS = 10
+"""Of the updates' thread, and of those that torch starts from it: the person's loop goes first."""
 LOOK_S = 0.002
 """How often it is asked whether an update is done, where that must be waited for."""
 
@@ -37,6 +42,7 @@ class UnhurriedLearning:
         self._kept_back: deque[Callable[[], None]] = deque()
         self._kept_back_steps = 0
         self._actor = copy.deepcopy(inner.learner.actor).eval()
+        inner.in_thread(_step_aside)
 
     @property
     def added(self) -> int:
@@ -132,3 +138,9 @@ class UnhurriedLearning:
 
     def _copy_actor(self) -> None:
         self._actor.load_state_dict(self._inner.learner.actor.state_dict())
+
+
+def _step_aside() -> None:
+    """Lower the priority of the thread that calls this, where threads have one (Linux)."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

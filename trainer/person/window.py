@@ -12,7 +12,7 @@ from edge_runtime.errors import UserError
 from trainer.person.interface import View
 from trainer.scenarios.scene import draw_scene
 
-SIZE = (1040, 640)
+SIZE = (1040, 680)
 SCENE_WIDTH = 736
 FRAME_SCALE = 3
 MARGIN = 16
@@ -125,7 +125,7 @@ class Window:
         """Key help and the learner's progress, at the bottom."""
         for row, line in enumerate((*view.help, view.progress)):
             colour = "text" if row < len(view.help) else "dim"
-            self._text(line, (MARGIN, 578 + 20 * row - 2), colour)
+            self._text(line, (MARGIN, 588 + 21 * row), colour)
 
     def _text(
         self,

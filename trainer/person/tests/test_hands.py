@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import time
 
+import msgspec
+import numpy as np
 import pytest
 
+from trainer.drivers import load_driver, make_environment
 from trainer.person.devices import WindowDevice, pygame
 from trainer.person.hands import JoystickHands, KeyboardHands
 from trainer.person.profile import SHIPPED, read_profile
@@ -71,6 +74,46 @@ def test_a_window_without_focus_holds_nothing():
     assert not hands.read(0.1).engaged
 
 
+def keys_for(wanted: float, action: float, keys: tuple[int, int], down: int | None) -> int | None:
+    """The key that a hand presses which wants an action and knows what its keys give now."""
+    if abs(wanted - action) > 0.12 and abs(wanted) > 0.08:
+        return keys[wanted > action]
+    return down if abs(wanted) > 0.3 and wanted * action > 0.0 else None
+
+
+@pytest.mark.parametrize(
+    ("scenario", "keys"),
+    [
+        ("left_turn", (pygame.K_DOWN, pygame.K_UP)),
+        ("congestion", (pygame.K_LEFT, pygame.K_RIGHT)),
+    ],
+)
+def test_keys_are_enough_to_drive(scenario, keys):
+    """Eyes that know the expert's mind, and a hand that is two tenths of a second behind."""
+    env = make_environment(scenario)
+    expert, _ = load_driver("expert", env)
+    outcomes = []
+    for seed in range(6):
+        observation, info = env.reset(seed=seed)
+        expert.reset()
+        hands, down, now_s, wanted, action = KeyboardHands(scenario), None, 0.0, [0.0, 0.0], 0.0
+        ended = False
+        while not ended:
+            wanted.append(float(expert.act(observation)[0]))
+            pressed = keys_for(wanted[-3], action, keys, down)
+            if pressed != down:
+                for code, is_down in ((down, False), (pressed, True)):
+                    if code is not None:
+                        hands.handle(key(is_down, code))
+                down = pressed
+            now_s += 0.1
+            action = hands.read(now_s).action
+            observation, _, terminated, truncated, info = env.step(np.array([action], np.float32))
+            ended = terminated or truncated
+        outcomes.append(info["outcome"])
+    assert outcomes == ["goal"] * 6
+
+
 @pytest.fixture
 def wheel(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -123,7 +166,5 @@ def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
 
 
 def test_another_device_is_not_taken_for_the_profiles(wheel):
-    class Other:
-        match, take_over, name = "Thrustmaster", "moving", "other"
-
-    assert not JoystickHands(Other(), "left_turn").present
+    other = msgspec.structs.replace(G29, match="Thrustmaster")
+    assert not JoystickHands(other, "left_turn").present

@@ -26,11 +26,12 @@ hold = [0]
 
 @st.composite
 def steerings(draw):
-    percent = st.lists(st.integers(-50, 50), min_size=3, max_size=3, unique=True)
-    places = [hundredth / 50.0 for hundredth in sorted(draw(percent))]
+    twentieths = st.lists(st.integers(-20, 20), min_size=3, max_size=3, unique=True)
+    places = [place / 20.0 for place in sorted(draw(twentieths))]
     if draw(st.booleans()):
         places.reverse()
-    return Steering(0, *places, dead_zone=draw(DEAD_ZONE))
+    left, centre, right = places
+    return Steering(0, left, centre, right, draw(DEAD_ZONE))
 
 
 @given(steerings(), st.lists(PLACE, min_size=2, max_size=8))

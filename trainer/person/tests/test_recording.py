@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+
 import numpy as np
 import pytest
 
@@ -87,6 +89,21 @@ def test_another_file_is_refused(tmp_path, data):
         list(read_steps(path))
     with pytest.raises(UserError, match="cannot be read"):
         list(read_steps(tmp_path / "none.mcap"))
+
+
+def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
+    recorder = Recorder(tmp_path)
+    recorder.write(recorded_step(1, 0))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (recorder.path.stat().st_size + 500, before[1]))
+    try:
+        with pytest.raises(UserError, match="cannot write"):
+            recorder.write(recorded_step(1, 1))
+        with pytest.raises(UserError, match="cannot write"):
+            recorder.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(read_steps(recorder.path)) == [recorded_step(1, 0)]
 
 
 def test_a_directory_that_cannot_be_written_is_one_line(tmp_path):

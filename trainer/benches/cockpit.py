@@ -1,0 +1,207 @@
+"""How soon a key in the browser reaches the car: a real Chromium, a real training, its recording.
+
+A press begins just before Chromium is told of it, and ends at the wall time of the recorded step
+that is the first of an intervention, stamped after the car has moved: both ends count against us.
+What the person presses while nobody drives (between two episodes) is not counted, and told.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import random
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
+from edge_runtime.files import check_writable, write_atomic
+from trainer.benches.chromium import Browser, find_chromium, open_browser
+from trainer.benches.cockpit_run import CockpitRun, cockpit_run
+from trainer.benches.machine import about
+from trainer.commands.options import not_negative, positive
+from trainer.person.recording import Step, find_recordings, read_steps
+
+OPENING_BAR_S, KEY_BAR_MS = 2.0, 150.0
+KEYS = {"left_turn": ("ArrowUp", "ArrowDown"), "congestion": ("ArrowLeft", "ArrowRight")}
+HELD_S, BETWEEN_S = (0.25, 0.45), (0.3, 0.6)
+POLICY_DRIVES = (
+    "document.body.dataset.control === 'policy' && document.body.dataset.link === 'live'"
+    " && !document.getElementById('message').textContent"
+)
+PERSON_DRIVES = "document.body.dataset.control === 'human'"
+
+
+class Press(NamedTuple):
+    """A key that was held for a moment; wall times, ns."""
+
+    down_ns: int
+    up_ns: int
+
+
+def key_to_applied_ms(presses: Sequence[Press], steps: Sequence[Step]) -> list[float | None]:
+    """From each press to the first step of its intervention, ms.
+
+    None: an episode ended in between, or none was being driven, so that nothing could be applied.
+    """
+    return [_latency_ms(press, steps) for press in presses]
+
+
+def _latency_ms(press: Press, steps: Sequence[Step]) -> float | None:
+    before = [step for step in steps if step.time_ns <= press.down_ns]
+    if not before or before[-1].outcome:
+        return None
+    for step in itertools.islice(steps, len(before), None):
+        if step.first:
+            return 1e-6 * (step.time_ns - press.down_ns)
+        if step.outcome:
+            return None
+    return None
+
+
+def quantiles(values: Sequence[float]) -> dict[str, float]:
+    """Median and tail."""
+    p50, p90, p99 = np.percentile(values, (50, 90, 99))
+    return {"p50": float(p50), "p90": float(p90), "p99": float(p99), "max": float(max(values))}
+
+
+async def measure(loads: int, presses: int, scenario: str, seed: int) -> dict[str, Any]:
+    """Open the page again and again, then press keys at moments of the seed's choice."""
+    generator = random.Random(seed)
+    with tempfile.TemporaryDirectory() as directory:
+        run_dir = Path(directory) / "run"
+        options = ("--scenario", scenario, "--seed", str(seed))
+        async with open_browser() as browser, cockpit_run(run_dir, options) as run:
+            keys = KEYS[scenario]
+            opened = [await _open_and_take_over(browser, run, keys[0]) for _ in range(loads)]
+            pressed, trips_ms = [], []
+            for _ in range(presses):
+                pressed.append(await _press(browser, generator, keys))
+                trips_ms.append(float(await browser.value("parseFloat(trip.textContent)")))
+            await quit_page(browser)
+            status = await run.ended()
+        steps = [step for path in find_recordings([run_dir]) for step in read_steps(path)]
+    if status != 0:
+        raise UserError(f"the training ended with status {status}")
+    return _report(opened, key_to_applied_ms(pressed, steps), trips_ms, steps)
+
+
+async def quit_page(browser: Browser) -> None:
+    """Quit, and be sure."""
+    await browser.tap("KeyQ")
+    await browser.tap("KeyQ")
+
+
+async def _open_and_take_over(browser: Browser, run: CockpitRun, key: str) -> dict[str, float]:
+    """Open the page, and hold a key from its load event on until the person drives."""
+    began_s = time.monotonic()
+    await browser.open(run.url)
+    loaded_s = time.monotonic()
+    await browser.key(key, True)
+    await browser.until(PERSON_DRIVES)
+    taken_s = time.monotonic()
+    await browser.key(key, False)
+    return {"load_s": loaded_s - began_s, "taken_over_s": taken_s - began_s}
+
+
+async def _press(browser: Browser, generator: random.Random, keys: Sequence[str]) -> Press:
+    await browser.until(POLICY_DRIVES)
+    await asyncio.sleep(generator.uniform(*BETWEEN_S))
+    key = generator.choice(keys)
+    down_ns = time.time_ns()
+    await browser.key(key, True)
+    await asyncio.sleep(generator.uniform(*HELD_S))
+    up_ns = time.time_ns()
+    await browser.key(key, False)
+    return Press(down_ns, up_ns)
+
+
+def _report(
+    opened: Sequence[dict[str, float]],
+    latencies_ms: Sequence[float | None],
+    trips_ms: Sequence[float],
+    steps: Sequence[Step],
+) -> dict[str, Any]:
+    counted = [latency for latency in latencies_ms if latency is not None]
+    key_ms = quantiles(counted)
+    opening_s = max(times["taken_over_s"] for times in opened)
+    return {
+        **about(),
+        "opening": {
+            "times": len(opened),
+            "load_s": quantiles([times["load_s"] for times in opened]),
+            "opened_to_taken_over_s": quantiles([times["taken_over_s"] for times in opened]),
+            "bar_s": OPENING_BAR_S,
+            "met": opening_s < OPENING_BAR_S,
+        },
+        "key_to_applied_ms": {
+            "presses": len(counted),
+            "not_counted": len(latencies_ms) - len(counted),
+            **key_ms,
+            "bar_p99": KEY_BAR_MS,
+            "met": key_ms["p99"] < KEY_BAR_MS,
+        },
+        "round_trip_ms": quantiles(trips_ms),
+        "recorded": {
+            "steps": len(steps),
+            "human_steps": sum(step.human for step in steps),
+            "interventions": sum(step.first for step in steps),
+        },
+    }
+
+
+async def picture(path: str, scenario: str, seed: int) -> None:
+    """Take a picture of the cockpit in the middle of a take-over."""
+    with tempfile.TemporaryDirectory() as directory:
+        options = ("--scenario", scenario, "--seed", str(seed))
+        async with open_browser() as browser, cockpit_run(Path(directory) / "run", options) as run:
+            await browser.open(run.url)
+            await browser.until(POLICY_DRIVES)
+            await asyncio.sleep(1.5)
+            await browser.key(KEYS[scenario][0], True)
+            await asyncio.sleep(0.6)
+            data = await browser.picture()
+            await browser.key(KEYS[scenario][0], False)
+            await quit_page(browser)
+            await run.ended()
+    write_atomic(path, data)
+
+
+def main(argv: list[str]) -> int:
+    """Measure and print, or take a picture; the exit status."""
+    parser = ArgumentParser(
+        prog="python -m trainer.benches.cockpit",
+        description="Measures the browser cockpit in a headless Chromium beside a real training.",
+        epilog="example: python -m trainer.benches.cockpit --presses 300 --out cockpit.json",
+    )
+    parser.add_argument("--presses", type=positive, default=300, metavar="N", help="keys pressed")
+    parser.add_argument("--loads", type=positive, default=10, metavar="N", help="pages opened")
+    parser.add_argument("--scenario", choices=["left_turn", "congestion"], default="left_turn")
+    parser.add_argument("--seed", type=not_negative, default=1, help="of run and presses")
+    parser.add_argument("--out", metavar="F.json", help="also write the figures to this file")
+    parser.add_argument("--picture", metavar="F.png", help="take this picture instead of measuring")
+    arguments = parser.parse_args(argv)
+    if find_chromium() is None:
+        raise UserError("no Chromium is installed (Debian: apt-get install chromium)")
+    for path in filter(None, (arguments.out, arguments.picture)):
+        check_writable(path)
+    if arguments.picture:
+        asyncio.run(picture(arguments.picture, arguments.scenario, arguments.seed))
+        print(arguments.picture)
+        return 0
+    report = asyncio.run(
+        measure(arguments.loads, arguments.presses, arguments.scenario, arguments.seed)
+    )
+    print(json.dumps(report, indent=2))
+    write_json_out(arguments.out, report)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run_cli(main))
