@@ -7,15 +7,17 @@ const RETRY_MS = 500;
 const GONE_MS = 2000; // a socket that long silent is given up for a new one
 
 export class Link {
-  // hands: what says(); on: {view, echo, state} are called back.
+  // hands: now() says what they do; on: {view, echo, state} are called back.
   constructor(hands, on) {
     this.hands = hands;
     this.on = on;
     this.wishes = [];
     this.seen = 0;
     this.saidMs = 0;
+    this.saidEngaged = false;
     this.trips = [];
     this.over = false;
+    this.opened = false;
     this.open();
     setInterval(() => this.beat(), LEAST_MS);
   }
@@ -28,7 +30,8 @@ export class Link {
     this.socket.onopen = () => {
       this.seen = 0;
       this.wishes = []; // pressed while nobody was there to hear it
-      this.say(true); // hands off: only then does a hold count
+      this.opened ? this.say() : this.greet();
+      this.opened = true;
     };
     this.socket.onmessage = (event) => this.hear(JSON.parse(event.data));
     this.socket.onclose = () => {
@@ -65,10 +68,11 @@ export class Link {
     this.changed();
   }
 
-  // The hands moved: say so now, or as soon as the 60 a second allow.
+  // The hands moved: say so now, or as soon as the 60 a second allow; taking and letting go at once.
   changed() {
     this.dirty = true;
-    if (performance.now() - this.saidMs >= LEAST_MS) this.say(false);
+    const edge = this.hands.now().engaged !== this.saidEngaged;
+    if (edge || performance.now() - this.saidMs >= LEAST_MS) this.say();
   }
 
   beat() {
@@ -76,18 +80,28 @@ export class Link {
     const silentMs = now - this.heardMs;
     if (silentMs > SILENCE_MS && !this.over) this.on.state("lost");
     if (silentMs > GONE_MS && !this.over) this.abandon();
-    if (this.dirty || now - this.saidMs >= HEARTBEAT_MS) this.say(false);
+    if (this.dirty || now - this.saidMs >= HEARTBEAT_MS) this.say();
   }
 
-  say(handsOff) {
+  // A hold counts only after hands off. What is held when a page is first there was pressed for it;
+  // after a lost connection the hands themselves must let go.
+  greet() {
+    this.send({ action: 0, engaged: false, by_moving: false });
+    this.dirty = true;
+  }
+
+  say() {
+    this.send(this.hands.now());
+  }
+
+  send({ action, engaged, by_moving }) {
     if (this.socket.readyState !== WebSocket.OPEN) return;
-    const { action, engaged, by_moving } = this.hands.now();
     this.saidMs = performance.now();
+    this.saidEngaged = engaged;
     this.dirty = false;
     const wishes = [...new Set(this.wishes)];
     this.wishes = [];
-    const held = engaged && !handsOff;
-    const said = { at_ms: this.saidMs, action, engaged: held, by_moving, wishes, seen: this.seen };
+    const said = { at_ms: this.saidMs, action, engaged, by_moving, wishes, seen: this.seen };
     this.socket.send(JSON.stringify(said));
   }
 

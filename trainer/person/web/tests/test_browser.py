@@ -19,6 +19,7 @@ WAIT_S = 10.0
 LIVE = "document.body.dataset.link === 'live'"
 READY = f"{LIVE} && document.getElementById('scenario').textContent"
 TWO_HEARTBEATS = "new Promise((done) => setTimeout(done, 200))"
+WHY = "document.getElementById('why').textContent"
 YOU = "document.querySelector('.bar.human output').textContent"
 
 FAKE_PADS = """
@@ -135,7 +136,7 @@ def test_a_page_that_hangs_has_let_go_and_must_press_again(runner, browser, cock
         await reads(cockpit, lambda r: r == LET_GO)
         assert not cockpit.present
         await busy
-        await browser.until("document.getElementById('why').textContent.includes('press again')")
+        await browser.until(f"{WHY}.includes('press again')")
         assert not poll(cockpit).engaged
         await browser.key("ArrowUp", False)
         await browser.key("ArrowUp", True)
@@ -281,7 +282,7 @@ def test_a_lost_connection_is_letting_go_and_comes_back(runner, browser, how):
             tunnel.cut() if how == "closed" else tunnel.swallow()
             await reads(cockpit, lambda r: r == LET_GO)
             await browser.until("document.body.dataset.link === 'lost'")
-            await browser.until(LIVE)
+            await browser.until(f"{LIVE} && {WHY}.includes('press again')")
             assert poll(cockpit) == LET_GO, "held all the while"
             await browser.key("ArrowUp", False)
             await browser.key("ArrowUp", True)
