@@ -19,6 +19,7 @@ PICTURES: dict[str, Callable[[Path, Path], None]] = {
     "congestion.png": scenes.congestion,
     "policy_sees.png": scenes.policy_sees,
     "take_over.gif": scenes.take_over,
+    "cockpit.png": scenes.cockpit,
     "learning_curve.png": curves.learning_curve,
     "success_against_latency.png": curves.success_against_latency,
     "loop.png": loop.loop,

@@ -57,6 +57,11 @@ def take_over(out: Path, work: Path) -> None:
     run_command("trainer", "picture", str(run_dir), *words, "--out", str(out))
 
 
+def cockpit(out: Path, _work: Path) -> None:
+    """The browser cockpit in the middle of a take-over; needs Chromium."""
+    run_command("trainer.benches.cockpit", "--picture", str(out))
+
+
 def _row(scenario: str, seed: int, time_s: float) -> Image.Image:
     frames = _frames(scenario, seed, time_s)
     size = (frames.shape[2] * SCALE, frames.shape[1] * SCALE)

@@ -165,6 +165,15 @@ def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(monkeypatch):
     assert len(pictures) == pytest.approx(20, abs=2)
 
 
+def test_an_episode_that_is_broken_off_is_handed_over():
+    kept = []
+    watcher = looking_on(kept)
+    for _ in range(7):
+        watcher.on_step(control_period(human=False))
+    watcher.close()
+    assert sum(len(part.entries) for part in kept) == 7
+
+
 def metrics_of(steps):
     numbers = dict.fromkeys(NAMES, math.nan)
     return EpisodeMetrics(**{**numbers, "steps": steps, "episode": 0, "outcome": "goal"})

@@ -43,6 +43,7 @@ def watched(run: TrainingRun, sink: Sink) -> Iterator[OnEpisode]:
             yield watcher.on_episode
         finally:
             run.on_step = None
+            watcher.close()
             background.close()
             if background.dropped:
                 print(f"{background.dropped} entries came faster than drawn", file=sys.stderr)
