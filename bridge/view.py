@@ -19,12 +19,11 @@ from bridge.viewer.recorded import read_heard
 from bridge.viewer.wire_log import WireLog
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.errors import UserError
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import check_endpoint
 from viewing.pace import PICTURE_INTERVAL_S
-from viewing.sinks import SERVE, SPAWN, SUFFIX, Sink, check_sink, open_sink
+from viewing.sinks import SERVE, SPAWN, Sink, check_sink, open_sink
 
 POLL_S = 0.1
 
@@ -73,11 +72,11 @@ def view(arguments: Any) -> int:
         wire.check_vehicle_id(arguments.vehicle_id)
     sink = _sink(arguments)
     if arguments.recording is not None:
-        _check_sink(sink)
+        check_sink(sink)
         _show_recording(arguments, sink)
     else:
         tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
-        _check_sink(sink)
+        check_sink(sink)
         dropped = _watch(arguments, sink, tls)
         if dropped:
             print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
@@ -90,15 +89,6 @@ def _sink(arguments: Any) -> Sink:
     if arguments.save is not None:
         return Sink("save", arguments.save)
     return Sink(SERVE if arguments.serve else SPAWN)
-
-
-def _check_sink(sink: Sink) -> None:
-    try:
-        check_sink(sink)
-    except UserError as error:
-        if sink.kind != SPAWN:
-            raise
-        raise UserError(f"{error}: --serve, or --save FILE{SUFFIX}") from None
 
 
 def _show_recording(arguments: Any, sink: Sink) -> None:

@@ -13,6 +13,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "what this machine can and cannot do, and how to get the rest",
     ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
+    "pictures": ("hil_tests.pictures.command", "every picture of the READMEs"),
     "campaign": ("hil_tests.campaign.command", "every fault, every latency row, one report"),
     "mock_hunter": (
         "hil_tests.mock_hunter.command",

@@ -95,7 +95,7 @@ def check_display() -> None:
     """Raise UserError where no window could open."""
     displays = (os.environ.get("DISPLAY"), os.environ.get("WAYLAND_DISPLAY"))
     if sys.platform.startswith("linux") and not any(displays):
-        raise UserError("no display for a window here")
+        raise UserError("no display for a window here: serve a page, or save a file")
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ from trainer.commands import (
     picture,
     plot,
     train,
+    view,
 )
 
 COMMANDS: dict[str, ModuleType] = {
@@ -22,6 +23,7 @@ COMMANDS: dict[str, ModuleType] = {
     "export": export,
     "plot": plot,
     "picture": picture,
+    "view": view,
     "bench": bench,
     "experiment": experiment,
 }

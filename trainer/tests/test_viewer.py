@@ -11,13 +11,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from rerun.chunk import RrdReader
 
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
 from trainer.human.guide import Intervention
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Critic
+from trainer.tests.drawn import values_in
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import TrainingRun
@@ -59,21 +59,6 @@ def train(directory, rrd=None):
         with watched(run, Sink("save", str(rrd))) as on_episode:
             run.train(on_episode)
     return run
-
-
-def values_in(rrd):
-    """What was logged, by entity: a list of (step or None, value)."""
-    found = {}
-    for chunk in RrdReader(str(rrd)).stream().to_chunks():
-        columns = chunk.to_record_batch().to_pydict()
-        steps = columns.get("step", [None] * chunk.num_rows)
-        for name, values in columns.items():
-            if name in ("Scalars:scalars", "StateChange:state"):
-                rows = found.setdefault(chunk.entity_path, [])
-                rows += [(step, value[0]) for step, value in zip(steps, values, strict=True)]
-            elif name not in ("step", "rerun.controls.RowId"):
-                found.setdefault(chunk.entity_path, [])
-    return {path: sorted(rows, key=lambda row: row[0] or 0) for path, rows in found.items()}
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +163,15 @@ def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(monkeypatch):
     assert all(len(part.entries) <= STEPS_TOGETHER for part in kept if isinstance(part, Steps))
     pictures = [part.picture for part in kept if isinstance(part, Steps) and part.picture]
     assert len(pictures) == pytest.approx(20, abs=2)
+
+
+def test_an_episode_that_is_broken_off_is_handed_over():
+    kept = []
+    watcher = looking_on(kept)
+    for _ in range(7):
+        watcher.on_step(control_period(human=False))
+    watcher.close()
+    assert sum(len(part.entries) for part in kept) == 7
 
 
 def metrics_of(steps):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import rerun.blueprint as rrb
 
 from viewing.scene import Scene
 from viewing.series import BLUE, GREEN, GREY, ORANGE, PURPLE, Plot, plot_view
 from viewing.shapes import view_bounds
 
-APPLICATION = "phil_hil_training"
+APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
 TIMELINE = "step"
 RECENT_STEPS = 200
 """Shown of what changes within an episode."""
@@ -20,7 +22,9 @@ EPISODES = (
     Plot("human", "The human's share of the steps", (-0.05, 1.05)),
     Plot("advantage", "Q advantage of the human's action, where it took over"),
 )
-"""From top to bottom."""
+"""Of a training, from top to bottom."""
+SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
+"""Of recorded sittings, of which a learner has told nothing."""
 RECENT = (
     Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
     Plot("speed", "Speed, m/s, the last 20 s"),
@@ -43,7 +47,7 @@ LINES = {
 POINTS = {"advantage/of_the_human": PURPLE}
 
 
-def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
+def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
     left = rrb.Vertical(
         _road(scene),
@@ -52,7 +56,7 @@ def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
         *(_recent(plot) for plot in RECENT),
         row_shares=[3, 1.6, 1, 1.2, 1],
     )
-    right = rrb.Vertical(*map(plot_view, EPISODES))
+    right = rrb.Vertical(*map(plot_view, episodes))
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1, 1]),
         rrb.BlueprintPanel(state="collapsed"),

@@ -32,6 +32,7 @@ class Picture:
     step: int
     frames: NDArray[np.uint8]
     scene: dict[str, Any]
+    """Of the environment; empty where the road is not known."""
 
 
 @dataclass(frozen=True)

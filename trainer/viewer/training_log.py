@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
@@ -15,8 +16,8 @@ from trainer.viewer.advantage import q_advantage
 from trainer.viewer.blueprint import LINES, POINTS, TIMELINE, make_blueprint
 from trainer.viewer.entries import Entry, Episode, Picture, StepEntry, Steps
 from viewing.road import draw_cars, draw_ground
-from viewing.scene import read_scene
-from viewing.series import BLUE, GREEN, GREY, style_lines, style_points
+from viewing.scene import SeenScene, read_scene
+from viewing.series import BLUE, GREEN, GREY, Plot, style_lines, style_points
 
 POLICY, HUMAN = "policy", "human"
 DRIVERS = {POLICY: BLUE, HUMAN: GREEN}
@@ -27,10 +28,15 @@ WINDOW = 20
 
 
 class TrainingLog:
-    """Draws one run."""
+    """Draws one run.
 
-    def __init__(self, recording: rr.RecordingStream) -> None:
-        self._recording = recording
+    Args:
+        recording: where.
+        episodes: the plots of whole episodes that are laid out.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, episodes: Sequence[Plot]) -> None:
+        self._recording, self._episodes = recording, episodes
         self._driver: tuple[str, str] | None = None
         self._ground_drawn = False
         self._returns: deque[float] = deque(maxlen=WINDOW)
@@ -79,16 +85,19 @@ class TrainingLog:
 
     def _draw_picture(self, picture: Picture) -> None:
         self._stand_at(picture.step)
-        scene = read_scene(picture.scene)
-        if not self._ground_drawn:
-            self._ground_drawn = True
-            self._recording.send_blueprint(make_blueprint(scene))
-            draw_ground(self._recording, scene)
-        who = POLICY if self._driver is None else self._driver[0]
-        draw_cars(self._recording, scene, DRIVERS[who])
+        if picture.scene:
+            self._draw_road(read_scene(picture.scene))
         before, now = picture.frames
         self._recording.log("frames/before", rr.Image(before, color_model="L"))
         self._recording.log("frames/now", rr.Image(now, color_model="L"))
+
+    def _draw_road(self, scene: SeenScene) -> None:
+        if not self._ground_drawn:
+            self._ground_drawn = True
+            self._recording.send_blueprint(make_blueprint(scene, self._episodes))
+            draw_ground(self._recording, scene)
+        who = POLICY if self._driver is None else self._driver[0]
+        draw_cars(self._recording, scene, DRIVERS[who])
 
     def _draw_episode(self, episode: Episode) -> None:
         metrics = episode.metrics

@@ -61,6 +61,10 @@ class Watcher:
             self._hand_over(None)
         self._step += 1
 
+    def close(self) -> None:
+        """Hand over what an episode that was broken off has left."""
+        self._hand_over(None)
+
     def on_episode(self, metrics: EpisodeMetrics) -> None:
         """Take an episode's end; no update is under way."""
         self._hand_over(None)
