@@ -23,7 +23,7 @@ const LINK = { connecting: "connecting", live: "connected", lost: "connection lo
 let view = null;
 let viewMs = 0;
 let driving = true; // and not watching
-let refused = false; // held since before the connection was lost
+let refused = false; // held since before the connection, or the wheel, was this page's
 const changed = () => link?.changed();
 const keyboard = new Keyboard(changed, (word) => wish(word));
 const touch = new Pad(byId("pad"), byId("knob"), changed);
@@ -100,7 +100,7 @@ function showWho() {
   if (view?.policy_action === null && control === "policy") who = "Nobody drives";
   if (!driving) why = "you watch: another page has the wheel";
   if (!driving && control === "human") who = "Another page drives";
-  if (refused) why = "the connection was lost: let go, and press again";
+  if (refused) why = "what was held before does not count: let go, and press again";
   byId("who").textContent = who;
   byId("why").textContent = why;
 }
