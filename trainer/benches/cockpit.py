@@ -177,17 +177,21 @@ def _periods_ms(steps: Sequence[Step]) -> list[float]:
 
 
 async def picture(path: str, scenario: str, seed: int) -> None:
-    """Take a picture of the cockpit in the middle of a take-over."""
+    """Take a picture of the cockpit in the middle of a take-over, here from the expert."""
+    options = ("--policy", "expert", "--scenario", scenario, "--seed", str(seed))
     with tempfile.TemporaryDirectory() as directory:
-        options = ("--scenario", scenario, "--seed", str(seed), *QUIET)
-        async with open_browser() as browser, cockpit_run(Path(directory) / "run", options) as run:
+        async with (
+            open_browser() as browser,
+            cockpit_run(Path(directory), options, "drive") as run,
+        ):
             await browser.open(run.url)
             await browser.until(POLICY_DRIVES)
             await asyncio.sleep(1.5)
-            await browser.key(KEYS[scenario][0], True)
-            await asyncio.sleep(0.6)
+            await browser.key(KEYS[scenario][1], True)
+            await browser.until(PERSON_DRIVES)
+            await asyncio.sleep(0.5)
             data = await browser.picture()
-            await browser.key(KEYS[scenario][0], False)
+            await browser.key(KEYS[scenario][1], False)
             await quit_page(browser)
             await run.ended()
     write_atomic(path, data)

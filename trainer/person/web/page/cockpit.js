@@ -14,6 +14,9 @@ const WORDS = {
   congestion: { title: "congestion", meaning: "steering", plus: "right", minus: "left" },
 };
 const WHO = {
+  waiting: ["Nobody drives yet", "the trainer is starting"],
+  lost: ["Connection lost", "you have let go; looking for the trainer"],
+  over: ["The sitting is over", "everything is saved"],
   policy: ["The policy drives", "hold a key, the pad, or your wheel's button to take over"],
   human: ["You drive", "let go to give back"],
   returning: ["Giving back", "the action returns to the policy's"],
@@ -48,7 +51,7 @@ function step() {
   touch.draw();
   bar("human", hands.now().action);
   bar("raw", gamepads.now().action);
-  if (view && now - viewMs > STALE_MS && link.heardMs > viewMs && !link.over) {
+  if (view && now - viewMs > STALE_MS && document.body.dataset.link === "live") {
     byId("message").textContent = view.message || "waiting for the trainer";
   }
 }
@@ -73,6 +76,7 @@ function enter(scenario) {
 }
 
 function draw() {
+  if (document.body.dataset.link !== "live") return;
   document.body.dataset.control = view.control;
   drawScene(byId("scene"), view);
   drawFrames(frames, view.frames);
@@ -123,15 +127,18 @@ function hearEcho(echo) {
 }
 
 function showState(state) {
+  if (document.body.dataset.link === state) return;
   document.body.dataset.link = state;
   byId("link").textContent = LINK[state];
-  if (state === "lost") byId("trip").textContent = "";
-  if (state === "lost" || state === "over") {
-    document.body.dataset.control = "policy";
-    byId("message").textContent = state === "over"
-      ? "the sitting is over: everything is saved"
-      : "connection lost: you have let go";
+  byId("message").textContent = state === "live" && !view ? "waiting for the trainer" : "";
+  if (state === "live") {
+    document.body.dataset.control = view?.control ?? "waiting";
+    if (view) requestAnimationFrame(draw);
+  } else {
+    document.body.dataset.control = state;
+    byId("trip").textContent = "";
   }
+  showWho();
 }
 
 let sureMs = -SURE_MS;
