@@ -11,7 +11,7 @@ from viewing.shapes import view_bounds
 APPLICATION = "phil_hil"
 PLOTS = (
     Plot("action", "Command in [-1, 1]: asked and achieved", (-1.1, 1.1)),
-    Plot("speed", "Speed, m/s", (-0.5, 8.0)),
+    Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
     Plot("latency", "Latency, ms: round trip, and its parts"),
     Plot("rejected", "Messages rejected so far, by reason"),
 )

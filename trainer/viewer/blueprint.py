@@ -52,9 +52,11 @@ def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Bluepri
     left = rrb.Vertical(
         _road(scene),
         _frames(),
-        rrb.StateTimelineView(origin="driver", name="Who drives, and why"),
+        rrb.StateTimelineView(
+            origin="driver", name="Who drives: the policy, or the human, and why"
+        ),
         *(_recent(plot) for plot in RECENT),
-        row_shares=[3, 1.6, 1, 1.2, 1],
+        row_shares=[3, 1.6, 0.9, 1.2, 1.1],
     )
     right = rrb.Vertical(*map(plot_view, episodes))
     return rrb.Blueprint(
