@@ -5,7 +5,7 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from bridge.scene import Scene
-from viewing.series import BLUE, GREEN, ORANGE, PURPLE, Plot, plot_view
+from viewing.series import ALL_OF_IT, BLUE, GREEN, ORANGE, PURPLE, Plot, plot_view
 from viewing.shapes import view_bounds
 
 APPLICATION = "phil_hil"
@@ -64,12 +64,16 @@ def _frames() -> rrb.Horizontal:
 
 def _numbers() -> rrb.Vertical:
     return rrb.Vertical(
-        rrb.StateTimelineView(origin="mode", name="Mode, and why it does not drive"),
+        rrb.StateTimelineView(
+            origin="mode",
+            name="Mode, and why it does not drive",
+            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+        ),
         *map(plot_view, PLOTS),
         rrb.TextLogView(
             origin="events",
             name="Events: modes, rejections, episodes",
             columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
         ),
-        row_shares=[1.6, 2, 2, 2, 1.6, 1.8],
+        row_shares=[2.2, 2, 2, 2, 1.6, 1.8],
     )
