@@ -127,9 +127,11 @@ def test_what_goes_wrong_in_a_check_is_its_finding():
     ]
     assert not basics_work([broken])
     assert summary([broken]) == "The basics do not work here: thing."
-    extra = found(probe)
-    assert basics_work([extra, found(lambda: "there")])
-    assert summary([extra]) == "The basics work. Missing besides: thing."
+    extra, basic = found(probe), found(lambda: "there", basic=True)
+    assert basics_work([extra, basic])
+    assert summary([extra, basic]) == "The basics work. Missing besides: thing."
+    assert summary([extra]) == "Missing: thing."
+    assert summary([basic]) == "The basics work. Nothing is missing."
 
 
 def test_an_unknown_group_is_one_line(capsys):
