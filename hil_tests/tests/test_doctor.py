@@ -37,7 +37,8 @@ def test_without_packages_it_still_runs_and_says_what_is_missing():
     assert done.returncode == 1, done.stderr
     assert done.stderr == ""
     assert "  ok       Python: 3." in done.stdout
-    assert "  missing  packages: not installed: cryptography, eclipse-zenoh," in done.stdout
+    (packages,) = (line for line in done.stdout.splitlines() if "missing  packages: " in line)
+    assert {"cryptography,", "numpy,", "torch"} <= set(packages.split())
     assert done.stdout.endswith("The basics do not work here: packages, loopback.\n")
 
 
