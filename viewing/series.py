@@ -22,13 +22,19 @@ class Plot(NamedTuple):
     """Of the y axis; None: as the values need."""
 
 
-def plot_view(plot: Plot, shown: rrb.TimeRange | None = None) -> rrb.TimeSeriesView:
-    """The view of a plot; ``shown`` is the part of the time axis, all of it if not given."""
+ALL_OF_IT = rrb.TimeRange(
+    start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+)
+"""Of the time axis. Otherwise rerun moves the axis with the cursor, and the beginning out of it."""
+
+
+def plot_view(plot: Plot, shown: rrb.TimeRange = ALL_OF_IT) -> rrb.TimeSeriesView:
+    """The view of a plot; ``shown`` is the part of the time axis."""
     return rrb.TimeSeriesView(
         origin=plot.origin,
         name=plot.title,
         axis_y=None if plot.limits is None else rrb.ScalarAxis(range=plot.limits),
-        axis_x=None if shown is None else rrb.TimeAxis(view_range=shown),
+        axis_x=rrb.TimeAxis(view_range=shown),
         plot_legend=rrb.Corner2D.LeftTop,
     )
 

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 import rerun as rr
 
@@ -165,8 +166,12 @@ def test_a_recording_that_cannot_be_shown_is_one_line_and_no_file(options, part,
 
 def keep_numbers(monkeypatch, log):
     """What the log draws as numbers from now on, by entity."""
-    kept = {}
-    monkeypatch.setattr(log, "_scalar", lambda path, value: kept.setdefault(path, []).append(value))
+    kept: dict[str, list[float]] = {}
+
+    def keep(path, value):
+        kept.setdefault(path, []).append(value)
+
+    monkeypatch.setattr(log, "_scalar", keep)
     return kept
 
 
@@ -186,11 +191,12 @@ def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(monkeypatch):
             step, received_ns=received_ns, inference_ns=2 * ms, sent_ns=received_ns + 3 * ms
         )
         log.write_command(command, received_ns)
+        repeated = msgspec.structs.replace(command, sent_ns=command.sent_ns + 100 * ms)
+        log.write_command(repeated, received_ns + 100 * ms)
     # The newest command is that of step 4, but the round trip that is told is still step 3's.
     for _ in range(2):
         log.write_scene(make_scene(round_trip_ms=60.0, answered_step=3), 10**18)
-    assert kept["latency/uplink"] == pytest.approx([23.0, 24.0])
-    assert kept["latency/inference"] == pytest.approx([2.0, 2.0])
+    assert kept["latency/uplink"] == pytest.approx([23.0, 23.0, 24.0, 24.0])
     assert kept["latency/round_trip"] == [60.0, 60.0]
     assert kept["latency/downlink"] == pytest.approx([60.0 - 26.0])
 
@@ -208,7 +214,12 @@ def test_rejections_are_counted_by_side_and_reason(monkeypatch):
 
 def test_live_pictures_are_at_most_ten_a_second(monkeypatch):
     drawn = []
-    monkeypatch.setattr(rr, "Image", lambda *_, **__: drawn.append(1) or rr.Clear(recursive=False))
+
+    def draw(*_, **__):
+        drawn.append(1)
+        return rr.Clear(recursive=False)
+
+    monkeypatch.setattr(rr, "Image", draw)
     for interval_s, expected in ((0.1, 2 * 11), (0.0, 2 * 101)):
         drawn.clear()
         log = WireLog(rr.RecordingStream("test"), interval_s)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from bridge.scene import Scene
-from viewing.series import BLUE, GREEN, ORANGE, PURPLE, Plot, plot_view
+from viewing.series import ALL_OF_IT, BLUE, GREEN, ORANGE, PURPLE, Plot, plot_view
 from viewing.shapes import view_bounds
 
 APPLICATION = "phil_hil"
 PLOTS = (
     Plot("action", "Command in [-1, 1]: asked and achieved", (-1.1, 1.1)),
-    Plot("speed", "Speed, m/s", (-0.5, 8.0)),
+    Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
     Plot("latency", "Latency, ms: round trip, and its parts"),
     Plot("rejected", "Messages rejected so far, by reason"),
 )
@@ -64,12 +64,16 @@ def _frames() -> rrb.Horizontal:
 
 def _numbers() -> rrb.Vertical:
     return rrb.Vertical(
-        rrb.StateTimelineView(origin="mode", name="Mode, and why it does not drive"),
+        rrb.StateTimelineView(
+            origin="mode",
+            name="Mode, and why it does not drive",
+            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+        ),
         *map(plot_view, PLOTS),
         rrb.TextLogView(
             origin="events",
             name="Events: modes, rejections, episodes",
             columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
         ),
-        row_shares=[1.6, 2, 2, 2, 1.6, 1.8],
+        row_shares=[2.2, 2, 2, 2, 1.6, 1.8],
     )

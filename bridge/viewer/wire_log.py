@@ -47,6 +47,8 @@ class WireLog:
         self._sent_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
         self._answered_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
         """From the sending of a state to that of its command, by the stamps of both."""
+        self._split: tuple[int, int] | None = None
+        """The state whose round trip was drawn in its parts last."""
         self._edge_counts: dict[str, int] = {}
         self._reasons: set[tuple[str, str]] = set()
         self._drawn_episode = -1
@@ -83,7 +85,10 @@ class WireLog:
         sent_ns = self._sent_ns.get((command.episode, command.step))
         if sent_ns is not None:
             self._scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
-            _keep(self._answered_ns, (command.episode, command.step), command.sent_ns - sent_ns)
+            # A safe stop is repeated for as long as it lasts: only the first is the answer.
+            if (command.episode, command.step) not in self._answered_ns:
+                answered_ns = command.sent_ns - sent_ns
+                _keep(self._answered_ns, (command.episode, command.step), answered_ns)
         self._scalar("latency/inference", command.inference_ns * 1e-6)
         driving = command.mode == "drive"
         level = rr.TextLogLevel.INFO if driving else rr.TextLogLevel.WARN
@@ -146,9 +151,11 @@ class WireLog:
         if scene.round_trip_ms is None or scene.answered_step is None:
             return
         self._scalar("latency/round_trip", scene.round_trip_ms)
-        # Taken out: a round trip is told with every scene until the next one is known.
-        answered_ns = self._answered_ns.pop((scene.episode, scene.answered_step), None)
-        if answered_ns is not None:
+        answered_ns = self._answered_ns.get((scene.episode, scene.answered_step))
+        # It is told with every scene until the next one is known.
+        is_new = (scene.episode, scene.answered_step) != self._split
+        if answered_ns is not None and is_new:
+            self._split = (scene.episode, scene.answered_step)
             self._scalar("latency/downlink", scene.round_trip_ms - answered_ns * 1e-6)
 
     def _rejections(self, side: str, counts: Mapping[str, int]) -> None:

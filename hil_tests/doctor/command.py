@@ -81,6 +81,7 @@ def summary(found: list[Finding]) -> str:
     if not basics_work(found):
         basics = ", ".join(finding.name for finding in found if finding.basic and not finding.ok)
         return f"The basics do not work here: {basics}."
+    basics = "The basics work. " if any(finding.basic for finding in found) else ""
     if missing:
-        return f"The basics work. Missing besides: {', '.join(missing)}."
-    return "Everything works here."
+        return f"{basics}Missing{' besides' if basics else ''}: {', '.join(missing)}."
+    return f"{basics}Nothing is missing."

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from edge_runtime.errors import UserError
 from hil_tests.doctor.check import MissingError, output_of
 
 _EVENTS = Path("/dev/input")
@@ -29,6 +30,18 @@ for number in range(pygame.joystick.get_count()):
     facts["controllers"].append(f"{stick.get_name()} ({stick.get_numaxes()} axes)")
 print(json.dumps(facts))
 """
+
+
+def rerun_viewer() -> str:
+    """Rerun's viewer comes up without a screen, and goes."""
+    from hil_tests.pictures.headless import headless_viewer
+
+    try:
+        with headless_viewer() as client:
+            picture = client.take_screenshot()
+    except UserError as error:
+        raise MissingError(str(error)) from None
+    return f"came up and drew a picture of {len(picture) / 1000:.0f} kB"
 
 
 def window() -> str:

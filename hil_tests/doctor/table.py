@@ -35,7 +35,7 @@ CHECKS: dict[str, tuple[Check, ...]] = {
             "an NVIDIA GPU with its driver, and torch with CUDA",
         ),
     ),
-    "driving by hand": (
+    "person": (
         Check(
             "window", person.window,
             "no `--human keyboard`, `gamepad` or `wheel`, no rerun window (--spawn)",
@@ -54,8 +54,15 @@ CHECKS: dict[str, tuple[Check, ...]] = {
         ),
         Check(
             "Chromium", machine.chromium,
-            "tests of the browser cockpit skip, no pictures of cockpit and rerun",
+            "tests of the browser cockpit skip, no picture of it",
             "apt install chromium; any browser shows the cockpit",
+        ),
+    ),
+    "seeing": (
+        Check(
+            "rerun's viewer", person.rerun_viewer,
+            "no rerun window (--spawn), no pictures of rerun; --serve and --save do",
+            "a graphics card with Vulkan, or apt install mesa-vulkan-drivers",
         ),
     ),
     "ports": (

@@ -1,27 +1,18 @@
-"""Pictures of rerun's viewer, which runs without a screen for it and draws in software."""
+"""Pictures of rerun's viewer with a recording in it."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
-import socket
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic
 from hil_tests.commands import run_command
 from hil_tests.pictures.drive import VEHICLE, recorded_drive
+from hil_tests.pictures.headless import headless_viewer
+from trainer.training.metrics import read_metrics
 
-SIZE = "1400x900"
-START_S, LOOK_S = 60.0, 0.5
-SETTLE_S = 5.0
-"""From the newest data to a picture in which all of it is drawn, by a slow software renderer."""
+LOADED_S, DRAWN_S = 20.0, 5.0
+"""Until some 10 MB are in the viewer, and until it has drawn them, in software."""
 LOOP_TIME_S = 8.0
 TRAINING = ("--episodes", "40", "--seed", "1", "--set", "batch_size=32",
             "--set", "evaluate_every=10", "--set", "evaluation_runs=10")  # fmt: skip
@@ -41,7 +32,9 @@ def rerun_training(out: Path, work: Path) -> None:
     rrd = work / "training.rrd"
     words = (*TRAINING, "--rerun", str(rrd), "--out", str(work / "training"))
     run_command("trainer", "train", *words)
-    write_atomic(out, screenshot(rrd, "step"))
+    rows = read_metrics(work / "training")
+    last = int(rows[-1]["total_steps"]) - 1
+    write_atomic(out, screenshot(rrd, "step", sequence=last))
 
 
 def screenshot(rrd: Path, timeline: str, **moment: float) -> bytes:
@@ -50,49 +43,15 @@ def screenshot(rrd: Path, timeline: str, **moment: float) -> bytes:
     Args:
         rrd: the recording.
         timeline: which one is active.
-        moment: where the cursor stands, as ``ViewerClient.set_time`` takes it; not given: the end.
+        moment: where the cursor stands, as ``ViewerClient.set_time`` takes it.
 
     Raises:
         UserError: the viewer does not start here.
     """
-    with _viewer() as client:
+    with headless_viewer() as client:
         client.open(str(rrd.resolve()))
-        time.sleep(SETTLE_S)
+        time.sleep(LOADED_S)
         client.set_time(timeline, **moment, play_state="paused")
-        time.sleep(SETTLE_S)
+        time.sleep(DRAWN_S)
         picture: bytes = client.take_screenshot()
         return picture
-
-
-@contextlib.contextmanager
-def _viewer() -> Iterator[Any]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
-    command += ["--bind", "127.0.0.1", "--port", str(port), "--window-size", SIZE]
-    # A group of its own: the module starts the real viewer as a child, which must end with it.
-    viewer = subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
-    try:
-        yield _connect(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(viewer.pid, signal.SIGTERM)
-        viewer.wait()
-
-
-def _connect(viewer: subprocess.Popen[bytes], url: str) -> Any:
-    from rerun.experimental import ViewerClient
-
-    give_up_s = time.monotonic() + START_S
-    while True:
-        try:
-            client = ViewerClient.connect(url)
-            client.get_state()
-            return client
-        except Exception as error:
-            if viewer.poll() is not None or time.monotonic() > give_up_s:
-                raise UserError(f"rerun's viewer does not start here: {error}") from None
-            time.sleep(LOOK_S)

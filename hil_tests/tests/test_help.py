@@ -46,6 +46,7 @@ def only_parse(monkeypatch):
 
 def main_of(program):
     spec = importlib.util.find_spec(program)
+    assert spec is not None
     is_package = spec.submodule_search_locations is not None
     module = importlib.import_module(f"{program}.__main__" if is_package else program)
     # The edge runtime's main is the entry point of an installed script, and takes no arguments.

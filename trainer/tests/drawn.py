@@ -7,7 +7,7 @@ from rerun.chunk import RrdReader
 
 def values_in(rrd):
     """What was logged, by entity: a list of (step or None, value)."""
-    found = {}
+    found: dict[str, list[tuple[int | None, object]]] = {}
     for chunk in RrdReader(str(rrd)).stream().to_chunks():
         columns = chunk.to_record_batch().to_pydict()
         steps = columns.get("step", [None] * chunk.num_rows)

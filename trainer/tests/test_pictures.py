@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
@@ -49,11 +49,8 @@ def test_the_commands_film_is_small_and_plays_in_real_time(tmp_path):
     words = ["picture", "expert", "--seed", "6", "--time", "2", "--out", str(out)]
     assert main(words) == 0
     with Image.open(out) as film:
-        assert film.n_frames <= 20  # Equal pictures are merged, and stay for longer.
-        times_ms = []
-        for number in range(film.n_frames):
-            film.seek(number)
-            times_ms.append(film.info["duration"])
+        # Equal pictures are merged, and stay for longer.
+        times_ms = [each.info["duration"] for each in ImageSequence.Iterator(film)]
         assert film.info["loop"] == 0
     assert sum(times_ms) == 19 * 100 + 1500
     assert out.stat().st_size < 500_000

@@ -61,8 +61,8 @@ def test_a_sitting_is_shown_whole(tmp_path, capsys):
     found = values_in(out)
     assert [value for _, value in found["/action/applied"]] == driven.applied
     assert {value for _, value in found["/action/policy"]} == {0.5}
-    assert found["/driver/who"] == [
-        (0, "policy"), (5, "human"), (10, "policy"), (20, "human"), (25, "policy"),
+    assert found["/driver"] == [
+        (0, "policy"), (5, "person"), (10, "policy"), (20, "person"), (25, "policy"),
     ]  # fmt: skip
     assert [step for step, _ in found["/return/episode"]] == [14, 29]
     assert {"/road/ego/body", "/road/roads", "/frames/now"} <= set(found)
@@ -78,7 +78,8 @@ def test_a_road_that_would_be_driven_differently_is_not_made_up(tmp_path):
     other.close()
     shown = Shown()
     entries = list(shown.entries([other.path]))
-    scenes = [bool(entry.picture.scene) for entry in entries if isinstance(entry, Steps)]
+    pictures = [entry.picture for entry in entries if isinstance(entry, Steps)]
+    scenes = [bool(picture and picture.scene) for picture in pictures]
     assert scenes == [False] * 15 + [True] * 15
     assert shown.without_road == 1
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 
 from viewing.scene import Scene
-from viewing.series import BLUE, GREEN, GREY, ORANGE, PURPLE, Plot, plot_view
+from viewing.series import ALL_OF_IT, BLUE, GREEN, GREY, ORANGE, PURPLE, Plot, plot_view
 from viewing.shapes import view_bounds
 
 APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
@@ -52,9 +52,13 @@ def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Bluepri
     left = rrb.Vertical(
         _road(scene),
         _frames(),
-        rrb.StateTimelineView(origin="driver", name="Who drives, and why"),
+        rrb.StateTimelineView(
+            origin="driver",
+            name="Who drives: the policy, or the human, and why",
+            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+        ),
         *(_recent(plot) for plot in RECENT),
-        row_shares=[3, 1.6, 1, 1.2, 1],
+        row_shares=[3, 1.6, 0.9, 1.2, 1.1],
     )
     right = rrb.Vertical(*map(plot_view, episodes))
     return rrb.Blueprint(

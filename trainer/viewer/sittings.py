@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from trainer.drivers import make_environment
+from trainer.human.guide import Reason
 from trainer.person.recording import Step, read_steps
 from trainer.training.metrics import NAMES, EpisodeMetrics
 from trainer.viewer.entries import Entry, Episode, Picture, StepEntry, Steps
@@ -37,7 +38,7 @@ class Shown:
         road = self._drive_again(episode)
         for step, scene in zip(episode, road, strict=True):
             policy = math.nan if step.policy_action is None else step.policy_action
-            reason = "person" if step.human else None
+            reason: Reason | None = "person" if step.human else None
             entry = StepEntry(self.steps, policy, step.action, step.speed_mps, reason)
             yield Steps([entry], Picture(self.steps, step.observation, scene))
             self.steps += 1
@@ -76,7 +77,7 @@ def _episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
 
 def _metrics(number: int, total_steps: int, episode: list[Step]) -> EpisodeMetrics:
     """What a recording tells of an episode; what only a learner knows is nan."""
-    known = {
+    known: dict[str, Any] = {
         "episode": number,
         "total_steps": total_steps,
         "steps": len(episode),

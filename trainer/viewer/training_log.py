@@ -17,12 +17,29 @@ from trainer.viewer.blueprint import LINES, POINTS, TIMELINE, make_blueprint
 from trainer.viewer.entries import Entry, Episode, Picture, StepEntry, Steps
 from viewing.road import draw_cars, draw_ground
 from viewing.scene import SeenScene, read_scene
-from viewing.series import BLUE, GREEN, GREY, Plot, style_lines, style_points
+from viewing.series import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    Plot,
+    style_lines,
+    style_points,
+)
 
-POLICY, HUMAN = "policy", "human"
-DRIVERS = {POLICY: BLUE, HUMAN: GREEN}
-"""Colour of the ego car by who drives it."""
-NO_REASON = "-"
+POLICY = "policy"
+DRIVERS = {
+    POLICY: BLUE,
+    "collision": RED,
+    "stuck": ORANGE,
+    "heading": PURPLE,
+    "offset": PURPLE,
+    "person": GREEN,
+}
+"""Who drives: the policy, or the human for one of these reasons; their colours on the time line."""
+HUMAN_EGO = GREEN
+"""The ego car's colour while the human drives it, whyever."""
 WINDOW = 20
 """Episodes of the moving means."""
 
@@ -37,7 +54,7 @@ class TrainingLog:
 
     def __init__(self, recording: rr.RecordingStream, episodes: Sequence[Plot]) -> None:
         self._recording, self._episodes = recording, episodes
-        self._driver: tuple[str, str] | None = None
+        self._driver = ""
         self._ground_drawn = False
         self._returns: deque[float] = deque(maxlen=WINDOW)
         self._successes: deque[float] = deque(maxlen=WINDOW)
@@ -58,9 +75,7 @@ class TrainingLog:
         lanes = rr.StateConfiguration(
             values=list(DRIVERS), labels=list(DRIVERS), colors=list(DRIVERS.values())
         )
-        self._recording.log("driver/who", lanes, static=True)
-        quiet = rr.StateConfiguration(values=[NO_REASON], labels=[" "], colors=[GREY])
-        self._recording.log("driver/reason", quiet, static=True)
+        self._recording.log("driver", lanes, static=True)
 
     def _draw_steps(self, entries: list[StepEntry]) -> None:
         steps = np.array([entry.step for entry in entries])
@@ -75,13 +90,12 @@ class TrainingLog:
 
     def _tell_driver(self, entry: StepEntry) -> None:
         """Draw who drives where that changes."""
-        told = (POLICY, NO_REASON) if entry.reason is None else (HUMAN, str(entry.reason))
-        if told == self._driver:
+        driver = POLICY if entry.reason is None else entry.reason
+        if driver == self._driver:
             return
-        self._driver = told
+        self._driver = driver
         self._stand_at(entry.step)
-        self._recording.log("driver/who", rr.StateChange(state=told[0]))
-        self._recording.log("driver/reason", rr.StateChange(state=told[1]))
+        self._recording.log("driver", rr.StateChange(state=driver))
 
     def _draw_picture(self, picture: Picture) -> None:
         self._stand_at(picture.step)
@@ -96,8 +110,7 @@ class TrainingLog:
             self._ground_drawn = True
             self._recording.send_blueprint(make_blueprint(scene, self._episodes))
             draw_ground(self._recording, scene)
-        who = POLICY if self._driver is None else self._driver[0]
-        draw_cars(self._recording, scene, DRIVERS[who])
+        draw_cars(self._recording, scene, BLUE if self._driver == POLICY else HUMAN_EGO)
 
     def _draw_episode(self, episode: Episode) -> None:
         metrics = episode.metrics
