@@ -6,6 +6,7 @@ Everything here runs in the event loop of the cockpit's own thread.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hmac
 import itertools
 import time
@@ -115,7 +116,7 @@ class Server:
         page = Page(next(self._numbers), socket)
         self._pages[page.number] = page
         self._seat.sit_down(page.number)
-        sender = asyncio.create_task(self._send_views(page))
+        sender = asyncio.create_task(self._keep_shown(page))
         try:
             why = await self._listen(page)
         finally:
@@ -145,6 +146,11 @@ class Server:
             driving = self._seat.is_driver(page.number)
             refused = driving and said.engaged and not held
             await page.socket.send_str(encode_echo(said.at_ms, driving, refused))
+
+    async def _keep_shown(self, page: Page) -> None:
+        """Show the page the newest view, until it is gone; who hears it notices that."""
+        with contextlib.suppress(ConnectionError):
+            await self._send_views(page)
 
     async def _send_views(self, page: Page) -> None:
         page.wake.set()
