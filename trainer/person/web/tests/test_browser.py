@@ -1,76 +1,17 @@
 """The page in a real headless Chromium: hands become readings, and losing it is letting go."""
 
 import asyncio
-import time
 from dataclasses import replace
 
 import pytest
 
-from trainer.benches.chromium import find_chromium, open_browser
 from trainer.person.interface import LET_GO
-from trainer.person.web.cockpit import Cockpit
-from trainer.person.web.tests.test_server import page
+from trainer.person.web.tests.pages import page
+from trainer.person.web.tests.readings import LIVE, READY, TWO_HEARTBEATS, WHY, YOU, poll, reads
+from trainer.person.web.tests.tunnel import Tunnel
 from trainer.person.web.tests.views import first_view
 
-pytestmark = pytest.mark.skipif(
-    find_chromium() is None, reason="no Chromium (Debian: apt-get install chromium)"
-)
-WAIT_S = 10.0
-LIVE = "document.body.dataset.link === 'live'"
-READY = f"{LIVE} && document.getElementById('scenario').textContent"
-TWO_HEARTBEATS = "new Promise((done) => setTimeout(done, 200))"
-WHY = "document.getElementById('why').textContent"
-YOU = "document.querySelector('.bar.human output').textContent"
-
-FAKE_PADS = """
-globalThis.pads = {};
-navigator.getGamepads = () => [0, 1, 2, 3].map((index) => globalThis.pads[index] ?? null);
-globalThis.plug = (id, mapping, axes, buttons) => {
-  globalThis.pads[0] = { id, mapping, axes, index: 0, connected: true,
-    buttons: buttons.map((value) => ({ value, pressed: value > 0.5 })) };
-};
-"""
-"""Headless Chromium has no gamepad: the page is given one that says what the test wants."""
-
-
-@pytest.fixture(scope="module")
-def runner():
-    with asyncio.Runner() as runner:
-        yield runner
-
-
-@pytest.fixture(scope="module")
-def browser(runner):
-    context = open_browser()
-    browser = runner.run(context.__aenter__())
-    runner.run(browser.call("Page.addScriptToEvaluateOnNewDocument", source=FAKE_PADS))
-    yield browser
-    runner.run(context.__aexit__(None, None, None))
-
-
-@pytest.fixture
-def cockpit(runner, browser):
-    """A cockpit that the browser has open, with the left turn in view."""
-    cockpit = Cockpit()
-    cockpit.show(first_view())
-    runner.run(browser.open(cockpit.url))
-    runner.run(browser.value("localStorage.clear()"))
-    runner.run(browser.until(READY))
-    yield cockpit
-    cockpit.close()
-
-
-def poll(cockpit):
-    return cockpit.poll(time.monotonic())
-
-
-async def reads(cockpit, condition):
-    """Poll until the reading is as wanted; that reading."""
-    end_s = time.monotonic() + WAIT_S
-    while not condition(reading := poll(cockpit)):
-        assert time.monotonic() < end_s, reading
-        await asyncio.sleep(0.005)
-    return reading
+pytestmark = pytest.mark.usefixtures("opened")
 
 
 def test_a_held_key_takes_over_and_grows_and_its_release_lets_go(runner, browser, cockpit):
@@ -241,10 +182,9 @@ def test_what_is_shown_is_drawn(runner, browser, cockpit):
     runner.run(look())
 
 
-def test_a_second_page_is_told_that_it_watches(runner, browser):
+def test_a_second_page_is_told_that_it_watches(runner, browser, cockpit):
     async def watch():
-        cockpit = Cockpit()
-        cockpit.show(first_view())
+        await browser.open("about:blank")
         async with page(cockpit):
             await browser.open(cockpit.url)
             await browser.until("document.body.classList.contains('watching')")
@@ -253,7 +193,6 @@ def test_a_second_page_is_told_that_it_watches(runner, browser):
             assert not poll(cockpit).engaged
             await browser.key("ArrowUp", False)
         await browser.until("!document.body.classList.contains('watching')")
-        cockpit.close()
 
     runner.run(watch())
 
@@ -268,12 +207,10 @@ def test_the_end_of_the_sitting_is_told(runner, browser, cockpit):
 
 
 @pytest.mark.parametrize("how", ["closed", "silent"])
-def test_a_lost_connection_is_letting_go_and_comes_back(runner, browser, how):
+def test_a_lost_connection_is_letting_go_and_comes_back(runner, browser, cockpit, how):
     """Through a tunnel, as over ``ssh -L``, that is cut or swallows everything."""
 
     async def lose():
-        cockpit = Cockpit()
-        cockpit.show(first_view())
         async with Tunnel(cockpit.port) as tunnel:
             await browser.open(cockpit.url.replace(str(cockpit.port), str(tunnel.port)))
             await browser.until(READY)
@@ -288,48 +225,5 @@ def test_a_lost_connection_is_letting_go_and_comes_back(runner, browser, how):
             await browser.key("ArrowUp", True)
             await reads(cockpit, lambda r: r.engaged)
             await browser.key("ArrowUp", False)
-        cockpit.close()
 
     runner.run(lose())
-
-
-class Tunnel:
-    """A TCP connection passed on to a port of this machine, until it is lost."""
-
-    def __init__(self, port):
-        self._to = port
-        self._ways = []
-
-    async def __aenter__(self):
-        self._server = await asyncio.start_server(self._join, "127.0.0.1")
-        self.port = self._server.sockets[0].getsockname()[1]
-        return self
-
-    async def __aexit__(self, *_):
-        self._server.close()
-        self.cut()
-
-    def cut(self):
-        """Close what is open; what comes afterwards is passed on."""
-        for _, writer in self._ways:
-            writer.transport.abort()
-        self._ways.clear()
-
-    def swallow(self):
-        """Pass on nothing of what is open, and close nothing either."""
-        for task, _ in self._ways:
-            task.cancel()
-
-    async def _join(self, reader, writer):
-        there = await asyncio.open_connection("127.0.0.1", self._to)
-        for source, sink in ((reader, there[1]), (there[0], writer)):
-            self._ways.append((asyncio.create_task(self._pass_on(source, sink)), sink))
-
-    @staticmethod
-    async def _pass_on(source, sink):
-        try:
-            while data := await source.read(65536):
-                sink.write(data)
-            sink.close()
-        except ConnectionError:
-            sink.transport.abort()

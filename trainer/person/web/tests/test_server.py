@@ -1,113 +1,19 @@
-"""The cockpit's server with real clients: who is let in, what is heard, what is shown."""
+"""What the server hears from pages and shows them; with real clients."""
 
 import asyncio
 import base64
 import json
-import socket
 import time
-from contextlib import asynccontextmanager
 
 import aiohttp
 import numpy as np
-import pytest
 
-from edge_runtime.errors import UserError
 from trainer.person.interface import LET_GO
-from trainer.person.registry import HUMANS, PersonOptions
 from trainer.person.web.cockpit import Cockpit
-from trainer.person.web.messages import MAX_INPUT_BYTES
 from trainer.person.web.server import VIEWS_UNDERWAY
+from trainer.person.web.tests.pages import WAIT_S, hear, origin, page, say, until
+from trainer.person.web.tests.readings import poll
 from trainer.person.web.tests.views import first_view, view_of_step
-
-WAIT_S = 5.0
-
-
-@pytest.fixture
-def cockpit():
-    cockpit = Cockpit()
-    yield cockpit
-    cockpit.close()
-
-
-def origin(cockpit):
-    return f"http://127.0.0.1:{cockpit.port}"
-
-
-@asynccontextmanager
-async def page(cockpit, **more):
-    """A page's WebSocket."""
-    async with (
-        aiohttp.ClientSession() as session,
-        session.ws_connect(
-            cockpit.url + "socket", origin=more.pop("origin", origin(cockpit)), **more
-        ) as link,
-    ):
-        yield link
-
-
-async def say(link, engaged=False, action=0.0, **more):
-    """Say something as a page does; the echo."""
-    await link.send_json({"at_ms": 12.5, "action": action, "engaged": engaged, **more})
-    return await hear(link, "echo")
-
-
-async def hear(link, kind):
-    """The next message of a kind."""
-    while True:
-        message = await link.receive_json(timeout=WAIT_S)
-        if message["kind"] == kind:
-            return message
-
-
-def poll(cockpit):
-    return cockpit.poll(time.monotonic())
-
-
-async def until(condition):
-    end_s = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < end_s, "did not come true"
-        await asyncio.sleep(0.005)
-
-
-async def status_of(url, **more):
-    async with aiohttp.ClientSession() as session, session.get(url, **more) as answer:
-        return answer.status, await answer.text(), answer.headers
-
-
-def test_the_page_and_its_files_are_served_behind_the_token(cockpit):
-    async def look():
-        status, text, headers = await status_of(cockpit.url)
-        assert status == 200
-        assert "<title>PHIL cockpit</title>" in text
-        assert headers["Referrer-Policy"] == "no-referrer"
-        assert "default-src 'self'" in headers["Content-Security-Policy"]
-        for name in ("cockpit.js", "hands.js", "link.js", "gamepad.js", "scene.js", "cockpit.css"):
-            assert (await status_of(cockpit.url + name))[0] == 200, name
-        assert (await status_of(cockpit.url + "server.py"))[0] == 404
-        assert (await status_of(cockpit.url + "..%2fserver.py"))[0] == 404
-        assert (await status_of(cockpit.url.rstrip("/")))[0] == 200, "without the last slash"
-
-    asyncio.run(look())
-
-
-@pytest.mark.parametrize("path", ["", "wrong/", "wrong/cockpit.js", "wrong/socket", "socket"])
-def test_without_the_token_nothing_is_shown(cockpit, path):
-    status, text, _ = asyncio.run(status_of(f"{origin(cockpit)}/{path}"))
-    assert status == 403
-    assert "token" in text
-
-
-@pytest.mark.parametrize("from_where", ["http://evil.example", "null", None])
-def test_another_sites_page_gets_no_socket(cockpit, from_where):
-    async def knock():
-        async with page(cockpit, origin=from_where):
-            pass
-
-    with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-        asyncio.run(knock())
-    assert refusal.value.status == 403
-    assert not cockpit.present
 
 
 def test_what_a_page_holds_is_polled_and_its_closing_is_letting_go(cockpit):
@@ -155,38 +61,6 @@ def test_a_second_page_watches_until_the_first_is_gone(cockpit):
                 assert (await say(watching))["driving"]
 
     asyncio.run(drive())
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "[]",
-        "{}",
-        '{"at_ms": 1, "action": 1.5, "engaged": true}',
-        '{"at_ms": 1, "action": NaN, "engaged": true}',
-        '{"at_ms": 1, "action": 1e999, "engaged": true}',
-        '{"at_ms": 1, "action": "1", "engaged": true}',
-        '{"at_ms": 1, "action": 1, "engaged": true, "wishes": ["fly"]}',
-        '{"at_ms": 1, "action": 1, "engaged": true, "admin": 1}',
-        "[" * MAX_INPUT_BYTES,
-        "x" * (MAX_INPUT_BYTES + 1),
-        b"\x00",
-    ],
-)
-def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
-    async def talk_nonsense():
-        async with page(cockpit) as link:
-            await say(link)
-            await say(link, True, 1.0)
-            await (link.send_bytes if isinstance(text, bytes) else link.send_str)(text)
-            while not (await link.receive(timeout=WAIT_S)).type.name.startswith("CLOS"):
-                pass
-        await until(lambda: not poll(cockpit).engaged)
-        async with page(cockpit) as link:
-            assert (await say(link))["driving"], "and it serves on"
-
-    asyncio.run(talk_nonsense())
 
 
 def test_a_view_arrives_whole(cockpit):
@@ -284,24 +158,3 @@ def test_a_wish_reaches_the_loop_once(cockpit):
             assert not poll(cockpit).wishes
 
     asyncio.run(ask())
-
-
-def test_a_port_in_use_is_a_plain_error(cockpit):
-    with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1 port {cockpit.port}"):
-        HUMANS["web"](PersonOptions(port=cockpit.port))
-
-
-def test_a_host_that_is_not_here_is_a_plain_error():
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))
-        with pytest.raises(UserError, match="cannot listen on"):
-            HUMANS["web"](PersonOptions(host="host.invalid"))
-
-
-def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys):
-    for host, warned in (("127.0.0.1", False), ("0.0.0.0", True)):
-        person = HUMANS["web"](PersonOptions(host=host))
-        out, err = capsys.readouterr()
-        person.close()
-        assert out.startswith("cockpit: open http://")
-        assert ("warning: --host" in err) == warned
