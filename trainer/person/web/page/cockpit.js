@@ -17,7 +17,7 @@ const WHO = {
   waiting: ["Nobody drives yet", "the trainer is starting"],
   lost: ["Connection lost", "you have let go; looking for the trainer"],
   over: ["The sitting is over", "everything is saved"],
-  policy: ["The policy drives", "hold a key, the pad, or your wheel's button to take over"],
+  policy: ["The policy drives", "hold a key, the pad or a button to take over"],
   human: ["You drive", "let go to give back"],
   returning: ["Giving back", "the action returns to the policy's"],
 };
@@ -69,8 +69,9 @@ function enter(scenario) {
   const words = WORDS[scenario];
   byId("scenario").textContent = words.title;
   byId("meaning").textContent = `${words.meaning}: ${words.minus} ◂ ▸ ${words.plus}`;
-  byId("pad-plus").textContent = words.plus;
-  byId("pad-minus").textContent = words.minus;
+  for (const side of ["plus", "minus"]) {
+    for (const word of document.querySelectorAll(`.${side}-word`)) word.textContent = words[side];
+  }
   byId("pad").className = scenario === "left_turn" ? "upright" : "level";
   changed(); // a key may be down already
 }

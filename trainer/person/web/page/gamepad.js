@@ -51,6 +51,7 @@ export class Gamepads {
     this.said = { action: 0, engaged: false, by_moving: false };
     for (const name of ["plus", "minus", "dead", "full", "invert", "hold"]) {
       form[name].addEventListener("input", () => this.choose());
+      form[name].addEventListener("change", () => form[name].blur()); // the arrow keys drive again
     }
   }
 
