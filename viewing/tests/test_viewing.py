@@ -35,6 +35,15 @@ def test_episodes_stand_end_to_end():
     assert timeline.now == late
 
 
+def test_a_car_far_from_the_path_does_not_shrink_the_picture():
+    def bounds(x):
+        car = SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
+        return view_bounds(SeenScene(path=[[0.0, 0.0], [10.0, 0.0]], vehicles=[car]))
+
+    assert bounds(-60.0) == bounds(5.0)
+    assert bounds(-15.0)[0][0] == pytest.approx(bounds(5.0)[0][0] - 15.0)
+
+
 def test_a_scene_is_read_without_what_is_not_drawn():
     scene = {
         "roads": [[[0.0, 0.0], [9.0, 0.0]]],
