@@ -74,7 +74,7 @@ def test_bad_input_gets_one_line_and_status_2(arguments, capsys, tmp_path):
 def test_every_command_has_help_with_an_example(command, capsys):
     status, out, _ = call(capsys, command, "--help")
     assert status == 0
-    assert "example: python -m trainer" in " ".join(out.split())
+    assert f"examples: python -m trainer {command}" in " ".join(out.split())
 
 
 def test_evaluate_reports_what_the_contract_asks_for(capsys, tmp_path):
