@@ -146,7 +146,7 @@ class Browser:
 
 @asynccontextmanager
 async def open_browser(
-    size: tuple[int, int] = (1280, 860), extra: tuple[str, ...] = ()
+    size: tuple[int, int] = (1280, 740), extra: tuple[str, ...] = ()
 ) -> AsyncIterator[Browser]:
     """A fresh Chromium with one empty page; ended with all its processes.
 

@@ -1,4 +1,4 @@
-"""``trainer train --human web`` as a process of its own, as a person starts it."""
+"""``trainer train|drive --human web`` as a process of its own, as a person starts it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ ENDLESS = 10**6
 
 
 class CockpitRun:
-    """A running training whose person sits in a browser.
+    """A running sitting whose person is in a browser.
 
     Args:
-        process: the training.
+        process: the sitting.
         url: of its cockpit.
-        run_dir: where it keeps its run.
     """
 
-    def __init__(self, process: asyncio.subprocess.Process, url: str, run_dir: Path) -> None:
-        self.process, self.url, self.run_dir = process, url, run_dir
+    def __init__(self, process: asyncio.subprocess.Process, url: str) -> None:
+        self.process, self.url = process, url
 
     async def ended(self) -> int:
         """Wait until it has ended; its exit status.
@@ -37,29 +36,32 @@ class CockpitRun:
 
 
 @asynccontextmanager
-async def cockpit_run(run_dir: Path, options: Sequence[str] = ()) -> AsyncIterator[CockpitRun]:
-    """Train with ``--human web`` until the page quits; whatever is left is ended.
+async def cockpit_run(
+    out: Path, options: Sequence[str] = (), command: str = "train"
+) -> AsyncIterator[CockpitRun]:
+    """Train or drive with ``--human web`` until the page quits; whatever is left is ended.
 
     Args:
-        run_dir: of the run.
-        options: more of ``trainer train``'s.
+        out: of the run, or of the recordings.
+        options: more of the command's.
+        command: ``train`` or ``drive``.
 
     Raises:
         RuntimeError: it ended before it served the cockpit; with its last line.
     """
-    command = [sys.executable, "-m", "trainer", "train", "--human", "web", "--port", "0"]
-    command += ["--out", str(run_dir), "--episodes", str(ENDLESS), *options]
+    words = [sys.executable, "-m", "trainer", command, "--human", "web", "--port", "0"]
+    words += ["--out", str(out), "--episodes", str(ENDLESS), *options]
     with tempfile.TemporaryFile() as log:
         process = await asyncio.create_subprocess_exec(
-            *command, stdout=asyncio.subprocess.PIPE, stderr=log
+            *words, stdout=asyncio.subprocess.PIPE, stderr=log
         )
         try:
             url = await asyncio.wait_for(_address(process), START_S)
             if url is None:
                 log.seek(0)
                 lines = log.read().decode(errors="replace").strip().splitlines()
-                raise RuntimeError(f"the training ended early: {lines[-1] if lines else 'silent'}")
-            yield CockpitRun(process, url, run_dir)
+                raise RuntimeError(f"it ended early: {lines[-1] if lines else 'silent'}")
+            yield CockpitRun(process, url)
         finally:
             if process.returncode is None:
                 process.terminate()

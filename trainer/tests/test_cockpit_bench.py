@@ -2,7 +2,7 @@
 
 import pytest
 
-from trainer.benches.cockpit import Press, key_to_applied_ms, quantiles
+from trainer.benches.cockpit import key_to_applied_ms, quantiles
 from trainer.person.recording import Step
 
 
@@ -38,8 +38,7 @@ def step(number, mark):
 
 
 def latencies(marks, *downs_ms):
-    presses = [Press(int(1e6 * down_ms), int(1e6 * down_ms) + 1) for down_ms in downs_ms]
-    return key_to_applied_ms(presses, steps(marks))
+    return key_to_applied_ms([1e6 * down_ms for down_ms in downs_ms], steps(marks))
 
 
 def test_a_press_is_answered_by_the_next_step_that_begins_an_intervention():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import secrets
 import socket
 import sys
@@ -108,13 +109,14 @@ class Cockpit:
 
 def open_cockpit(options: PersonOptions) -> Person:
     """Serve the cockpit and print its address."""
+    cockpit = Cockpit(options.host, options.port, options.scenario)
     if options.host not in LOOPBACK:
         print(
             f"warning: --host {options.host}: whoever reads this network's traffic can take the "
-            "wheel; safer: leave it out, and ssh -L PORT:127.0.0.1:PORT from the browser's machine",
+            f"wheel; safer: leave it out, and ssh -L {cockpit.port}:127.0.0.1:{cockpit.port} from "
+            "the browser's machine",
             file=sys.stderr,
         )
-    cockpit = Cockpit(options.host, options.port, options.scenario)
     print(f"cockpit: open {cockpit.url}", flush=True)
     return Person(cockpit, cockpit)
 
@@ -134,7 +136,9 @@ def _listen(host: str, port: int) -> socket.socket:
             listener.close()
             raise
     except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
+        reason = getattr(error, "strerror", None) or str(error)
+        if getattr(error, "errno", None) == errno.EADDRINUSE:
+            reason += "; without --port any that is free will do"
         raise UserError(f"the cockpit cannot listen on {host} port {port}: {reason}") from error
     return listener
 

@@ -14,6 +14,9 @@ const WORDS = {
   congestion: { title: "congestion", meaning: "steering", plus: "right", minus: "left" },
 };
 const WHO = {
+  waiting: ["Nobody drives yet", "the trainer is starting"],
+  lost: ["Connection lost", "you have let go; looking for the trainer"],
+  over: ["The sitting is over", "everything is saved"],
   policy: ["The policy drives", "hold a key, the pad, or your wheel's button to take over"],
   human: ["You drive", "let go to give back"],
   returning: ["Giving back", "the action returns to the policy's"],
@@ -23,7 +26,7 @@ const LINK = { connecting: "connecting", live: "connected", lost: "connection lo
 let view = null;
 let viewMs = 0;
 let driving = true; // and not watching
-let refused = false; // held since before the connection was lost
+let refused = false; // held since before the connection, or the wheel, was this page's
 const changed = () => link?.changed();
 const keyboard = new Keyboard(changed, (word) => wish(word));
 const touch = new Pad(byId("pad"), byId("knob"), changed);
@@ -48,7 +51,7 @@ function step() {
   touch.draw();
   bar("human", hands.now().action);
   bar("raw", gamepads.now().action);
-  if (view && now - viewMs > STALE_MS && link.heardMs > viewMs && !link.over) {
+  if (view && now - viewMs > STALE_MS && document.body.dataset.link === "live") {
     byId("message").textContent = view.message || "waiting for the trainer";
   }
 }
@@ -73,6 +76,7 @@ function enter(scenario) {
 }
 
 function draw() {
+  if (document.body.dataset.link !== "live") return;
   document.body.dataset.control = view.control;
   drawScene(byId("scene"), view);
   drawFrames(frames, view.frames);
@@ -100,7 +104,7 @@ function showWho() {
   if (view?.policy_action === null && control === "policy") who = "Nobody drives";
   if (!driving) why = "you watch: another page has the wheel";
   if (!driving && control === "human") who = "Another page drives";
-  if (refused) why = "the connection was lost: let go, and press again";
+  if (refused) why = "what was held before does not count: let go, and press again";
   byId("who").textContent = who;
   byId("why").textContent = why;
 }
@@ -123,15 +127,18 @@ function hearEcho(echo) {
 }
 
 function showState(state) {
+  if (document.body.dataset.link === state) return;
   document.body.dataset.link = state;
   byId("link").textContent = LINK[state];
-  if (state === "lost") byId("trip").textContent = "";
-  if (state === "lost" || state === "over") {
-    document.body.dataset.control = "policy";
-    byId("message").textContent = state === "over"
-      ? "the sitting is over: everything is saved"
-      : "connection lost: you have let go";
+  byId("message").textContent = state === "live" && !view ? "waiting for the trainer" : "";
+  if (state === "live") {
+    document.body.dataset.control = view?.control ?? "waiting";
+    if (view) requestAnimationFrame(draw);
+  } else {
+    document.body.dataset.control = state;
+    byId("trip").textContent = "";
   }
+  showWho();
 }
 
 let sureMs = -SURE_MS;

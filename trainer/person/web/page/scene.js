@@ -120,7 +120,8 @@ export class History {
     this.steps.forEach(([, , control], i) => {
       if (control === "policy") return;
       pen.fillStyle = control === "human" ? "rgba(255, 194, 71, 0.22)" : "rgba(185, 140, 255, 0.22)";
-      pen.fillRect(left + i * dx, 0, dx + 0.5, height);
+      const [from, to] = [Math.round(left + i * dx), Math.round(left + (i + 1) * dx)];
+      pen.fillRect(from, 0, to - from, height);
     });
     line(pen, [[0, height / 2], [width, height / 2]], "#3a424d", 1);
     const trace = (index, colour, wide) => {

@@ -262,7 +262,7 @@ def test_the_end_of_the_sitting_is_told(runner, browser, cockpit):
     async def end():
         cockpit.close()
         await browser.until("document.body.dataset.link === 'over'")
-        assert "saved" in await browser.text("#message")
+        assert await browser.text("#who") == "The sitting is over"
 
     runner.run(end())
 

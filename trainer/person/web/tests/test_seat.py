@@ -120,7 +120,7 @@ def test_only_the_driver_heard_lately_and_after_hands_off_ever_holds(events):
     """The seat beside a plain account of the same events."""
     seat, now_s = Seat(), 0.0
     pages, told = [], []
-    heard = []  # (page, time, engaged) of the present driver since it sat in front
+    heard: list[tuple[float, bool]] = []  # when, and whether engaged: of the present driver
     wished = []
     for kind, *what in events:
         if kind == "wait":

@@ -45,6 +45,7 @@ def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path):
     # Towards the brake within the first period, by no more than a hand-over may.
     first = ours[0]
     before = steps[steps.index(first) - 1].action if first.step else first.policy_action
+    assert before is not None
     towards = min(max(first.human_action - before, -MAX_SLEW), MAX_SLEW)
     assert first.human_action < 0.0
     assert first.action == pytest.approx(before + towards)
