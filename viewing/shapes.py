@@ -9,7 +9,9 @@ from viewing.scene import Car, Scene
 Point = tuple[float, float]
 
 MARGIN_M = (10.0, 5.0)
-"""Ground shown beyond the path: along x, along y."""
+"""Ground shown beyond path and cars: along x, along y."""
+NEAR_M = 20.0
+"""From the path; whoever is farther away comes into the picture when it matters."""
 
 
 def outline(car: Car) -> list[Point]:
@@ -32,15 +34,15 @@ def windscreen(car: Car) -> list[Point]:
 
 
 def view_bounds(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the x and y ranges (m) that show the path, and the cars at the start."""
-    points = [(point[0], point[1]) for point in scene.path]
-    points += [(car.x, car.y) for car in scene.vehicles]
-    if not points:
-        points = [(0.0, 0.0)]
+    """Return the x and y ranges (m) that show the path, and the cars that are near it now."""
+    path = [(point[0], point[1]) for point in scene.path]
+    cars = [(car.x, car.y) for car in scene.vehicles]
     ranges = []
     for axis, margin in enumerate(MARGIN_M):
-        values = [point[axis] for point in points]
-        ranges.append((min(values) - margin, max(values) + margin))
+        known = [point[axis] for point in path] or [point[axis] for point in cars] or [0.0]
+        low, high = min(known), max(known)
+        near = [point[axis] for point in cars if low - NEAR_M < point[axis] < high + NEAR_M]
+        ranges.append((min([low, *near]) - margin, max([high, *near]) + margin))
     return ranges[0], ranges[1]
 
 

@@ -8,9 +8,11 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
+from types import FrameType
 from typing import NamedTuple
 from urllib.parse import quote
 
@@ -62,14 +64,43 @@ def check_sink(sink: Sink) -> None:
         check_display()
 
 
+@contextlib.contextmanager
 def open_sink(
     sink: Sink, application: str, blueprint: rrb.Blueprint
-) -> AbstractContextManager[rr.RecordingStream]:
-    """A recording that goes there; ``application`` keeps layouts of different kinds apart."""
+) -> Iterator[rr.RecordingStream]:
+    """A recording that goes there; ``application`` keeps layouts of different kinds apart.
+
+    SIGTERM raises KeyboardInterrupt meanwhile, unless the command has another use for it: a file
+    is to be finished, and a server not to be left behind.
+    """
     recording = rr.RecordingStream(application)
+    with _sigterm_as_interrupt(), _opened(recording, sink, blueprint):
+        yield recording
+
+
+def _opened(
+    recording: rr.RecordingStream, sink: Sink, blueprint: rrb.Blueprint
+) -> AbstractContextManager[rr.RecordingStream]:
     if sink.path:
         return save_to(recording, sink.path, blueprint)
     return (serve_page if sink.kind == SERVE else spawn_window)(recording, blueprint)
+
+
+@contextlib.contextmanager
+def _sigterm_as_interrupt() -> Iterator[None]:
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @contextlib.contextmanager

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
+import time
 
 import pytest
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
 
 from edge_runtime.errors import UserError
 from viewing.pace import Pace
 from viewing.scene import SeenCar, SeenScene, read_scene
 from viewing.shapes import outline, view_bounds
-from viewing.sinks import Sink, read_sink
+from viewing.sinks import Sink, open_sink, read_sink
 from viewing.timeline import Timeline
 
 
@@ -33,6 +39,15 @@ def test_episodes_stand_end_to_end():
     late = timeline.place(1, 2)
     assert (late.episode_time_s, late.sim_time_s) == (0.2, 1.0)
     assert timeline.now == late
+
+
+def test_a_car_far_from_the_path_does_not_shrink_the_picture():
+    def bounds(x):
+        car = SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
+        return view_bounds(SeenScene(path=[[0.0, 0.0], [10.0, 0.0]], vehicles=[car]))
+
+    assert bounds(-60.0) == bounds(5.0)
+    assert bounds(-15.0)[0][0] == pytest.approx(bounds(5.0)[0][0] - 15.0)
 
 
 def test_a_scene_is_read_without_what_is_not_drawn():
@@ -64,6 +79,35 @@ def test_what_comes_faster_is_thinned_out_and_a_pause_brings_no_burst():
 def test_an_interval_of_zero_takes_all():
     pace = Pace(0.0)
     assert all(pace.due(now_s) for now_s in [0.0, 0.0, 5.0, 5.0, 4.0])
+
+
+def test_sigterm_finishes_the_file(tmp_path):
+    out = tmp_path / "a.rrd"
+
+    def draw():
+        with open_sink(Sink("save", str(out)), "test", rrb.Blueprint()) as recording:
+            recording.log("speed", rr.Scalars(3.0))
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5.0)
+
+    with pytest.raises(KeyboardInterrupt):
+        draw()
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
+    found = [chunk.entity_path for chunk in RrdReader(str(out)).stream().to_chunks()]
+    assert "/speed" in found
+
+
+def test_a_command_with_another_use_for_sigterm_keeps_it(tmp_path):
+    def quit_softly(*_):
+        pass
+
+    before = signal.signal(signal.SIGTERM, quit_softly)
+    try:
+        with open_sink(Sink("save", str(tmp_path / "a.rrd")), "test", rrb.Blueprint()):
+            assert signal.getsignal(signal.SIGTERM) is quit_softly
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_a_sink_is_named_by_a_word():
