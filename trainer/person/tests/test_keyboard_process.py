@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import time
 
@@ -60,15 +59,4 @@ def test_a_key_takes_over_at_once_and_everything_is_kept(tmp_path, display):
         xdotool(display, "key", "q")
         status, errors = training.end()
     assert status == 0, errors
-    assert_all_in_replay(run_dir)
-
-
-def test_a_signal_ends_a_sitting_as_quitting_does(tmp_path, display):
-    run_dir = tmp_path / "run"
-    with Training(run_dir, "trainer", ["--human", "keyboard"], display) as training:
-        training.wait_for_step(lambda step: step.step >= 2)
-        training.process.send_signal(signal.SIGTERM)
-        status, errors = training.end()
-    assert status == 0, errors
-    assert "0 interventions" in errors
     assert_all_in_replay(run_dir)

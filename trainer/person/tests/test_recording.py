@@ -35,7 +35,7 @@ def test_a_file_cut_anywhere_holds_every_step_before_the_cut(tmp_path):
         ends.append(recorder.path.stat().st_size)
     recorder.close()
     data, cut = recorder.path.read_bytes(), tmp_path / "cut.mcap"
-    for length in [*range(8, len(data), 37), *ends, len(data) - 1]:
+    for length in [*range(8, len(data), 311), *ends, len(data) - 1]:
         cut.write_bytes(data[:length])
         indices = [step.index for step in read_steps(cut)]
         flushed = sum(end <= length for end in ends)
