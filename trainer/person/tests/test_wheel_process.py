@@ -35,7 +35,7 @@ def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
     assert_taken_over_at_once(killed, asked_ns)
 
     with train(run_dir, "--resume") as training:
-        training.wait_for_step(lambda step: step.step >= 1)
+        training.wait_for_step(lambda step: step.sitting == 2 and step.step >= 1)
         training.process.terminate()  # Which is quitting, too.
         status, errors = training.end()
     assert status == 0, errors
