@@ -12,8 +12,8 @@ CONTAINER_STAMP := $(CONTAINER)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-ray test-network test-board lint format lint-container bench bench-quick bench-gpu \
-	bench-loop bench-can network vehicle board fleet recording mutate lock clean
+.PHONY: help install doctor pictures demo test test-ray test-network test-board lint format lint-container bench bench-quick bench-gpu \
+	bench-loop bench-view bench-can network vehicle board fleet recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -26,6 +26,13 @@ $(STAMP): pyproject.toml requirements/workstation.txt
 	@touch $@
 
 install: $(STAMP)  ## the virtual environment with the locked dependencies
+
+# Before the installation, too: then with any Python.
+doctor:  ## what this machine can and cannot do, and how to get the rest
+	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) -m hil_tests doctor
+
+pictures: $(STAMP)  ## every picture of the READMEs, into docs
+	$(BIN)/python -m hil_tests pictures --out docs
 
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
@@ -47,7 +54,7 @@ test-board: $(STAMP)  ## whole bundles installed, on an emulated board, too, wit
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests
+	$(BIN)/mypy edge_runtime viewing bridge trainer deploy hil_tests
 	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer
 
 $(CONTAINER_STAMP): requirements/container.txt
@@ -100,6 +107,10 @@ bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
 	@mkdir -p $(BENCH)
 	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
+
+bench-view: $(STAMP)  ## what looking on costs the training loop and the simulator
+	@mkdir -p $(BENCH)
+	$(BIN)/python -m hil_tests.benches.viewing --out $(BENCH)/viewing.json
 
 bench-can: $(STAMP)  ## ten minutes of the 50 Hz CAN stream, every core busy, beside a bare sender
 	@mkdir -p $(BENCH)

@@ -34,6 +34,9 @@ class Clock(Protocol):
     def exchange(self, state: State) -> Decision:
         """Send the state of one tick and decide what the vehicle does in it."""
 
+    def newest_answer(self) -> tuple[int, float] | None:
+        """The newest state of this episode that was answered, and its latency in ms."""
+
     def finish(self, state: State) -> None:
         """Send the final state. It says that the simulation has ended, which no radio link
         carries, so no delay or loss is injected; whatever is still under way is forgotten.

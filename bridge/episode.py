@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
@@ -13,13 +13,14 @@ import numpy as np
 from bridge.actions import Apply, policy_action
 from bridge.clock import Clock
 from bridge.safe_stops import SafeStopLog
+from bridge.scene import Stamps
 from edge_runtime.cli import UserError
 from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.latency.command_hold import Decision
 from edge_runtime.wire import CONTROL_PERIOD_S, State
 
-PublishScene = Callable[[Any, int, int, float, float | None], None]
-"""Called with environment, episode, step, simulated time (s), newest round trip (ms)."""
+PublishScene = Callable[[Any, Stamps], None]
+"""Called with the environment and what is to stand beside its scene."""
 OnTick = Callable[[int, int, Decision], None]
 """Called with episode, step, decision after every tick."""
 
@@ -36,6 +37,7 @@ class EpisodeRunner:
         on_tick: OnTick,
         apply: Apply = policy_action,
         standing: bool = False,
+        rejected: Callable[[], Mapping[str, int]] = dict,
     ) -> None:
         self.safe_stops = SafeStopLog(CONTROL_PERIOD_S)
         self.deadline_misses = 0
@@ -48,6 +50,7 @@ class EpisodeRunner:
         self._publish_scene = publish_scene
         self._on_tick = on_tick
         self._apply = apply
+        self._rejected = rejected
         self._options = {"standing": True} if standing else None
 
     def run(self, episode: int, seed: int) -> EpisodeResult:
@@ -107,14 +110,11 @@ class EpisodeRunner:
         )
 
     def _show(self, state: State) -> None:
-        answered = self._clock.latencies_ms
-        self._publish_scene(
-            self._environment,
-            state.episode,
-            state.step,
-            state.sim_time_s,
-            answered[-1] if answered else None,
+        step, round_trip_ms = self._clock.newest_answer() or (None, None)
+        stamps = Stamps(
+            state.episode, state.step, state.sim_time_s, round_trip_ms, step, self._rejected()
         )
+        self._publish_scene(self._environment, stamps)
 
     def _note(self, state: State, decision: Decision, speed_mps: float) -> None:
         self.deadline_misses += not decision.fresh

@@ -62,6 +62,11 @@ class LockStepClock:
             self._arrive_at_edge(arrival)
         return self._link.decide(self._wall_silence_s())
 
+    def newest_answer(self) -> tuple[int, float] | None:
+        """The newest state of this episode that was answered, and its latency in ms."""
+        step = self._link.hold.newest_step
+        return None if step < 0 else (step, self.latencies_ms[-1])
+
     def finish(self, state: State) -> None:
         """Publish the final state at once; nobody waits for an answer to it."""
         self._check.end(state.step, self._link.hold.newest_step)

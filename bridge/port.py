@@ -14,7 +14,7 @@ import zenoh
 from bridge.edge_counts import EdgeCounts
 from bridge.environments import scene_of
 from bridge.feed import connect_client
-from bridge.scene import encode_scene, scene_key
+from bridge.scene import Stamps, encode_scene, scene_key
 from edge_runtime import access
 from edge_runtime.cli import UserError
 from edge_runtime.manifest import Manifest
@@ -78,21 +78,14 @@ class SimulatorPort:
         """Send an encoded state to the edge runtime (and to viewers)."""
         self._states.put(payload)
 
-    def publish_scene(
-        self,
-        environment: Any,
-        episode: int,
-        step: int,
-        sim_time_s: float,
-        round_trip_ms: float | None,
-    ) -> None:
+    def publish_scene(self, environment: Any, stamps: Stamps) -> None:
         """Send the scene, if the environment has one and anybody is listening."""
         somebody: Any = self._scenes.matching_status
         if not somebody.matching:
             return
         scene = scene_of(environment)
         if scene is not None:
-            self._scenes.put(encode_scene(scene, episode, step, sim_time_s, round_trip_ms))
+            self._scenes.put(encode_scene(scene, stamps))
 
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
         """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""

@@ -53,6 +53,12 @@ class RealTimeClock:
         """Wait for the tick, send its state, and decide when its command window closes."""
         return self._decide(state.step, self._send_state(state) + COMMAND_WINDOW_S)
 
+    def newest_answer(self) -> tuple[int, float] | None:
+        """The newest state of this episode that was answered, and its latency in ms."""
+        with self._arrived:
+            step = self._hold.newest_step
+            return None if step < 0 else (step, self.latencies_ms[-1])
+
     def finish(self, state: State) -> None:
         """Forget what is under way and publish the final state at once."""
         self._line.clear()

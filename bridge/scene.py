@@ -5,7 +5,8 @@ The policy never hears this topic: it holds what the environment knows and the v
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -41,6 +42,22 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
     path: list[Point] = []
     goal: Point | None = None
     vehicles: list[SceneVehicle] = []
+    lane_lines: list[list[Point]] = []
+    answered_step: int | None = None
+    """The state, of this episode, that ``round_trip_ms`` is of."""
+    rejected: dict[str, int] = {}
+    """What the simulator did not believe so far, by reason."""
+
+
+class Stamps(NamedTuple):
+    """What the simulator adds to an environment's ``scene()``: the fields of ``Scene``."""
+
+    episode: int
+    step: int
+    sim_time_s: float
+    round_trip_ms: float | None = None
+    answered_step: int | None = None
+    rejected: Mapping[str, int] = {}
 
 
 _ENCODER = msgspec.msgpack.Encoder(
@@ -54,16 +71,9 @@ def scene_key(vehicle_id: str) -> str:
     return f"phil/{check_vehicle_id(vehicle_id)}/scene"
 
 
-def encode_scene(
-    scene: dict[str, Any],
-    episode: int,
-    step: int,
-    sim_time_s: float,
-    round_trip_ms: float | None = None,
-) -> bytes:
+def encode_scene(scene: dict[str, Any], stamps: Stamps) -> bytes:
     """Encode an environment's ``scene()`` with its place in time as a MessagePack map."""
-    stamps = {"episode": episode, "step": step, "sim_time_s": sim_time_s}
-    return _ENCODER.encode({**scene, **stamps, "round_trip_ms": round_trip_ms})
+    return _ENCODER.encode({**scene, **stamps._asdict()})
 
 
 def decode_scene(payload: bytes) -> Scene | None:
@@ -72,5 +82,5 @@ def decode_scene(payload: bytes) -> Scene | None:
         return None
     try:
         return _DECODER.decode(payload)
-    except (msgspec.MsgspecError, RecursionError):
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return None

@@ -194,6 +194,8 @@ def _drive(
         bar.tick,
         apply=vehicle.apply if vehicle else policy_action,
         standing=settings.standing,
+        # Copies, made at once: other threads go on counting.
+        rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
     )
     results = []
     port.note_edge_counts()

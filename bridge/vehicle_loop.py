@@ -23,7 +23,7 @@ class VehicleInLoop:
 
     def rejected(self) -> Counter[str]:
         """Return the feedback that was not believed, as ``feedback_REASON``."""
-        counts = self.clock.feedback_check.rejected
+        counts = dict(self.clock.feedback_check.rejected)  # Its own thread goes on counting.
         return Counter({f"feedback_{name}": n for name, n in counts.items()})
 
     def report(self) -> dict[str, Any]:

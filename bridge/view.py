@@ -1,4 +1,4 @@
-"""``python -m bridge view``: a listener of its own that shows the wire in rerun."""
+"""``python -m bridge view``: the wire in rerun, as a listener of its own or from a recording."""
 
 from __future__ import annotations
 
@@ -6,22 +6,24 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from itertools import chain
+from pathlib import Path
 from typing import Any
 
-import rerun as rr
-
-from bridge.arguments import add_connect, add_span, add_tls, add_vehicle_id
+from bridge.arguments import add_connect, add_span, add_tls
 from bridge.feed import Feed, Heard, open_feed
 from bridge.scene import decode_scene
-from bridge.signals import sigterm_as_interrupt
-from bridge.viewer import sinks
+from bridge.signals import sigterm_as_interrupt, wait_to_be_told
+from bridge.viewer.blueprint import APPLICATION, make_blueprint
+from bridge.viewer.recorded import read_heard
 from bridge.viewer.wire_log import WireLog
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.files import check_writable
 from edge_runtime.tls import TlsFiles, tls_for
+from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import check_endpoint
+from viewing.pace import PICTURE_INTERVAL_S
+from viewing.sinks import SERVE, SPAWN, Sink, check_sink, open_sink
 
 POLL_S = 0.1
 
@@ -36,11 +38,18 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
 EXAMPLE = examples(
     "python -m bridge view --serve",
     "python -m bridge view --save drive.rrd --wait-s 60",
+    "python -m bridge view hil_tests/recordings/left_turn.mcap --save left_turn.rrd",
 )
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
+    parser.add_argument(
+        "recording",
+        nargs="?",
+        metavar="F.mcap",
+        help="show what bridge record has written, instead of listening",
+    )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--spawn", action="store_true", help="open a rerun window (the default)")
     where.add_argument(
@@ -49,50 +58,70 @@ def add_arguments(parser: ArgumentParser) -> None:
     where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
     add_connect(parser)
     add_tls(parser)
-    add_vehicle_id(parser, "the vehicle to watch")
+    parser.add_argument(
+        "--vehicle-id",
+        metavar="ID",
+        help=f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)",
+    )
     add_span(parser)
 
 
 def view(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    wire.check_vehicle_id(arguments.vehicle_id)
-    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
-    _check_sink(arguments)
-    dropped = _watch(arguments, tls)
-    if dropped:
-        print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
-    if arguments.save is not None:
-        print(f"wrote {arguments.save}")
+    if arguments.vehicle_id is not None:
+        wire.check_vehicle_id(arguments.vehicle_id)
+    sink = _sink(arguments)
+    if arguments.recording is not None:
+        check_sink(sink)
+        _show_recording(arguments, sink)
+    else:
+        tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+        check_sink(sink)
+        dropped = _watch(arguments, sink, tls)
+        if dropped:
+            print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
+    if sink.path:
+        print(f"wrote {sink.path}")
     return 0
 
 
-def _watch(arguments: Any, tls: TlsFiles | None) -> int:
-    """Draw until there is a reason to stop; return how many messages had to be dropped."""
+def _sink(arguments: Any) -> Sink:
+    if arguments.save is not None:
+        return Sink("save", arguments.save)
+    return Sink(SERVE if arguments.serve else SPAWN)
+
+
+def _show_recording(arguments: Any, sink: Sink) -> None:
+    """Draw all of it; a page is served until somebody interrupts."""
+    heard = read_heard(Path(arguments.recording), arguments.vehicle_id)
+    first = next(heard, None)  # Says what is wrong with the file before anything is opened.
     with (
         sigterm_as_interrupt(),
-        open_feed(arguments.connect, arguments.vehicle_id, arguments.wait_s, tls) as feed,
-        _sink(arguments) as recording,
+        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        log = WireLog(recording)
+        for each in chain([first] if first else [], heard):
+            _write(log, each)
+        if sink.kind == SERVE:
+            recording.flush()
+            print("all of it is there; ^C ends", flush=True)
+            wait_to_be_told()
+
+
+def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
+    """Draw until there is a reason to stop; return how many messages had to be dropped."""
+    vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    with (
+        sigterm_as_interrupt(),
+        open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,
+        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         contextlib.suppress(KeyboardInterrupt),
     ):
-        _show(feed, WireLog(recording), arguments.duration_s)
+        log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
+        _show(feed, log, arguments.duration_s)
     return feed.dropped
-
-
-def _check_sink(arguments: Any) -> None:
-    """Say at once, not after waiting for the simulator, that nothing could be shown."""
-    if arguments.save is not None:
-        check_writable(arguments.save)
-    elif arguments.serve:
-        sinks.check_ports()
-    else:
-        sinks.check_display()
-
-
-def _sink(arguments: Any) -> AbstractContextManager[rr.RecordingStream]:
-    if arguments.save is not None:
-        return sinks.save_to(arguments.save)
-    return sinks.serve_page() if arguments.serve else sinks.spawn_window()
 
 
 def _show(feed: Feed, log: WireLog, duration_s: float | None) -> None:

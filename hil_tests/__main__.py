@@ -7,7 +7,12 @@ import sys
 from edge_runtime.cli import ArgumentParser, examples, run_cli, run_command
 
 COMMANDS: dict[str, tuple[str, str]] = {
+    "doctor": (
+        "hil_tests.doctor.command",
+        "what this machine can and cannot do, and how to get the rest",
+    ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
+    "pictures": ("hil_tests.pictures.command", "every picture of the READMEs"),
     "campaign": ("hil_tests.campaign.command", "every fault, every latency row, one report"),
     "mock_hunter": (
         "hil_tests.mock_hunter.command",

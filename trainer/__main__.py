@@ -8,11 +8,13 @@ from edge_runtime.cli import ArgumentParser, examples, run_cli, run_command
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("trainer.commands.train", "train a policy with human guidance"),
+    "drive": ("trainer.commands.drive", "drive yourself, or take over from a policy; recorded"),
     "human": ("trainer.commands.human", "train the DAgger human model from interventions"),
     "evaluate": ("trainer.commands.evaluate", "drive test episodes and report how well it does"),
     "export": ("trainer.commands.export", "write a run's actor as the file that a board drives"),
     "plot": ("trainer.commands.plot", "draw the learning curve of a run"),
     "picture": ("trainer.commands.picture", "draw a moment of an episode, from above"),
+    "view": ("trainer.commands.view", "show recorded sittings in rerun"),
     "bench": ("trainer.commands.bench", "measure learner, environment, training, replay, memory"),
     "experiment": ("trainer.commands.experiment", "run the paper's experiments, judge its claims"),
 }

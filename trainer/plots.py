@@ -1,9 +1,11 @@
-"""Pictures of a run."""
+"""Pictures of a run, or of several that differ in their seeds."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,6 +19,15 @@ from trainer.training.metrics import read_metrics
 CURVE_FILE = "learning_curve.png"
 WINDOW = 20
 """Episodes of the moving average."""
+Values = NDArray[np.float64]
+PANELS = (
+    ("episode_return", "return (without shaping)"),
+    ("distance_m", "surviving distance, m"),
+    ("success", "success"),
+    ("human_share", "share of steps driven by the human"),
+)
+"""Column -> title."""
+SUCCESS = 2
 
 
 def write_learning_curve(run_dir: Path) -> Path:
@@ -25,45 +36,85 @@ def write_learning_curve(run_dir: Path) -> Path:
     Raises:
         UserError: the run has no metrics yet.
     """
-    rows = read_metrics(run_dir)
-    if not rows:
-        raise UserError(f"{run_dir} holds no metrics to draw")
-    column = {name: [row[name] for row in rows] for name in rows[0]}
-    episodes = np.array(column["episode"], dtype=int) + 1
-    steps, human_steps = (np.array(column[name], dtype=float) for name in ("steps", "human_steps"))
-    success = np.array([outcome == GOAL for outcome in column["outcome"]], dtype=float)
-    validation = np.array(column["validation_success"], dtype=float)
-    figure = Figure(figsize=(10, 6), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True).flat
-    returns = np.array(column["episode_return"], dtype=float)
-    distances_m = np.array(column["distance_m"], dtype=float)
-    for panel, values, title in (
-        (panels[0], returns, "return (without shaping)"),
-        (panels[1], distances_m, "surviving distance, m"),
-        (panels[2], success, "success"),
-        (panels[3], human_steps / steps, "share of steps driven by the human"),
-    ):
-        panel.plot(episodes, values, ".", markersize=3, color="0.75")
-        panel.plot(episodes, moving_average(values, WINDOW), color="C0", label=f"mean of {WINDOW}")
-        panel.set_title(title)
-        panel.grid(alpha=0.3)
-    tested = ~np.isnan(validation)
-    panels[2].plot(
-        episodes[tested], validation[tested], "o-", color="C1", label="policy alone, validation"
-    )
-    panels[2].legend()
-    for panel in (panels[2], panels[3]):
-        panel.set_xlabel("episode")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
     path = run_dir / CURVE_FILE
-    write_atomic(path, buffer.getvalue())
+    write_learning_curves([run_dir], path)
     return path
 
 
-def moving_average(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+def write_learning_curves(run_dirs: Sequence[Path], path: Path) -> None:
+    """The same for several runs: each as a thin line, and their mean up to the shortest's end.
+
+    Raises:
+        UserError: one of them has no metrics yet.
+    """
+    runs = [_columns(run_dir) for run_dir in run_dirs]
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    panels = figure.subplots(2, 2, sharex=True).flat
+    for panel, (name, title) in zip(panels, PANELS, strict=True):
+        if len(runs) == 1:
+            panel.plot(runs[0]["episode"], runs[0][name], ".", markersize=3, color="0.75")
+        _draw_means(panel, runs, name)
+        panel.set_title(title)
+        panel.grid(alpha=0.3)
+    panels = figure.axes
+    _draw_validation(panels[SUCCESS], runs)
+    panels[SUCCESS].legend()
+    for panel in panels[SUCCESS:]:
+        panel.set_xlabel("episode")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    write_atomic(path, buffer.getvalue())
+
+
+def moving_average(values: Values, window: int) -> Values:
     """The mean of the last ``window`` values (fewer at the start), same length."""
     sums = np.cumsum(np.concatenate([[0.0], values]))
     ends = np.arange(1, len(values) + 1)
     starts = np.maximum(ends - window, 0)
     return (sums[ends] - sums[starts]) / (ends - starts)
+
+
+def _columns(run_dir: Path) -> dict[str, Values]:
+    rows = read_metrics(run_dir)
+    if not rows:
+        raise UserError(f"{run_dir} holds no metrics to draw")
+
+    def column(name: str) -> Values:
+        return np.array([row[name] for row in rows], dtype=float)
+
+    return {
+        "episode": column("episode") + 1,
+        "episode_return": column("episode_return"),
+        "distance_m": column("distance_m"),
+        "success": np.array([row["outcome"] == GOAL for row in rows], dtype=float),
+        "human_share": column("human_steps") / column("steps"),
+        "validation": column("validation_success"),
+    }
+
+
+def _draw_means(panel: Any, runs: list[dict[str, Values]], name: str) -> None:
+    """A moving average for each run; of several, theirs besides, which is what is looked at."""
+    curves = [moving_average(run[name], WINDOW) for run in runs]
+    if len(runs) == 1:
+        panel.plot(runs[0]["episode"], curves[0], color="C0", label=f"mean of {WINDOW}")
+        return
+    for run, curve in zip(runs, curves, strict=True):
+        panel.plot(run["episode"], curve, color="C0", alpha=0.25, linewidth=1)
+    shortest = min(len(curve) for curve in curves)
+    mean = np.mean([curve[:shortest] for curve in curves], axis=0)
+    label = f"{len(runs)} runs, mean of {WINDOW}"
+    panel.plot(runs[0]["episode"][:shortest], mean, color="C0", linewidth=2, label=label)
+
+
+def _draw_validation(panel: Any, runs: list[dict[str, Values]]) -> None:
+    """Success of the policy alone where it was validated; of several runs, the mean."""
+    label = "policy alone, validation"
+    if len(runs) == 1:
+        tested = ~np.isnan(runs[0]["validation"])
+        episodes, successes = runs[0]["episode"][tested], runs[0]["validation"][tested]
+    else:
+        shortest = min(len(run["episode"]) for run in runs)
+        values = np.array([run["validation"][:shortest] for run in runs])
+        tested = ~np.isnan(values).any(axis=0)
+        episodes, successes = runs[0]["episode"][:shortest][tested], values[:, tested].mean(axis=0)
+    panel.plot(episodes, successes, "o-", color="C1", label=label)

@@ -6,6 +6,8 @@ import numpy as np
 
 TRAINING, VALIDATION, EXPLORATION, REPLAY, HUMAN_EPISODES, HUMAN_BATCHES, GUIDANCE = range(7)
 """Purposes, each with a stream of its own."""
+SITTINGS = 7
+"""The same, of the episodes that a person drives without learning."""
 
 
 def episode_seed(run_seed: int, purpose: int, episode: int) -> int:

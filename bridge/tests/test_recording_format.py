@@ -10,7 +10,7 @@ from bridge.recording.reader import Recording
 from bridge.recording.writer import RecordingWriter
 from bridge.replaying.in_process import replay_in_process
 from bridge.replaying.recorded import RecordedDrive
-from bridge.scene import encode_scene
+from bridge.scene import Stamps, encode_scene
 from bridge.tests.commands import make_command
 from bridge.tests.processes import make_policy
 from bridge.tests.test_edge_counts import health
@@ -69,7 +69,7 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
         encode(make_state(1)),
         encode(make_command(1)),
         encode(health(1, 2.0, stale=2**63)),
-        encode_scene({"vehicles": []}, 1, 1, 0.1),
+        encode_scene({"vehicles": []}, Stamps(1, 1, 0.1)),
     ]
     writer = RecordingWriter(tmp_path / "a.mcap")
     for number in range(3000):

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import msgspec
 import pytest
 import rerun as rr
 
+from bridge.__main__ import main
 from bridge.port import open_port
-from bridge.scene import Scene, SceneVehicle, decode_scene, encode_scene
+from bridge.scene import Scene, Stamps, decode_scene, encode_scene
+from bridge.tests.commands import make_command
 from bridge.tests.processes import (
     SLOW_TOY,
     BridgeProcess,
@@ -22,11 +25,11 @@ from bridge.tests.processes import (
     start_simulate,
 )
 from bridge.tests.toy import ToyEnv
-from bridge.viewer.shapes import outline, view_bounds
-from bridge.viewer.timeline import Timeline
 from bridge.viewer.wire_log import WireLog
 from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import free_endpoint
+
+LEFT_TURN = Path(__file__).parents[2] / "hil_tests" / "recordings" / "left_turn.mcap"
 
 
 def verify(recording):
@@ -129,35 +132,102 @@ def test_a_late_viewer_does_not_call_it_silence(monkeypatch):
 def test_a_scene_survives_the_wire_with_numpy_numbers_inside():
     environment = ToyEnv()
     environment.reset(seed=1)
-    scene = decode_scene(encode_scene(environment.scene(), episode=2, step=3, sim_time_s=0.3))
+    stamps = Stamps(episode=2, step=3, sim_time_s=0.3, rejected={"stale": 2})
+    scene = decode_scene(encode_scene(environment.scene(), stamps))
     assert scene is not None
     assert (scene.episode, scene.step, scene.vehicles[0].ego) == (2, 3, True)
     assert scene.path == [[0.0, 0.0], [14.0, 0.0]]
 
 
+def test_a_recording_is_shown_without_a_drive(tmp_path, capsys):
+    out = tmp_path / "left_turn.rrd"
+    assert main(["view", str(LEFT_TURN), "--save", str(out)]) == 0
+    found = verify(out)
+    entities = ("frames/now", "road/ego/body", "road/roads", "action/asked", "latency/uplink",
+                "latency/inference", "mode/reason", "rejected/edge/all")  # fmt: skip
+    assert [entity for entity in entities if entity not in found] == []
+    assert capsys.readouterr().out == f"wrote {out}\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (["none.mcap"], "cannot be read"),
+        ([str(LEFT_TURN), "--vehicle-id", "other"], "holds no vehicle other"),
+        ([str(LEFT_TURN.with_name("make.py"))], "no MCAP recording"),
+    ],
+)
+def test_a_recording_that_cannot_be_shown_is_one_line_and_no_file(options, part, capsys, tmp_path):
+    assert refuse(["view", *options, "--save", str(tmp_path / "a.rrd")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert part in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def keep_numbers(monkeypatch, log):
+    """What the log draws as numbers from now on, by entity."""
+    kept: dict[str, list[float]] = {}
+
+    def keep(path, value):
+        kept.setdefault(path, []).append(value)
+
+    monkeypatch.setattr(log, "_scalar", keep)
+    return kept
+
+
+def make_scene(**fields):
+    return Scene(episode=0, step=9, sim_time_s=0.9, **fields)
+
+
+def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(monkeypatch):
+    log = WireLog(rr.RecordingStream("test"))
+    kept = keep_numbers(monkeypatch, log)
+    ms = 10**6
+    for step in (3, 4):
+        sent_ns = 10**18 + step * 100 * ms
+        log.write_state(make_state(step, sent_ns=sent_ns), sent_ns)
+        received_ns = sent_ns + (20 + step) * ms
+        command = make_command(
+            step, received_ns=received_ns, inference_ns=2 * ms, sent_ns=received_ns + 3 * ms
+        )
+        log.write_command(command, received_ns)
+        repeated = msgspec.structs.replace(command, sent_ns=command.sent_ns + 100 * ms)
+        log.write_command(repeated, received_ns + 100 * ms)
+    # The newest command is that of step 4, but the round trip that is told is still step 3's.
+    for _ in range(2):
+        log.write_scene(make_scene(round_trip_ms=60.0, answered_step=3), 10**18)
+    assert kept["latency/uplink"] == pytest.approx([23.0, 23.0, 24.0, 24.0])
+    assert kept["latency/round_trip"] == [60.0, 60.0]
+    assert kept["latency/downlink"] == pytest.approx([60.0 - 26.0])
+
+
+def test_rejections_are_counted_by_side_and_reason(monkeypatch):
+    log = WireLog(rr.RecordingStream("test"))
+    kept = keep_numbers(monkeypatch, log)
+    for count in (0, 2, 5):
+        log.write_scene(make_scene(rejected={"stale": count}), 10**18)
+    assert kept == {
+        "rejected/simulator/all": [0, 2, 5],
+        "rejected/simulator/stale": [0, 2, 5],  # From zero, so that the line shows the step.
+    }
+
+
+def test_live_pictures_are_at_most_ten_a_second(monkeypatch):
+    drawn = []
+
+    def draw(*_, **__):
+        drawn.append(1)
+        return rr.Clear(recursive=False)
+
+    monkeypatch.setattr(rr, "Image", draw)
+    for interval_s, expected in ((0.1, 2 * 11), (0.0, 2 * 101)):
+        drawn.clear()
+        log = WireLog(rr.RecordingStream("test"), interval_s)
+        for step in range(101):  # A lock-step drive at ten times real time.
+            log.write_state(make_state(step), 10**18 + step * 10**7)
+        assert len(drawn) == pytest.approx(expected, abs=2)
+
+
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80", bytes(70_000)])
 def test_what_is_no_scene_is_none(payload):
     assert decode_scene(payload) is None
-
-
-def test_a_car_that_heads_down_the_picture_is_long_in_y():
-    car = SceneVehicle(
-        id=1, x=5.0, y=2.0, heading_rad=math.pi / 2, length_m=4.0, width_m=2.0, speed_mps=0.0
-    )
-    xs, ys = zip(*outline(car), strict=True)
-    assert (min(xs), max(xs)) == pytest.approx((4.0, 6.0))
-    assert (min(ys), max(ys)) == pytest.approx((0.0, 4.0))
-    x_range, y_range = view_bounds(Scene(episode=0, step=0, sim_time_s=0.0, vehicles=[car]))
-    assert x_range[0] < 4.0 < 6.0 < x_range[1]
-    assert y_range[0] < 0.0 < 4.0 < y_range[1]
-
-
-def test_episodes_stand_end_to_end():
-    timeline = Timeline()
-    assert timeline.place(0, 0).total_step == 0
-    assert timeline.place(0, 7).total_step == 7
-    assert timeline.place(1, 0).total_step == 8
-    assert timeline.place(0, 5).total_step == 5
-    late = timeline.place(1, 2)
-    assert (late.episode_time_s, late.sim_time_s) == (0.2, 1.0)
-    assert timeline.now == late

@@ -5,14 +5,28 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from bridge.scene import Scene
-from bridge.viewer.shapes import view_bounds
+from viewing.series import ALL_OF_IT, BLUE, GREEN, ORANGE, PURPLE, Plot, plot_view
+from viewing.shapes import view_bounds
 
+APPLICATION = "phil_hil"
 PLOTS = (
-    ("action", "Command in [-1, 1]: asked and achieved", (-1.1, 1.1)),
-    ("speed", "Speed, m/s", (-0.5, 8.0)),
-    ("latency", "Latency, ms", None),
+    Plot("action", "Command in [-1, 1]: asked and achieved", (-1.1, 1.1)),
+    Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
+    Plot("latency", "Latency, ms: round trip, and its parts"),
+    Plot("rejected", "Messages rejected so far, by reason"),
 )
-"""Origin, title and fixed y range of each plot, from top to bottom."""
+"""From top to bottom."""
+SERIES = {
+    "action/asked": BLUE,
+    "action/achieved": ORANGE,
+    "speed/simulated": BLUE,
+    "speed/vehicle": ORANGE,
+    "latency/uplink": BLUE,
+    "latency/inference": GREEN,
+    "latency/downlink": PURPLE,
+    "latency/round_trip": ORANGE,
+}
+"""Lines that are there from the start; those of rejections come with their reasons."""
 
 
 def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
@@ -49,22 +63,17 @@ def _frames() -> rrb.Horizontal:
 
 
 def _numbers() -> rrb.Vertical:
-    plots = [
-        rrb.TimeSeriesView(
-            origin=origin,
-            name=title,
-            axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
-            plot_legend=rrb.Corner2D.LeftTop,
-        )
-        for origin, title, limits in PLOTS
-    ]
     return rrb.Vertical(
-        rrb.StateTimelineView(origin="mode", name="Mode, and why it does not drive"),
-        *plots,
+        rrb.StateTimelineView(
+            origin="mode",
+            name="Mode, and why it does not drive",
+            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+        ),
+        *map(plot_view, PLOTS),
         rrb.TextLogView(
             origin="events",
             name="Events: modes, rejections, episodes",
             columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
         ),
-        row_shares=[1.6, 2, 2, 2, 1.8],
+        row_shares=[2.2, 2, 2, 2, 1.6, 1.8],
     )

@@ -19,7 +19,17 @@ from edge_runtime.tests.harness import (
 from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
 
-UNWANTED = {"torch", "gymnasium", "highway_env", "rerun", "rerun_sdk", "onnx", "trainer", "bridge"}
+UNWANTED = {
+    "torch",
+    "gymnasium",
+    "highway_env",
+    "rerun",
+    "rerun_sdk",
+    "onnx",
+    "trainer",
+    "bridge",
+    "viewing",
+}
 WHITE_FRAMES = bytes([WHITE]) * FRAMES_BYTES
 
 

@@ -5,18 +5,22 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from edge_runtime.cli import examples, write_json_out
+from edge_runtime.cli import UserError, examples, write_json_out
 from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
 from trainer.drivers import make_environment
 from trainer.files import make_directory
 from trainer.human.dagger import HumanTraining
-from trainer.human.model import HumanModelConfig
+from trainer.human.model import HumanModel, HumanModelConfig
+from trainer.person.imitation import demonstrate
+from trainer.person.recording import find_recordings
 from trainer.progress import ProgressBar
 
 EXAMPLE = examples(
     "python -m trainer human --scenario left_turn --out runs/human",
     "python -m trainer human --scenario congestion --frames 2 --out runs/human_congestion",
+    "python -m trainer human --from runs/drives --out runs/me",
 )
 DEFAULTS = HumanModelConfig()
 
@@ -60,6 +64,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=DEFAULTS.refining_updates,
         help="gradient steps after the last episode, under a learning rate that falls to zero",
     )
+    parser.add_argument(
+        "--from",
+        dest="recordings",
+        nargs="+",
+        metavar="RECORDING",
+        help="imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
+        "their directories, or such a training run (default: the scripted expert)",
+    )
     add_threads(parser)
 
 
@@ -74,8 +86,26 @@ def run(arguments: argparse.Namespace) -> int:
         label_every_step=arguments.label_every_step,
         refining_updates=arguments.refining_updates,
     )
+    scripted = arguments.recordings is None
+    model, about = (_from_expert if scripted else _from_person)(arguments, config)
+    if config.refining_updates:
+        with ProgressBar("refining", config.refining_parts) as bar:
+            for loss in model.refine():
+                bar.advance({"loss": f"{loss:.3f}"})
     directory = Path(arguments.out)
-    make_directory(directory)
+    about = {"scenario": arguments.scenario, "seed": arguments.seed, **about}
+    model.save(directory, {**about, "config": asdict(config)})
+    report = {**about, "config": asdict(config), "demonstrations": model.demonstrations}
+    write_json_out(str(directory / "human.json"), report)
+    print(f"human model from {model.demonstrations} demonstrated steps: {directory}")
+    return 0
+
+
+def _from_expert(
+    arguments: argparse.Namespace, config: HumanModelConfig
+) -> tuple[HumanModel, dict[str, Any]]:
+    """A model of the scripted expert, which takes over from it while it drives."""
+    make_directory(Path(arguments.out))
     training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)
     with ProgressBar("human model", config.episodes) as bar:
         for episode in training.episodes():
@@ -87,13 +117,22 @@ def run(arguments: argparse.Namespace) -> int:
                     "outcome": episode.outcome,
                 }
             )
-    if config.refining_updates:
-        with ProgressBar("refining", config.refining_parts) as bar:
-            for loss in training.model.refine():
-                bar.advance({"loss": f"{loss:.3f}"})
-    about = {"scenario": arguments.scenario, "seed": arguments.seed, "config": asdict(config)}
-    training.model.save(directory, about)
-    report = {**about, "demonstrations": training.model.demonstrations}
-    write_json_out(str(directory / "human.json"), report)
-    print(f"human model from {training.model.demonstrations} demonstrated steps: {directory}")
-    return 0
+    return training.model, {}
+
+
+def _from_person(
+    arguments: argparse.Namespace, config: HumanModelConfig
+) -> tuple[HumanModel, dict[str, Any]]:
+    """A model of a person, from recordings: as many gradient steps as with the expert."""
+    if config.label_every_step:
+        raise UserError("--label-every-step asks the scripted expert; a recording holds no more")
+    recordings = find_recordings([Path(place) for place in arguments.recordings])
+    model = HumanModel(config, arguments.seed)
+    interventions = demonstrate(model, recordings, arguments.scenario)
+    make_directory(Path(arguments.out))
+    with ProgressBar("human model", config.episodes) as bar:
+        for _ in range(config.episodes):
+            loss = model.learn(config.updates_per_episode)
+            bar.advance({"demonstrations": str(model.demonstrations), "loss": f"{loss:.3f}"})
+    about = {"recordings": [str(path) for path in recordings], "interventions": interventions}
+    return model, about

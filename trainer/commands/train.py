@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import time
 from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,8 @@ from trainer.drivers import CHECKPOINT_FILE
 from trainer.files import make_directory
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.learner.config import LearnerConfig
+from trainer.person.options import PERSON, add_person, check_no_person
+from trainer.person.registry import HUMANS
 from trainer.plots import write_learning_curve
 from trainer.progress import ProgressBar
 from trainer.training.config import RunConfig
@@ -38,6 +42,7 @@ from trainer.training.run import CONFIG_FILE, TrainingRun
 EXAMPLE = examples(
     "python -m trainer train --scenario left_turn --episodes 120 --out runs/phil_1",
     "python -m trainer train --episodes 240 --out runs/phil_1 --resume",
+    "python -m trainer train --human keyboard --rerun mine.rrd --out runs/mine",
     "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
     "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
 )
@@ -57,9 +62,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--human",
         default=DEFAULTS.human,
-        metavar="expert|HUMAN_DIR",
-        help="who guides: the scripted expert, or a model trained by `trainer human`",
+        metavar=f"expert|HUMAN_DIR|{'|'.join(HUMANS)}",
+        help="who guides: the scripted expert, a model trained by `trainer human`, or you",
     )
+    add_person(parser)
     parser.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learner's device")
@@ -78,6 +84,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help=f"change a setting: {', '.join(_settings())}",
     )
+    parser.add_argument(
+        "--rerun",
+        metavar="spawn|serve|F.rrd",
+        help="show the run in rerun: in a window, on a page on this machine, or into a file",
+    )
     add_threads(parser)
 
 
@@ -89,14 +100,67 @@ def run(arguments: argparse.Namespace) -> int:
     config = _config(arguments)
     run_dir = Path(arguments.out)
     _check_directory(run_dir, config, arguments.resume)
-    training = TrainingRun(config, run_dir, arguments.resume)
-    make_directory(run_dir)
-    deadline_s = time.monotonic() + 60.0 * arguments.max_minutes if arguments.max_minutes else None
-    with ProgressBar("training", config.episodes, training.episode) as bar:
-        training.train(_Reporter(bar), deadline_s)
+    sink = _sink(arguments.rerun)
+    with _training(arguments, config, run_dir) as training:
+        deadline_s = (
+            time.monotonic() + 60.0 * arguments.max_minutes if arguments.max_minutes else None
+        )
+        with (
+            ProgressBar("training", config.episodes, training.episode) as bar,
+            _watched(training, sink) as watch,
+        ):
+            training.train(_both(_Reporter(bar), watch), deadline_s)
     write_learning_curve(run_dir)
     print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
     return 0
+
+
+@contextmanager
+def _training(
+    arguments: argparse.Namespace, config: RunConfig, run_dir: Path
+) -> Iterator[TrainingRun]:
+    """The run, and the person in it where one guides."""
+    if arguments.human in HUMANS:
+        from trainer.person.command import training_with_person
+
+        with training_with_person(arguments, config, run_dir) as guided:
+            yield guided
+    else:
+        check_no_person(arguments)
+        training = TrainingRun(config, run_dir, arguments.resume)
+        make_directory(run_dir)
+        yield training
+
+
+def _sink(word: str | None) -> Any:
+    """Where ``--rerun`` shows the run; None, and nothing imported, where it is not asked for."""
+    if word is None:
+        return None
+    from trainer.viewer.command import check_word
+
+    return check_word(word)
+
+
+@contextmanager
+def _watched(training: TrainingRun, sink: Any) -> Iterator[Callable[[EpisodeMetrics], None] | None]:
+    if sink is None:
+        yield None
+        return
+    from trainer.viewer.command import watched
+
+    with watched(training, sink) as on_episode:
+        yield on_episode
+
+
+def _both(
+    first: Callable[[EpisodeMetrics], None], second: Callable[[EpisodeMetrics], None] | None
+) -> Callable[[EpisodeMetrics], None]:
+    def on_episode(metrics: EpisodeMetrics) -> None:
+        first(metrics)
+        if second is not None:
+            second(metrics)
+
+    return on_episode
 
 
 class _Reporter:
@@ -128,7 +192,7 @@ def _config(arguments: argparse.Namespace) -> RunConfig:
         algorithm=arguments.algorithm,
         seed=arguments.seed,
         episodes=arguments.episodes,
-        human=arguments.human,
+        human=PERSON if arguments.human in HUMANS else arguments.human,
         latency=str(parse_spec(arguments.latency)),
         device=arguments.device,
         threads=arguments.threads,

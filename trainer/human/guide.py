@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
-Reason = Literal["collision", "stuck", "heading", "offset"]
+Reason = Literal["collision", "stuck", "heading", "offset", "person"]
 """Why the human takes over: a crash ahead, a car that waits for nothing, one that turns aside, one
-that drifts aside."""
+that drifts aside; a person has reasons of their own."""
 
 
 class Driver(Protocol):
@@ -45,6 +45,17 @@ class Intervention:
     reason: Reason
     first: bool
     """Whether the human took over at this step (eq. 17's intervention time)."""
+
+
+class Guide(Protocol):
+    """Whoever watches the policy."""
+
+    def reset(self) -> None:
+        """Start an episode with the policy in control."""
+
+    def watch(self, observation: Observation, policy_action: Action) -> Intervention | None:
+        """What the human does about ``policy_action``: None lets it pass. Once a step."""
+        ...
 
 
 class HumanGuide:

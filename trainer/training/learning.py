@@ -144,6 +144,16 @@ class ProcessorLearning:
         """Transitions stored since the run began."""
         return self.replay.added
 
+    @property
+    def begun(self) -> bool:
+        """Whether ``begin`` was called and ``finish`` not yet."""
+        return self._begun is not None
+
+    @property
+    def updating(self) -> bool:
+        """Whether ``finish`` would wait now."""
+        return self._begun is not None and not self._begun[1].done()
+
     def act(self, observation: Observation, averaged: bool = False) -> Action:
         """The actor's action, or the target actor's, float32 [action size]; not while updating."""
         return self.in_thread(self.learner.act, observation, averaged)

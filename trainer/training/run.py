@@ -26,14 +26,15 @@ from trainer.drivers import (
 )
 from trainer.evaluation import drive_episodes
 from trainer.files import load_torch, save_torch
-from trainer.human.guide import HumanGuide, Intervention
+from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.revision import source_revision
 from trainer.training.config import RunConfig
-from trainer.training.learning import LearningDriver
+from trainer.training.learning import Learning, LearningDriver
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 from trainer.training.placement import make_learning
+from trainer.training.seen import OnStep, Seen
 from trainer.training.tally import Tally
 from trainer.training.wheel import Ends, make_wheel
 
@@ -55,13 +56,15 @@ class TrainingRun:
         self.env = make_environment(config.scenario)
         self.validation_env = make_environment(config.scenario)
         action_size = self.env.action_space.shape[0]
-        self.learning = make_learning(config, self.algorithm, action_size)
+        self.learning = self._make_learning(action_size)
         self.network = parse_spec(config.latency)
         self.wheel = make_wheel(self.learning, self.env, self.network)
         self.guide = self._make_guide()
         self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
         self.guidance = seeds.stream(config.seed, seeds.GUIDANCE)
         self.episode = 0
+        self.on_step: OnStep | None = None
+        """Called at the end of each control period, if anybody looks on."""
         self.best_validation = (-1.0, -1.0)
         if resume:
             self._load()
@@ -83,7 +86,7 @@ class TrainingRun:
             while self.episode < self.config.episodes:
                 metrics = self.advance()
                 last = self.episode == self.config.episodes
-                late = deadline_s is not None and time.monotonic() > deadline_s
+                late = self._must_stop(deadline_s)
                 self._validate(metrics, at_end=last or late)
                 metrics_writer.add(metrics)
                 if last or late or self.episode % self.config.checkpoint_every == 0:
@@ -107,6 +110,7 @@ class TrainingRun:
             self.run_dir / CHECKPOINT_FILE,
             {
                 **self._label(),
+                **self._more_state(),
                 "learning": self.learning.state_dict(),
                 "kept_actor": self._kept_actor,
                 "exploration": self.exploration.bit_generator.state,
@@ -114,6 +118,10 @@ class TrainingRun:
                 "best_validation": self.best_validation,
             },
         )
+
+    def _more_state(self) -> dict[str, Any]:
+        """What another kind of run needs to go on, besides."""
+        return {}
 
     def _load(self) -> None:
         path = self.run_dir / CHECKPOINT_FILE
@@ -129,7 +137,14 @@ class TrainingRun:
         self.guidance.bit_generator.state = state["guidance"]
         self.best_validation = tuple(state["best_validation"])
 
-    def _make_guide(self) -> HumanGuide | None:
+    def _must_stop(self, deadline_s: float | None) -> bool:
+        """Whether the episode just driven is the last of this call."""
+        return deadline_s is not None and time.monotonic() > deadline_s
+
+    def _make_learning(self, action_size: int) -> Learning:
+        return make_learning(self.config, self.algorithm, action_size)
+
+    def _make_guide(self) -> Guide | None:
         if not self.algorithm.guided:
             return None
         expert = EXPERTS[self.config.scenario](self.env)
@@ -185,6 +200,9 @@ class TrainingRun:
         tally.acting_s += acted_s - began_s
         tally.environment_s += moved_s - begun_s
         tally.storing_s += begun_s - acted_s + stored_s - moved_s - waited_s
+        if self.on_step is not None:
+            speed_mps = float(info["speed_mps"])
+            self.on_step(Seen(observation, policy_action, intervention, action, speed_mps))
         return next_observation, terminated or truncated, info
 
     def _spoil(self, intervention: Intervention | None) -> Intervention | None:

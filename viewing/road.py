@@ -6,21 +6,21 @@ from collections.abc import Sequence
 
 import rerun as rr
 
-from bridge.scene import Scene, SceneVehicle
-from bridge.viewer.shapes import body, outline, windscreen
+from viewing.scene import Car, Scene
+from viewing.shapes import body, outline, windscreen
 
 ROAD = (92, 97, 105)
 PATH = (120, 190, 255)
 GOAL = (84, 200, 120)
 TRAFFIC = (235, 140, 40)
+MARKING = (235, 235, 235)
 GLASS = (30, 34, 40)
-EGO = {"drive": (40, 120, 230), "safe_stop": (220, 50, 50), "no command": (160, 30, 120)}
-"""Colour of the ego car by what it is told."""
 
 
 def draw_ground(recording: rr.RecordingStream, scene: Scene) -> None:
     """Draw what stays for an episode: roads, path and goal."""
     _lines(recording, "road/roads", scene.roads, ROAD, scene.road_width_m / 2, order=0.0)
+    _lines(recording, "road/lanes", scene.lane_lines, MARKING, 0.06, order=0.5)
     _lines(recording, "road/path", [scene.path] if scene.path else [], PATH, 0.15, order=1.0)
     if scene.goal is not None:
         recording.log(
@@ -29,17 +29,19 @@ def draw_ground(recording: rr.RecordingStream, scene: Scene) -> None:
         )
 
 
-def draw_cars(recording: rr.RecordingStream, scene: Scene, told: str) -> None:
-    """Draw the cars; the ego car's colour says what it is told (a key of EGO)."""
+def draw_cars(
+    recording: rr.RecordingStream, scene: Scene, ego_colour: tuple[int, int, int]
+) -> None:
+    """Draw the cars; the ego car's colour may say what it does, or by whose will."""
     for name, ego in (("traffic", False), ("ego", True)):
         cars = [car for car in scene.vehicles if car.ego == ego]
-        _draw_cars(recording, f"road/{name}", cars, EGO[told] if ego else TRAFFIC)
+        _draw_cars(recording, f"road/{name}", cars, ego_colour if ego else TRAFFIC)
 
 
 def _draw_cars(
     recording: rr.RecordingStream,
     path: str,
-    cars: Sequence[SceneVehicle],
+    cars: Sequence[Car],
     colour: tuple[int, int, int],
 ) -> None:
     half_widths = [car.width_m / 2 for car in cars]

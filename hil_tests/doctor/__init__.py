@@ -1,0 +1,1 @@
+"""``python -m hil_tests doctor``: what this machine can do, found out by doing it."""

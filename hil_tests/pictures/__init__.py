@@ -1,0 +1,1 @@
+"""``python -m hil_tests pictures``: every picture of the READMEs, made by commands."""

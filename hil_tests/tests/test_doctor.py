@@ -1,0 +1,141 @@
+"""``python -m hil_tests doctor``: its checks find what is there, and what is not."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from edge_runtime.cli import run_cli
+from hil_tests.__main__ import main
+from hil_tests.doctor import links, machine, person, software
+from hil_tests.doctor.check import Check, MissingError, examine, output_of
+from hil_tests.doctor.command import basics_work, lines, summary
+from hil_tests.doctor.table import CHECKS
+
+ROOT = Path(__file__).parents[2]
+
+
+def found(probe, basic=False):
+    return examine("group", Check("thing", probe, "no driving", "buy one", basic))
+
+
+def test_the_basics_work_where_the_tests_run(capsys):
+    assert main(["doctor", "--only", "basics", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["basics"] is True
+    assert [check["name"] for check in report["checks"] if not check["ok"]] == []
+
+
+def test_without_packages_it_still_runs_and_says_what_is_missing():
+    # -S: no site-packages, as in a fresh clone.
+    command = [sys.executable, "-S", "-m", "hil_tests", "doctor", "--only", "basics"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1, done.stderr
+    assert done.stderr == ""
+    assert "  ok       Python: 3." in done.stdout
+    (packages,) = (line for line in done.stdout.splitlines() if "missing  packages: " in line)
+    assert {"cryptography,", "numpy,", "torch"} <= set(packages.split())
+    assert done.stdout.endswith("The basics do not work here: packages, loopback.\n")
+
+
+def test_every_line_says_what_is_lost_and_how_to_get_it():
+    checks = [check for group in CHECKS.values() for check in group]
+    assert all(check.without and check.remedy for check in checks)
+    assert len({check.name for check in checks}) == len(checks)
+
+
+def test_a_port_is_tried():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        number = other.getsockname()[1]
+        taken = found(links.port(number))
+        assert not taken.ok
+        assert "Address already in use" in taken.detail
+    assert found(links.port(number)).ok
+
+
+def test_a_directory_that_takes_no_file_and_a_full_disk(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert found(machine.disk).ok
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(machine, "DISK_BYTES", 10**18)
+    assert "are wanted" in found(machine.disk).detail
+    monkeypatch.chdir("/proc")
+    assert not found(machine.disk).ok
+
+
+def test_packages_are_asked_for(monkeypatch, tmp_path):
+    (tmp_path / "pyproject.toml").write_text(
+        '[project]\ndependencies = ["numpy>=1", "no-such-thing!=1.2"]\n'
+    )
+    lock = tmp_path / "lock.txt"
+    lock.write_text("numpy==0.0.1\nno-such-thing==1.0\n")
+    monkeypatch.setattr(software, "ROOT", tmp_path)
+    monkeypatch.setattr(software, "LOCK", lock)
+    assert found(software.packages).detail == "not installed: no-such-thing"
+    assert "(locked: 0.0.1)" in found(software.versions).detail
+
+
+def test_an_old_python_is_missing(monkeypatch):
+    monkeypatch.setattr(software, "OLDEST", (99, 0))
+    assert not found(software.python).ok
+
+
+def test_the_can_bus_between_processes_carries_a_frame():
+    assert found(links.multicast_can).detail == "a frame went through UDP multicast on loopback"
+
+
+@pytest.mark.parametrize("display", [None, ":4711"])
+def test_a_window_needs_a_display(monkeypatch, display):
+    person._sdl.cache_clear()
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    if display:
+        monkeypatch.setenv("DISPLAY", display)
+    seen = found(person.window)
+    person._sdl.cache_clear()
+    assert not seen.ok
+    assert (display or "neither DISPLAY") in seen.detail
+
+
+def test_programs_are_run(monkeypatch, tmp_path):
+    tool = tmp_path / "tool"
+    tool.write_text("#!/bin/sh\necho tool 1.2\necho second line\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    assert found(machine.program("tool")).detail == "tool 1.2"
+    tool.write_text("#!/bin/sh\necho broken >&2\nexit 3\n")
+    assert found(machine.program("tool")).detail == "tool: broken"
+    assert found(machine.program("toool")).detail == "toool is not installed"
+    with pytest.raises(MissingError, match="not installed"):
+        output_of(str(tmp_path / "none"))
+
+
+def test_what_goes_wrong_in_a_check_is_its_finding():
+    def probe():
+        raise ImportError("libsomething.so:\n no such file")
+
+    broken = found(probe, basic=True)
+    assert lines(broken) == [
+        "  missing  thing: ImportError: libsomething.so: no such file",
+        "           without it: no driving",
+        "           get it: buy one",
+    ]
+    assert not basics_work([broken])
+    assert summary([broken]) == "The basics do not work here: thing."
+    extra, basic = found(probe), found(lambda: "there", basic=True)
+    assert basics_work([extra, basic])
+    assert summary([extra, basic]) == "The basics work. Missing besides: thing."
+    assert summary([extra]) == "Missing: thing."
+    assert summary([basic]) == "The basics work. Nothing is missing."
+
+
+def test_an_unknown_group_is_one_line(capsys):
+    assert run_cli(main, ["doctor", "--only", "wheels"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "choose from basics, training" in line

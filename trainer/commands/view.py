@@ -1,0 +1,58 @@
+"""Show recorded sittings in rerun: the road, both actions, who drove, and what the policy saw."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from edge_runtime.cli import examples
+from trainer.person.recording import find_recordings
+
+EXAMPLE = examples(
+    "python -m trainer view runs/drives --serve",
+    "python -m trainer view runs/mine/sittings/sitting-0001.mcap --save sitting.rrd",
+)
+LOOK_S = 0.2
+"""The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "recordings",
+        metavar="RECORDING",
+        nargs="+",
+        help="sitting-NNNN.mcap, a directory of such, or a run that a person guided",
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--spawn", action="store_true", help="open a rerun window (the default)")
+    where.add_argument(
+        "--serve", action="store_true", help="serve a web page on this machine's loopback only"
+    )
+    where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw all of it; a page is served until somebody interrupts. Returns the exit status."""
+    from trainer.viewer.command import show_sittings
+    from viewing.sinks import SERVE, SPAWN, Sink, check_sink
+
+    paths = find_recordings([Path(place) for place in arguments.recordings])
+    sink = Sink(SERVE if arguments.serve else SPAWN)
+    if arguments.save is not None:
+        sink = Sink("save", arguments.save)
+    check_sink(sink)
+    with show_sittings(paths, sink) as shown:
+        road = f"; {shown.without_road} without their road" if shown.without_road else ""
+        print(
+            f"{shown.episodes} episodes, {shown.steps} steps, {shown.human_steps} of them the "
+            f"person's{road}",
+            flush=True,
+        )
+        try:
+            while sink.kind == SERVE:
+                time.sleep(LOOK_S)
+        except KeyboardInterrupt:
+            pass
+    return 0

@@ -1,0 +1,1 @@
+"""A person at the wheel: drives, takes over from a policy, and is recorded."""

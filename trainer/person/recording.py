@@ -1,0 +1,206 @@
+"""A sitting's recording: every step, kept from the moment it is taken.
+
+One MCAP file a sitting, ``sitting-0001.mcap`` and so on, whose messages are whole transitions
+(``Step``) in MessagePack. Each step is a chunk of its own and handed to the operating system at
+once, so whatever ends the process, at most the step that was being taken is lost; 30 minutes are
+about 15 MB. Nothing is ever overwritten: sittings add up.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+import msgspec
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Chunk, McapRecord, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+from zstandard import ZstdError
+
+from edge_runtime import __version__
+from edge_runtime.errors import UserError
+from trainer.files import make_directory
+from trainer.person.interface import Control
+
+TOPIC = "person/step"
+DIRECTORY = "sittings"
+"""Where a training run keeps its recordings."""
+MAGIC = b"\x89MCAP0\r\n"
+FRAME_SHAPE = (45, 80)
+NAME = re.compile(r"sitting-(\d{4,})\.mcap")
+TORN = (
+    McapError, struct.error, ZstdError, msgspec.DecodeError, ValueError, KeyError, RuntimeError,
+    OverflowError, MemoryError,
+)  # fmt: skip
+"""What the libraries raise for a file that was cut off."""
+MAX_RECORD_BYTES = 64 << 20
+"""A torn length must not ask for more memory than any chunk of ours needs."""
+
+
+class Step(msgspec.Struct, frozen=True):
+    """One control period, whole: a transition, and who did what in it."""
+
+    sitting: int
+    index: int
+    """Of the step in the sitting, from 0."""
+    scenario: str
+    seed: int
+    """Of the episode."""
+    episode: int
+    step: int
+    """In the episode, from 0."""
+    time_ns: int
+    """When the hands were asked: wall time, ns since 1970."""
+    time_s: float
+    """Simulated, since the episode's start."""
+    frames: bytes
+    """s: what the policy saw, uint8 [2, 45, 80]."""
+    next_frame: bytes
+    """The newer frame of s', uint8 [45, 80]; the older is the newer of s."""
+    policy_action: float | None
+    human_action: float
+    """What the device said."""
+    action: float
+    """What was applied."""
+    control: Control
+    human: bool
+    """The mask Delta."""
+    first: bool
+    """Whether an intervention began here."""
+    reward: float
+    """Without the shaping of eq. 17."""
+    terminated: bool
+    truncated: bool
+    speed_mps: float
+    outcome: str = ""
+    """How the episode ended here, if it did."""
+
+    @property
+    def observation(self) -> NDArray[np.uint8]:
+        """s, uint8 [2, 45, 80]."""
+        return np.frombuffer(self.frames, np.uint8).reshape(2, *FRAME_SHAPE)
+
+    @property
+    def next_observation(self) -> NDArray[np.uint8]:
+        """s', uint8 [2, 45, 80]."""
+        newer = np.frombuffer(self.next_frame, np.uint8).reshape(FRAME_SHAPE)
+        return np.stack([self.observation[1], newer])
+
+
+class Recorder:
+    """Writes a new sitting into a directory.
+
+    Raises:
+        UserError: the directory cannot be written.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        make_directory(directory)
+        self.sitting, self.index = 1, 0
+        for path in sittings(directory):
+            self.sitting = max(self.sitting, _number(path) + 1)
+        self.path = directory / f"sitting-{self.sitting:04d}.mcap"
+        try:
+            self._file: IO[bytes] = self.path.open("xb")
+        except OSError as error:
+            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
+        self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
+        self._mcap.start(profile="", library=f"phil-hil {__version__}")
+        self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)
+        self._flush()
+
+    @property
+    def position(self) -> tuple[int, int]:
+        """Sitting and index of the step that comes next."""
+        return self.sitting, self.index
+
+    def write(self, step: Step) -> None:
+        """Keep a step; from here on no kill takes it away. UserError on a full disk."""
+        data = msgspec.msgpack.encode(step)
+        self._mcap.add_message(self._channel, step.time_ns, data, step.time_ns, self.index)
+        self.index += 1
+        self._flush()
+
+    def close(self) -> None:
+        """Write the index and close the file; a sitting without steps leaves none behind."""
+        if self._file.closed:
+            return
+        try:
+            try:
+                self._mcap.finish()
+            finally:
+                self._file.close()
+        except OSError as error:
+            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
+        if self.index == 0:
+            self.path.unlink()
+
+    def _flush(self) -> None:
+        try:
+            self._mcap.flush()
+            self._file.flush()
+        except OSError as error:
+            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
+
+
+def sittings(directory: Path) -> list[Path]:
+    """The recordings in a directory, in their order; none where it is not there."""
+    found = [path for path in directory.glob("sitting-*.mcap") if NAME.fullmatch(path.name)]
+    return sorted(found, key=_number)
+
+
+def find_recordings(places: Sequence[Path]) -> list[Path]:
+    """The files that recordings, their directories and training runs name.
+
+    Raises:
+        UserError: one of them names none.
+    """
+    found: list[Path] = []
+    for place in places:
+        here = [place] if place.is_file() else sittings(place) or sittings(place / DIRECTORY)
+        if not here:
+            raise UserError(f"no recording in {place}: expected sitting-NNNN.mcap, or such files")
+        found += [path for path in here if path not in found]
+    return found
+
+
+def read_steps(path: Path) -> Iterator[Step]:
+    """The steps of a recording, up to its end or to where a kill has cut it off.
+
+    Raises:
+        UserError: no such file, or not one of ours.
+    """
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
+    with stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            raise UserError(f"{path} is no recording of a sitting")
+        stream.seek(0)
+        try:
+            for message in _messages(stream):
+                yield msgspec.msgpack.decode(message.data, type=Step)
+        except TORN:
+            return
+
+
+def _messages(stream: IO[bytes]) -> Iterator[Message]:
+    reader = StreamReader(stream, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
+    for record in reader.records:
+        parts: Sequence[McapRecord] = (
+            breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+        )
+        yield from (part for part in parts if isinstance(part, Message))
+
+
+def _number(path: Path) -> int:
+    match = NAME.fullmatch(path.name)
+    assert match is not None
+    return int(match.group(1))

@@ -1,0 +1,67 @@
+"""What a killed training run had recorded, but not yet saved: back into its replay buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import groupby
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from trainer.human.guide import Intervention
+from trainer.person.recording import Step, read_steps, sittings
+from trainer.training.learning import Action, Observation
+
+Position = tuple[int, int]
+"""Sitting and index of a recorded step."""
+Shape = Callable[[float, Intervention | None], float]
+"""The reward to store (eq. 17), from the environment's and what the person did."""
+
+
+class Store(Protocol):
+    """The part of a learner that is needed here."""
+
+    def start_episode(self, observation: Observation) -> None:
+        """Take an episode's first observation."""
+
+    def add(
+        self, action: Action, reward: float, observation: Observation, terminal: bool, human: bool
+    ) -> None:
+        """Store a transition that led to ``observation``."""
+
+
+def steps_since(directory: Path, position: Position) -> Iterator[Step]:
+    """The recorded steps from ``position`` on, over all sittings."""
+    for path in sittings(directory):
+        yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)
+
+
+def store_again(
+    store: Store, steps: Iterable[Step], shape: Shape, ticks_late: int = 0
+) -> tuple[int, int]:
+    """Put recorded steps into the replay buffer as the run had put them there.
+
+    Args:
+        store: the learner, or its buffer.
+        steps: in their order.
+        shape: the run's reward shaping.
+        ticks_late: how many ticks old the observation is that an action answers, behind a network
+            (``training/wheel.py``).
+
+    Returns:
+        How many steps were stored, and how many of them are the person's.
+    """
+    stored = human = 0
+    for _, drive in groupby(steps, key=lambda step: (step.sitting, step.index - step.step)):
+        episode = list(drive)
+        for known, step in zip(episode, episode[ticks_late:], strict=False):
+            if step is episode[ticks_late]:
+                store.start_episode(known.observation)
+            action = np.array([step.action], np.float32)
+            by_person = Intervention(action, "person", step.first) if step.human else None
+            reward = shape(step.reward, by_person)
+            store.add(action, reward, known.next_observation, step.terminated, step.human)
+            stored += 1
+            human += step.human
+    return stored, human

@@ -1,0 +1,141 @@
+"""A training run that a person guides: paced, recorded, and never waiting for an update."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from edge_runtime.errors import UserError
+from trainer.human.guide import Guide
+from trainer.learner.algorithms import ALGORITHMS
+from trainer.person.guide import PersonGuide
+from trainer.person.interface import Person
+from trainer.person.recording import DIRECTORY, Recorder
+from trainer.person.recovery import steps_since, store_again
+from trainer.person.sitting import Sitting, SittingOver
+from trainer.person.unhurried import UnhurriedLearning
+from trainer.person.watched import WatchedEnv
+from trainer.training.config import RunConfig
+from trainer.training.learning import Learning, ProcessorLearning
+from trainer.training.metrics import EpisodeMetrics
+from trainer.training.run import TrainingRun
+from trainer.training.wheel import ticks_late
+
+
+class PersonRun(TrainingRun):
+    """``TrainingRun`` in a sitting.
+
+    Args:
+        config: what to train; ``human`` is ``options.PERSON``.
+        run_dir: where everything goes; the recordings into ``sittings`` there.
+        person: hands and eyes; closed with the run.
+        resume: go on from the checkpoint, and from what was recorded after it.
+        speed: simulated seconds in one of the person's.
+
+    Raises:
+        UserError: settings that leave no place for a person.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        run_dir: Path,
+        person: Person,
+        resume: bool = False,
+        speed: float = 1.0,
+    ) -> None:
+        check_settings(config)
+        self._resumed = resume
+        self.longest_save_s = 0.0
+        """The longest that a checkpoint has kept the person between two episodes."""
+        self.recovered = (0, 0)
+        """Steps, and the person's among them, that a kill had kept from the checkpoint."""
+        super().__init__(config, run_dir, resume)
+        recorder = Recorder(run_dir / DIRECTORY)
+        self.sitting = Sitting(person, recorder, self.env, speed=speed)
+        self.guide = PersonGuide(self.sitting)
+        self.watched = self.env = WatchedEnv(self.env, self.sitting)
+
+    def train(
+        self,
+        on_episode: Callable[[EpisodeMetrics], None] = lambda metrics: None,
+        deadline_s: float | None = None,
+    ) -> None:
+        """Train until the person quits, or as ``TrainingRun`` does."""
+        try:
+            if not self._resumed:
+                self.save()  # So that a run killed in its first episode can be resumed.
+            super().train(on_episode, deadline_s)
+        except SittingOver:
+            self.save()
+        finally:
+            self.sitting.close()
+
+    def advance(self) -> EpisodeMetrics:
+        """Train one episode, and rest."""
+        self.watched.episode = self.episode
+        metrics = super().advance()
+        self.sitting.rest(metrics.outcome)
+        self.sitting.progress = (
+            f"{self.learning.added} steps stored, {self.sitting.human_steps} yours in "
+            f"{self.sitting.interventions} interventions of this sitting; "
+            f"critic loss {metrics.critic_loss:.3f}, return {metrics.episode_return:.1f}"
+        )
+        return metrics
+
+    def save(self) -> None:
+        """Write the checkpoint, which the person sees."""
+        self.sitting.announce("saving")
+        began_s = time.perf_counter()
+        super().save()
+        self.longest_save_s = max(self.longest_save_s, time.perf_counter() - began_s)
+
+    def _make_learning(self, action_size: int) -> Learning:
+        learning = super()._make_learning(action_size)
+        # On an accelerator the loop waits for milliseconds only.
+        if isinstance(learning, ProcessorLearning):
+            return UnhurriedLearning(learning)
+        return learning
+
+    def _make_guide(self) -> Guide | None:
+        return None  # The sitting is opened when all else is known to work.
+
+    def _must_stop(self, deadline_s: float | None) -> bool:
+        return self.sitting.stop or super()._must_stop(deadline_s)
+
+    def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
+        """Only at a sitting's end, behind its closed window: a person is not to wait."""
+        if not at_end:
+            return
+        self.save()
+        self.sitting.close()
+        if self.config.evaluate_every:
+            print(
+                f"validating on {self.config.evaluation_runs} episodes; all is saved, "
+                "^C leaves it out",
+                file=sys.stderr,
+                flush=True,
+            )
+        super()._validate(metrics, at_end)
+
+    def _more_state(self) -> dict[str, Any]:
+        return {"recorded": list(self.sitting.recorder.position)}
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        super()._restore(state)
+        position = tuple(state["recorded"])
+        steps = steps_since(self.run_dir / DIRECTORY, position)
+        self.recovered = store_again(self.learning, steps, self._shape, ticks_late(self.network))
+
+
+def check_settings(config: RunConfig) -> None:
+    """Refuse what a person cannot be a part of; raises UserError."""
+    if not ALGORITHMS[config.algorithm].guided:
+        raise UserError(f"{config.algorithm} takes no guidance: nobody could take over")
+    if config.guided_share != 1:
+        raise UserError("a person watches every episode: guided_share is 1")
+    if config.poor_guidance_share:
+        raise UserError("a person's actions are not replaced: poor_guidance_share is 0")

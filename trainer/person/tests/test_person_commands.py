@@ -1,0 +1,114 @@
+"""The person's commands as a user meets them, mistakes included."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from trainer.drivers import load_driver, make_environment
+from trainer.person.recording import Recorder
+from trainer.person.tests.steps import recorded_step
+from trainer.tests.test_commands import call
+
+DRIVE = ("drive", "--out", "{tmp}/rec")
+TRAIN = ("train", "--out", "{tmp}/run")
+WRONG = [
+    (DRIVE, ("--human", "telepathy"), "invalid choice"),
+    (DRIVE, ("--human", "wheel", "--profile", "{tmp}/none.toml"), "does not exist"),
+    (DRIVE, ("--human", "wheel", "--profile", "{tmp}/bad.toml"), "missing required field"),
+    (DRIVE, ("--human", "wheel"), "no wheel that fits the profile g29.toml (G29)"),
+    (DRIVE, ("--human", "gamepad"), "none is plugged in"),
+    (DRIVE, ("--human", "keyboard", "--profile", "x"), "--profile means nothing"),
+    (DRIVE, ("--human", "keyboard", "--port", "80"), "--port means nothing"),
+    (DRIVE, ("--human", "web", "--port", "70000"), "is no port"),
+    (DRIVE, ("--speed", "0"), "not a finite number above zero"),
+    (DRIVE, ("--policy", "{tmp}/nobody"), "is no policy"),
+    (("drive", "--out", "{tmp}/file"), (), "cannot create the directory"),
+    (("drive",), (), "one of the arguments --out --calibrate is required"),
+    (("drive", "--calibrate", "{tmp}/p.toml"), (), "--calibrate asks a --human gamepad or wheel"),
+    (("drive", "--calibrate", "{tmp}/p.toml"), ("--human", "wheel"), "no wheel is plugged in"),
+    (("drive", "--calibrate", "{tmp}/no/p.toml"), ("--human", "wheel"), "cannot write"),
+    (TRAIN, ("--human", "keyboard", "--algorithm", "per_td3"), "takes no guidance"),
+    (TRAIN, ("--human", "keyboard", "--set", "guided_share=3"), "watches every episode"),
+    (TRAIN, ("--human", "keyboard", "--set", "poor_guidance_share=0.3"), "not replaced"),
+    (TRAIN, ("--speed", "2"), "--speed means nothing with --human expert"),
+    (TRAIN, ("--human", "keyboard", "--resume"), "no checkpoint"),
+    (("human", "--out", "{tmp}/h", "--from", "{tmp}"), (), "no recording in"),
+    (("human", "--out", "{tmp}/h", "--from", "{tmp}/file"), (), "no recording of a sitting"),
+]
+
+
+@pytest.mark.parametrize(("command", "more", "complaint"), WRONG)
+def test_a_mistake_is_one_line_and_status_2(
+    capsys, tmp_path, monkeypatch, command, more, complaint
+):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    (tmp_path / "file").write_text("not a recording")
+    (tmp_path / "bad.toml").write_text('name = "half"\n')
+    arguments = [word.format(tmp=tmp_path) for word in (*command, *more)]
+    status, _, errors = call(capsys, *arguments)
+    assert status == 2
+    assert complaint in errors
+    assert errors.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_a_screen_it_says_what_to_do(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+    monkeypatch.setenv("DISPLAY", ":9999")
+    status, _, errors = call(capsys, "drive", "--out", str(tmp_path / "rec"))
+    assert status == 2
+    assert "--human web needs none" in errors
+    assert errors.count("\n") == 1
+
+
+def record(directory, steps):
+    recorder = Recorder(directory)
+    for step in steps:
+        recorder.write(step)
+    recorder.close()
+
+
+def demonstrated(index: int):
+    """Bright pictures are answered with throttle, dark ones with brake."""
+    bright = index % 2 == 0
+    value = bytes([200 if bright else 20]) * 3600
+    return recorded_step(
+        1,
+        index,
+        frames=value + value,
+        control="human",
+        human=True,
+        first=index == 0,
+        human_action=0.8 if bright else -0.8,
+        action=0.0,
+    )
+
+
+def test_a_human_model_learns_what_the_hands_did(capsys, tmp_path, one_thread):
+    letting_go = recorded_step(1, 8, control="returning", human=True, human_action=0.0)
+    record(tmp_path / "a", [*map(demonstrated, range(8)), letting_go, recorded_step(1, 9)])
+    record(tmp_path / "b", [demonstrated(0)])
+    command = ["human", "--from", str(tmp_path / "a"), str(tmp_path / "b"), "--episodes", "3"]
+    status, out, errors = call(capsys, *command, "--out", str(tmp_path / "me"))
+    assert (status, errors.count("error")) == (0, 0)
+    assert "human model from 9 demonstrated steps" in out
+    about = json.loads((tmp_path / "me" / "human.json").read_text())
+    assert (about["demonstrations"], about["interventions"]) == (9, 2)
+    driver, _ = load_driver(str(tmp_path / "me"), make_environment("left_turn"))
+    assert driver.act(np.full((2, 45, 80), 200, np.uint8))[0] > 0.3
+    assert driver.act(np.full((2, 45, 80), 20, np.uint8))[0] < -0.3
+
+
+def test_recordings_that_teach_nothing_are_refused(capsys, tmp_path):
+    record(tmp_path / "policy", [recorded_step(1, 0)])
+    record(tmp_path / "other", [demonstrated(0)])
+    command = ["human", "--out", str(tmp_path / "me"), "--from"]
+    assert "nobody took over" in call(capsys, *command, str(tmp_path / "policy"))[2]
+    wrong = call(capsys, *command, str(tmp_path / "other"), "--scenario", "congestion")
+    assert "was driven in left_turn, not in congestion" in wrong[2]
+    label = call(capsys, *command, str(tmp_path / "other"), "--label-every-step")
+    assert "asks the scripted expert" in label[2]
+    assert {wrong[0], label[0]} == {2}

@@ -1,0 +1,112 @@
+"""Recordings: whole, cut off, foreign; sittings add up."""
+
+from __future__ import annotations
+
+import resource
+
+import numpy as np
+import pytest
+
+from edge_runtime.errors import UserError
+from trainer.person.recording import Recorder, Step, find_recordings, read_steps, sittings
+from trainer.person.tests.steps import recorded_step
+
+
+def record(directory, count: int) -> list[Step]:
+    recorder = Recorder(directory)
+    steps = [recorded_step(recorder.sitting, index) for index in range(count)]
+    for step in steps:
+        recorder.write(step)
+    recorder.close()
+    return steps
+
+
+def test_what_is_written_is_read(tmp_path):
+    steps = record(tmp_path, 5)
+    (path,) = sittings(tmp_path)
+    assert list(read_steps(path)) == steps
+    np.testing.assert_array_equal(steps[0].next_observation, steps[1].observation)
+
+
+def test_a_file_cut_anywhere_holds_every_step_before_the_cut(tmp_path):
+    recorder, ends = Recorder(tmp_path / "whole"), []
+    for index in range(6):
+        recorder.write(recorded_step(1, index))
+        ends.append(recorder.path.stat().st_size)
+    recorder.close()
+    data, cut = recorder.path.read_bytes(), tmp_path / "cut.mcap"
+    for length in [*range(8, len(data), 311), *ends, len(data) - 1]:
+        cut.write_bytes(data[:length])
+        indices = [step.index for step in read_steps(cut)]
+        flushed = sum(end <= length for end in ends)
+        # The cut may lie in what follows a step's chunk: then that step is whole, too.
+        assert indices in (list(range(flushed)), list(range(flushed + 1)))
+
+
+def test_a_damaged_byte_ends_the_reading_without_a_wrong_step(tmp_path):
+    steps = record(tmp_path, 4)
+    (path,) = sittings(tmp_path)
+    data = path.read_bytes()
+    for place in range(100, len(data) // 2, 61):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
+        read = list(read_steps(path))
+        assert read == steps[: len(read)]
+
+
+def test_every_step_is_there_before_the_next_is_taken(tmp_path):
+    recorder = Recorder(tmp_path)
+    for index in range(3):
+        recorder.write(recorded_step(1, index))
+        assert [step.index for step in read_steps(recorder.path)] == list(range(index + 1))
+
+
+def test_sittings_add_up_and_are_never_overwritten(tmp_path):
+    first, second = record(tmp_path, 2), record(tmp_path, 3)
+    paths = sittings(tmp_path)
+    assert [path.name for path in paths] == ["sitting-0001.mcap", "sitting-0002.mcap"]
+    assert [step for path in paths for step in read_steps(path)] == first + second
+
+
+def test_a_sitting_without_a_step_leaves_nothing_behind(tmp_path):
+    record(tmp_path, 0)
+    assert sittings(tmp_path) == []
+
+
+def test_recordings_are_found_by_file_directory_and_run_each_once(tmp_path):
+    record(tmp_path / "run" / "sittings", 1)
+    record(tmp_path / "run" / "sittings", 1)
+    (path, other) = sittings(tmp_path / "run" / "sittings")
+    assert find_recordings([other, tmp_path / "run", path.parent]) == [other, path]
+    with pytest.raises(UserError, match="no recording"):
+        find_recordings([tmp_path])
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89MCAP", b"hello" * 100])
+def test_another_file_is_refused(tmp_path, data):
+    path = tmp_path / "x.mcap"
+    path.write_bytes(data)
+    with pytest.raises(UserError, match="no recording of a sitting"):
+        list(read_steps(path))
+    with pytest.raises(UserError, match="cannot be read"):
+        list(read_steps(tmp_path / "none.mcap"))
+
+
+def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
+    recorder = Recorder(tmp_path)
+    recorder.write(recorded_step(1, 0))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (recorder.path.stat().st_size + 500, before[1]))
+    try:
+        with pytest.raises(UserError, match="cannot write"):
+            recorder.write(recorded_step(1, 1))
+        with pytest.raises(UserError, match="cannot write"):
+            recorder.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(read_steps(recorder.path)) == [recorded_step(1, 0)]
+
+
+def test_a_directory_that_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot create"):
+        Recorder(tmp_path / "file")

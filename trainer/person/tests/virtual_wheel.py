@@ -1,0 +1,110 @@
+"""A wheel made of SDL's own virtual joystick: all is real but the plastic.
+
+As a program, ``python -m trainer.person.tests.virtual_wheel COMMAND ...`` plugs one in, runs
+``python -m trainer COMMAND ...`` in the same process, and obeys lines on stdin: ``axis N PLACE``,
+``button N 0|1``; each is answered on stdout with ``did LINE TIME_NS``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+import threading
+import time
+from pathlib import Path
+
+AXES, BUTTONS = 4, 12
+WHEEL_TYPE = 2
+NAME = b"Virtual G29 wheel"
+
+
+class Description(ctypes.Structure):
+    """SDL_VirtualJoystickDesc, version 1 (SDL_joystick.h)."""
+
+    _fields_ = [
+        ("version", ctypes.c_uint16),
+        ("type", ctypes.c_uint16),
+        ("naxes", ctypes.c_uint16),
+        ("nbuttons", ctypes.c_uint16),
+        ("nhats", ctypes.c_uint16),
+        ("vendor_id", ctypes.c_uint16),
+        ("product_id", ctypes.c_uint16),
+        ("padding", ctypes.c_uint16),
+        ("button_mask", ctypes.c_uint32),
+        ("axis_mask", ctypes.c_uint32),
+        ("name", ctypes.c_char_p),
+        ("userdata", ctypes.c_void_p),
+        ("callbacks", ctypes.c_void_p * 6),
+    ]
+
+
+class VirtualWheel:
+    """Plugged in when made; SDL must have been started with its joysticks."""
+
+    def __init__(self) -> None:
+        self._sdl = load_sdl()
+        description = Description(1, WHEEL_TYPE, AXES, BUTTONS, name=NAME)
+        self.index = self._sdl.SDL_JoystickAttachVirtualEx(ctypes.byref(description))
+        if self.index < 0:
+            raise RuntimeError(self._sdl.SDL_GetError().decode())
+        self._joystick = self._sdl.SDL_JoystickOpen(self.index)
+
+    def axis(self, number: int, place: float) -> None:
+        """Put an axis to a place in [-1, 1]."""
+        value = round(min(max(place, -1.0), 1.0) * 32767)
+        self._sdl.SDL_JoystickSetVirtualAxis(self._joystick, number, ctypes.c_int16(value))
+
+    def button(self, number: int, down: bool) -> None:
+        """Press or release a button."""
+        self._sdl.SDL_JoystickSetVirtualButton(self._joystick, number, ctypes.c_uint8(down))
+
+    def unplug(self) -> None:
+        """Pull it out."""
+        self._sdl.SDL_JoystickDetachVirtual(self.index)
+
+
+def load_sdl():
+    """The very SDL that pygame has loaded; None where it has no virtual joysticks."""
+    import pygame
+
+    libraries = sorted((Path(pygame.__file__).parent.parent / "pygame_ce.libs").glob("libSDL2-2*"))
+    if not libraries:
+        return None
+    sdl = ctypes.CDLL(str(libraries[0]))
+    sdl.SDL_GetError.restype = ctypes.c_char_p
+    sdl.SDL_JoystickOpen.restype = ctypes.c_void_p
+    sdl.SDL_JoystickSetVirtualAxis.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_int16]
+    sdl.SDL_JoystickSetVirtualButton.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_uint8]
+    return sdl if hasattr(sdl, "SDL_JoystickAttachVirtualEx") else None
+
+
+def obey(wheel: VirtualWheel) -> None:
+    """Do what stdin says."""
+    for line in sys.stdin:
+        what, number, value = line.split()
+        if what == "axis":
+            wheel.axis(int(number), float(value))
+        else:
+            wheel.button(int(number), value == "1")
+        print(f"did {line.strip()} {time.time_ns()}", flush=True)
+
+
+def main(argv: list[str]) -> int:
+    """Plug in, and run the trainer beside it."""
+    from trainer.person.devices import pygame
+
+    pygame.display.init()
+    pygame.joystick.init()
+    wheel = VirtualWheel()
+    for pedal in (2, 3):
+        wheel.axis(pedal, 1.0)
+    threading.Thread(target=obey, args=(wheel,), daemon=True).start()
+
+    from edge_runtime.cli import run_cli
+    from trainer.__main__ import main as trainer
+
+    return run_cli(trainer, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,149 @@
+"""``--human web``: device and display in one, served by a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import secrets
+import socket
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from aiohttp import web
+
+from edge_runtime.errors import UserError
+from trainer.person.interface import Person, Reading, View
+from trainer.person.web.seat import Seat
+from trainer.person.web.server import CLOSING_S, Server
+
+if TYPE_CHECKING:
+    from trainer.person.registry import PersonOptions
+
+TOKEN_BYTES = 16
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+KEYS = {
+    "left_turn": "Up / W: throttle    Down / S: brake",
+    "congestion": "Left / A, Right / D: steer",
+}
+HELP = (
+    "Space: take over without driving",
+    "or slide on the pad, or use a gamepad or wheel",
+    "P: pause    R: restart the episode    Q: quit",
+)
+
+
+class Cockpit:
+    """A person in a browser: ``Device`` and ``Display``.
+
+    A thread of its own serves the page; ``poll`` and ``show`` only hand over, in microseconds.
+
+    Args:
+        host: where to listen.
+        port: at which port; 0: any free one.
+        scenario: decides the keys.
+
+    Raises:
+        UserError: the address cannot be listened on.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
+        self.help = (f"hold to take over    {KEYS[scenario]}", *HELP)
+        self.seat = Seat()
+        self._listener = _listen(host, port)
+        self.port: int = self._listener.getsockname()[1]
+        token = secrets.token_urlsafe(TOKEN_BYTES)
+        self.url = f"http://{_in_url(host)}:{self.port}/{token}/"
+        self._server = Server(token, self.seat)
+        self._shown = 0
+        self._loop = asyncio.new_event_loop()
+        self._closing = asyncio.Event()
+        self._thread = threading.Thread(target=self._serve, name="cockpit", daemon=True)
+        self._thread.start()
+
+    @property
+    def present(self) -> bool:
+        """Whether a page has the wheel and is heard."""
+        return self.seat.is_heard(time.monotonic())
+
+    def poll(self, now_s: float) -> Reading:
+        """What the driving page said last; nothing, if that is half a second ago."""
+        return self.seat.poll(now_s)
+
+    def show(self, view: View) -> None:
+        """Show the newest view to every page."""
+        self._shown += 1
+        self._tell(self._server.show, self._shown, view, time.monotonic())
+
+    def close(self) -> None:
+        """Tell the pages that it is over, and end the thread."""
+        self._tell(self._closing.set)
+        self._thread.join(4 * CLOSING_S)
+
+    def _tell(self, function: object, *arguments: object) -> None:
+        """Call something in the server's thread; nothing once that is closed."""
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(function, *arguments)  # type: ignore[arg-type]
+
+    def _serve(self) -> None:
+        try:
+            self._loop.run_until_complete(self._run())
+        finally:
+            self._loop.close()
+
+    async def _run(self) -> None:
+        runner = web.AppRunner(
+            self._server.application(),
+            # The log would hold the token.
+            access_log=None,
+            handle_signals=False,
+            shutdown_timeout=CLOSING_S,
+        )
+        await runner.setup()
+        await web.SockSite(runner, self._listener).start()
+        await self._closing.wait()
+        await self._server.close()
+        await runner.cleanup()
+
+
+def open_cockpit(options: PersonOptions) -> Person:
+    """Serve the cockpit and print its address."""
+    cockpit = Cockpit(options.host, options.port, options.scenario)
+    if options.host not in LOOPBACK:
+        print(
+            f"warning: --host {options.host}: whoever reads this network's traffic can take the "
+            f"wheel; safer: leave it out, and ssh -L {cockpit.port}:127.0.0.1:{cockpit.port} from "
+            "the browser's machine",
+            file=sys.stderr,
+        )
+    print(f"cockpit: open {cockpit.url}", flush=True)
+    return Person(cockpit, cockpit)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        try:
+            # A port of a sitting just ended may be taken again at once.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen()
+        except OSError:
+            listener.close()
+            raise
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        if getattr(error, "errno", None) == errno.EADDRINUSE:
+            reason += "; without --port any that is free will do"
+        raise UserError(f"the cockpit cannot listen on {host} port {port}: {reason}") from error
+    return listener
+
+
+def _in_url(host: str) -> str:
+    if host in ("0.0.0.0", "::"):
+        host = socket.gethostname()
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,166 @@
+// The cockpit: joins the hands, the link to the trainer, and what is drawn.
+
+import { Gamepads } from "./gamepad.js";
+import { Keyboard, Pad } from "./hands.js";
+import { Link } from "./link.js";
+import { drawFrames, drawScene, History } from "./scene.js";
+
+const byId = (id) => document.getElementById(id);
+const STEP_MS = 1000 / 60;
+const SURE_MS = 3000; // within which Quit is pressed again
+const STALE_MS = 1000; // without a new view the trainer is busy, and says so
+const WORDS = {
+  left_turn: { title: "left turn", meaning: "pedal", plus: "throttle", minus: "brake" },
+  congestion: { title: "congestion", meaning: "steering", plus: "right", minus: "left" },
+};
+const WHO = {
+  waiting: ["Nobody drives yet", "the trainer is starting"],
+  lost: ["Connection lost", "you have let go; looking for the trainer"],
+  over: ["The sitting is over", "everything is saved"],
+  policy: ["The policy drives", "hold a key, the pad or a button to take over"],
+  human: ["You drive", "let go to give back"],
+  returning: ["Giving back", "the action returns to the policy's"],
+};
+const LINK = { connecting: "connecting", live: "connected", lost: "connection lost", over: "ended" };
+
+let view = null;
+let viewMs = 0;
+let driving = true; // and not watching
+let refused = false; // held since before the connection, or the wheel, was this page's
+const changed = () => link?.changed();
+const keyboard = new Keyboard(changed, (word) => wish(word));
+const touch = new Pad(byId("pad"), byId("knob"), changed);
+const choices = ["plus", "minus", "dead", "full", "invert", "hold"].map((id) => [id, byId(id)]);
+const gamepads = new Gamepads({ ...Object.fromEntries(choices), name: byId("pad-name") }, changed);
+// A finger goes before a key, a key before a device that may only lie there.
+const hands = {
+  now: () => [touch, keyboard, gamepads].map((hand) => hand.now()).find((said) => said.engaged)
+    ?? gamepads.now(),
+};
+const history = new History(byId("history"));
+const frames = [...document.querySelectorAll("#frames canvas")];
+const link = new Link(hands, { view: see, echo: hearEcho, state: showState });
+let lastMs = performance.now();
+setInterval(step, STEP_MS);
+
+function step() {
+  const now = performance.now();
+  keyboard.step((now - lastMs) / 1000);
+  gamepads.step();
+  lastMs = now;
+  touch.draw();
+  bar("human", hands.now().action);
+  bar("raw", gamepads.now().action);
+  if (view && now - viewMs > STALE_MS && document.body.dataset.link === "live") {
+    byId("message").textContent = view.message || "waiting for the trainer";
+  }
+}
+
+function see(next) {
+  if (next.scenario !== view?.scenario) enter(next.scenario);
+  view = next;
+  viewMs = performance.now();
+  history.add(view);
+  requestAnimationFrame(draw);
+}
+
+function enter(scenario) {
+  keyboard.scenario = touch.scenario = gamepads.scenario = scenario;
+  const words = WORDS[scenario];
+  byId("scenario").textContent = words.title;
+  byId("meaning").textContent = `${words.meaning}: ${words.minus} ◂ ▸ ${words.plus}`;
+  for (const side of ["plus", "minus"]) {
+    for (const word of document.querySelectorAll(`.${side}-word`)) word.textContent = words[side];
+  }
+  byId("pad").className = scenario === "left_turn" ? "upright" : "level";
+  changed(); // a key may be down already
+}
+
+function draw() {
+  if (document.body.dataset.link !== "live") return;
+  document.body.dataset.control = view.control;
+  drawScene(byId("scene"), view);
+  drawFrames(frames, view.frames);
+  history.draw();
+  bar("policy", view.policy_action);
+  bar("applied", view.applied_action);
+  byId("place").textContent = `episode ${view.episode}, ${view.time_s.toFixed(1)} s`;
+  byId("speed-value").textContent = view.speed_mps.toFixed(1);
+  byId("distance").textContent = `${view.distance_m.toFixed(1)} of ${view.goal_m.toFixed(0)} m`;
+  byId("late").textContent = view.late_ticks ? `${view.late_ticks} late` : "";
+  byId("progress").textContent = view.progress;
+  byId("message").textContent = view.paused ? view.message || "paused" : view.message;
+  document.querySelector("[data-wish=pause]").textContent = view.paused ? "Go on" : "Pause";
+  const help = view.help.join("\n");
+  if (byId("help").dataset.text !== help) {
+    byId("help").dataset.text = help;
+    byId("help").replaceChildren(...view.help.map((text) => item(text)));
+  }
+  showWho();
+}
+
+function showWho() {
+  const control = document.body.dataset.control;
+  let [who, why] = WHO[control];
+  if (view?.policy_action === null && control === "policy") who = "Nobody drives";
+  if (!driving) why = "you watch: another page has the wheel";
+  if (!driving && control === "human") who = "Another page drives";
+  if (refused) why = "what was held before does not count: let go, and press again";
+  byId("who").textContent = who;
+  byId("why").textContent = why;
+}
+
+function bar(name, action) {
+  const element = document.querySelector(`.bar.${name}`);
+  const known = action !== null && action !== undefined;
+  const value = known ? action : 0;
+  const fill = element.querySelector("u");
+  fill.style.left = `${50 + Math.min(value, 0) * 50}%`;
+  fill.style.width = `${Math.abs(value) * 50}%`;
+  element.querySelector("output").textContent = known ? value.toFixed(2) : "–";
+}
+
+function hearEcho(echo) {
+  ({ driving, refused } = echo);
+  document.body.classList.toggle("watching", !driving);
+  byId("trip").textContent = `${link.tripMs().toFixed(link.tripMs() < 10 ? 1 : 0)} ms`;
+  showWho();
+}
+
+function showState(state) {
+  if (document.body.dataset.link === state) return;
+  document.body.dataset.link = state;
+  byId("link").textContent = LINK[state];
+  byId("message").textContent = state === "live" && !view ? "waiting for the trainer" : "";
+  if (state === "live") {
+    document.body.dataset.control = view?.control ?? "waiting";
+    if (view) requestAnimationFrame(draw);
+  } else {
+    document.body.dataset.control = state;
+    byId("trip").textContent = "";
+  }
+  showWho();
+}
+
+let sureMs = -SURE_MS;
+function wish(word) {
+  const button = document.querySelector("[data-wish=quit]");
+  const now = performance.now();
+  if (word === "quit" && now - sureMs > SURE_MS) {
+    sureMs = now;
+    button.textContent = "Really quit?";
+    setTimeout(() => (button.textContent = "Quit"), SURE_MS);
+    return;
+  }
+  link.wish(word);
+}
+
+for (const button of document.querySelectorAll("[data-wish]")) {
+  button.addEventListener("click", () => wish(button.dataset.wish));
+}
+
+function item(text) {
+  const element = document.createElement("li");
+  element.textContent = text;
+  return element;
+}

@@ -1,0 +1,124 @@
+// The browser's Gamepad API: any axis, pedal or trigger as the action, any button as the hold.
+//
+// The action is what pushes to the plus less what pushes to the minus; a stick or a wheel is both
+// in one axis, a pair of pedals is two.
+
+const KEPT = "phil-cockpit-gamepad"; // in localStorage, by device and scenario
+const MOVING = "moving"; // instead of a button: moving the wheel takes over, letting it rest gives back
+
+const SOURCES = {
+  axis: (pad, index) => pad.axes[index] ?? 0,
+  // A pedal is an axis that rests at 1 and is -1 when pressed down. Until it has moved, browsers
+  // report 0 for it.
+  pedal: (pad, index) => (pad.axes[index] ? (1 - pad.axes[index]) / 2 : 0),
+  button: (pad, index) => pad.buttons[index]?.value ?? 0,
+};
+
+export function preset(pad, scenario) {
+  const common = { dead: 0.05, full: 1, invert: false, hold: "button 5" };
+  if (pad.mapping === "standard") {
+    return scenario === "left_turn"
+      ? { ...common, plus: "button 7", minus: "button 6" }
+      : { ...common, plus: "axis 0", minus: "", dead: 0.15 };
+  }
+  // A wheel: axis 0 turns, the next ones are pedals (a G29's throttle and brake).
+  return scenario === "left_turn"
+    ? { ...common, plus: "pedal 2", minus: "pedal 3", hold: MOVING }
+    : { ...common, plus: "axis 0", minus: "", dead: 0.02, full: 0.25, hold: MOVING };
+}
+
+export function read(pad, choice) {
+  const { plus, minus, dead, full, invert, hold } = choice;
+  const raw = ((value(pad, plus) - value(pad, minus)) * (invert ? -1 : 1)) / full;
+  const size = Math.max(0, Math.abs(raw) - dead) / (1 - dead); // no jump at the zone's edge
+  const action = Math.sign(raw) * Math.min(size, 1);
+  const by_moving = hold === MOVING;
+  return { action, engaged: !by_moving && value(pad, hold) > 0.5, by_moving };
+}
+
+function value(pad, source) {
+  const [kind, index] = source.split(" ");
+  return kind in SOURCES ? SOURCES[kind](pad, Number(index)) : 0;
+}
+
+export class Gamepads {
+  // form: the selects and inputs by name.
+  constructor(form, changed) {
+    this.form = form;
+    this.changed = changed;
+    this.scenario = null;
+    this.pad = null;
+    this.said = { action: 0, engaged: false, by_moving: false };
+    for (const name of ["plus", "minus", "dead", "full", "invert", "hold"]) {
+      form[name].addEventListener("input", () => this.choose());
+      form[name].addEventListener("change", () => form[name].blur()); // the arrow keys drive again
+    }
+  }
+
+  // Look at the device; once an animation frame or so.
+  step() {
+    if (!this.scenario) return;
+    // Absent where the page came over plain http from another machine.
+    const pads = [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad?.connected);
+    // Whoever was there first stays, and so does who drives.
+    const pad = pads.find((other) => other.index === this.pad?.index) ?? pads[0] ?? null;
+    if (pad?.id !== this.pad?.id || (pad && this.chosenFor !== this.scenario)) this.take(pad);
+    this.pad = pad;
+    const said = pad ? read(pad, this.choice) : { action: 0, engaged: false, by_moving: false };
+    const before = this.said;
+    this.said = said;
+    const moved = Math.abs(said.action - before.action) > 0.002;
+    if (moved || said.engaged !== before.engaged || said.by_moving !== before.by_moving) {
+      this.changed();
+    }
+  }
+
+  now() {
+    return this.said;
+  }
+
+  take(pad) {
+    this.chosenFor = this.scenario;
+    this.form.name.textContent = pad ? pad.id : "none: press one of its buttons";
+    if (!pad) return;
+    this.key = `${pad.id} ${this.scenario}`;
+    this.choice = { ...preset(pad, this.scenario), ...kept()[this.key] };
+    const numbered = (kind, count) => [...Array(count).keys()].map((index) => `${kind} ${index}`);
+    const axes = numbered("axis", pad.axes.length);
+    const pedals = numbered("pedal", pad.axes.length);
+    const buttons = numbered("button", pad.buttons.length);
+    options(this.form.plus, ["", ...axes, ...pedals, ...buttons], this.choice.plus);
+    options(this.form.minus, ["", ...pedals, ...buttons], this.choice.minus);
+    options(this.form.hold, [MOVING, ...buttons], this.choice.hold);
+    this.form.dead.value = this.choice.dead;
+    this.form.full.value = this.choice.full;
+    this.form.invert.checked = this.choice.invert;
+  }
+
+  choose() {
+    if (!this.pad) return;
+    const { plus, minus, dead, full, invert, hold } = this.form;
+    this.choice = {
+      plus: plus.value,
+      minus: minus.value,
+      dead: Number(dead.value),
+      full: Number(full.value),
+      invert: invert.checked,
+      hold: hold.value,
+    };
+    localStorage.setItem(KEPT, JSON.stringify({ ...kept(), [this.key]: this.choice }));
+  }
+}
+
+function kept() {
+  try {
+    return JSON.parse(localStorage.getItem(KEPT)) ?? {};
+  } catch {
+    return {}; // somebody else's, or forbidden
+  }
+}
+
+function options(select, values, chosen) {
+  select.replaceChildren(...values.map((text) => new Option(text || "nothing", text)));
+  select.value = values.includes(chosen) ? chosen : values[0];
+}

@@ -1,0 +1,113 @@
+// The WebSocket: says what the hands do, hears views and echoes, and comes back when it is lost.
+
+const HEARTBEAT_MS = 100;
+const LEAST_MS = 1000 / 60; // between two inputs
+const SILENCE_MS = 500; // the trainer counts this as letting go, and so does the page
+const RETRY_MS = 500;
+const GONE_MS = 2000; // a socket that long silent is given up for a new one
+
+export class Link {
+  // hands: now() says what they do; on: {view, echo, state} are called back.
+  constructor(hands, on) {
+    this.hands = hands;
+    this.on = on;
+    this.wishes = [];
+    this.seen = 0;
+    this.saidMs = 0;
+    this.saidEngaged = false;
+    this.trips = [];
+    this.over = false;
+    this.opened = false;
+    this.open();
+    setInterval(() => this.beat(), LEAST_MS);
+  }
+
+  open() {
+    const url = new URL("socket", location.href);
+    url.protocol = "ws:";
+    this.socket = new WebSocket(url);
+    this.heardMs = performance.now();
+    this.socket.onopen = () => {
+      this.seen = 0;
+      this.wishes = []; // pressed while nobody was there to hear it
+      this.opened ? this.say() : this.greet();
+      this.opened = true;
+    };
+    this.socket.onmessage = (event) => this.hear(JSON.parse(event.data));
+    this.socket.onclose = () => {
+      this.on.state(this.over ? "over" : "lost");
+      if (!this.over) setTimeout(() => this.open(), RETRY_MS);
+    };
+  }
+
+  // Closing waits for an answer that will not come: what the old socket says is heard no more.
+  abandon() {
+    this.socket.onopen = this.socket.onmessage = this.socket.onclose = null;
+    this.socket.close();
+    this.open();
+  }
+
+  hear(message) {
+    const now = performance.now();
+    this.heardMs = now;
+    if (message.kind === "echo") {
+      this.trips.push(now - message.at_ms);
+      if (this.trips.length > 20) this.trips.shift();
+      this.on.state("live");
+      this.on.echo(message);
+    } else if (message.kind === "view") {
+      this.seen = message.number;
+      this.on.view(message);
+    } else {
+      this.over = true;
+    }
+  }
+
+  wish(word) {
+    this.wishes.push(word);
+    this.changed();
+  }
+
+  // The hands moved: say so now, or as soon as the 60 a second allow; taking and letting go at once.
+  changed() {
+    this.dirty = true;
+    const edge = this.hands.now().engaged !== this.saidEngaged;
+    if (edge || performance.now() - this.saidMs >= LEAST_MS) this.say();
+  }
+
+  beat() {
+    const now = performance.now();
+    const silentMs = now - this.heardMs;
+    if (silentMs > SILENCE_MS && !this.over) this.on.state("lost");
+    if (silentMs > GONE_MS && !this.over) this.abandon();
+    if (this.dirty || now - this.saidMs >= HEARTBEAT_MS) this.say();
+  }
+
+  // A hold counts only after hands off. What is held when a page is first there was pressed for it;
+  // after a lost connection the hands themselves must let go.
+  greet() {
+    this.send({ action: 0, engaged: false, by_moving: false });
+    this.dirty = true;
+  }
+
+  say() {
+    this.send(this.hands.now());
+  }
+
+  send({ action, engaged, by_moving }) {
+    if (this.socket.readyState !== WebSocket.OPEN) return;
+    this.saidMs = performance.now();
+    this.saidEngaged = engaged;
+    this.dirty = false;
+    const wishes = [...new Set(this.wishes)];
+    this.wishes = [];
+    const said = { at_ms: this.saidMs, action, engaged, by_moving, wishes, seen: this.seen };
+    this.socket.send(JSON.stringify(said));
+  }
+
+  // The median of the last two seconds, ms.
+  tripMs() {
+    const sorted = [...this.trips].sort((a, b) => a - b);
+    return sorted.length ? sorted[sorted.length >> 1] : NaN;
+  }
+}

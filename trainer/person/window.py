@@ -1,0 +1,146 @@
+"""The window: the scene from above, what the policy sees, and who does what."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pygame
+from numpy.typing import NDArray
+
+from edge_runtime.errors import UserError
+from trainer.person.interface import View
+from trainer.scenarios.scene import draw_scene
+
+SIZE = (1040, 680)
+SCENE_WIDTH = 736
+FRAME_SCALE = 3
+MARGIN = 16
+COLOURS = {
+    "background": (24, 27, 32),
+    "panel": (36, 41, 48),
+    "text": (232, 234, 237),
+    "dim": (150, 157, 166),
+    "policy": (120, 190, 255),
+    "human": (255, 176, 80),
+    "returning": (200, 140, 255),
+    "applied": (130, 220, 150),
+    "warning": (255, 110, 100),
+}
+CONTROL_TEXT = {"policy": "the policy drives", "human": "YOU drive", "returning": "giving back"}
+
+
+class Window:
+    """A window of SDL's.
+
+    Raises:
+        UserError: there is no screen to open it on.
+    """
+
+    def __init__(self, title: str = "PHIL-TD3: at the wheel") -> None:
+        try:
+            pygame.display.init()
+            pygame.joystick.init()
+            pygame.font.init()
+            self._screen = pygame.display.set_mode(SIZE)
+        except pygame.error as error:
+            pygame.quit()
+            raise UserError(
+                f"no window can be opened ({error}): there is no screen here, or DISPLAY does not "
+                "name it; --human web needs none"
+            ) from None
+        pygame.display.set_caption(title)
+        self._fonts = {size: pygame.font.Font(None, size) for size in (20, 24, 38)}
+
+    def show(self, view: View) -> None:
+        """Draw everything anew."""
+        if not pygame.display.get_init():
+            return
+        self._screen.fill(COLOURS["background"])
+        self._blit(draw_scene(view.scene), (0, 0))
+        self._frames(view)
+        self._state(view)
+        self._bars(view)
+        self._lines(view)
+        pygame.display.flip()
+
+    def close(self) -> None:
+        """Close the window, and SDL with it."""
+        pygame.quit()
+
+    def _frames(self, view: View) -> None:
+        """What the policy sees, the older frame first."""
+        top = 400 + MARGIN + 22
+        for place, (frame, when) in enumerate(zip(view.frames, ("0.1 s ago", "now"), strict=True)):
+            large = np.repeat(np.repeat(frame, FRAME_SCALE, axis=0), FRAME_SCALE, axis=1)
+            left = MARGIN + place * (large.shape[1] + MARGIN)
+            self._text(f"the policy sees, {when}", (left, top - 20), "dim")
+            self._blit(np.repeat(large[:, :, None], 3, axis=2), (left, top))
+
+    def _state(self, view: View) -> None:
+        """The right column: who is in control, and how the drive is going."""
+        left, top = SCENE_WIDTH + MARGIN, MARGIN
+        self._text(CONTROL_TEXT[view.control], (left, top), view.control, 38)
+        lines = (
+            f"{view.speed_mps:.1f} m/s",
+            f"{view.distance_m:.1f} of {view.goal_m:.0f} m",
+            f"{view.time_s:.1f} s",
+            f"episode {view.episode}, step {view.step}",
+        )
+        for row, line in enumerate(lines):
+            self._text(line, (left, top + 44 + 28 * row), "text", 24)
+        if view.late_ticks:
+            late = f"{view.late_ticks} control periods began late"
+            self._text(late, (left, top + 44 + 28 * len(lines)), "warning")
+        message = "paused: P goes on" if view.paused else view.message
+        if message:
+            self._text(message, (left, top + 220), "warning", 24)
+
+    def _bars(self, view: View) -> None:
+        """The three actions, one above the other, -1 to 1."""
+        left, width = 2 * (MARGIN + 80 * FRAME_SCALE) + 2 * MARGIN, 400
+        policy = 0.0 if view.policy_action is None else view.policy_action
+        words = ("left", "right") if view.scenario == "congestion" else ("brake", "throttle")
+        top = 400 + MARGIN
+        self._text(words[0], (left, top), "dim")
+        self._text(words[1], (left + width, top), "dim", right=True)
+        rows = (
+            ("policy", policy, "policy"),
+            ("you", view.human_action, "human"),
+            ("applied", view.applied_action, "applied"),
+        )
+        for row, (name, action, colour) in enumerate(rows):
+            y = top + 24 + 42 * row
+            box = pygame.Rect(left, y, width, 18)
+            pygame.draw.rect(self._screen, COLOURS["panel"], box)
+            reach = int(action * width / 2)
+            bar = pygame.Rect(left + width // 2 + min(reach, 0), y, abs(reach), 18)
+            pygame.draw.rect(self._screen, COLOURS[colour], bar)
+            pygame.draw.line(
+                self._screen, COLOURS["dim"], box.midtop, (box.centerx, box.bottom - 1)
+            )
+            self._text(f"{name} {action:+.2f}", (left, y + 20), "dim")
+
+    def _lines(self, view: View) -> None:
+        """Key help and the learner's progress, at the bottom."""
+        for row, line in enumerate((*view.help, view.progress)):
+            colour = "text" if row < len(view.help) else "dim"
+            self._text(line, (MARGIN, 588 + 21 * row), colour)
+
+    def _text(
+        self,
+        text: str,
+        place: tuple[int, int],
+        colour: str,
+        size: int = 20,
+        right: bool = False,
+    ) -> None:
+        drawn = self._fonts[size].render(text, True, COLOURS[colour])
+        x, y = place
+        self._screen.blit(drawn, (x - drawn.get_width() if right else x, y))
+
+    def _blit(self, picture: NDArray[np.uint8], place: tuple[int, int]) -> None:
+        """Put a picture uint8 [height, width, 3] on the screen."""
+        height, width = picture.shape[:2]
+        surface: Any = pygame.image.frombuffer(picture.tobytes(), (width, height), "RGB")
+        self._screen.blit(surface, place)

@@ -1,0 +1,99 @@
+"""How a training is laid out: the road and who drives on the left, what is learned on the right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import rerun.blueprint as rrb
+
+from viewing.scene import Scene
+from viewing.series import ALL_OF_IT, BLUE, GREEN, GREY, ORANGE, PURPLE, Plot, plot_view
+from viewing.shapes import view_bounds
+
+APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
+TIMELINE = "step"
+RECENT_STEPS = 200
+"""Shown of what changes within an episode."""
+EPISODES = (
+    Plot("return", "Return of an episode, and the mean of 20"),
+    Plot("success", "Success: mean of 20 episodes, and policy alone in validation", (-0.05, 1.05)),
+    Plot("loss", "Losses, means of an episode"),
+    Plot("priority", "Mean priority in the replay buffer: the human's samples, the policy's"),
+    Plot("human", "The human's share of the steps", (-0.05, 1.05)),
+    Plot("advantage", "Q advantage of the human's action, where it took over"),
+)
+"""Of a training, from top to bottom."""
+SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
+"""Of recorded sittings, of which a learner has told nothing."""
+RECENT = (
+    Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
+    Plot("speed", "Speed, m/s, the last 20 s"),
+)
+LINES = {
+    "return/episode": GREY,
+    "return/mean_of_20": BLUE,
+    "success/mean_of_20": BLUE,
+    "success/validation": ORANGE,
+    "loss/critic": BLUE,
+    "loss/policy": GREEN,
+    "loss/cloning": ORANGE,
+    "priority/human": ORANGE,
+    "priority/policy": BLUE,
+    "human/share": ORANGE,
+    "action/policy": BLUE,
+    "action/applied": ORANGE,
+    "speed/ego": BLUE,
+}
+POINTS = {"advantage/of_the_human": PURPLE}
+
+
+def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
+    """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
+    left = rrb.Vertical(
+        _road(scene),
+        _frames(),
+        rrb.StateTimelineView(
+            origin="driver",
+            name="Who drives: the policy, or the human, and why",
+            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+        ),
+        *(_recent(plot) for plot in RECENT),
+        row_shares=[3, 1.6, 0.9, 1.2, 1.1],
+    )
+    right = rrb.Vertical(*map(plot_view, episodes))
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right, column_shares=[1, 1]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+    )
+
+
+def _road(scene: Scene | None) -> rrb.Spatial2DView:
+    bounds = None
+    if scene is not None:
+        x_range, y_range = view_bounds(scene)
+        bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
+    return rrb.Spatial2DView(
+        origin="road",
+        name="Road from above (blue: the policy drives, green: the human)",
+        background=[222, 229, 216],
+        visual_bounds=bounds,
+    )
+
+
+def _frames() -> rrb.Horizontal:
+    return rrb.Horizontal(
+        rrb.Spatial2DView(origin="frames/before", name="Policy sees t-1"),
+        rrb.Spatial2DView(origin="frames/now", name="Policy sees t"),
+        rrb.TextDocumentView(origin="status", name="Now"),
+        column_shares=[1, 1, 1],
+    )
+
+
+def _recent(plot: Plot) -> rrb.TimeSeriesView:
+    recent = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seq=-RECENT_STEPS),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    return plot_view(plot, recent)

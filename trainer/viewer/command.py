@@ -1,0 +1,61 @@
+"""``trainer train --rerun``: opens the view around a run. The only door to rerun in the trainer."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from trainer.training.metrics import EpisodeMetrics
+from trainer.training.run import TrainingRun
+from trainer.viewer.background import Background
+from trainer.viewer.blueprint import (
+    APPLICATION,
+    EPISODES,
+    SITTING_APPLICATION,
+    SITTINGS,
+    make_blueprint,
+)
+from trainer.viewer.sittings import Shown
+from trainer.viewer.training_log import TrainingLog
+from trainer.viewer.watcher import Watcher
+from viewing.sinks import Sink, check_sink, open_sink, read_sink
+
+OnEpisode = Callable[[EpisodeMetrics], None]
+
+
+def check_word(word: str) -> Sink:
+    """The sink that ``--rerun`` names; UserError where nothing could be shown there."""
+    sink = read_sink(word)
+    check_sink(sink)
+    return sink
+
+
+@contextmanager
+def watched(run: TrainingRun, sink: Sink) -> Iterator[OnEpisode]:
+    """Show a run for as long as it lasts; what it yields is to be called after each episode."""
+    with open_sink(sink, APPLICATION, make_blueprint(None, EPISODES)) as recording:
+        background = Background(TrainingLog(recording, EPISODES).draw)
+        watcher = Watcher(run, background.put)
+        run.on_step = watcher.on_step
+        try:
+            yield watcher.on_episode
+        finally:
+            run.on_step = None
+            watcher.close()
+            background.close()
+            if background.dropped:
+                print(f"{background.dropped} entries came faster than drawn", file=sys.stderr)
+
+
+@contextmanager
+def show_sittings(paths: Iterable[Path], sink: Sink) -> Iterator[Shown]:
+    """Draw recorded sittings; what it yields says how much there was."""
+    shown = Shown()
+    with open_sink(sink, SITTING_APPLICATION, make_blueprint(None, SITTINGS)) as recording:
+        log = TrainingLog(recording, SITTINGS)
+        for entry in shown.entries(paths):
+            log.draw(entry)
+        recording.flush()
+        yield shown
