@@ -17,6 +17,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from deploy.installer.archive import MANIFEST, SIGNATURE, Bundle
@@ -123,9 +124,18 @@ def _fill(bundle: Bundle, draft: Path, folder: Path, group: int | None) -> None:
             _write(draft / entry.path, data, 0o640 if secret else 0o644, group if secret else None)
     _write(draft / "launch.py", _LAUNCH.encode())
     _write(draft / LAUNCHER, _launcher(folder).encode(), 0o755)
-    # Now, because the service may not write here, and compiling at each start takes seconds.
+    _compile(draft / SITE)
+
+
+def _compile(site: Path) -> None:
+    """Now, because the service may not write here, and compiling at each start takes seconds."""
     workers = os.cpu_count() or 1
-    compileall.compile_dir(str(draft / SITE), quiet=2, workers=workers, rx=_NOT_COMPILED)
+    try:
+        compileall.compile_dir(str(site), quiet=2, workers=workers, rx=_NOT_COMPILED)
+    except BrokenProcessPool:
+        raise UserError(
+            "a process that compiled the release was killed; is there too little memory?"
+        ) from None
 
 
 def _launcher(folder: Path) -> str:

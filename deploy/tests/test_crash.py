@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 
@@ -22,25 +23,45 @@ def watch(event, arguments):
     if event in STEPS and str(arguments[event in STEPS[:2]]).endswith(where):
         left -= 1
         if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.killpg(0, signal.SIGKILL)
 
 sys.addaudithook(watch)
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
-"""Kills itself before the step of that number among those whose path ends so."""
+"""Kills itself, and the processes that compile for it, before the step of that number among those
+whose path ends so."""
+
+COMPILER_KILLER = """\
+import os, runpy, signal, sys
+sys.argv = sys.argv[1:]
+installer = os.getpid()
+
+def watch(event, arguments):
+    if event == "os.rename" and os.getpid() != installer:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+sys.addaudithook(watch)
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+"""Kills a process that compiles, as a kernel without memory would."""
 
 
 def killed(board: Board, bundle, where: str, number: int) -> bool:
     """Whether it came to that step."""
+    done = install_under(KILLER, board, bundle, where, str(number))
+    assert done.returncode in (0, -signal.SIGKILL), done.stderr
+    return done.returncode != 0
+
+
+def install_under(program: str, board: Board, bundle, *arguments: str):
+    """Install in a process group of its own, with a program of Python around the installer."""
     python, _, *line = board.command(
         "install", bundle, "--trust", board.workshop.public_key, "--service", "none"
     )
-    done = subprocess.run(
-        [python, "-c", KILLER, where, str(number), *line],
+    return subprocess.run(
+        [python, "-c", program, *arguments, *line], start_new_session=True,
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert done.returncode in (0, -signal.SIGKILL), done.stderr
-    return done.returncode != 0
 
 
 def whole(board: Board) -> str | None:
@@ -65,6 +86,15 @@ def test_killed_before_each_step_of_the_switch(board, workshop):
         assert killed(board, new.path, where, 1), where
         assert whole(board) == old.manifest.version
     complete(board, new)
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one processor compiles without a pool")
+def test_a_process_that_compiles_is_killed(board, workshop):
+    made = workshop.make(0.1)
+    done = install_under(COMPILER_KILLER, board, made.path)
+    assert (done.returncode, len(done.stderr.strip().splitlines())) == (2, 1), done.stderr
+    assert "too little memory" in done.stderr
+    complete(board, made)
 
 
 @pytest.mark.board
