@@ -41,6 +41,7 @@ def test_a_policy_without_a_pedal_has_the_scenarios_speed():
 def test_a_brake_is_speed_zero_at_once_and_latches():
     bench = Bench().driving()
     bench.core.brake(bench.now_s)
+    assert bench.core.report(bench.now_s).commanded_speed_mps == 0.0  # before the next tick, too
     count = len(bench.sent)
     bench.step(100, {"pedal": 1.0})
     assert set(bench.motions(count)) == {(0.0, 0.0)}
@@ -100,9 +101,11 @@ def test_the_remote_control_keeps_its_brake_and_its_control_at_the_end():
     assert ends == [0x111, 0x421]
 
 
-def test_the_end_stands_parks_and_gives_control_back():
+@pytest.mark.parametrize("brakes", [True, False])
+def test_the_end_stands_parks_and_gives_control_back(brakes):
     bench = Bench().driving()
-    bench.core.brake(bench.now_s)
+    if brakes:
+        bench.core.brake(bench.now_s)
     ends = bench.core.close(bench.now_s)
     assert [(part.frame.can_id, part.data) for part in ends] == [
         (0x111, bytes(8)),

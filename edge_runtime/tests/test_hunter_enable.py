@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from edge_runtime.tests.hunter_bench import (
@@ -75,6 +77,7 @@ def test_a_new_core_knows_nothing():
     assert report.action == {"pedal": -1.0, "steering": 0.0}
     assert report.self_braking
     assert core.standing(0.0) == ["the chassis sends no 0x221"]
+    assert core.late_at_s == math.inf
 
 
 def test_errors_are_cleared_before_control_is_asked_for():
@@ -147,9 +150,11 @@ def test_what_is_at_rest():
     assert not bench.core.is_at_rest(bench.now_s + 1.0)  # that was then
 
 
-def test_a_status_from_before_confirms_nothing():
+@pytest.mark.parametrize("age_s", [0.0, 0.3])
+def test_a_status_from_before_confirms_nothing(age_s):
     bench = Bench()
     bench.tell(frames.SYSTEM_STATUS, OK)
+    bench.now_s += age_s
     bench.core.enable(bench.now_s)
     bench.tell(frames.REAR_LEFT_SLOW, frames.MotorSlow(24.0, 30, 30, 0))
     assert bench.core.state is State.ENABLING

@@ -11,7 +11,7 @@ from edge_runtime.tests.hunter_bench import (
     sent_ids,
 )
 from edge_runtime.vehicles.hunter import frames
-from edge_runtime.vehicles.hunter.states import State
+from edge_runtime.vehicles.hunter.states import Event, State
 
 
 @pytest.mark.parametrize(
@@ -49,6 +49,9 @@ def test_a_motors_fault_stops_it():
     hot = frames.MotorSlow(24.0, 30, 90, 0b10)
     bench.tell(frames.REAR_LEFT_SLOW, hot)
     assert bench.words == ["rear left motor: motor overtemperature"]
+    assert bench.core.cause is Event.FAULT
+    bench.core.enable(bench.now_s)
+    assert (bench.core.cause, bench.core.words) == (None, "")
 
 
 def test_feedback_that_falls_silent_stops_it_and_the_brake_is_locked():
@@ -98,7 +101,10 @@ def test_a_drive_that_does_not_follow_is_stuck_and_its_brake_is_locked_at_once(s
     bench = Bench().driving(1.0)
     bench.obeys, bench.speed_mps = False, speed_mps
     pedal = {"pedal": -1.0 if speed_mps else 1.0}
-    bench.step(130, pedal)
+    while bench.core.state is State.ENABLED:
+        assert bench.ticks < 200
+        bench.step(1, pedal)
+    bench.step(1, pedal)
     assert "the speed stays at" in bench.words[0]
     locks = (0x131, b"\x01") in [(part.frame.can_id, part.data) for _, part in bench.sent]
     assert locks == (speed_mps > 0)
