@@ -110,5 +110,8 @@ def assert_taken_over_at_once(steps: Sequence[Step], asked_ns: int) -> None:
     assert after[0].human
     assert after[0].action != after[0].policy_action
     # It has moved from what was applied before towards what the person wants, as far as it may.
-    last, wanted = before[-1].action, after[0].human_action
+    together = before[-1].episode == after[0].episode
+    last = before[-1].action if together else after[0].policy_action
+    wanted = after[0].human_action
+    assert last is not None
     assert after[0].action == last + min(max(wanted - last, -MAX_SLEW), MAX_SLEW)
