@@ -110,7 +110,8 @@ def run(arguments: argparse.Namespace) -> int:
             _watched(training, sink) as watch,
         ):
             training.train(_both(_Reporter(bar), watch), deadline_s)
-    write_learning_curve(run_dir)
+    if training.episode:  # a person may quit before the first
+        write_learning_curve(run_dir)
     print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
     return 0
 

@@ -42,6 +42,8 @@ def training_with_person(
 def summary(training: PersonRun) -> str:
     """What the sitting amounts to, in a line."""
     sitting = training.sitting
+    if not sitting.recorder.index:
+        return "nothing was driven, and nothing recorded"
     return (
         f"{sitting.episodes} episodes, {sitting.interventions} interventions, "
         f"{sitting.human_steps} steps yours; {sitting.pacer.late} control periods late, "

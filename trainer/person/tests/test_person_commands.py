@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from trainer.drivers import load_driver, make_environment
+from trainer.person.interface import Person
 from trainer.person.recording import Recorder
+from trainer.person.registry import HUMANS
+from trainer.person.tests.people import QUIT, Eyes, Hands
 from trainer.person.tests.steps import recorded_step
 from trainer.tests.test_commands import call
 
@@ -62,6 +65,19 @@ def test_without_a_screen_it_says_what_to_do(capsys, tmp_path, monkeypatch):
     assert status == 2
     assert "--human web needs none" in errors
     assert errors.count("\n") == 1
+
+
+def test_whoever_quits_before_the_first_episode_has_lost_nothing(
+    capsys, tmp_path, monkeypatch, one_thread
+):
+    hands = Hands([], then=QUIT)
+    hands.present = False
+    monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, Eyes()))
+    command = ["train", "--human", "keyboard", "--out", str(tmp_path / "run"), "--speed", "1000"]
+    status, out, errors = call(capsys, *command)
+    assert (status, errors.strip()) == (0, "nothing was driven, and nothing recorded")
+    assert "0 episodes, 0 steps" in out
+    assert call(capsys, *command, "--resume")[0] == 0
 
 
 def record(directory, steps):
