@@ -54,7 +54,9 @@ def test_two_wheels_may_not_hold_the_same_file(tmp_path):
             unpack_wheel(wheel(clash), "b-1.whl", tmp_path)
 
 
-@pytest.mark.parametrize("data", [b"", b"no zip", wheel("a.py")[:-30]])
+@pytest.mark.parametrize(
+    "data", [b"", b"no zip", wheel("a.py")[:-30]], ids=["empty", "no zip", "cut off"]
+)
 def test_what_is_no_wheel_is_said(tmp_path, data):
     with pytest.raises(InstallerError, match="is not a wheel"):
         unpack_wheel(data, "a-1.whl", tmp_path)
