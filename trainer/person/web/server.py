@@ -145,7 +145,10 @@ class Server:
             page.wake.set()
             driving = self._seat.is_driver(page.number)
             refused = driving and not counts
-            await page.socket.send_str(encode_echo(said.at_ms, driving, refused))
+            try:
+                await page.socket.send_str(encode_echo(said.at_ms, driving, refused))
+            except ConnectionError:
+                return WSCloseCode.GOING_AWAY  # To nobody: it was cut off while it spoke.
 
     async def _keep_shown(self, page: Page) -> None:
         """Show the page the newest view, until it is gone; who hears it notices that."""
