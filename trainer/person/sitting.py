@@ -69,6 +69,7 @@ class Sitting:
             self._idle("waiting for the person's device")
         if self.stop:
             raise SittingOver
+        self._restart = False
         self.pacer.restart()
 
     def decide(self, observation: Observation, policy_action: float | None) -> Applied:
