@@ -134,6 +134,17 @@ def test_what_was_wished_before_an_episode_does_not_end_it(tmp_path, monkeypatch
     assert dict(outcomes) == {STOPPED: 1}
 
 
+def test_nobody_demonstrates_where_nobody_is(tmp_path, monkeypatch):
+    sitting, _ = make_sitting(tmp_path, [hold(1.0)] * 2 + [LET_GO] * 2 + [hold(1.0)], alone=True)
+    who_is_there(monkeypatch, True, True, True, False, False)
+    drive(sitting, None, 0, None)
+    sitting.close()
+    steps = list(read_steps(sitting.recorder.path))[:5]
+    assert [step.human for step in steps] == [True, True, False, False, True]
+    assert [step.control for step in steps] == ["human"] * 2 + ["policy"] * 2 + ["human"]
+    assert [step.first for step in steps] == [True, False, False, False, True]
+
+
 def test_sittings_drive_other_episodes(tmp_path):
     seeds = [
         {step.seed for step in drive_and_read(tmp_path, [wish("restart"), *[LET_GO] * 12])[1]}
