@@ -1,9 +1,9 @@
 """How soon a key in the browser reaches the car: a real Chromium, a real training, its recording.
 
-A press begins just before Chromium is told of it, and ends at the wall time of the recorded step
-that is the first of an intervention, stamped after the car has moved: both ends count against us.
-Beside it stands the same from the page's own key event on. What is pressed while nobody drives
-(between two episodes) is not counted, and told.
+A press begins just before Chromium is told of it, which counts against us, and ends at the wall
+time of the recorded step that is the first of an intervention: when its control period asked the
+hands, right before the car moves. Beside it stands the same from the page's own key event on. What
+is pressed while nobody drives (between two episodes) is not counted, and told.
 """
 
 from __future__ import annotations
