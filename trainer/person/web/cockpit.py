@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import secrets
 import socket
@@ -83,7 +84,7 @@ class Cockpit:
 
     def _tell(self, function: object, *arguments: object) -> None:
         """Call something in the server's thread; nothing once that is closed."""
-        if not self._loop.is_closed():
+        with contextlib.suppress(RuntimeError):  # Closed, perhaps this very moment.
             self._loop.call_soon_threadsafe(function, *arguments)  # type: ignore[arg-type]
 
     def _serve(self) -> None:
