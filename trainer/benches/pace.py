@@ -42,11 +42,14 @@ def drive(directory: Path, command: list[str], seconds: float) -> str:
     words = [sys.executable, "-m", "trainer.benches.scripted_person", str(seen), *command]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     end_s = time.monotonic() + PATIENCE_S
-    while last_seen(seen)[1] == 0 and process.poll() is None and time.monotonic() < end_s:
-        time.sleep(0.05)
-    time.sleep(seconds)
-    process.terminate()
-    _, errors = process.communicate(timeout=PATIENCE_S)
+    try:
+        while last_seen(seen)[1] == 0 and process.poll() is None and time.monotonic() < end_s:
+            time.sleep(0.05)
+        time.sleep(seconds)
+        process.terminate()
+        _, errors = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
     if process.returncode != 0:
         raise UserError(f"the trainer ended with status {process.returncode}: {errors.strip()}")
     return errors
