@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import logging
 import secrets
 import socket
 import sys
@@ -13,6 +14,7 @@ import time
 from typing import TYPE_CHECKING
 
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from edge_runtime.errors import UserError
 from trainer.person.interface import Person, Reading, View
@@ -33,6 +35,17 @@ HELP = (
     "or slide on the pad, or use a gamepad or wheel",
     "P: pause    R: restart the episode    Q: quit",
 )
+
+
+LOGGER = logging.getLogger(__name__)
+
+
+def _is_ours(record: logging.LogRecord) -> bool:
+    """Whether it is an error of the cockpit's, and not of somebody who speaks no HTTP to it."""
+    return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
+
+
+LOGGER.addFilter(_is_ours)
 
 
 class Cockpit:
@@ -98,6 +111,7 @@ class Cockpit:
             self._server.application(),
             # The log would hold the token.
             access_log=None,
+            logger=LOGGER,
             handle_signals=False,
             shutdown_timeout=CLOSING_S,
         )
