@@ -22,6 +22,7 @@ import numpy as np
 
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.errors import UserError
+from edge_runtime.files import check_writable
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.commands.options import not_negative, positive, positive_float
 from trainer.drivers import CHECKPOINT_FILE
@@ -149,6 +150,8 @@ def main(argv: list[str]) -> int:
     )
     _add_arguments(parser)
     arguments = parser.parse_args(argv)
+    if arguments.out is not None:
+        check_writable(arguments.out)
     with tempfile.TemporaryDirectory() as directory:
         run = KilledRun(Path(directory), arguments.speed, arguments.batch_size)
         result = measure(run, arguments.minutes, arguments.longest, arguments.seed)

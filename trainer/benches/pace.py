@@ -21,6 +21,7 @@ import numpy as np
 
 from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
 from edge_runtime.errors import UserError
+from edge_runtime.files import check_writable
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.commands.options import add_scenario, not_negative, positive_float
 from trainer.person.pacing import LATE_S
@@ -116,6 +117,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--threads", type=not_negative, default=0, help="the learner's; 0: all")
     parser.add_argument("--out", metavar="F.json", help="the figures")
     arguments = parser.parse_args(argv)
+    if arguments.out is not None:
+        check_writable(arguments.out)
     with tempfile.TemporaryDirectory() as directory:
         result = measure(Path(directory), arguments)
     write_json_out(arguments.out, result)

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from edge_runtime.errors import UserError
-from trainer.benches import pace
+from trainer.benches import killed_sitting, pace
 from trainer.benches.killed_sitting import KilledRun
 
 SLEEPER = [sys.executable, "-c", "import time; time.sleep(600)"]
@@ -43,3 +43,10 @@ def test_a_training_that_does_not_begin_to_drive_is_ended(tmp_path, monkeypatch,
         with pytest.raises(UserError, match="did not begin to drive"):
             run.kill(process, 0.0) if how == "kill" else run.end(process)
         assert process.wait(SOON_S) == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("bench", [pace, killed_sitting])
+def test_a_file_that_cannot_be_written_is_told_before_the_minutes_of_driving(bench, monkeypatch):
+    monkeypatch.setattr(bench, "measure", None)
+    with pytest.raises(UserError, match="cannot write"):
+        bench.main(["--out", "/none/figures.json"])
