@@ -29,6 +29,8 @@ WRONG = [
     (DRIVE, ("--human", "keyboard", "--profile", "x"), "--profile means nothing"),
     (DRIVE, ("--human", "keyboard", "--port", "80"), "--port means nothing"),
     (DRIVE, ("--human", "web", "--port", "70000"), "is no port"),
+    (DRIVE, ("--human", "web", "--port", "http"), "http is no port"),
+    (DRIVE, ("--human", "web", "--host", "a..b"), "the cockpit cannot listen on a..b"),
     (DRIVE, ("--speed", "0"), "not a finite number above zero"),
     (DRIVE, ("--policy", "{tmp}/nobody"), "is no policy"),
     (("drive", "--out", "{tmp}/file"), (), "cannot create the directory"),
