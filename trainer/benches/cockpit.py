@@ -108,7 +108,10 @@ async def quit_page(browser: Browser) -> None:
 
 
 async def _open_and_take_over(browser: Browser, run: CockpitRun, key: str) -> dict[str, float]:
-    """Open the page, and hold a key from its load event on until the person drives."""
+    """Open the page, and hold a key from its load event on until the person drives.
+
+    Ends when the policy drives again: the next page must not find the person driving still.
+    """
     began_s = time.monotonic()
     await browser.open(run.url)
     loaded_s = time.monotonic()
@@ -116,6 +119,7 @@ async def _open_and_take_over(browser: Browser, run: CockpitRun, key: str) -> di
     await browser.until(PERSON_DRIVES)
     taken_s = time.monotonic()
     await browser.key(key, False)
+    await browser.until(POLICY_DRIVES)
     return {"load_s": loaded_s - began_s, "taken_over_s": taken_s - began_s}
 
 
