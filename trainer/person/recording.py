@@ -3,7 +3,7 @@
 One MCAP file a sitting, ``sitting-0001.mcap`` and so on, whose messages are whole transitions
 (``Step``) in MessagePack. Each step is a chunk of its own and handed to the operating system at
 once, so whatever ends the process, at most the step that was being taken is lost; 30 minutes are
-about 15 MB. Nothing is ever overwritten: sittings add up.
+about 12 MB. Nothing is ever overwritten: sittings add up.
 """
 
 from __future__ import annotations
