@@ -23,6 +23,7 @@ import numpy as np
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
+from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.commands.options import not_negative, positive, positive_float
 from trainer.drivers import CHECKPOINT_FILE
@@ -129,6 +130,7 @@ def measure(run: KilledRun, minutes: float, longest_s: float, seed: int) -> dict
     run.end(run.start(episodes=100000))
     steps = run.steps()
     return {
+        **about(),
         "simulated_minutes": len(steps) * CONTROL_PERIOD_S / 60.0,
         "steps": len(steps),
         "human_steps": sum(step.human for step in steps),

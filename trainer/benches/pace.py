@@ -22,6 +22,7 @@ import numpy as np
 from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
+from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.commands.options import add_scenario, not_negative, positive_float
 from trainer.person.pacing import LATE_S
@@ -96,6 +97,7 @@ def measure(directory: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     driven_s = PERIOD_S * sum(int(row["steps"]) for row in rows)
     save = re.search(r"checkpoints in ([\d.]+) s", errors)
     return {
+        **about(),
         "scenario": arguments.scenario,
         "threads": arguments.threads,
         "learning": pace(read(run_dir / DIRECTORY)),
