@@ -16,7 +16,6 @@ DISK_BYTES = 2 * 10**9
 """A training run with its checkpoint takes some 0.5 GB, recordings and pictures come on top."""
 MEMORY_BYTES = 2 * 10**9
 """A full replay buffer and torch take 1.2 GB."""
-CHROMIUMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 
 def disk() -> str:
@@ -89,7 +88,8 @@ def xvfb() -> str:
 
 def chromium() -> str:
     """A browser that runs without a screen."""
-    for name in CHROMIUMS:
-        if path := shutil.which(name):
-            return output_of(path, "--version")
-    raise MissingError(f"none of {', '.join(CHROMIUMS)} is installed")
+    from trainer.benches.chromium import NAMES, find_chromium
+
+    if (path := find_chromium()) is None:
+        raise MissingError(f"none of {', '.join(NAMES)} is installed")
+    return output_of(path, "--version")

@@ -15,6 +15,7 @@ from hil_tests.doctor import links, machine, person, software
 from hil_tests.doctor.check import Check, MissingError, examine, output_of
 from hil_tests.doctor.command import basics_work, lines, summary
 from hil_tests.doctor.table import CHECKS
+from trainer.benches.chromium import find_chromium
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,7 +39,7 @@ def test_without_packages_it_still_runs_and_says_what_is_missing():
     assert done.stderr == ""
     assert "  ok       Python: 3." in done.stdout
     (packages,) = (line for line in done.stdout.splitlines() if "missing  packages: " in line)
-    assert {"cryptography,", "numpy,", "torch"} <= set(packages.split())
+    assert {"cryptography", "numpy", "torch"} <= set(packages.replace(",", "").split())
     assert done.stdout.endswith("The basics do not work here: packages, loopback.\n")
 
 
@@ -46,6 +47,17 @@ def test_every_line_says_what_is_lost_and_how_to_get_it():
     checks = [check for group in CHECKS.values() for check in group]
     assert all(check.without and check.remedy for check in checks)
     assert len({check.name for check in checks}) == len(checks)
+
+
+def test_the_browser_that_is_found_is_the_one_that_the_tests_use(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert not found(machine.chromium).ok
+    assert find_chromium() is None
+    browser = tmp_path / "google-chrome-stable"
+    browser.write_text("#!/bin/sh\necho Chrome 1\n")
+    browser.chmod(0o755)
+    assert found(machine.chromium).detail == "Chrome 1"
+    assert find_chromium() == str(browser)
 
 
 def test_a_port_is_tried():

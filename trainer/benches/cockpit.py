@@ -1,9 +1,9 @@
 """How soon a key in the browser reaches the car: a real Chromium, a real training, its recording.
 
-A press begins just before Chromium is told of it, and ends at the wall time of the recorded step
-that is the first of an intervention, stamped after the car has moved: both ends count against us.
-Beside it stands the same from the page's own key event on. What is pressed while nobody drives
-(between two episodes) is not counted, and told.
+A press begins just before Chromium is told of it, which counts against us, and ends at the wall
+time of the recorded step that is the first of an intervention: when its control period asked the
+hands, right before the car moves. Beside it stands the same from the page's own key event on. What
+is pressed while nobody drives (between two episodes) is not counted, and told.
 """
 
 from __future__ import annotations
@@ -108,7 +108,10 @@ async def quit_page(browser: Browser) -> None:
 
 
 async def _open_and_take_over(browser: Browser, run: CockpitRun, key: str) -> dict[str, float]:
-    """Open the page, and hold a key from its load event on until the person drives."""
+    """Open the page, and hold a key from its load event on until the person drives.
+
+    Ends when the policy drives again: the next page must not find the person driving still.
+    """
     began_s = time.monotonic()
     await browser.open(run.url)
     loaded_s = time.monotonic()
@@ -116,6 +119,7 @@ async def _open_and_take_over(browser: Browser, run: CockpitRun, key: str) -> di
     await browser.until(PERSON_DRIVES)
     taken_s = time.monotonic()
     await browser.key(key, False)
+    await browser.until(POLICY_DRIVES)
     return {"load_s": loaded_s - began_s, "taken_over_s": taken_s - began_s}
 
 

@@ -22,8 +22,10 @@ import numpy as np
 
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.errors import UserError
+from edge_runtime.files import check_writable
+from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
-from trainer.commands.options import not_negative, positive_float
+from trainer.commands.options import not_negative, positive, positive_float
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.files import load_torch
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
@@ -71,16 +73,28 @@ class KilledRun:
 
     def kill(self, process: subprocess.Popen[bytes], after_s: float) -> Kill:
         """Kill it so long after its first step; what that cost."""
-        self.wait_for_first_step(process)
-        time.sleep(after_s)
-        process.kill()
-        killed_ns = time.time_ns()
-        process.wait()
+        try:
+            self.wait_for_first_step(process)
+            time.sleep(after_s)
+        finally:
+            process.kill()
+            killed_ns = time.time_ns()
+            process.wait()
         recorded = list(read_steps(sittings(self.run_dir / DIRECTORY)[-1]))
         episode, taken = last_seen(self.seen)
         kept = sum(step.episode == episode for step in recorded)
         lost_s = (killed_ns - recorded[-1].time_ns) * 1e-9
         return Kill(after_s, len(recorded), max(taken - kept, 0), lost_s)
+
+    def end(self, process: subprocess.Popen[bytes]) -> None:
+        """End it well after its first step; UserError if that does not happen."""
+        try:
+            self.wait_for_first_step(process)
+            process.terminate()
+            if process.wait(timeout=PATIENCE_S) != 0:
+                raise UserError("the training did not end well on SIGTERM")
+        finally:
+            process.kill()
 
     def steps(self) -> list[Step]:
         """All that was recorded, in its order."""
@@ -113,13 +127,10 @@ def measure(run: KilledRun, minutes: float, longest_s: float, seed: int) -> dict
     while len(run.steps()) * CONTROL_PERIOD_S < 60.0 * minutes:
         kills.append(run.kill(run.start(episodes=100000), draw.uniform(0.1, longest_s)))
         print(f"killed after {kills[-1].after_s:.1f} s: {kills[-1]}", file=sys.stderr, flush=True)
-    process = run.start(episodes=100000)
-    run.wait_for_first_step(process)
-    process.terminate()
-    if process.wait(timeout=PATIENCE_S) != 0:
-        raise UserError("the training did not end well on SIGTERM")
+    run.end(run.start(episodes=100000))
     steps = run.steps()
     return {
+        **about(),
         "simulated_minutes": len(steps) * CONTROL_PERIOD_S / 60.0,
         "steps": len(steps),
         "human_steps": sum(step.human for step in steps),
@@ -141,6 +152,8 @@ def main(argv: list[str]) -> int:
     )
     _add_arguments(parser)
     arguments = parser.parse_args(argv)
+    if arguments.out is not None:
+        check_writable(arguments.out)
     with tempfile.TemporaryDirectory() as directory:
         run = KilledRun(Path(directory), arguments.speed, arguments.batch_size)
         result = measure(run, arguments.minutes, arguments.longest, arguments.seed)
@@ -156,7 +169,7 @@ def main(argv: list[str]) -> int:
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--minutes", type=positive_float, default=30.0, help="simulated, in all")
     parser.add_argument("--speed", type=positive_float, default=10.0, help="times real time")
-    parser.add_argument("--batch-size", type=int, default=8, help="of the learner")
+    parser.add_argument("--batch-size", type=positive, default=8, help="of the learner")
     parser.add_argument("--longest", type=positive_float, default=40.0, help="s until a kill")
     parser.add_argument("--seed", type=not_negative, default=0, help="of the moments")
     parser.add_argument("--out", metavar="F.json", help="the figures")

@@ -21,6 +21,8 @@ import numpy as np
 
 from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
 from edge_runtime.errors import UserError
+from edge_runtime.files import check_writable
+from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.commands.options import add_scenario, not_negative, positive_float
 from trainer.person.pacing import LATE_S
@@ -42,11 +44,14 @@ def drive(directory: Path, command: list[str], seconds: float) -> str:
     words = [sys.executable, "-m", "trainer.benches.scripted_person", str(seen), *command]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     end_s = time.monotonic() + PATIENCE_S
-    while last_seen(seen)[1] == 0 and process.poll() is None and time.monotonic() < end_s:
-        time.sleep(0.05)
-    time.sleep(seconds)
-    process.terminate()
-    _, errors = process.communicate(timeout=PATIENCE_S)
+    try:
+        while last_seen(seen)[1] == 0 and process.poll() is None and time.monotonic() < end_s:
+            time.sleep(0.05)
+        time.sleep(seconds)
+        process.terminate()
+        _, errors = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
     if process.returncode != 0:
         raise UserError(f"the trainer ended with status {process.returncode}: {errors.strip()}")
     return errors
@@ -92,6 +97,7 @@ def measure(directory: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     driven_s = PERIOD_S * sum(int(row["steps"]) for row in rows)
     save = re.search(r"checkpoints in ([\d.]+) s", errors)
     return {
+        **about(),
         "scenario": arguments.scenario,
         "threads": arguments.threads,
         "learning": pace(read(run_dir / DIRECTORY)),
@@ -113,6 +119,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--threads", type=not_negative, default=0, help="the learner's; 0: all")
     parser.add_argument("--out", metavar="F.json", help="the figures")
     arguments = parser.parse_args(argv)
+    if arguments.out is not None:
+        check_writable(arguments.out)
     with tempfile.TemporaryDirectory() as directory:
         result = measure(Path(directory), arguments)
     write_json_out(arguments.out, result)

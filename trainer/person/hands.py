@@ -110,7 +110,6 @@ class JoystickHands:
         self._places: dict[int, float] = {}
         """Of the axes that have moved: SDL calls the others 0, which is a pedal half pressed."""
         self._wishes: set[Wish] = set()
-        self._held_s = 0.0
         how = "hold the button to take over"
         if profile.take_over == "moving":
             how = (

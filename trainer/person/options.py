@@ -64,7 +64,6 @@ def _refuse(arguments: argparse.Namespace, name: str, useful: bool) -> None:
 
 def _port(text: str) -> int:
     """An argparse type: a TCP port."""
-    value = int(text)
-    if not 0 <= value < 65536:
+    if not (text.isdecimal() and int(text) < 65536):
         raise argparse.ArgumentTypeError(f"{text} is no port")
-    return value
+    return int(text)

@@ -119,7 +119,10 @@ class PersonRun(TrainingRun):
                 file=sys.stderr,
                 flush=True,
             )
-        super()._validate(metrics, at_end)
+        try:
+            super()._validate(metrics, at_end)
+        except KeyboardInterrupt:
+            print("validation left out", file=sys.stderr)
 
     def _more_state(self) -> dict[str, Any]:
         return {"recorded": list(self.sitting.recorder.position)}

@@ -69,6 +69,7 @@ class Sitting:
             self._idle("waiting for the person's device")
         if self.stop:
             raise SittingOver
+        self._restart = False
         self.pacer.restart()
 
     def decide(self, observation: Observation, policy_action: float | None) -> Applied:
@@ -144,9 +145,16 @@ class Sitting:
 
     def _weigh(self, policy_action: float | None) -> Applied:
         if policy_action is None:
-            return Applied(self._reading.action, "human", True, first=self._number == 0)
+            return self._alone()
         holds = self._intent.update(self._reading, time.monotonic())
         return self._take_over.step(policy_action, self._reading.action, holds)
+
+    def _alone(self) -> Applied:
+        """The hands decide; where they are gone, the car rolls, and that demonstrates nothing."""
+        if not self.person.device.present:
+            return Applied(0.0, "policy", False, False)
+        first = self._number == 0 or not self._applied.human
+        return Applied(self._reading.action, "human", True, first)
 
     def _read(self) -> None:
         """Ask the hands, and heed what they wish."""

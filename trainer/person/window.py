@@ -80,7 +80,9 @@ class Window:
     def _state(self, view: View) -> None:
         """The right column: who is in control, and how the drive is going."""
         left, top = SCENE_WIDTH + MARGIN, MARGIN
-        self._text(CONTROL_TEXT[view.control], (left, top), view.control, 38)
+        nobody = view.control == "policy" and view.policy_action is None
+        who = "nobody drives" if nobody else CONTROL_TEXT[view.control]
+        self._text(who, (left, top), view.control, 38)
         lines = (
             f"{view.speed_mps:.1f} m/s",
             f"{view.distance_m:.1f} of {view.goal_m:.0f} m",

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
@@ -26,9 +27,9 @@ class Driven:
     human: list
 
 
-def drive(directory, seeds=(4, 9), steps=15, sitting_policy=True):
+def drive(directory, seeds=(4, 9), steps=15, sitting_policy=True, scenario="left_turn"):
     """A sitting: the policy wants half throttle, the person brakes from step 5 to 9."""
-    env, recorder = make_environment("left_turn"), Recorder(directory)
+    env, recorder = make_environment(scenario), Recorder(directory)
     applied, human = [], []
     for episode, seed in enumerate(seeds):
         observation, _ = env.reset(seed=seed)
@@ -40,7 +41,7 @@ def drive(directory, seeds=(4, 9), steps=15, sitting_policy=True):
             step = recorded_step(recorder.sitting, recorder.index)
             recorder.write(
                 msgspec.structs.replace(
-                    step, scenario="left_turn", seed=seed, episode=episode, step=number,
+                    step, scenario=scenario, seed=seed, episode=episode, step=number,
                     frames=frames.tobytes(), next_frame=observation[1].tobytes(),
                     policy_action=0.5 if sitting_policy else None, action=action, human=taken,
                     first=number == 5, reward=float(reward), speed_mps=float(env.ego.speed),
@@ -67,6 +68,16 @@ def test_a_sitting_is_shown_whole(tmp_path, capsys):
     assert [step for step, _ in found["/return/episode"]] == [14, 29]
     assert {"/road/ego/body", "/road/roads", "/frames/now"} <= set(found)
     assert "/loss/critic" not in {path for path, rows in found.items() if rows}
+
+
+def test_each_scenario_is_shown_on_its_own_ground(tmp_path):
+    for scenario in ("left_turn", "left_turn", "congestion"):
+        drive(tmp_path / "drives", seeds=(4,), steps=6, scenario=scenario)
+    out = tmp_path / "both.rrd"
+    assert main(["view", str(tmp_path / "drives"), "--save", str(out)]) == 0
+    chunks = [c for c in RrdReader(str(out)).stream().to_chunks() if c.entity_path == "/road/roads"]
+    drawn = [step for chunk in chunks for step in chunk.to_record_batch().to_pydict()["step"]]
+    assert sorted(drawn) == [0, 12]
 
 
 def test_a_road_that_would_be_driven_differently_is_not_made_up(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -55,7 +56,8 @@ class TrainingLog:
     def __init__(self, recording: rr.RecordingStream, episodes: Sequence[Plot]) -> None:
         self._recording, self._episodes = recording, episodes
         self._driver = ""
-        self._ground_drawn = False
+        self._ground: tuple[Any, ...] = ()
+        """What is drawn of the ground: recordings may be of several scenarios."""
         self._returns: deque[float] = deque(maxlen=WINDOW)
         self._successes: deque[float] = deque(maxlen=WINDOW)
         self._define_series()
@@ -106,8 +108,9 @@ class TrainingLog:
         self._recording.log("frames/now", rr.Image(now, color_model="L"))
 
     def _draw_road(self, scene: SeenScene) -> None:
-        if not self._ground_drawn:
-            self._ground_drawn = True
+        ground = (scene.roads, scene.path, scene.goal)
+        if ground != self._ground:
+            self._ground = ground
             self._recording.send_blueprint(make_blueprint(scene, self._episodes))
             draw_ground(self._recording, scene)
         draw_cars(self._recording, scene, BLUE if self._driver == POLICY else HUMAN_EGO)

@@ -47,12 +47,13 @@ def test_a_key_takes_over_at_once_and_everything_is_kept(tmp_path, display):
     run_dir = tmp_path / "run"
     with Training(run_dir, "trainer", ["--human", "keyboard"], display) as training:
         training.wait_for_step(lambda step: step.step >= 2)
-        asked_ns = xdotool(display, "keydown", "Down")
+        began_ns = time.time_ns()
+        done_ns = xdotool(display, "keydown", "Down")
         training.wait_for_step(lambda step: step.human and step.action < -0.99)
         let_go_ns = xdotool(display, "keyup", "Down")
         back = training.wait_for_step(lambda step: step.time_ns > let_go_ns and not step.human)
         steps = newest_sitting(run_dir)
-        assert_taken_over_at_once(steps, asked_ns)
+        assert_taken_over_at_once(steps, began_ns, done_ns)
         after = next(step for step in steps if step.time_ns > let_go_ns)
         assert after.control != "human"
         assert back.action == back.policy_action

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from trainer.drivers import load_driver, make_environment
-from trainer.person.interface import Person
+from trainer.person.interface import LET_GO, Person
 from trainer.person.recording import Recorder
 from trainer.person.registry import HUMANS
+from trainer.person.sitting import STOPPED
 from trainer.person.tests.people import QUIT, Eyes, Hands
 from trainer.person.tests.steps import recorded_step
 from trainer.tests.test_commands import call
+from trainer.training.metrics import read_metrics
+from trainer.training.run import TrainingRun
 
 DRIVE = ("drive", "--out", "{tmp}/rec")
 TRAIN = ("train", "--out", "{tmp}/run")
@@ -26,6 +29,8 @@ WRONG = [
     (DRIVE, ("--human", "keyboard", "--profile", "x"), "--profile means nothing"),
     (DRIVE, ("--human", "keyboard", "--port", "80"), "--port means nothing"),
     (DRIVE, ("--human", "web", "--port", "70000"), "is no port"),
+    (DRIVE, ("--human", "web", "--port", "http"), "http is no port"),
+    (DRIVE, ("--human", "web", "--host", "a..b"), "the cockpit cannot listen on a..b"),
     (DRIVE, ("--speed", "0"), "not a finite number above zero"),
     (DRIVE, ("--policy", "{tmp}/nobody"), "is no policy"),
     (("drive", "--out", "{tmp}/file"), (), "cannot create the directory"),
@@ -78,6 +83,25 @@ def test_whoever_quits_before_the_first_episode_has_lost_nothing(
     assert (status, errors.strip()) == (0, "nothing was driven, and nothing recorded")
     assert "0 episodes, 0 steps" in out
     assert call(capsys, *command, "--resume")[0] == 0
+
+
+def test_a_validation_that_is_left_out_costs_nothing_else(
+    capsys, tmp_path, monkeypatch, one_thread
+):
+    def interrupted(*_arguments):
+        raise KeyboardInterrupt
+
+    person = Person(Hands([LET_GO] * 3, then=QUIT), Eyes())
+    monkeypatch.setitem(HUMANS, "keyboard", lambda options: person)
+    monkeypatch.setattr(TrainingRun, "_validate", interrupted)
+    run_dir = tmp_path / "run"
+    command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
+    status, out, errors = call(capsys, *command)
+    assert status == 0
+    assert "validation left out" in errors
+    assert "1 episodes, 4 steps" in out
+    assert [row["outcome"] for row in read_metrics(run_dir)] == [STOPPED]
+    assert (run_dir / "learning_curve.png").is_file()
 
 
 def record(directory, steps):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import resource
+from typing import cast
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -51,6 +53,17 @@ def test_a_damaged_byte_ends_the_reading_without_a_wrong_step(tmp_path):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
         read = list(read_steps(path))
         assert read == steps[: len(read)]
+
+
+def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_path):
+    class Older(msgspec.Struct):
+        time_ns: int = 1
+
+    recorder = Recorder(tmp_path)
+    recorder.write(cast(Step, Older()))
+    recorder.close()
+    with pytest.raises(UserError, match="recorded by another version: Object missing"):
+        list(read_steps(recorder.path))
 
 
 def test_every_step_is_there_before_the_next_is_taken(tmp_path):

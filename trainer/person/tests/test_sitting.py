@@ -12,7 +12,7 @@ from trainer.person.interface import LET_GO
 from trainer.person.recording import read_steps
 from trainer.person.sitting import RESTARTED, STOPPED
 from trainer.person.takeover import MAX_SLEW
-from trainer.person.tests.people import QUIT, hold, make_sitting, wish
+from trainer.person.tests.people import QUIT, Hands, hold, make_sitting, wish
 
 
 class Steady:
@@ -26,6 +26,12 @@ class Steady:
 
     def act(self, observation):
         return self.action
+
+
+def who_is_there(monkeypatch, *presence: bool):
+    """Hands whose device is there, or not, each time it is asked; then for good."""
+    there = iter(presence)
+    monkeypatch.setattr(Hands, "present", property(lambda _: next(there, True)), raising=False)
 
 
 def drive_and_read(directory, readings, policy=0.5, **options):
@@ -119,6 +125,24 @@ def test_without_the_person_no_episode_begins(tmp_path, monkeypatch):
     sitting.close()
     assert {view.message for view in eyes.views} == {"waiting for the person's device"}
     assert not sitting.recorder.path.exists()
+
+
+def test_what_was_wished_before_an_episode_does_not_end_it(tmp_path, monkeypatch):
+    sitting, _ = make_sitting(tmp_path, [wish("restart"), *[LET_GO] * 4])
+    who_is_there(monkeypatch, False)
+    outcomes = drive(sitting, Steady(0.0), 0, None)
+    assert dict(outcomes) == {STOPPED: 1}
+
+
+def test_nobody_demonstrates_where_nobody_is(tmp_path, monkeypatch):
+    sitting, _ = make_sitting(tmp_path, [hold(1.0)] * 2 + [LET_GO] * 2 + [hold(1.0)], alone=True)
+    who_is_there(monkeypatch, True, True, True, False, False)
+    drive(sitting, None, 0, None)
+    sitting.close()
+    steps = list(read_steps(sitting.recorder.path))[:5]
+    assert [step.human for step in steps] == [True, True, False, False, True]
+    assert [step.control for step in steps] == ["human"] * 2 + ["policy"] * 2 + ["human"]
+    assert [step.first for step in steps] == [True, False, False, False, True]
 
 
 def test_sittings_drive_other_episodes(tmp_path):

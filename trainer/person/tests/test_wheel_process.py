@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from trainer.person.tests.processes import (
@@ -27,12 +29,13 @@ def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
     run_dir = tmp_path / "run"
     with train(run_dir) as training:
         training.wait_for_step(lambda step: step.step >= 2)
-        asked_ns = training.tell("axis 3 -1")
+        began_ns = time.time_ns()
+        done_ns = training.tell("axis 3 -1")
         training.wait_for_step(lambda step: step.human and step.action < -0.99)
         training.process.kill()
         training.process.wait()
     killed = newest_sitting(run_dir)
-    assert_taken_over_at_once(killed, asked_ns)
+    assert_taken_over_at_once(killed, began_ns, done_ns)
 
     with train(run_dir, "--resume") as training:
         training.wait_for_step(lambda step: step.sitting == 2 and step.step >= 1)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
+import logging
 import secrets
 import socket
 import sys
@@ -12,6 +14,7 @@ import time
 from typing import TYPE_CHECKING
 
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from edge_runtime.errors import UserError
 from trainer.person.interface import Person, Reading, View
@@ -32,6 +35,17 @@ HELP = (
     "or slide on the pad, or use a gamepad or wheel",
     "P: pause    R: restart the episode    Q: quit",
 )
+
+
+LOGGER = logging.getLogger(__name__)
+
+
+def _is_ours(record: logging.LogRecord) -> bool:
+    """Whether it is an error of the cockpit's, and not of somebody who speaks no HTTP to it."""
+    return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
+
+
+LOGGER.addFilter(_is_ours)
 
 
 class Cockpit:
@@ -83,7 +97,7 @@ class Cockpit:
 
     def _tell(self, function: object, *arguments: object) -> None:
         """Call something in the server's thread; nothing once that is closed."""
-        if not self._loop.is_closed():
+        with contextlib.suppress(RuntimeError):  # Closed, perhaps this very moment.
             self._loop.call_soon_threadsafe(function, *arguments)  # type: ignore[arg-type]
 
     def _serve(self) -> None:
@@ -97,6 +111,7 @@ class Cockpit:
             self._server.application(),
             # The log would hold the token.
             access_log=None,
+            logger=LOGGER,
             handle_signals=False,
             shutdown_timeout=CLOSING_S,
         )
@@ -135,7 +150,8 @@ def _listen(host: str, port: int) -> socket.socket:
         except OSError:
             listener.close()
             raise
-    except (OSError, OverflowError) as error:
+    # A name that is none for DNS is a UnicodeError.
+    except (OSError, OverflowError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             reason += "; without --port any that is free will do"

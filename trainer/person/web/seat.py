@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 
-from trainer.person.interface import LET_GO, Reading, Wish
+from trainer.person.interface import LET_GO, Moving, Reading, Wish
 from trainer.person.web.messages import Input
 
 SILENCE_S = 0.5
@@ -18,8 +18,9 @@ SILENCE_S = 0.5
 class Seat:
     """One driver, the page that has been here longest; the others watch.
 
-    A hold counts only after the page was heard with its hands off, and after a silence it must be
-    heard so again: a connection that comes back does not take over by itself.
+    A hold, or a wheel that is turned, counts only after the page was heard with its hands off, and
+    after a silence it must be heard so again: a connection that comes back does not take over by
+    itself.
     """
 
     def __init__(self) -> None:
@@ -55,22 +56,23 @@ class Seat:
             return now_s - self._heard_s <= SILENCE_S
 
     def hear(self, page: int, said: Input, now_s: float) -> bool:
-        """Take note of what ``page`` says; whether it holds the wheel by that."""
+        """Take note of what ``page`` says; whether that counts."""
         with self._lock:
             if self._pages[:1] != [page]:
                 return False
             if now_s - self._heard_s > SILENCE_S:
                 self._let_go()
             self._heard_s = now_s
-            self._hands_were_off |= not said.engaged
-            held = said.engaged and self._hands_were_off
-            pressed = held and not self._said.engaged
-            refused = said.engaged and not held
-            self._said = LET_GO if refused else Reading(said.action, held, by_moving=said.by_moving)
+            self._wishes |= set(said.wishes)
+            self._hands_were_off |= _hands_are_off(said)
+            if not self._hands_were_off:
+                self._said = LET_GO
+                return False
+            pressed = said.engaged and not self._said.engaged
+            self._said = Reading(said.action, said.engaged, by_moving=said.by_moving)
             if pressed:
                 self._tap = self._said
-            self._wishes |= set(said.wishes)
-            return held
+            return True
 
     def poll(self, now_s: float) -> Reading:
         """What the driver does at ``now_s``; each wish once."""
@@ -87,3 +89,9 @@ class Seat:
         self._said, self._tap = LET_GO, None
         self._hands_were_off = False
         self._heard_s = float("-inf")
+
+
+def _hands_are_off(said: Input) -> bool:
+    """Whether nothing is held, nor a wheel that takes over by moving away from its rest."""
+    resting = not said.by_moving or abs(said.action) <= Moving.rest
+    return resting and not said.engaged

@@ -140,12 +140,15 @@ class Server:
                 said = decode_input(message.data)
             except msgspec.MsgspecError:
                 return WSCloseCode.POLICY_VIOLATION
-            held = self._seat.hear(page.number, said, time.monotonic())
+            counts = self._seat.hear(page.number, said, time.monotonic())
             page.seen = min(max(page.seen, said.seen), page.sent)
             page.wake.set()
             driving = self._seat.is_driver(page.number)
-            refused = driving and said.engaged and not held
-            await page.socket.send_str(encode_echo(said.at_ms, driving, refused))
+            refused = driving and not counts
+            try:
+                await page.socket.send_str(encode_echo(said.at_ms, driving, refused))
+            except ConnectionError:
+                return WSCloseCode.GOING_AWAY  # To nobody: it was cut off while it spoke.
 
     async def _keep_shown(self, page: Page) -> None:
         """Show the page the newest view, until it is gone; who hears it notices that."""

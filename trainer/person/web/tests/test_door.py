@@ -41,6 +41,17 @@ def test_without_the_token_nothing_is_shown(cockpit, path):
     assert "token" in text
 
 
+@pytest.mark.parametrize(
+    "words", [b"GET /\xff HTTP/1.1", b"\x16\x03\x01\x02\x00", b"GET / HTTP/9.9"]
+)
+def test_who_speaks_no_http_is_told_so_and_nobody_else(cockpit, caplog, words):
+    with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as link:
+        link.sendall(words + b"\r\nHost: x\r\n\r\n")
+        assert b"400 Bad Request" in link.recv(200)
+    cockpit.close()
+    assert caplog.messages == []
+
+
 @pytest.mark.parametrize("from_where", ["http://evil.example", "null", None])
 def test_another_sites_page_gets_no_socket(cockpit, from_where):
     async def knock():

@@ -10,6 +10,8 @@ from trainer.person.web.seat import SILENCE_S, Seat
 
 OFF = Input(at_ms=0.0, action=0.0, engaged=False)
 HOLD = Input(at_ms=0.0, action=0.8, engaged=True)
+RESTING = Input(at_ms=0.0, action=0.03, engaged=False, by_moving=True)
+TURNED = Input(at_ms=0.0, action=0.8, engaged=False, by_moving=True)
 
 
 @pytest.fixture
@@ -46,6 +48,18 @@ def test_after_a_silence_the_hands_must_be_off_once(seat):
     seat.hear(1, OFF, late_s + 0.1)
     assert seat.hear(1, HOLD, late_s + 0.2)
     assert seat.poll(late_s + 0.2).engaged
+
+
+def test_a_wheel_that_is_turned_when_the_connection_comes_back_must_rest_first(seat):
+    seat.hear(1, RESTING, 0.0)
+    seat.hear(1, TURNED, 0.1)
+    assert seat.poll(0.1).action == 0.8
+    late_s = 0.1 + SILENCE_S + 0.1
+    assert not seat.hear(1, TURNED, late_s)
+    assert seat.poll(late_s) == LET_GO
+    seat.hear(1, RESTING, late_s + 0.1)
+    assert seat.hear(1, TURNED, late_s + 0.2)
+    assert seat.poll(late_s + 0.2).action == 0.8
 
 
 def test_a_page_that_comes_holding_does_not_take_over(seat):
@@ -101,7 +115,8 @@ def test_a_wish_outlives_its_page_and_is_told_once(seat):
 
 
 def test_a_wheel_takes_over_by_moving_only_while_it_is_heard(seat):
-    seat.hear(1, Input(at_ms=0.0, action=0.3, engaged=False, by_moving=True), 0.0)
+    seat.hear(1, RESTING, 0.0)
+    seat.hear(1, TURNED, 0.0)
     assert seat.poll(0.1).by_moving
     assert not seat.poll(1.0).by_moving
 

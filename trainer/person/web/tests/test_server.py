@@ -3,6 +3,8 @@
 import asyncio
 import base64
 import json
+import socket
+import struct
 import time
 
 import aiohttp
@@ -14,6 +16,9 @@ from trainer.person.web.server import VIEWS_UNDERWAY
 from trainer.person.web.tests.pages import WAIT_S, hear, origin, page, say, until
 from trainer.person.web.tests.readings import poll
 from trainer.person.web.tests.views import first_view, view_of_step
+
+RESET = struct.pack("ii", 1, 0)
+"""SO_LINGER that closes without a good-bye."""
 
 
 def test_what_a_page_holds_is_polled_and_its_closing_is_letting_go(cockpit):
@@ -131,6 +136,24 @@ def test_a_page_that_reads_nothing_holds_nobody_up(cockpit):
         writer.close()
 
     asyncio.run(stare())
+
+
+def test_pages_that_are_cut_off_while_they_speak_are_no_error(cockpit, caplog):
+    async def speak_and_go():
+        async with page(cockpit) as link:
+            for _ in range(50):
+                await link.send_json({"at_ms": 1.0, "action": 0.0, "engaged": False})
+            link.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+            link._response.connection.transport.abort()
+
+    async def several():
+        for _ in range(10):
+            await speak_and_go()
+        await until(lambda: not cockpit.present)
+
+    asyncio.run(several())
+    cockpit.close()
+    assert caplog.messages == []
 
 
 def test_closing_tells_every_page_and_frees_the_port():
