@@ -11,8 +11,8 @@ from bridge.signals import sigterm_as_interrupt, wait_to_be_told
 with sigterm_as_interrupt():
     threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
-    print("ready", flush=True)
     try:
+        print("ready", flush=True)
         wait_to_be_told()
     except KeyboardInterrupt:
         print("told")

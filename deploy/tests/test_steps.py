@@ -28,6 +28,9 @@ class Service:
         self.heard: list[str] = []
         """What ran at a moment when commands could leave."""
 
+    def account(self) -> None:
+        """Nobody special."""
+
     def start(self, release) -> None:
         self.runs = release.name
 
