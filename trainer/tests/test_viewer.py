@@ -214,9 +214,14 @@ def test_a_slow_view_holds_nobody_up():
     assert len(drawn) + background.dropped == len(entries)
 
 
-def test_a_view_that_fails_does_not_end_the_run(capsys):
+class PanicError(BaseException):
+    """As pyo3's, of which rerun is made: no Exception."""
+
+
+@pytest.mark.parametrize("error", [OSError("disk full"), PanicError("disk full")])
+def test_a_view_that_fails_does_not_end_the_run(capsys, error):
     def draw(_entry):
-        raise OSError("disk full")
+        raise error
 
     background = Background(draw)
     for _ in range(3):

@@ -46,6 +46,6 @@ class Background:
                 continue  # The queue is emptied all the same: close() must not wait for ever.
             try:
                 self._draw(entry)
-            except Exception as error:
+            except BaseException as error:  # a panic of rerun's Rust is no Exception
                 drawing = False
                 print(f"the view ends, the training goes on: {error}", file=sys.stderr)
