@@ -94,6 +94,7 @@ def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
     path = Path(policy)
     if path.suffix == ".onnx":
         driver = OnnxDriver(path)
+        _check_action(driver, env.scenario, policy)
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
         actor, _ = load_human_model(path)
@@ -104,7 +105,21 @@ def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
             "a human model's directory, or the word expert"
         )
     actor, state = load_actor(path)
+    if state["scenario"] != env.scenario:
+        raise UserError(f"{policy} was trained in {state['scenario']}, not in {env.scenario}")
     return NetworkDriver(actor), f"run:{path.name}:{state['episode']}"
+
+
+def _check_action(driver: OnnxDriver, scenario: str, policy: str) -> None:
+    """Refuse a file whose action means something else than the scenario's."""
+    from trainer.export import ACTIONS  # which needs this module
+
+    names = [action.name for action in driver.policy.manifest.action]
+    wanted = ACTIONS[scenario].name
+    if names != [wanted]:
+        raise UserError(
+            f"{policy} answers with {', '.join(names)}, and {scenario} asks for {wanted}"
+        )
 
 
 def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:

@@ -97,6 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.device == "cuda" and not torch.cuda.is_available():
         raise UserError("no CUDA device is available; use --device cpu")
     set_threads(arguments.threads)
+    _check_human(arguments.human)
     config = _config(arguments)
     run_dir = Path(arguments.out)
     _check_directory(run_dir, config, arguments.resume)
@@ -114,6 +115,12 @@ def run(arguments: argparse.Namespace) -> int:
         write_learning_curve(run_dir)
     print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
     return 0
+
+
+def _check_human(human: str) -> None:
+    if human != DEFAULTS.human and human not in HUMANS and not Path(human).exists():
+        words = ", ".join([DEFAULTS.human, *HUMANS])
+        raise UserError(f"--human {human} is none of {words}, nor a human model's directory")
 
 
 @contextmanager

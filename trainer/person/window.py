@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,16 @@ COLOURS = {
     "applied": (130, 220, 150),
     "warning": (255, 110, 100),
 }
+UNSEEN = ("offscreen", "dummy", "evdev")
+"""Drivers of SDL that it takes by itself where nobody could see anything."""
 CONTROL_TEXT = {"policy": "the policy drives", "human": "YOU drive", "returning": "giving back"}
+
+
+def _check_visible() -> None:
+    """Raise pygame's error where SDL found no screen and would draw into memory, unless told to."""
+    driver = pygame.display.get_driver()
+    if driver in UNSEEN and "SDL_VIDEODRIVER" not in os.environ:
+        raise pygame.error(f"SDL would draw {driver}")
 
 
 class Window:
@@ -40,6 +50,7 @@ class Window:
     def __init__(self, title: str = "PHIL-TD3: at the wheel") -> None:
         try:
             pygame.display.init()
+            _check_visible()
             pygame.joystick.init()
             pygame.font.init()
             self._screen = pygame.display.set_mode(SIZE)

@@ -22,6 +22,7 @@ def call(capsys, *arguments: str) -> tuple[int, str, str]:
 WRONG = [
     ("train", "--scenario", "moon", "--out", "x"),
     ("train", "--algorithm", "magic", "--out", "x"),
+    ("train", "--human", "mouse", "--out", "{tmp}/x"),
     ("train", "--episodes", "0", "--out", "x"),
     ("train", "--out", "{tmp}/x", "--set", "no_such=1"),
     ("train", "--out", "{tmp}/x", "--set", "batch_size=many"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from trainer.training.run import TrainingRun
 
 DRIVE = ("drive", "--out", "{tmp}/rec")
 TRAIN = ("train", "--out", "{tmp}/run")
+SHIPPED = str(Path(__file__).parents[3] / "results/policies/left_turn.onnx")
 WRONG = [
     (DRIVE, ("--human", "telepathy"), "invalid choice"),
     (DRIVE, ("--human", "wheel", "--profile", "{tmp}/none.toml"), "does not exist"),
@@ -33,6 +35,7 @@ WRONG = [
     (DRIVE, ("--human", "web", "--host", "a..b"), "the cockpit cannot listen on a..b"),
     (DRIVE, ("--speed", "0"), "not a finite number above zero"),
     (DRIVE, ("--policy", "{tmp}/nobody"), "is no policy"),
+    (DRIVE, ("--scenario", "congestion", "--policy", SHIPPED), "and congestion asks for steering"),
     (("drive", "--out", "{tmp}/file"), (), "cannot create the directory"),
     (("drive",), (), "one of the arguments --out --calibrate is required"),
     (("drive", "--calibrate", "{tmp}/p.toml"), (), "--calibrate asks a --human gamepad or wheel"),
@@ -63,8 +66,14 @@ def test_a_mistake_is_one_line_and_status_2(
     assert not (tmp_path / "run").exists()
 
 
-def test_without_a_screen_it_says_what_to_do(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+@pytest.mark.parametrize("driver", ["x11", None])
+def test_without_a_screen_it_says_what_to_do(capsys, tmp_path, monkeypatch, driver):
+    """Left to itself, SDL would draw into memory, and nobody would see it drive."""
+    if driver is None:
+        monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    else:
+        monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":9999")
     status, _, errors = call(capsys, "drive", "--out", str(tmp_path / "rec"))
     assert status == 2
