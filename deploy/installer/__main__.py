@@ -120,6 +120,7 @@ def _dispatch(arguments: argparse.Namespace) -> int:
     # A link that breaks must not end it between two releases; whoever ends it makes it go back.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    os.register_at_fork(after_in_child=_just_end)
     limits = Limits(arguments.health_limit, arguments.settle)
     if not (limits.within_s > 0 and limits.settle_s >= 0):
         raise UserError("--health-limit must be above 0, and --settle 0 or more")
@@ -130,6 +131,12 @@ def _dispatch(arguments: argparse.Namespace) -> int:
         version = rollback(layout, way)
     print(f"current: {version}")
     return 0
+
+
+def _just_end() -> None:
+    """A process that compiles has nothing to go back to, nor to say, when it is told to end."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def _status(layout: Layout, service: Any, as_json: bool) -> int:
