@@ -5,8 +5,8 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from bridge.scene import Scene
+from viewing.layout import frames_view, full_blueprint, road_view
 from viewing.series import ALL_OF_IT, BLUE, GREEN, ORANGE, PURPLE, Plot, plot_view
-from viewing.shapes import view_bounds
 
 APPLICATION = "phil_hil"
 PLOTS = (
@@ -31,35 +31,8 @@ SERIES = {
 
 def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
-    left = rrb.Vertical(_road(scene), _frames(), row_shares=[3, 1.4])
-    return rrb.Blueprint(
-        rrb.Horizontal(left, _numbers(), column_shares=[3, 2]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="sim_time"),
-    )
-
-
-def _road(scene: Scene | None) -> rrb.Spatial2DView:
-    bounds = None
-    if scene is not None:
-        x_range, y_range = view_bounds(scene)
-        bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
-    return rrb.Spatial2DView(
-        origin="road",
-        name="Road from above",
-        background=[222, 229, 216],
-        visual_bounds=bounds,
-    )
-
-
-def _frames() -> rrb.Horizontal:
-    return rrb.Horizontal(
-        rrb.Spatial2DView(origin="frames/before", name="Policy sees t-1"),
-        rrb.Spatial2DView(origin="frames/now", name="Policy sees t"),
-        rrb.TextDocumentView(origin="status", name="Now"),
-        column_shares=[1, 1, 1],
-    )
+    left = rrb.Vertical(road_view(scene, "Road from above"), frames_view(), row_shares=[3, 1.4])
+    return full_blueprint(left, _numbers(), [3, 2], "sim_time")
 
 
 def _numbers() -> rrb.Vertical:

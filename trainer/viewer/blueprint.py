@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
+from viewing.layout import frames_view, full_blueprint, road_view
 from viewing.scene import Scene
 from viewing.series import ALL_OF_IT, BLUE, GREEN, GREY, ORANGE, PURPLE, Plot, plot_view
-from viewing.shapes import view_bounds
 
 APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
 TIMELINE = "step"
@@ -46,12 +46,14 @@ LINES = {
 }
 POINTS = {"advantage/of_the_human": PURPLE}
 
+ROAD = "Road from above (blue: the policy drives, green: the human)"
+
 
 def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
     left = rrb.Vertical(
-        _road(scene),
-        _frames(),
+        road_view(scene, ROAD),
+        frames_view(),
         rrb.StateTimelineView(
             origin="driver",
             name="Who drives: the policy, or the human, and why",
@@ -61,34 +63,7 @@ def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Bluepri
         row_shares=[3, 1.6, 0.9, 1.2, 1.1],
     )
     right = rrb.Vertical(*map(plot_view, episodes))
-    return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[1, 1]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
-    )
-
-
-def _road(scene: Scene | None) -> rrb.Spatial2DView:
-    bounds = None
-    if scene is not None:
-        x_range, y_range = view_bounds(scene)
-        bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
-    return rrb.Spatial2DView(
-        origin="road",
-        name="Road from above (blue: the policy drives, green: the human)",
-        background=[222, 229, 216],
-        visual_bounds=bounds,
-    )
-
-
-def _frames() -> rrb.Horizontal:
-    return rrb.Horizontal(
-        rrb.Spatial2DView(origin="frames/before", name="Policy sees t-1"),
-        rrb.Spatial2DView(origin="frames/now", name="Policy sees t"),
-        rrb.TextDocumentView(origin="status", name="Now"),
-        column_shares=[1, 1, 1],
-    )
+    return full_blueprint(left, right, [1, 1], TIMELINE)
 
 
 def _recent(plot: Plot) -> rrb.TimeSeriesView:
