@@ -11,7 +11,7 @@ from typing import Any
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
-from trainer.drivers import make_environment
+from trainer.drivers import TRIGGERS, make_environment
 from trainer.experiments.plan import (
     HUMAN_MODEL,
     LAST_ACTOR,
@@ -23,6 +23,7 @@ from trainer.experiments.plan import (
     SETTINGS,
     Plan,
 )
+from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.learner.config import LearnerConfig
@@ -109,8 +110,8 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
 def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
     """Everything that decides a unit's result, as plain values: what its id is made from.
 
-    The human model counts by the contents of its file, and not at all where no human guides; the
-    scenario by every number of its config.
+    The human model counts by the contents of its file, when it takes over by the trigger's
+    numbers, and neither where no human guides; the scenario by every number of its config.
     """
     human = _fingerprint(human_file(unit.scenario, humans)) if unit.needs_human else "nobody"
     values: dict[str, Any] = {
@@ -123,6 +124,9 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
         run = run_config(unit, plan, humans).as_dict()
         values["run"] = {name: run[name] for name in run if name not in (*NOT_DECIDING, "human")}
         values["switches"] = asdict(ALGORITHMS[unit.algorithm])
+        if unit.needs_human:
+            kinds = (HumanGuide, TRIGGERS[unit.scenario])
+            values["taking_over"] = {k: v for kind in kinds for k, v in _constants_of(kind).items()}
     plain: dict[str, Any] = json.loads(json.dumps(without_neutral(values)))
     return plain
 
@@ -155,6 +159,11 @@ def human_file(scenario: str, humans: Path) -> Path:
 @cache
 def _numbers_of(scenario: str) -> dict[str, Any]:
     return asdict(make_environment(scenario).config)
+
+
+def _constants_of(kind: Any) -> dict[str, float]:
+    """The numbers that a class gives names in capitals."""
+    return {name: value for name, value in vars(kind).items() if name.isupper()}
 
 
 def _fingerprint(path: Path) -> str:

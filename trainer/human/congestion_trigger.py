@@ -18,13 +18,19 @@ class CongestionTrigger:
         expert: knows the environment.
     """
 
-    HORIZON_S = 0.8
+    HORIZON_S = 1.0
     """How far the judged steering is followed."""
-    MARGIN_M = 0.2
+    MARGIN_M = 0.5
     """Room to other cars within which one counts as hit."""
-    HEADING_RAD = 0.15
-    OFFSET_M = 1.1
-    """From the lane's middle, at the horizon."""
+    HEADING_RAD = 0.12
+    OFFSET_M = 0.8
+    """From the lane's middle."""
+    DRIFT_S = 3.0
+    """A car that will be that far aside within this time, at its present heading, ..."""
+    BACK = 0.1
+    """... must be steered back at least as much as this share of the full angle. A person sees a
+    drift well before it is dangerous; a policy that is only told at the edge does not learn what
+    led there."""
 
     def __init__(self, expert: CongestionExpert) -> None:
         self.expert = expert
@@ -42,7 +48,15 @@ class CongestionTrigger:
                 return "heading"
             if self._hits(shape, step * env.config.control_period_s):
                 return "collision"
-        return "offset" if abs(shape.y) > self.OFFSET_M else None
+        return "offset" if abs(shape.y) > self.OFFSET_M or self._drifts(float(action[0])) else None
+
+    def _drifts(self, steering: float) -> bool:
+        """Whether the car is on its way aside and is not steered back."""
+        ego = self.expert.env.ego
+        shape = ego.footprint
+        y = shape.y + ego.speed * self.DRIFT_S * math.sin(shape.heading)
+        outwards = steering * math.copysign(1.0, y)
+        return abs(y) > self.OFFSET_M and outwards > -self.BACK
 
     def _motion(self, angle_rad: float, steps: int) -> list[Rectangle]:
         """The ego car's footprints under a held steering angle, at its present speed."""

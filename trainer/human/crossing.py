@@ -29,6 +29,8 @@ class PedalPlan:
     hold_s: float = 0.0
     then_mps: float | None = None
     """Full throttle up to this speed; None keeps the speed that the pedal led to."""
+    then_brake: float = 0.0
+    """Instead of throttle: this share of the full brake, until the car stands."""
 
 
 class Crossing:
@@ -64,6 +66,10 @@ class Crossing:
         car_x, reach_m = x + speed_mps * time_s, 0.5 * length_m + margin_m
         return not np.any((car_x + reach_m > rear_x) & (car_x - reach_m < front_x))
 
+    def reached_m(self, horizon_s: float, plan: PedalPlan) -> float:
+        """How far along the path the ego car is after ``horizon_s``."""
+        return float(self._ego_motion(horizon_s, plan)[1][-1])
+
     def _ego_motion(
         self, horizon_s: float, plan: PedalPlan
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -78,6 +84,8 @@ class Crossing:
             s_m += speed_mps * dt_s
             if step < held:
                 speed_mps = min(max(speed_mps + held_mps2 * dt_s, 0.0), c.max_speed_mps)
+            elif plan.then_brake:
+                speed_mps = max(speed_mps - plan.then_brake * c.brake_mps2 * dt_s, 0.0)
             elif plan.then_mps is not None and speed_mps < plan.then_mps:
                 speed_mps = min(speed_mps + c.throttle_mps2 * dt_s, plan.then_mps)
             positions.append(s_m)

@@ -64,10 +64,13 @@ class HumanGuide:
     Args:
         driver: who acts while the human is in control.
         trigger: when the human takes over.
-        hold_steps: shortest time in control; a person does not let go within a tenth of a second.
+        hold_steps: shortest time in control after the last reason for it.
     """
 
-    def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int = 5) -> None:
+    HOLD_STEPS = 15
+    """A second and a half: a person who had to take over first brings the car out of it."""
+
+    def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int = HOLD_STEPS) -> None:
         self.driver, self.trigger, self.hold_steps = driver, trigger, hold_steps
         self.reset()
 

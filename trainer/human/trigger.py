@@ -12,32 +12,57 @@ from trainer.human.guide import Reason
 class LeftTurnTrigger:
     """Judges the policy's action before it is carried out.
 
+    A person lets every action pass that leaves a way out. A judge that asked only where the
+    present pedal leads would object to each brisk approach to the stop line: to four of five
+    drives of the expert. Theorem 1 presupposes that humans take over from what is worse than what
+    they would do themselves.
+
     Args:
         expert: knows the environment and what a driver would do in it.
     """
 
     HOLD_S = 0.5
-    """How long the judged pedal is taken to be held; after that the speed is kept."""
-    HORIZON_S = 2.5
-    MARGIN_M = 0.3
+    """How long the judged pedal is taken to be held: a person's reaction time."""
+    RESCUE_BRAKE = 0.7
+    """Share of the full brake with which the car could then still be stopped in time; the rest is
+    room for a human who is a network."""
+    STOP_BY_M = 7.5
+    """Path length at which it must then stand: half a metre before the expert's point of no return,
+    past which a car can only be driven on. Whoever creeps up to that point has not waited."""
+    RESCUE_MARGIN_M = 1.0
+    """Room along the lane with which it could then still drive on, at full throttle."""
     STANDING_MPS = 0.3
     STANDING_STEPS = 15
+    OPEN_STEPS = 5
+    """How long the way must have been free before a car that stands counts as stuck: half a
+    second, a person's reaction time once more."""
+    START_PEDAL = 0.2
+    """Least throttle that counts as starting by oneself."""
 
     def __init__(self, expert: LeftTurnExpert) -> None:
         self.expert = expert
-        self.standing_steps = 0
+        self.reset()
 
     def reset(self) -> None:
         """Forget the last episode."""
-        self.standing_steps = 0
+        self.standing_steps = self.open_steps = 0
 
     def judge(self, action: NDArray) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""
+        pedal = float(action[0])
         standing = self.expert.env.ego.speed < self.STANDING_MPS
         self.standing_steps = self.standing_steps + 1 if standing else 0
-        plan = PedalPlan(pedal=float(action[0]), hold_s=self.HOLD_S)
-        if not self.expert.crossing.clear(self.HORIZON_S, self.MARGIN_M, plan):
+        waiting = self.standing_steps > self.STANDING_STEPS
+        self.open_steps = self.open_steps + 1 if waiting and self.expert.would_go() else 0
+        if not self._leaves_a_way_out(pedal):
             return "collision"
-        if self.standing_steps > self.STANDING_STEPS and self.expert.would_go():
-            return "stuck"
-        return None
+        return "stuck" if self.open_steps > self.OPEN_STEPS and pedal < self.START_PEDAL else None
+
+    def _leaves_a_way_out(self, pedal: float) -> bool:
+        """Whether after this pedal the car can still be stopped, or driven on, unharmed."""
+        expert, crossing = self.expert, self.expert.crossing
+        stop = PedalPlan(pedal, self.HOLD_S, then_brake=self.RESCUE_BRAKE)
+        if crossing.reached_m(expert.HORIZON_S, stop) <= self.STOP_BY_M:
+            return True
+        go = PedalPlan(pedal, self.HOLD_S, then_mps=expert.CRUISE_MPS)
+        return crossing.clear(expert.HORIZON_S, self.RESCUE_MARGIN_M, go)

@@ -73,23 +73,32 @@ def judge(env: CongestionEnv, action: np.ndarray) -> str | None:
 
 
 def test_turning_aside_is_taken_over():
-    assert judge(environment(heading_rad=0.1), STRAIGHT) is None
-    assert judge(environment(heading_rad=0.16), STRAIGHT) == "heading"
-    assert judge(environment(heading_rad=-0.16), STRAIGHT) == "heading"
+    assert judge(environment(heading_rad=0.11), LEFT) is None
+    assert judge(environment(heading_rad=0.14), LEFT) == "heading"
+    assert judge(environment(heading_rad=-0.14), RIGHT) == "heading"
 
 
-def test_drifting_aside_is_taken_over_even_where_the_road_is_free():
-    assert judge(environment(0.9, config=ALONE), STRAIGHT) is None
-    assert judge(environment(1.0, 0.05, ALONE), STRAIGHT) == "offset"
-    assert judge(environment(-1.0, -0.05, ALONE), STRAIGHT) == "offset"
+def test_an_offset_is_taken_over_even_where_the_road_is_free():
+    assert judge(environment(0.7, config=ALONE), STRAIGHT) is None
+    assert judge(environment(0.9, config=ALONE), STRAIGHT) == "offset"
+    assert judge(environment(-0.9, config=ALONE), STRAIGHT) == "offset"
     # Steered back in time it is no matter.
-    assert judge(environment(1.0, 0.0, ALONE), LEFT) is None
+    assert judge(environment(0.9, config=ALONE), LEFT) is None
+    assert judge(environment(-0.9, config=ALONE), RIGHT) is None
+
+
+def test_a_drift_that_nobody_steers_against_is_taken_over():
+    for side, back, onwards in ((1.0, LEFT, RIGHT), (-1.0, RIGHT, LEFT)):
+        drifting = environment(0.1 * side, 0.06 * side, ALONE)
+        assert judge(drifting, STRAIGHT) == "offset"
+        assert judge(drifting, onwards) == "offset"
+        assert judge(drifting, back) is None
+        assert judge(environment(0.1 * side, -0.06 * side, ALONE), onwards) is None
 
 
 def test_a_side_that_will_touch_is_taken_over():
-    env = environment(0.9, 0.1)
-    assert judge(env, RIGHT) == "collision"
-    assert judge(environment(-0.9, 0.1), STRAIGHT) is None
+    assert judge(environment(0.75, 0.1), RIGHT) == "collision"
+    assert judge(environment(-0.75, 0.1), STRAIGHT) is None
 
 
 def test_every_crash_is_foreseen():

@@ -10,6 +10,7 @@ from edge_runtime.errors import UserError
 from trainer.experiments import units
 from trainer.experiments.plan import HUMAN_MODEL
 from trainer.experiments.units import Unit, deciding, digest, obstacle, run_config, unit_id
+from trainer.human.trigger import LeftTurnTrigger
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.tests.experiments import GUIDED, TINY, UNIT, store_in, write_human
 
@@ -80,6 +81,13 @@ def test_device_and_threads_are_not_among_what_decides(humans):
     assert not {"device", "threads", "checkpoint_every"} & set(
         deciding(GUIDED, TINY, humans)["run"]
     )
+
+
+def test_when_the_human_takes_over_counts_only_where_one_guides(humans, monkeypatch):
+    guided, alone = unit_id(GUIDED, TINY, humans), unit_id(UNIT, TINY, humans)
+    monkeypatch.setattr(LeftTurnTrigger, "HOLD_S", 0.4)
+    assert unit_id(GUIDED, TINY, humans) != guided
+    assert unit_id(UNIT, TINY, humans) == alone
 
 
 def test_another_switch_of_an_algorithm_gives_another_id(humans, monkeypatch):

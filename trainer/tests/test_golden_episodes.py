@@ -25,8 +25,8 @@ QUEUE = LeftTurnConfig(traffic_cars=8, first_car_m=(-30.0, 12.0), short_gap_m=(7
 GOLDEN = {
     "random": "4919dea65601fa82481b39f3e0200a62adbaee2f98728d95572abbeea5255927",
     "expert": "fe283cd598c08709a5089edf6820655d7b4b57618db77b148ecc3a5860af9d82",
-    "guided": "6bccdc728fec9379b8da4561798543acd8bdc6273b287e44e9344b7e9b72f3d0",
-    "queue": "765a45f4236b450263b2aa6d1822cf028d8aa1db5dbb4cd1656e8aff04b0c0a4",
+    "guided": "d3c077b55930d7a28f88dd929a6e649e047d592e781eff4690c50a27ba9f6aed",
+    "queue": "ba8078bd0edab5235a2b9ddaae22cf7cc864e829e49a5e236f2e831cbbec944b",
 }
 
 

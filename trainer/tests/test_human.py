@@ -60,13 +60,48 @@ def test_foresight_takes_each_car_at_its_own_length():
     assert not crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
 
 
-def test_trigger_takes_over_before_a_crash_and_lets_braking_pass():
-    env = environment(first_car_m=(9.0, 9.0), ego_speed_mps=(5.0, 5.0))
+def test_the_trigger_lets_the_expert_drive():
+    """Or the policy would be punished for driving like the human: theorem 1's assumption."""
+    env = LeftTurnEnv()
+    for seed in range(20):
+        env.reset(seed=seed)
+        expert = LeftTurnExpert(env)
+        trigger = LeftTurnTrigger(expert)
+        info: dict = {}
+        while "outcome" not in info:
+            action = expert.act(env.frames)
+            assert trigger.judge(action) is None
+            *_, info = env.step(action)
+
+
+def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
+    env = environment(first_car_m=(9.0, 9.0))
     trigger = LeftTurnTrigger(LeftTurnExpert(env))
-    assert trigger.judge(FULL) == "collision"
+    reasons: list[str | None] = []
+    while not reasons or reasons[-1] is None:
+        reasons.append(trigger.judge(NOTHING))
+        env.step(BRAKE if reasons[-1] else NOTHING)
+    assert len(reasons) > 2
+    assert reasons[-1] == "collision"
+    assert trigger.judge(BRAKE) is None
     for _ in range(20):
         env.step(BRAKE)
-    assert trigger.judge(BRAKE) is None
+    assert env.distance_m < LeftTurnExpert.POINT_OF_NO_RETURN_M
+
+
+@pytest.mark.parametrize("pedal", [0.3, 1.0])
+def test_a_human_who_takes_over_when_the_trigger_says_so_always_arrives(pedal):
+    env = LeftTurnEnv()
+    for seed in range(15):
+        env.reset(seed=seed)
+        expert = LeftTurnExpert(env)
+        guide = HumanGuide(expert, LeftTurnTrigger(expert))
+        info: dict = {}
+        while "outcome" not in info:
+            action = np.array([pedal], np.float32)
+            intervention = guide.watch(env.frames, action)
+            *_, info = env.step(action if intervention is None else intervention.action)
+        assert info["outcome"] == "goal"
 
 
 def test_trigger_takes_over_from_a_car_that_waits_for_nothing():
@@ -78,8 +113,9 @@ def test_trigger_takes_over_from_a_car_that_waits_for_nothing():
         env.step(BRAKE)
     assert reasons[0] is None
     first = reasons.index("stuck")
-    assert first > LeftTurnTrigger.STANDING_STEPS
+    assert first > LeftTurnTrigger.STANDING_STEPS + LeftTurnTrigger.OPEN_STEPS
     assert set(reasons[first:]) == {"stuck"}
+    assert trigger.judge(FULL) is None  # it starts by itself
 
 
 def test_waiting_for_traffic_is_not_stuck():
