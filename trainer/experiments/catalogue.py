@@ -23,6 +23,7 @@ from trainer.experiments.plan import (
     NETWORK,
     NORMAL,
     POOR,
+    PRINTED_RATES,
     REMEDY,
     SCENARIO_TITLES,
     TOUGH,
@@ -138,7 +139,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     "table2": _table("surviving distance beside the human model, congestion", "congestion"),
     "ablation": _curves(
         "PHIL-TD3 without each of its parts",
-        _lines(("phil_td3", "phil_without_cloning", "phil_without_tdqa", "phil_without_shaping")),
+        # Without TDQA it is IA-TD3.
+        _lines(("phil_td3", "phil_without_cloning", "ia_td3", "phil_without_shaping")),
         learning.judge_ablation,
         by_metric=False,
     ),
@@ -153,8 +155,8 @@ EXPERIMENTS: dict[str, Experiment] = {
         by_metric=False,
     ),
     "switches": _curves(
-        "what the paper leaves open: loss form, importance weights, which actor is judged",
-        _lines(("phil_td3",), NORMAL, EXACT_LOSSES, IMPORTANCE, LAST_ACTOR),
+        "what the paper leaves open: loss form, importance weights, learning rates, actor judged",
+        _lines(("phil_td3",), NORMAL, EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, LAST_ACTOR),
         ours.judge_switches,
         by_metric=False,
     ),

@@ -9,13 +9,17 @@ from typing import Any, NamedTuple
 HUMAN_MODEL = "human_model"
 """Stands in an algorithm's place where the human model itself is tested: nothing is trained."""
 
-NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE, LAST_ACTOR, NETWORK = SETTINGS = (
-    "normal", "tough", "poor", "remedy", "exact_losses", "importance", "last_actor", "network",
+NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, LAST_ACTOR, NETWORK = (
+    SETTINGS
+) = (
+    "normal", "tough", "poor", "remedy",
+    "exact_losses", "importance", "printed_rates", "last_actor", "network",
 )  # fmt: skip
 """Section VI's definition; one frame instead of two; one third of the demonstrations random; a
 price on the action before tanh, for algorithms whose policy saturates; losses as eq. 22 and 23 are
-printed; the importance weights that the paper calls optional; the actor as it stands judged, not
-its average; training behind ``NETWORK_SPEC``."""
+printed; the importance weights that the paper calls optional; table A5's learning rates, which the
+authors' code has the other way round; the actor as it stands judged, not its average;
+training behind ``NETWORK_SPEC``."""
 
 POOR_SHARE = 1.0 / 3.0
 """Demonstrations replaced by random actions in the poor setting (section VII-E)."""
@@ -27,6 +31,7 @@ LEARNER_OF: Mapping[str, Mapping[str, Any]] = {
     REMEDY: {"saturation_weight": 0.1},
     EXACT_LOSSES: {"split_loss": True},
     IMPORTANCE: {"importance_sampling": True},
+    PRINTED_RATES: {"actor_learning_rate": 5e-4, "critic_learning_rate": 2e-4},
 }
 """Setting -> the hyper-parameters that it changes."""
 

@@ -14,7 +14,7 @@ SKILLS = {
     "phil_td3": 0.99, "ia_td3": 0.9, "hi_td3": 0.8, "per_td3": 0.3, "human_model": 0.93,
     "phil_td_only": 0.85, "phil_q_advantage_only": 0.9, "phil_advantage_0.1": 0.88,
     "phil_advantage_100": 0.97, "rd2_td3": 0.7, "rd2_phil": 0.9, "phil_without_cloning": 0.8,
-    "phil_without_tdqa": 0.7, "phil_without_shaping": 0.9,
+    "phil_without_shaping": 0.9,
 }  # fmt: skip
 FACTORS = {
     "normal": 1.0,
@@ -23,6 +23,7 @@ FACTORS = {
     "remedy": 1.0,
     "exact_losses": 0.9,
     "importance": 0.9,
+    "printed_rates": 0.9,
     "last_actor": 0.95,
     "network": 0.95,
 }

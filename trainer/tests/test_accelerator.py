@@ -79,7 +79,7 @@ def test_an_episode_reports_mean_losses_and_decays_the_rates():
     assert episode.value == pytest.approx(np.mean(per_update, axis=0)[3])
     assert episode.learning_s > 0
     assert episode.policy_priority != episode.human_priority
-    assert learning.learner.actor_optimiser.param_groups[0]["lr"] == pytest.approx(2.5e-4)
+    assert learning.learner.actor_optimiser.param_groups[0]["lr"] == pytest.approx(1e-4)
     after = learning.end_episode()
     assert np.isnan(after.critic_loss)
     assert after.learning_s == after.waiting_s == 0.0

@@ -10,7 +10,7 @@ from trainer.experiments.figures.style import LABELS, write_figure
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.tests.synthetic import gathered
 
-CURVES = {"fig7": 4, "fig11": 3, "fig12": 3, "fig13": 3, "ablation": 4, "remedy": 5, "switches": 4,
+CURVES = {"fig7": 4, "fig11": 3, "fig12": 3, "fig13": 3, "ablation": 4, "remedy": 5, "switches": 5,
           "network": 2}  # fmt: skip
 """Experiment -> curves in each panel."""
 PANELS = {"fig8": 4, "fig9": 3, "fig10": 2, "fig14": 3, "fig15": 6, "table1": 1, "table2": 1}

@@ -76,7 +76,7 @@ def test_learning_rates_decay_once_an_episode(tmp_path):
     run.train(
         lambda metrics: rates.append(run.learning.learner.actor_optimiser.param_groups[0]["lr"])
     )
-    assert rates == pytest.approx([5e-4 * 0.9, 5e-4 * 0.81])
+    assert rates == pytest.approx([2e-4 * 0.9, 2e-4 * 0.81])
 
 
 def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):

@@ -130,8 +130,8 @@ def test_an_update_is_the_papers_losses_and_plain_adam(split):
     after = weights_of(learner)
     # Adam's first step is the learning rate against the gradient's sign, wherever it is not tiny.
     for name, flat, rate in (
-        ("critics", torch.cat([g.flatten() for g in gradients]), 2e-4),
-        ("actor", torch.cat([g.flatten() for g in actor_gradients]), 5e-4),
+        ("critics", torch.cat([g.flatten() for g in gradients]), SMALL.critic_learning_rate),
+        ("actor", torch.cat([g.flatten() for g in actor_gradients]), SMALL.actor_learning_rate),
     ):
         clear = flat.abs() > 1e-5
         assert clear.float().mean() > 0.2
@@ -146,8 +146,8 @@ def test_each_decay_scales_both_learning_rates():
             [group["lr"] for group in optimiser.param_groups]
             for optimiser in (learner.actor_optimiser, learner.critic_optimiser)
         )
-        assert actor == pytest.approx(5e-4 * factor)
-        assert critics == pytest.approx(2e-4 * factor)
+        assert actor == pytest.approx(SMALL.actor_learning_rate * factor)
+        assert critics == pytest.approx(SMALL.critic_learning_rate * factor)
         learner.decay_learning_rates()
 
 

@@ -29,9 +29,9 @@ PHIL, IA, HI, PER = map(Line, ("phil_td3", "ia_td3", "hi_td3", "per_td3"))
 TD, Q_ADVANTAGE = Line("phil_td_only"), Line("phil_q_advantage_only")
 SMALL, LARGE = Line("phil_advantage_0.1"), Line("phil_advantage_100")
 RD2, RD2_PHIL = Line("rd2_td3"), Line("rd2_phil")
-NO_CLONING, NO_TDQA, NO_SHAPING = map(
-    Line, ("phil_without_cloning", "phil_without_tdqa", "phil_without_shaping")
-)
+NO_CLONING, NO_SHAPING = map(Line, ("phil_without_cloning", "phil_without_shaping"))
+NO_TDQA = IA
+"""IA-TD3 is PHIL-TD3 without TDQA: the same switches."""
 
 SPEEDS = {("left_turn", "episode_return"): 7.0, ("congestion", "distance_m"): 2.2}
 """The paper's learning efficiency, where it gives one."""

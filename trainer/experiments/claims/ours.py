@@ -12,6 +12,7 @@ from trainer.experiments.plan import (
     IMPORTANCE,
     LAST_ACTOR,
     NETWORK,
+    PRINTED_RATES,
     REMEDY,
     SCENARIO_TITLES,
 )
@@ -20,7 +21,7 @@ from trainer.experiments.verdict import Claim
 PHIL, PER = Line("phil_td3"), Line("per_td3")
 HI_REMEDY, PER_REMEDY = Line("hi_td3", REMEDY), Line("per_td3", REMEDY)
 EXACT, WEIGHED = Line("phil_td3", EXACT_LOSSES), Line("phil_td3", IMPORTANCE)
-LAST = Line("phil_td3", LAST_ACTOR)
+PRINTED, LAST = Line("phil_td3", PRINTED_RATES), Line("phil_td3", LAST_ACTOR)
 BEHIND_NETWORK = Line("phil_td3", NETWORK)
 
 
@@ -46,6 +47,8 @@ def judge_switches(gathered: Gathered) -> list[Claim]:
             final_claim(*place, PHIL, [EXACT],
                         "one mean over the batch ends above eq. 22 and 23 as printed", "–"),
             final_claim(*place, PHIL, [WEIGHED], "no importance weights end above eq. 15", "–"),
+            final_claim(*place, PHIL, [PRINTED],
+                        "the faster critic ends above table A5's learning rates", "–"),
         ]  # fmt: skip
     for scenario in SCENARIO_TITLES:
         text = "the averaged actor ends above the last one"

@@ -68,12 +68,16 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
 def _draw_panel(
     panel: Any, gathered: Gathered, lines: Sequence[Line], scenario: str, metric: str
 ) -> None:
+    several = len({line.algorithm for line in lines}) > 1
     for place, line in enumerate(lines):
         outcomes = gathered.of(scenario, line.algorithm, line.setting)
         named = f"{line.label} ({len(outcomes)} of {gathered.seeds} seeds)"
-        shade = colour(line.algorithm, place)
+        # Of a single algorithm, each setting has a colour of its own.
+        shade = colour(line.algorithm if several or place == 0 else line.setting, place)
         settings = [other.setting for other in lines if other.algorithm == line.algorithm]
-        style = STYLES[settings.index(line.setting)] if NORMAL in settings else STYLES[1]
+        style = (
+            STYLES[settings.index(line.setting) % len(STYLES)] if NORMAL in settings else STYLES[1]
+        )
         if not outcomes:
             panel.plot([], [], style, color=shade, alpha=0.4, label=named)
             continue

@@ -24,7 +24,6 @@ LABELS = {
     "rd2_td3": "RD2-TD3",
     "rd2_phil": "RD2-PHIL",
     "phil_without_cloning": "without cloning",
-    "phil_without_tdqa": "without TDQA",
     "phil_without_shaping": "without shaping",
     HUMAN_MODEL: "human model",
 }
