@@ -44,7 +44,6 @@ ALGORITHMS: dict[str, Algorithm] = {
     "phil_advantage_0.1": replace(PHIL, advantage_weight=0.1),
     "phil_advantage_100": replace(PHIL, advantage_weight=100.0),
     "phil_without_cloning": replace(PHIL, behaviour_cloning=False),
-    "phil_without_tdqa": replace(PHIL, advantage_weight=0.0),
     "phil_without_shaping": replace(PHIL, penalty=False),
 }
 """Command-line name -> switches. The first six are the paper's; the rest take PHIL-TD3 apart."""
