@@ -16,7 +16,7 @@ from trainer.scenarios import SCENARIOS
 LEFT_TURN_MOMENT = ("--seed", "8", "--time", "3.4")
 CONGESTION_MOMENT = ("--seed", "3", "--time", "5")
 FILM_SEED = "29"
-"""A drive of 7 s in which an untrained policy would meet a car, once."""
+"""A drive of 6 s in which an untrained policy would meet a car, once."""
 SEEN_MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}
 """Scenario -> seed and time, s."""
 SCALE, MARGIN, TITLE_PIXELS = 5, 16, 26
