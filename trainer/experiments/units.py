@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
-from trainer.drivers import TRIGGERS, make_environment
+from trainer.drivers import EXPERTS, TRIGGERS, make_environment
 from trainer.experiments.plan import (
     HUMAN_MODEL,
     LAST_ACTOR,
@@ -110,8 +110,9 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
 def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
     """Everything that decides a unit's result, as plain values: what its id is made from.
 
-    The human model counts by the contents of its file, when it takes over by the trigger's
-    numbers, and neither where no human guides; the scenario by every number of its config.
+    The human model counts by the contents of its file, when it takes over by the numbers of guide,
+    trigger and the expert behind it, and neither where no human guides; the scenario by every
+    number of its config.
     """
     human = _fingerprint(human_file(unit.scenario, humans)) if unit.needs_human else "nobody"
     values: dict[str, Any] = {
@@ -125,8 +126,8 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
         values["run"] = {name: run[name] for name in run if name not in (*NOT_DECIDING, "human")}
         values["switches"] = asdict(ALGORITHMS[unit.algorithm])
         if unit.needs_human:
-            kinds = (HumanGuide, TRIGGERS[unit.scenario])
-            values["taking_over"] = {k: v for kind in kinds for k, v in _constants_of(kind).items()}
+            kinds = (HumanGuide, TRIGGERS[unit.scenario], EXPERTS[unit.scenario])
+            values["taking_over"] = [_constants_of(kind) for kind in kinds]
     plain: dict[str, Any] = json.loads(json.dumps(without_neutral(values)))
     return plain
 
@@ -161,9 +162,10 @@ def _numbers_of(scenario: str) -> dict[str, Any]:
     return asdict(make_environment(scenario).config)
 
 
-def _constants_of(kind: Any) -> dict[str, float]:
-    """The numbers that a class gives names in capitals."""
-    return {name: value for name, value in vars(kind).items() if name.isupper()}
+def _constants_of(kind: Any) -> dict[str, Any]:
+    """What a class gives names in capitals: numbers, and plans of them."""
+    named = {name: value for name, value in vars(kind).items() if name.isupper()}
+    return {name: vars(v) if is_dataclass(v) else v for name, v in named.items()}
 
 
 def _fingerprint(path: Path) -> str:

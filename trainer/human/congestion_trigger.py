@@ -26,11 +26,11 @@ class CongestionTrigger:
     OFFSET_M = 0.8
     """From the lane's middle."""
     DRIFT_S = 3.0
-    """A car that will be that far aside within this time, at its present heading, ..."""
+    """How far ahead a car that moves away from the lane's middle is followed at its present
+    heading. A person sees a drift well before it is dangerous; a policy that is only told at the
+    edge does not learn what led there."""
     BACK = 0.1
-    """... must be steered back at least as much as this share of the full angle. A person sees a
-    drift well before it is dangerous; a policy that is only told at the edge does not learn what
-    led there."""
+    """Share of the full angle with which such a car must at least be steered back."""
 
     def __init__(self, expert: CongestionExpert) -> None:
         self.expert = expert
@@ -43,20 +43,22 @@ class CongestionTrigger:
         env = self.expert.env
         steps = round(self.HORIZON_S / env.config.control_period_s)
         angle_rad = float(action[0]) * env.config.lambda_rad
-        for step, shape in enumerate(self._motion(angle_rad, steps), start=1):
-            if abs(shape.heading) > self.HEADING_RAD and step == 1:
-                return "heading"
+        motion = self._motion(angle_rad, steps)
+        if abs(motion[0].heading) > self.HEADING_RAD:
+            return "heading"
+        for step, shape in enumerate(motion, start=1):
             if self._hits(shape, step * env.config.control_period_s):
                 return "collision"
-        return "offset" if abs(shape.y) > self.OFFSET_M or self._drifts(float(action[0])) else None
+        aside = abs(motion[-1].y) > self.OFFSET_M
+        return "offset" if aside or self._drifts(float(action[0])) else None
 
     def _drifts(self, steering: float) -> bool:
-        """Whether the car is on its way aside and is not steered back."""
+        """Whether the car moves away from the middle, too far, and is not steered back."""
         ego = self.expert.env.ego
-        shape = ego.footprint
-        y = shape.y + ego.speed * self.DRIFT_S * math.sin(shape.heading)
-        outwards = steering * math.copysign(1.0, y)
-        return abs(y) > self.OFFSET_M and outwards > -self.BACK
+        shape, side = ego.footprint, math.copysign(1.0, ego.footprint.heading)
+        reached_m = side * shape.y + ego.speed * self.DRIFT_S * abs(math.sin(shape.heading))
+        away = side * shape.y >= 0.0
+        return away and reached_m > self.OFFSET_M and side * steering > -self.BACK
 
     def _motion(self, angle_rad: float, steps: int) -> list[Rectangle]:
         """The ego car's footprints under a held steering angle, at its present speed."""

@@ -30,7 +30,7 @@ class PedalPlan:
     then_mps: float | None = None
     """Full throttle up to this speed; None keeps the speed that the pedal led to."""
     then_brake: float = 0.0
-    """Instead of throttle: this share of the full brake, until the car stands."""
+    """Instead of that: this share of the full brake, until the car stands."""
 
 
 class Crossing:
@@ -41,7 +41,7 @@ class Crossing:
         side_clearance_m: room kept to the sides of a passing car.
     """
 
-    def __init__(self, env: LeftTurnEnv, side_clearance_m: float = 0.3) -> None:
+    def __init__(self, env: LeftTurnEnv, side_clearance_m: float) -> None:
         self.env = env
         config = env.config
         lane_y, half_width_m = 0.5 * config.lane_width_m, 0.5 * EgoVehicle.WIDTH + side_clearance_m

@@ -28,11 +28,13 @@ class LeftTurnExpert:
     APPROACH_MPS2 = 1.5
     """Comfortable deceleration towards the stop line; full brake is kept for surprises."""
     CRUISE_MPS = 5.2
+    SIDE_CLEARANCE_M = 0.3
+    """Room to the sides of a passing car."""
     GO = PedalPlan(then_mps=CRUISE_MPS)
 
     def __init__(self, env: LeftTurnEnv) -> None:
         self.env = env
-        self.crossing = Crossing(env)
+        self.crossing = Crossing(env, self.SIDE_CLEARANCE_M)
         self.going = False
 
     def reset(self) -> None:

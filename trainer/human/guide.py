@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
 Reason = Literal["collision", "stuck", "heading", "offset", "person"]
-"""Why the human takes over: a crash ahead, a car that waits for nothing, one that turns aside, one
-that drifts aside; a person has reasons of their own."""
+"""Why the human takes over: hardly a way out of a crash, a car that waits for nothing, one that
+turns aside, one that is or drifts aside; a person has reasons of their own."""
 
 
 class Driver(Protocol):
@@ -64,14 +64,15 @@ class HumanGuide:
     Args:
         driver: who acts while the human is in control.
         trigger: when the human takes over.
-        hold_steps: shortest time in control after the last reason for it.
+        hold_steps: shortest time in control, from the last reason for it; None: ``HOLD_STEPS``.
     """
 
     HOLD_STEPS = 15
     """A second and a half: a person who had to take over first brings the car out of it."""
 
-    def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int = HOLD_STEPS) -> None:
-        self.driver, self.trigger, self.hold_steps = driver, trigger, hold_steps
+    def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int | None = None) -> None:
+        self.driver, self.trigger = driver, trigger
+        self.hold_steps = self.HOLD_STEPS if hold_steps is None else hold_steps
         self.reset()
 
     def reset(self) -> None:

@@ -13,9 +13,8 @@ class LeftTurnTrigger:
     """Judges the policy's action before it is carried out.
 
     A person lets every action pass that leaves a way out. A judge that asked only where the
-    present pedal leads would object to each brisk approach to the stop line: to four of five
-    drives of the expert. Theorem 1 presupposes that humans take over from what is worse than what
-    they would do themselves.
+    present pedal leads would object to each brisk approach to the stop line, the expert's own, too;
+    but theorem 1 holds only where no optimal policy goes where the human takes over.
 
     Args:
         expert: knows the environment and what a driver would do in it.
@@ -23,19 +22,19 @@ class LeftTurnTrigger:
 
     HOLD_S = 0.5
     """How long the judged pedal is taken to be held: a person's reaction time."""
-    RESCUE_BRAKE = 0.7
+    RESCUE_BRAKE = 0.85
     """Share of the full brake with which the car could then still be stopped in time; the rest is
     room for a human who is a network."""
-    STOP_BY_M = 7.5
-    """Path length at which it must then stand: half a metre before the expert's point of no return,
-    past which a car can only be driven on. Whoever creeps up to that point has not waited."""
+    STOP_BY_M = LeftTurnExpert.POINT_OF_NO_RETURN_M - 0.5
+    """Path length by which it must then stand; past the point of no return a car can only be driven
+    on, and who creeps up to it has not waited."""
     RESCUE_MARGIN_M = 1.0
     """Room along the lane with which it could then still drive on, at full throttle."""
     STANDING_MPS = 0.3
     STANDING_STEPS = 15
+    """Steps that a car stands before anybody thinks of it as stuck."""
     OPEN_STEPS = 5
-    """How long the way must have been free before a car that stands counts as stuck: half a
-    second, a person's reaction time once more."""
+    """Steps that the way must then have been free: a person's reaction time once more."""
     START_PEDAL = 0.2
     """Least throttle that counts as starting by oneself."""
 
@@ -62,7 +61,12 @@ class LeftTurnTrigger:
         """Whether after this pedal the car can still be stopped, or driven on, unharmed."""
         expert, crossing = self.expert, self.expert.crossing
         stop = PedalPlan(pedal, self.HOLD_S, then_brake=self.RESCUE_BRAKE)
-        if crossing.reached_m(expert.HORIZON_S, stop) <= self.STOP_BY_M:
+        if crossing.reached_m(expert.HORIZON_S, stop) <= self.STOP_BY_M or self._stays(pedal):
             return True
         go = PedalPlan(pedal, self.HOLD_S, then_mps=expert.CRUISE_MPS)
         return crossing.clear(expert.HORIZON_S, self.RESCUE_MARGIN_M, go)
+
+    def _stays(self, pedal: float) -> bool:
+        """Whether the car stands outside of the lane, and goes on standing."""
+        ego_at_m, last_m = self.expert.env.distance_m, self.expert.POINT_OF_NO_RETURN_M
+        return pedal <= 0.0 and self.expert.env.ego.speed == 0.0 and ego_at_m <= last_m

@@ -96,6 +96,16 @@ def test_a_drift_that_nobody_steers_against_is_taken_over():
         assert judge(environment(0.1 * side, -0.06 * side, ALONE), onwards) is None
 
 
+def test_on_the_way_back_to_the_middle_nobody_is_taken_over():
+    for offset_m in (0.2, 0.45, 0.7):
+        env = environment(offset_m, -0.08, replace(ALONE, ego_speed_mps=(6.0, 6.0)))
+        trigger = CongestionTrigger(CongestionExpert(env))
+        for _ in range(40):
+            action = trigger.expert.act(env.frames)
+            assert trigger.judge(action) is None
+            env.step(action)
+
+
 def test_a_side_that_will_touch_is_taken_over():
     assert judge(environment(0.75, 0.1), RIGHT) == "collision"
     assert judge(environment(-0.75, 0.1), STRAIGHT) is None

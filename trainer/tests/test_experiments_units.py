@@ -10,6 +10,9 @@ from edge_runtime.errors import UserError
 from trainer.experiments import units
 from trainer.experiments.plan import HUMAN_MODEL
 from trainer.experiments.units import Unit, deciding, digest, obstacle, run_config, unit_id
+from trainer.human.crossing import PedalPlan
+from trainer.human.expert import LeftTurnExpert
+from trainer.human.guide import HumanGuide
 from trainer.human.trigger import LeftTurnTrigger
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.tests.experiments import GUIDED, TINY, UNIT, store_in, write_human
@@ -84,10 +87,21 @@ def test_device_and_threads_are_not_among_what_decides(humans):
 
 
 def test_when_the_human_takes_over_counts_only_where_one_guides(humans, monkeypatch):
-    guided, alone = unit_id(GUIDED, TINY, humans), unit_id(UNIT, TINY, humans)
-    monkeypatch.setattr(LeftTurnTrigger, "HOLD_S", 0.4)
-    assert unit_id(GUIDED, TINY, humans) != guided
+    alone, seen = unit_id(UNIT, TINY, humans), {unit_id(GUIDED, TINY, humans)}
+    for kind, name, value in (
+        (LeftTurnTrigger, "HOLD_S", 0.4),
+        (LeftTurnExpert, "GO", PedalPlan(then_mps=5.0)),
+        (HumanGuide, "HOLD_STEPS", 7),
+    ):
+        monkeypatch.setattr(kind, name, value)
+        seen.add(unit_id(GUIDED, TINY, humans))
+    assert len(seen) == 4
     assert unit_id(UNIT, TINY, humans) == alone
+
+
+def test_without_tdqa_phil_td3_is_ia_td3():
+    """The ablation trains it once."""
+    assert ALGORITHMS["ia_td3"] == replace(ALGORITHMS["phil_td3"], advantage_weight=0.0)
 
 
 def test_another_switch_of_an_algorithm_gives_another_id(humans, monkeypatch):

@@ -25,8 +25,8 @@ QUEUE = LeftTurnConfig(traffic_cars=8, first_car_m=(-30.0, 12.0), short_gap_m=(7
 GOLDEN = {
     "random": "4919dea65601fa82481b39f3e0200a62adbaee2f98728d95572abbeea5255927",
     "expert": "fe283cd598c08709a5089edf6820655d7b4b57618db77b148ecc3a5860af9d82",
-    "guided": "d3c077b55930d7a28f88dd929a6e649e047d592e781eff4690c50a27ba9f6aed",
-    "queue": "ba8078bd0edab5235a2b9ddaae22cf7cc864e829e49a5e236f2e831cbbec944b",
+    "guided": "08f42cb808f2095a55723b7c24e91a0afa78462c36392b1cc010ed1a27d31933",
+    "queue": "d7c9de4998b78c169d7c8c0495b0516eb24461b367401c5b16ad29160e4e29d4",
 }
 
 

@@ -49,12 +49,12 @@ def test_foresight_agrees_with_what_then_happens():
 @pytest.mark.parametrize(("first_car_m", "clear"), [(9.0, False), (60.0, True)])
 def test_a_near_car_blocks_and_a_far_one_does_not(first_car_m, clear):
     env = environment(first_car_m=(first_car_m, first_car_m))
-    assert Crossing(env).clear(6.0, 1.5, LeftTurnExpert.GO) is clear
+    assert LeftTurnExpert(env).crossing.clear(6.0, 1.5, LeftTurnExpert.GO) is clear
 
 
 def test_foresight_takes_each_car_at_its_own_length():
     env = environment(first_car_m=(60.0, 60.0))
-    crossing = Crossing(env)
+    crossing = LeftTurnExpert(env).crossing
     assert crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
     env.traffic[0].LENGTH = 90.0
     assert not crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
@@ -78,19 +78,42 @@ def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
     env = environment(first_car_m=(9.0, 9.0))
     trigger = LeftTurnTrigger(LeftTurnExpert(env))
     reasons: list[str | None] = []
-    while not reasons or reasons[-1] is None:
+    for _ in range(60):
         reasons.append(trigger.judge(NOTHING))
-        env.step(BRAKE if reasons[-1] else NOTHING)
+        if reasons[-1]:
+            break
+        env.step(NOTHING)
     assert len(reasons) > 2
     assert reasons[-1] == "collision"
     assert trigger.judge(BRAKE) is None
     for _ in range(20):
         env.step(BRAKE)
-    assert env.distance_m < LeftTurnExpert.POINT_OF_NO_RETURN_M
+    assert env.ego.speed == 0.0
+    assert env.distance_m < LeftTurnTrigger.STOP_BY_M
+
+
+def test_a_car_that_stands_short_of_the_lane_may_stay_but_not_creep_on():
+    env = environment(first_car_m=(9.0, 9.0))
+    trigger = LeftTurnTrigger(LeftTurnExpert(env))
+    env.traffic[0].position[0] = -2.0
+    env.ego.speed = 0.0
+    for place_m, stays in ((7.8, None), (8.1, "collision")):
+        env.distance_m = place_m
+        assert trigger.judge(BRAKE) == stays
+        assert trigger.judge(np.array([0.1], np.float32)) == "collision"
+
+
+def test_a_plan_may_end_in_a_stop():
+    env = environment(first_car_m=(60.0, 60.0))
+    crossing = LeftTurnExpert(env).crossing
+    # 0.5 s at 4 m/s, then 2 m/s2: 2 m and 4 m, and a little for whole control periods.
+    plan = PedalPlan(pedal=0.0, hold_s=0.5, then_brake=0.5)
+    assert crossing.reached_m(6.0, plan) == pytest.approx(6.0 + 0.5 * 4.0 * 0.1, abs=0.01)
+    assert crossing.reached_m(9.0, plan) == crossing.reached_m(6.0, plan)
 
 
 @pytest.mark.parametrize("pedal", [0.3, 1.0])
-def test_a_human_who_takes_over_when_the_trigger_says_so_always_arrives(pedal):
+def test_a_pedal_that_never_looks_arrives_with_a_human_beside_it(pedal):
     env = LeftTurnEnv()
     for seed in range(15):
         env.reset(seed=seed)
@@ -165,6 +188,13 @@ def test_the_human_holds_on_and_only_the_first_step_is_an_intervention():
     assert in_control == [False, True, True, True, False, True, True, True, False]
     assert [step.first for step in steps if step] == [True, False, False, True, False, False]
     assert all(step.action is BRAKE for step in steps if step)
+
+
+def test_by_default_the_human_holds_for_a_second_and_a_half():
+    guide = HumanGuide(Brakes(), ScriptedTrigger(["collision", *[None] * 20]))
+    observation = np.zeros((2, 45, 80), np.uint8)
+    in_control = [guide.watch(observation, FULL) is not None for _ in range(21)]
+    assert in_control == [True] * 15 + [False] * 6
 
 
 def test_a_reason_that_lasts_prolongs_the_same_intervention():
