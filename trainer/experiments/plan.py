@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 HUMAN_MODEL = "human_model"
 """Stands in an algorithm's place where the human model itself is tested: nothing is trained."""
 
-NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, LAST_ACTOR, NETWORK = (
-    SETTINGS
-) = (
+SETTINGS = (
     "normal", "tough", "poor", "remedy",
     "exact_losses", "importance", "printed_rates", "last_actor", "network",
 )  # fmt: skip
+NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, LAST_ACTOR, NETWORK = SETTINGS
 """Section VI's definition; one frame instead of two; one third of the demonstrations random; a
 price on the action before tanh, for algorithms whose policy saturates; losses as eq. 22 and 23 are
 printed; the importance weights that the paper calls optional; table A5's learning rates, which the

@@ -8,7 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from trainer.experiments.figures.style import colour, label, letter, new_figure, note_missing
+from trainer.experiments.figures.style import (
+    colour,
+    label,
+    letter,
+    new_figure,
+    note_missing,
+    other_colour,
+)
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import FULL_PATH_M, NORMAL, SCENARIO_TITLES
 from trainer.experiments.statistics import WINDOW, smoothed
@@ -68,16 +75,10 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
 def _draw_panel(
     panel: Any, gathered: Gathered, lines: Sequence[Line], scenario: str, metric: str
 ) -> None:
-    several = len({line.algorithm for line in lines}) > 1
-    for place, line in enumerate(lines):
+    for line in lines:
         outcomes = gathered.of(scenario, line.algorithm, line.setting)
         named = f"{line.label} ({len(outcomes)} of {gathered.seeds} seeds)"
-        # Of a single algorithm, each setting has a colour of its own.
-        shade = colour(line.algorithm if several or place == 0 else line.setting, place)
-        settings = [other.setting for other in lines if other.algorithm == line.algorithm]
-        style = (
-            STYLES[settings.index(line.setting) % len(STYLES)] if NORMAL in settings else STYLES[1]
-        )
+        shade, style = _look(line, lines)
         if not outcomes:
             panel.plot([], [], style, color=shade, alpha=0.4, label=named)
             continue
@@ -93,3 +94,13 @@ def _draw_panel(
     if not panel.has_data():
         note_missing(panel)
     panel.grid(alpha=0.3)
+
+
+def _look(line: Line, lines: Sequence[Line]) -> tuple[str, str]:
+    """Colour and style: settings differ by style, or by colour where all are of one algorithm."""
+    place = lines.index(line)
+    settings = [other.setting for other in lines if other.algorithm == line.algorithm]
+    if len(settings) == len(lines) and place > 0:
+        return other_colour(place), STYLES[0]
+    style = STYLES[settings.index(line.setting)] if NORMAL in settings else STYLES[1]
+    return colour(line.algorithm, place), style

@@ -38,7 +38,12 @@ def label(algorithm: str) -> str:
 
 def colour(algorithm: str, place: int = 0) -> str:
     """Its colour; those without one of their own take turns by their place in the figure."""
-    return _COLOURS.get(algorithm, _OTHERS[place % len(_OTHERS)])
+    return _COLOURS.get(algorithm, other_colour(place))
+
+
+def other_colour(place: int) -> str:
+    """A colour that no algorithm has for itself."""
+    return _OTHERS[place % len(_OTHERS)]
 
 
 def short(algorithm: str) -> str:
