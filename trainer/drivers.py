@@ -97,7 +97,8 @@ def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
         _check_action(driver, env.scenario, policy)
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
-        actor, _ = load_human_model(path)
+        actor, about = load_human_model(path)
+        _check_scenario(about["scenario"], env.scenario, policy)
         return NetworkDriver(actor), f"human:{path.name}"
     if not path.is_dir():
         raise UserError(
@@ -105,9 +106,13 @@ def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
             "a human model's directory, or the word expert"
         )
     actor, state = load_actor(path)
-    if state["scenario"] != env.scenario:
-        raise UserError(f"{policy} was trained in {state['scenario']}, not in {env.scenario}")
+    _check_scenario(state["scenario"], env.scenario, policy)
     return NetworkDriver(actor), f"run:{path.name}:{state['episode']}"
+
+
+def _check_scenario(trained_in: str, scenario: str, policy: str) -> None:
+    if trained_in != scenario:
+        raise UserError(f"{policy} was trained in {trained_in}, not in {scenario}")
 
 
 def _check_action(driver: OnnxDriver, scenario: str, policy: str) -> None:

@@ -12,6 +12,7 @@ import torch
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from trainer.commands.options import not_negative, positive, positive_float
+from trainer.experiments import timing
 from trainer.experiments.catalogue import NAMES, TIME, units_of
 from trainer.experiments.plan import PLAN, QUICK
 from trainer.experiments.ray_runner import run_on_ray
@@ -28,10 +29,12 @@ from trainer.experiments.summary import BEGIN, write_summary
 from trainer.experiments.units import Unit
 from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task
 from trainer.parallel import cores
+from trainer.scenarios import SCENARIOS
 
 EXAMPLE = examples(
     "python -m trainer experiment status",
     "python -m trainer experiment fig7 fig9 --jobs 2 --max-minutes 60",
+    "python -m trainer experiment all --scenario congestion",
 )
 ALL, STATUS, SUMMARY = "all", "status", "summary"
 DEFAULT_SEEDS = 3
@@ -56,6 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0,
         metavar="N",
         help="processes of one thread each; 0: one a core",
+    )
+    parser.add_argument(
+        "--scenario",
+        choices=list(SCENARIOS),
+        help="compute what there is in this one only (default: in both)",
     )
     parser.add_argument(
         "--max-minutes",
@@ -95,16 +103,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Compute, draw and judge; returns the exit status."""
     store, names = _store(arguments), _names(arguments.names)
+    _check_scenario(arguments, names)
     if STATUS in arguments.names:
         print_status(store, names, arguments.seeds)
         return 0
     tally = Tally(0)
     if not arguments.draw_only and names:
-        tally = _compute(arguments, store, units_of(names, arguments.seeds))
+        tally = _compute(arguments, store, units_of(names, arguments.seeds, arguments.scenario))
     for name in names:
-        late = tally.count(STOPPED) > 0 and name == TIME
+        untimed = tally.count(STOPPED) > 0 or arguments.scenario not in (None, timing.SCENARIO)
         verdict = draw_experiment(
-            store, name, arguments.seeds, arguments.device, arguments.draw_only or late
+            store, name, arguments.seeds, arguments.device, arguments.draw_only or untimed
         )
         print(outcome_line(verdict, directory_of(store, name)))
     if write_summary(store.results, NAMES):
@@ -113,6 +122,17 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(f"{store.results / 'README.md'} has no line {BEGIN!r} for the table")
     _say_what_is_left(tally)
     return 1 if tally.count(FAILED) else 0
+
+
+def _check_scenario(arguments: argparse.Namespace, names: list[str]) -> None:
+    scenario = arguments.scenario
+    if scenario is None:
+        return
+    if arguments.draw_only or STATUS in arguments.names:
+        raise UserError("--scenario chooses what is computed, and this computes nothing")
+    timed = TIME in names and scenario == timing.SCENARIO
+    if not timed and not units_of(names, arguments.seeds, scenario):
+        raise UserError(f"{', '.join(arguments.names)}: nothing to compute in {scenario}")
 
 
 def _store(arguments: argparse.Namespace) -> Store:

@@ -174,14 +174,16 @@ TIME = "time"
 NAMES = (*(name for name in EXPERIMENTS if name not in OURS), TIME, *OURS)
 
 
-def units_of(names: Iterable[str], seeds: int) -> list[Unit]:
+def units_of(names: Iterable[str], seeds: int, scenario: str | None = None) -> list[Unit]:
     """The units of some experiments, each once, those first that most experiments need.
+
+    With ``scenario`` those of this one only.
 
     Of units that equally many need, all seeds of one algorithm come before the next algorithm.
     """
     papers = [experiment for name, experiment in EXPERIMENTS.items() if name not in OURS]
     needed = Counter(unit for experiment in papers for unit in experiment.units(seeds))
     wanted = [u for name in names if name != TIME for u in EXPERIMENTS[name].units(seeds)]
-    unique = list(dict.fromkeys(wanted))
+    unique = [unit for unit in dict.fromkeys(wanted) if scenario in (None, unit.scenario)]
     # The human model takes seconds, and its absence should be known before hours of training.
     return sorted(unique, key=lambda unit: (unit.trained, -needed[unit]))

@@ -28,6 +28,10 @@ def places(tmp_path):
         ("fig7", "--jobs", "-1"),
         ("fig7", "--max-minutes", "0"),
         ("fig7", "--device", "abacus"),
+        ("fig7", "--scenario", "roundabout"),
+        ("status", "--scenario", "left_turn"),
+        ("table2", "--scenario", "left_turn"),
+        ("time", "--scenario", "congestion"),
         ("summary",),
     ],
     ids=" ".join,
@@ -70,14 +74,13 @@ def test_status_counts_the_units_and_says_what_stands_in_the_way(capsys, places)
 
 def test_units_are_computed_in_processes_and_never_twice(capsys, places, tmp_path, monkeypatch):
     """Vanilla TD3 needs no human: of fig. 7 it is what can be computed here."""
-    only_left = replace(EXPERIMENTS["fig7"], scenarios=("left_turn",))
-    monkeypatch.setitem(EXPERIMENTS, "fig7", only_left)
     monkeypatch.setattr(experiment, "PLAN", TINY)
-    command = ("experiment", "fig7", "--seeds", "1", "--jobs", "2", *places)
+    command = ("experiment", "fig7", "--scenario", "left_turn", "--seeds", "1", "--jobs", "2")
+    command = (*command, *places)
     status, out, err = call(capsys, *command)
     assert status == 0
     assert "left out: 3 units, since there is no human model" in err
-    assert "fig7: 1 of 4 units; claims: 16 undecided" in out
+    assert "fig7: 1 of 8 units; claims: 16 undecided" in out
     (result,) = (tmp_path / "results" / "units").rglob("tests.json")
     before = result.stat().st_mtime_ns
     status, out, _ = call(capsys, *command)
