@@ -19,6 +19,7 @@ GAUGE_PIXELS = (150, 14)
 PILL_PIXELS = (310, 34)
 FACTS = {
     "collision": "the human drives: a crash ahead",
+    "lane": "the human drives: no stopping in the lane",
     "stuck": "the human drives: the way is clear",
     "heading": "the human drives: it turned aside",
     "offset": "the human drives: it drifted aside",

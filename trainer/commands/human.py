@@ -59,6 +59,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the person also says what they would do while the model drives, as an expert can",
     )
     parser.add_argument(
+        "--unaided-share",
+        type=not_negative,
+        default=DEFAULTS.unaided_share,
+        metavar="N",
+        help="nobody takes over in one episode in N, though every step is labelled; 0: never; "
+        "episodes that the person drives alone stay theirs",
+    )
+    parser.add_argument(
         "--refining-updates",
         type=not_negative,
         default=DEFAULTS.refining_updates,
@@ -78,15 +86,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Train the model, showing progress; returns the exit status."""
     set_threads(arguments.threads)
+    scripted = arguments.recordings is None
+    if not scripted and (arguments.label_every_step or arguments.unaided_share):
+        raise UserError(
+            "--label-every-step and --unaided-share ask the scripted expert; "
+            "a recording holds no more"
+        )
     config = HumanModelConfig(
         frames=arguments.frames,
         episodes=arguments.episodes,
         updates_per_episode=arguments.updates_per_episode,
         demonstrated_share=arguments.demonstrated_share,
         label_every_step=arguments.label_every_step,
+        unaided_share=arguments.unaided_share,
         refining_updates=arguments.refining_updates,
     )
-    scripted = arguments.recordings is None
     model, about = (_from_expert if scripted else _from_person)(arguments, config)
     if config.refining_updates:
         with ProgressBar("refining", config.refining_parts) as bar:
@@ -124,8 +138,6 @@ def _from_person(
     arguments: argparse.Namespace, config: HumanModelConfig
 ) -> tuple[HumanModel, dict[str, Any]]:
     """A model of a person, from recordings: as many gradient steps as with the expert."""
-    if config.label_every_step:
-        raise UserError("--label-every-step asks the scripted expert; a recording holds no more")
     recordings = find_recordings([Path(place) for place in arguments.recordings])
     model = HumanModel(config, arguments.seed)
     interventions = demonstrate(model, recordings, arguments.scenario)

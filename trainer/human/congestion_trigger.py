@@ -38,6 +38,10 @@ class CongestionTrigger:
     def reset(self) -> None:
         """Nothing to forget."""
 
+    def may_return(self) -> bool:
+        """Whether the wheel can be given back: anywhere, the clock alone decides."""
+        return True
+
     def judge(self, action: NDArray) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""
         env = self.expert.env

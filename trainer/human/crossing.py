@@ -55,7 +55,7 @@ class Crossing:
 
     def clear(self, horizon_s: float, margin_m: float, plan: PedalPlan) -> bool:
         """Whether nothing comes within ``margin_m`` along the lane during ``horizon_s``."""
-        time_s, s_m = self._ego_motion(horizon_s, plan)
+        time_s, s_m, _ = self._ego_motion(horizon_s, plan)
         cells = np.minimum((s_m / TABLE_STEP_M).astype(int), len(self._covered_x) - 1)
         if cells[-1] < self._first_cell:
             return True  # The ego car does not get as far as the lane.
@@ -66,14 +66,20 @@ class Crossing:
         car_x, reach_m = x + speed_mps * time_s, 0.5 * length_m + margin_m
         return not np.any((car_x + reach_m > rear_x) & (car_x - reach_m < front_x))
 
-    def reached_m(self, horizon_s: float, plan: PedalPlan) -> float:
-        """How far along the path the ego car is after ``horizon_s``."""
-        return float(self._ego_motion(horizon_s, plan)[1][-1])
+    def state_after(self, horizon_s: float, plan: PedalPlan) -> tuple[float, float]:
+        """How far along the path the ego car is after ``horizon_s`` (m), and its speed (m/s)."""
+        _, s_m, speed_mps = self._ego_motion(horizon_s, plan)
+        return float(s_m[-1]), speed_mps
+
+    def in_lane(self, s_m: float) -> bool:
+        """Whether the ego car at this path length reaches into the traffic's way."""
+        cell = min(int(s_m / TABLE_STEP_M), len(self._covered_x) - 1)
+        return bool(np.isfinite(self._covered_x[cell, 0]))
 
     def _ego_motion(
         self, horizon_s: float, plan: PedalPlan
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times ahead (s) and the arc lengths reached (m), one entry a control period."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Times ahead (s), arc lengths reached (m), an entry a control period; the last speed."""
         c, dt_s = self.env.config, self.env.config.control_period_s
         steps, held = round(horizon_s / dt_s), round(plan.hold_s / dt_s)
         held_mps2 = plan.pedal * (c.throttle_mps2 if plan.pedal > 0 else c.brake_mps2)
@@ -89,7 +95,7 @@ class Crossing:
             elif plan.then_mps is not None and speed_mps < plan.then_mps:
                 speed_mps = min(speed_mps + c.throttle_mps2 * dt_s, plan.then_mps)
             positions.append(s_m)
-        return _instants(steps, dt_s), np.array(positions)
+        return _instants(steps, dt_s), np.array(positions), speed_mps
 
     def _footprint(self, s_m: float) -> Rectangle:
         pose = self.env.path.pose(s_m)

@@ -50,8 +50,9 @@ class HumanTraining:
 
     def _drive(self, episode: int) -> tuple[int, str]:
         """One episode; the number of take-overs, and the outcome."""
-        share = self.config.demonstrated_share
-        demonstrated = share > 0 and episode % share == share - 1
+        c = self.config
+        demonstrated = _nth(episode, c.demonstrated_share, c.demonstrated_share - 1)
+        unaided = _nth(episode, c.unaided_share, 0)
         seed = seeds.episode_seed(self.seed, seeds.HUMAN_EPISODES, episode)
         observation, info = self.env.reset(seed=seed)
         self.guide.reset()
@@ -59,15 +60,21 @@ class HumanTraining:
         interventions, ended = 0, False
         while not ended:
             action = self.model.act(observation)
-            intervention = None if demonstrated else self.guide.watch(observation, action)
+            watched = not (demonstrated or unaided)
+            intervention = self.guide.watch(observation, action) if watched else None
             if demonstrated or intervention is not None:
                 action = (
                     self.expert.act(observation) if intervention is None else intervention.action
                 )
                 self.model.add(observation, action)
-            elif self.config.label_every_step:
+            elif c.label_every_step:
                 self.model.add(observation, self.adviser.act(observation))
             interventions += intervention is not None and intervention.first
             observation, _, terminated, truncated, info = self.env.step(action)
             ended = terminated or truncated
         return interventions, info["outcome"]
+
+
+def _nth(episode: int, share: int, rest: int) -> bool:
+    """Whether it is one in ``share``, from number ``rest`` on; with a share of 0 none is."""
+    return share > 0 and episode % share == rest

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
-Reason = Literal["collision", "stuck", "heading", "offset", "person"]
-"""Why the human takes over: hardly a way out of a crash, a car that waits for nothing, one that
-turns aside, one that is or drifts aside; a person has reasons of their own."""
+Reason = Literal["collision", "lane", "stuck", "heading", "offset", "person"]
+"""Why the human takes over: hardly a way out of a crash, a car that stops in the traffic's lane,
+one that waits for nothing, one that turns aside, one that is or drifts aside; a person has reasons
+of their own."""
 
 
 class Driver(Protocol):
@@ -34,6 +35,10 @@ class Trigger(Protocol):
 
     def judge(self, action: Action) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""
+        ...
+
+    def may_return(self) -> bool:
+        """Whether a person would give the wheel back here."""
         ...
 
 
@@ -88,10 +93,10 @@ class HumanGuide:
         before = self._reason
         if trigger is not None:
             self._steps_left = self.hold_steps
-        if self._steps_left == 0:
+        if self._steps_left == 0 and (before is None or self.trigger.may_return()):
             self._reason = None
             return None
-        self._steps_left -= 1
+        self._steps_left = max(self._steps_left - 1, 0)
         if before is None:
             # A person who takes over looks at the scene afresh.
             self.driver.reset()

@@ -1,10 +1,10 @@
 """Who drives in the traffic: cars, and in the variant scenes vans, trucks and motorcycles too.
 
-Cars come in four sizes, as CARLA's do: a policy that only ever saw one outline takes any other
-vehicle for something new. Vans, trucks and motorcycles have the default sizes of Eclipse SUMO's
-vehicle classes delivery, truck and motorcycle ("Vehicle Type Parameter Defaults"); ``CAR`` is
-highway-env's own. Accelerations are of the order of SUMO's; they and the time gaps are chosen: the
-heavier, the more sluggish and the longer.
+Cars come in five sizes of the range of CARLA's, whose earlier releases have a bubble car, too: a
+policy that only ever saw one outline takes any other vehicle for something new. Vans, trucks and
+motorcycles have the default sizes of Eclipse SUMO's vehicle classes delivery, truck and motorcycle
+("Vehicle Type Parameter Defaults"); ``CAR`` is highway-env's own. Accelerations are of the order of
+SUMO's; they and the time gaps are chosen: the heavier, the more sluggish and the longer.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ class VehicleType:
 
 
 CAR = VehicleType("car", 5.0, 2.0, 3.0, 5.0, 0.8)
+BUBBLE_CAR = replace(CAR, name="bubble car", length_m=2.3, width_m=1.4)
 SMALL_CAR = replace(CAR, name="small car", length_m=3.6, width_m=1.65)
 COMPACT_CAR = replace(CAR, name="compact car", length_m=4.3, width_m=1.8)
 LARGE_CAR = replace(CAR, name="large car", length_m=5.3, width_m=2.1)
@@ -43,7 +44,7 @@ MOTORCYCLE = VehicleType("motorcycle", 2.2, 0.9, 6.0, 10.0, 0.6)
 
 Mix = tuple[tuple[VehicleType, float], ...]
 """Vehicle types and their shares, which sum to 1."""
-CARS_ONLY: Mix = ((SMALL_CAR, 0.25), (COMPACT_CAR, 0.25), (CAR, 0.25), (LARGE_CAR, 0.25))
+CARS_ONLY: Mix = tuple((car, 0.2) for car in (BUBBLE_CAR, SMALL_CAR, COMPACT_CAR, CAR, LARGE_CAR))
 """Traffic of the nominal scenes."""
 MIXED: Mix = ((CAR, 0.4), (VAN, 0.2), (TRUCK, 0.2), (MOTORCYCLE, 0.2))
 """Traffic of the variant scenes (section VII-D: more types and amounts of vehicles)."""

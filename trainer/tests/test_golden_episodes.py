@@ -23,10 +23,10 @@ QUEUE = LeftTurnConfig(traffic_cars=8, first_car_m=(-30.0, 12.0), short_gap_m=(7
 """A longer queue than usual, closely packed: the followers brake."""
 
 GOLDEN = {
-    "random": "4919dea65601fa82481b39f3e0200a62adbaee2f98728d95572abbeea5255927",
-    "expert": "fe283cd598c08709a5089edf6820655d7b4b57618db77b148ecc3a5860af9d82",
-    "guided": "08f42cb808f2095a55723b7c24e91a0afa78462c36392b1cc010ed1a27d31933",
-    "queue": "d7c9de4998b78c169d7c8c0495b0516eb24461b367401c5b16ad29160e4e29d4",
+    "random": "99a651c9237ffb067728760ccd5fbf1279e7c4c5266122f08155fa63490e79ab",
+    "expert": "3f816926ad56a5b6ad373eceedb1eea9b1f318576a4ee3a215a282b9036edf42",
+    "guided": "0f2bcfc8346c08a9dd857cf4994cfe2db0f0989bc1a7437a5ab8530883dbdc26",
+    "queue": "c252a806eb9146149777fb1c514a07e0acf34b762737cad66d265a74242ebcf1",
 }
 
 

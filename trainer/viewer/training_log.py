@@ -33,6 +33,7 @@ POLICY = "policy"
 DRIVERS = {
     POLICY: BLUE,
     "collision": RED,
+    "lane": RED,
     "stuck": ORANGE,
     "heading": PURPLE,
     "offset": PURPLE,

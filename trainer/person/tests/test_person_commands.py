@@ -159,5 +159,6 @@ def test_recordings_that_teach_nothing_are_refused(capsys, tmp_path):
     wrong = call(capsys, *command, str(tmp_path / "other"), "--scenario", "congestion")
     assert "was driven in left_turn, not in congestion" in wrong[2]
     label = call(capsys, *command, str(tmp_path / "other"), "--label-every-step")
-    assert "asks the scripted expert" in label[2]
-    assert {wrong[0], label[0]} == {2}
+    unaided = call(capsys, *command, str(tmp_path / "other"), "--unaided-share", "4")
+    assert all("ask the scripted expert" in refused[2] for refused in (label, unaided))
+    assert {wrong[0], label[0], unaided[0]} == {2}
