@@ -65,14 +65,6 @@ class LeftTurnTrigger:
             return "lane"
         return "stuck" if self.open_steps > self.OPEN_STEPS and pedal < self.START_PEDAL else None
 
-    def _stops_in_the_lane(self, pedal: float) -> bool:
-        """Whether after this pedal the car hardly moves, with its nose in the lane."""
-        if pedal >= self.START_PEDAL:
-            return False
-        held = PedalPlan(pedal, self.HESITATION_S)
-        at_m, speed_mps = self.expert.crossing.state_after(self.HESITATION_S, held)
-        return speed_mps < self.CRAWL_MPS and self.expert.crossing.in_lane(at_m)
-
     def may_return(self) -> bool:
         """Whether the wheel can be given back: nobody does while driving through the lane.
 
@@ -80,6 +72,14 @@ class LeftTurnTrigger:
         """
         standing = self.expert.env.ego.speed < self.STANDING_MPS
         return standing or not self.expert.crossing.in_lane(self.expert.env.distance_m)
+
+    def _stops_in_the_lane(self, pedal: float) -> bool:
+        """Whether after this pedal the car hardly moves, with its nose in the lane."""
+        if pedal >= self.START_PEDAL:
+            return False
+        held = PedalPlan(pedal, self.HESITATION_S)
+        at_m, speed_mps = self.expert.crossing.state_after(self.HESITATION_S, held)
+        return speed_mps < self.CRAWL_MPS and self.expert.crossing.in_lane(at_m)
 
     def _leaves_a_way_out(self, pedal: float) -> bool:
         """Whether after this pedal the car can still be stopped, or driven on, unharmed."""
