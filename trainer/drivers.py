@@ -66,8 +66,11 @@ class OnnxDriver:
         """Policies have no memory."""
 
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The policy's action, float32 [action size]."""
-        return self.policy.act(observation)
+        """The policy's action, float32 [action size], within its domain as the edge sends it.
+
+        onnxruntime's tanh exceeds 1 by a last bit now and then.
+        """
+        return np.clip(self.policy.act(observation), -1.0, 1.0)
 
 
 def make_environment(scenario: str, condition: str = "nominal") -> Any:

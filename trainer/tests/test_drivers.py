@@ -1,9 +1,13 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from trainer.drivers import BEST_FILE, load_actor, load_driver, make_environment
+from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver, make_environment
 from trainer.files import save_torch
 from trainer.learner.networks import Actor
+
+POLICY = Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx"
 
 
 @pytest.mark.parametrize("frames", [1, 2])
@@ -16,3 +20,11 @@ def test_an_actor_is_loaded_with_the_frames_that_it_was_trained_on(tmp_path, fra
     driver, policy_id = load_driver(str(tmp_path), make_environment("congestion"))
     assert policy_id.startswith("run:")
     assert driver.act(np.zeros((2, 45, 80), np.uint8)).shape == (1,)
+
+
+def test_a_policy_file_answers_within_the_domain_as_the_edge_sends_it(monkeypatch):
+    driver = OnnxDriver(POLICY)
+    beyond = np.array([np.nextafter(np.float32(1.0), np.float32(2.0))])
+    monkeypatch.setattr(driver.policy, "act", lambda observation: beyond)
+    action = driver.act(np.zeros((2, 45, 80), np.uint8))
+    assert (action.dtype, action.tolist()) == (np.float32, [1.0])
