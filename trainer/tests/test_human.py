@@ -1,5 +1,7 @@
 """The human model: what it learns from whom, and that it is kept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,8 @@ from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.tests.humans import BRAKE, FULL
+
+LABELLED = HumanModelConfig(updates_per_episode=1, batch_size=8, label_every_step=True)
 
 
 def test_the_model_starts_as_an_untrained_actor_and_learns_what_it_is_shown():
@@ -85,14 +89,7 @@ def test_training_is_reproducible_and_survives_saving(tmp_path):
 def test_nobody_takes_over_in_an_unaided_episode_but_every_step_is_labelled(
     unaided_share, monkeypatch
 ):
-    config = HumanModelConfig(
-        episodes=2,
-        updates_per_episode=1,
-        batch_size=8,
-        demonstrated_share=0,
-        label_every_step=True,
-        unaided_share=unaided_share,
-    )
+    config = replace(LABELLED, episodes=2, demonstrated_share=0, unaided_share=unaided_share)
     training = HumanTraining(LeftTurnEnv(), config, seed=5)
     # Never looks: soon in a car's way.
     monkeypatch.setattr(training.model, "act", lambda observation: FULL)
@@ -105,14 +102,7 @@ def test_nobody_takes_over_in_an_unaided_episode_but_every_step_is_labelled(
 
 
 def test_episodes_are_demonstrated_watched_or_unaided_in_turn(monkeypatch):
-    config = HumanModelConfig(
-        episodes=8,
-        updates_per_episode=1,
-        batch_size=8,
-        demonstrated_share=2,
-        label_every_step=True,
-        unaided_share=4,
-    )
+    config = replace(LABELLED, episodes=8, demonstrated_share=2, unaided_share=4)
     training = HumanTraining(LeftTurnEnv(), config, seed=5)
     looks: list[int] = []
     watch = training.guide.watch
