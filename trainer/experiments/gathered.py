@@ -58,9 +58,15 @@ class Outcome:
         next; the first one holds before it, too.
         """
         values = np.asarray(self.metrics[metric], dtype=float)
-        measured = np.flatnonzero(~np.isnan(values))
-        last = np.searchsorted(measured, np.arange(len(values)), side="right") - 1
-        return values[measured[np.maximum(last, 0)]] if len(measured) else values
+        episodes, known = self.measured(metric)
+        last = np.searchsorted(episodes, np.arange(len(values)) + 1.0, side="right") - 1
+        return known[np.maximum(last, 0)] if len(known) else values
+
+    def measured(self, metric: str) -> tuple[Numbers, Numbers]:
+        """Episodes, counted from 1, after which a metric was measured, and its values there."""
+        values = np.asarray(self.metrics[metric], dtype=float)
+        at = np.flatnonzero(~np.isnan(values))
+        return 1.0 + at.astype(float), values[at]
 
     @property
     def best_validation(self) -> float:

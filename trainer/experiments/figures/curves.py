@@ -16,7 +16,7 @@ from trainer.experiments.figures.style import (
     note_missing,
     other_colour,
 )
-from trainer.experiments.gathered import Gathered
+from trainer.experiments.gathered import Gathered, Numbers, Outcome
 from trainer.experiments.plan import FULL_PATH_M, NORMAL, SCENARIO_TITLES
 from trainer.experiments.statistics import WINDOW, smoothed
 
@@ -42,33 +42,35 @@ class Line(NamedTuple):
 
 
 def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = False) -> Figure:
-    """Four panels: reward and surviving distance in both scenarios.
+    """Six panels: the paper's reward and surviving distance, and the policy alone, twice.
 
     Args:
         gathered: the units.
         lines: the curves of each panel.
-        by_metric: rewards above and distances below (figs. 11 to 13) instead of a row a scenario.
+        by_metric: a row a metric (figs. 11 to 13) instead of a row a scenario.
     """
-    figure = new_figure(10.0 if by_metric else 12.0, 6.6)
-    panels = figure.subplots(2, 2, sharex="col" if by_metric else "row")
-    for row, scenario in enumerate(SCENARIO_TITLES):
-        for column, metric in enumerate(METRICS):
-            place = (column, row) if by_metric else (row, column)
-            panel = panels[place]
-            letter(
-                panel, 2 * place[0] + place[1], f"{METRICS[metric]}, {SCENARIO_TITLES[scenario]}"
-            )
-            _draw_panel(panel, gathered, lines, scenario, metric)
-        if by_metric:
-            panels[1, row].legend(
-                fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2
-            )
-        else:
-            panels[row, 1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
-    for panel in panels[1]:
-        panel.set_xlabel(
-            f"training episode (mean of {WINDOW}; band: standard deviation of seeds)", fontsize=9
-        )
+    figure = new_figure(10.0, 9.6) if by_metric else new_figure(16.0, 6.6)
+    shape = (len(TITLES), len(SCENARIO_TITLES))
+    # Scenarios differ in their number of episodes.
+    if by_metric:
+        panels = figure.subplots(*shape, sharex="col")
+    else:
+        panels = figure.subplots(*shape[::-1], sharex="row")
+    for row, column in np.ndindex(panels.shape):
+        metric_at, scenario_at = (row, column) if by_metric else (column, row)
+        metric, scenario = list(TITLES)[metric_at], list(SCENARIO_TITLES)[scenario_at]
+        title = f"{TITLES[metric]}, {SCENARIO_TITLES[scenario]}"
+        letter(panels[row, column], row * panels.shape[1] + column, title)
+        _draw_panel(panels[row, column], gathered, lines, scenario, metric)
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
+    beside = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)}
+    for panel in panels[-1] if by_metric else panels[:, -1]:
+        panel.legend(fontsize=8, **(below if by_metric else beside))
+    figure.supxlabel(
+        f"training episode (in training: mean of {WINDOW}; alone: as validated; "
+        "band: standard deviation of seeds)",
+        fontsize=9,
+    )
     return figure
 
 
@@ -82,18 +84,27 @@ def _draw_panel(
         if not outcomes:
             panel.plot([], [], style, color=shade, alpha=0.4, label=named)
             continue
-        curves = smoothed([outcome.curve(metric) for outcome in outcomes])
+        episodes, curves = _curves(outcomes, metric)
         mean, deviation = curves.mean(axis=0), curves.std(axis=0)
-        episodes = np.arange(1, len(mean) + 1)
         panel.plot(episodes, mean, style, color=shade, label=named)
         panel.fill_between(
             episodes, mean - deviation, mean + deviation, color=shade, alpha=0.18, lw=0
         )
-    if metric == "distance_m":
+    if metric != "episode_return":
         panel.axhline(FULL_PATH_M[scenario], color="0.6", lw=0.8, ls=":")
     if not panel.has_data():
         note_missing(panel)
     panel.grid(alpha=0.3)
+
+
+def _curves(outcomes: Sequence[Outcome], metric: str) -> tuple[Numbers, Numbers]:
+    """Episodes counted from 1, and a curve a seed there: smoothed, or just where validated."""
+    if metric != ALONE:
+        curves = smoothed([outcome.curve(metric) for outcome in outcomes])
+        return np.arange(1.0, curves.shape[1] + 1.0), curves
+    measured = [outcome.measured(metric) for outcome in outcomes]
+    shortest = min(len(episodes) for episodes, _ in measured)
+    return measured[0][0][:shortest], np.stack([values[:shortest] for _, values in measured])
 
 
 def _look(line: Line, lines: Sequence[Line]) -> tuple[str, str]:
