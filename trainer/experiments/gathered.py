@@ -21,6 +21,8 @@ from trainer.experiments.units import Unit
 from trainer.training.metrics import METRICS_FILE
 
 Numbers = NDArray[np.float64]
+Episodes = NDArray[np.int64]
+"""Counted from 1."""
 TEXT = ("outcome",)
 """Columns that are no numbers."""
 
@@ -59,14 +61,14 @@ class Outcome:
         """
         values = np.asarray(self.metrics[metric], dtype=float)
         episodes, known = self.measured(metric)
-        last = np.searchsorted(episodes, np.arange(len(values)) + 1.0, side="right") - 1
+        last = np.searchsorted(episodes, np.arange(len(values)) + 1, side="right") - 1
         return known[np.maximum(last, 0)] if len(known) else values
 
-    def measured(self, metric: str) -> tuple[Numbers, Numbers]:
+    def measured(self, metric: str) -> tuple[Episodes, Numbers]:
         """Episodes, counted from 1, after which a metric was measured, and its values there."""
         values = np.asarray(self.metrics[metric], dtype=float)
         at = np.flatnonzero(~np.isnan(values))
-        return 1.0 + at.astype(float), values[at]
+        return at + 1, values[at]
 
     @property
     def best_validation(self) -> float:

@@ -38,11 +38,12 @@ def test_learning_curves_have_a_line_and_a_band_for_each_algorithm(name):
     assert len(figure.axes) == 6
     for panel in figure.axes:
         # The policy alone is drawn where it was validated: after every tenth episode.
-        points = 10 if "alone" in panel.get_title(loc="left") else 100
+        points = 10 if "without help" in panel.get_title(loc="left") else 100
         curves = [line for line in panel.get_lines() if len(line.get_xdata()) == points]
         assert len(curves) == len(panel.collections) == CURVES[name]
         assert len({(line.get_color(), line.get_linestyle()) for line in curves}) == CURVES[name]
         assert curves[0].get_xdata()[-1] == 100
+    assert "training episode" in figure.get_supxlabel()
     assert texts(figure).count(f"({SEEDS} of {SEEDS} seeds)") == 2 * CURVES[name]
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,14 +18,16 @@ from trainer.experiments.figures.style import (
     note_missing,
     other_colour,
 )
-from trainer.experiments.gathered import Gathered, Numbers, Outcome
+from trainer.experiments.gathered import Episodes, Gathered, Numbers, Outcome
 from trainer.experiments.plan import FULL_PATH_M, NORMAL, SCENARIO_TITLES
 from trainer.experiments.statistics import WINDOW, smoothed
 
 METRICS = {"episode_return": "training reward", "distance_m": "surviving distance, m"}
-"""What learning curves show: episodes in which the human may take over."""
+"""What the paper's learning curves show: episodes in which the human may take over."""
 ALONE = "validation_distance_m"
-TITLES = {**METRICS, ALONE: "surviving distance of the policy alone, m"}
+"""The policy alone, now and then."""
+TITLES = {**METRICS, ALONE: "surviving distance without help, m"}
+"""What ours show."""
 
 STYLES = ("-", "--", ":", "-.")
 """Of an algorithm's settings, the normal one first."""
@@ -42,32 +46,31 @@ class Line(NamedTuple):
 
 
 def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = False) -> Figure:
-    """Six panels: the paper's reward and surviving distance, and the policy alone, twice.
+    """Six panels: the paper's reward and surviving distance, and the policy alone, by scenario.
 
     Args:
         gathered: the units.
         lines: the curves of each panel.
         by_metric: a row a metric (figs. 11 to 13) instead of a row a scenario.
     """
-    figure = new_figure(10.0, 9.6) if by_metric else new_figure(16.0, 6.6)
-    shape = (len(TITLES), len(SCENARIO_TITLES))
-    # Scenarios differ in their number of episodes.
     if by_metric:
-        panels = figure.subplots(*shape, sharex="col")
+        places = [[(scenario, metric) for scenario in SCENARIO_TITLES] for metric in TITLES]
+        figure = new_figure(10.0, 9.6)
+        legend = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
     else:
-        panels = figure.subplots(*shape[::-1], sharex="row")
-    for row, column in np.ndindex(panels.shape):
-        metric_at, scenario_at = (row, column) if by_metric else (column, row)
-        metric, scenario = list(TITLES)[metric_at], list(SCENARIO_TITLES)[scenario_at]
-        title = f"{TITLES[metric]}, {SCENARIO_TITLES[scenario]}"
-        letter(panels[row, column], row * panels.shape[1] + column, title)
-        _draw_panel(panels[row, column], gathered, lines, scenario, metric)
-    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
-    beside = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)}
+        places = [[(scenario, metric) for metric in TITLES] for scenario in SCENARIO_TITLES]
+        figure = new_figure(16.0, 6.6)
+        legend = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)}
+    # Panels of one scenario share their episodes; the other one's are more or fewer.
+    panels: Any = figure.subplots(len(places), len(places[0]), sharex="col" if by_metric else "row")
+    for number, (scenario, metric) in enumerate(chain.from_iterable(places)):
+        panel = panels.flat[number]
+        letter(panel, number, f"{TITLES[metric]}, {SCENARIO_TITLES[scenario]}")
+        _draw_panel(panel, gathered, lines, scenario, metric)
     for panel in panels[-1] if by_metric else panels[:, -1]:
-        panel.legend(fontsize=8, **(below if by_metric else beside))
+        panel.legend(fontsize=8, **legend)
     figure.supxlabel(
-        f"training episode (in training: mean of {WINDOW}; alone: as validated; "
+        f"training episode (with help: mean of {WINDOW}; without: where validated; "
         "band: standard deviation of seeds)",
         fontsize=9,
     )
@@ -97,14 +100,14 @@ def _draw_panel(
     panel.grid(alpha=0.3)
 
 
-def _curves(outcomes: Sequence[Outcome], metric: str) -> tuple[Numbers, Numbers]:
+def _curves(outcomes: Sequence[Outcome], metric: str) -> tuple[Episodes, Numbers]:
     """Episodes counted from 1, and a curve a seed there: smoothed, or just where validated."""
     if metric != ALONE:
         curves = smoothed([outcome.curve(metric) for outcome in outcomes])
-        return np.arange(1.0, curves.shape[1] + 1.0), curves
+        return np.arange(curves.shape[1]) + 1, curves
     measured = [outcome.measured(metric) for outcome in outcomes]
-    shortest = min(len(episodes) for episodes, _ in measured)
-    return measured[0][0][:shortest], np.stack([values[:shortest] for _, values in measured])
+    shared = reduce(np.intersect1d, [episodes for episodes, _ in measured])
+    return shared, np.stack([values[np.isin(episodes, shared)] for episodes, values in measured])
 
 
 def _look(line: Line, lines: Sequence[Line]) -> tuple[str, str]:
