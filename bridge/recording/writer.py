@@ -49,7 +49,7 @@ class RecordingWriter:
         stream: Any = self._file
         self._mcap = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD)
         self._mcap.start(profile="", library=f"phil-hil {__version__}")
-        self._mcap.flush()  # From the first moment on, whoever looks sees an MCAP file.
+        self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, tuple[protobuf.Schema, int]] = {}
         self._counts: dict[str, int] = {}

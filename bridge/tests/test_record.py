@@ -37,7 +37,8 @@ from edge_runtime.wire import State, decode_state
 def start_record(endpoint: str, path: Path, *options: str) -> BridgeProcess:
     """Start ``record`` and wait until it writes."""
     run = BridgeProcess("record", "--out", str(path), "--connect", endpoint, *options)
-    wait_until(path.exists, "the recording to begin")
+    # A file is made before its first bytes are in it.
+    wait_until(lambda: path.exists() and path.stat().st_size > 0, "the recording to begin")
     return run
 
 

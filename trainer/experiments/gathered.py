@@ -60,9 +60,9 @@ class Outcome:
         next; the first one holds before it, too.
         """
         values = np.asarray(self.metrics[metric], dtype=float)
-        episodes, known = self.measured(metric)
-        last = np.searchsorted(episodes, np.arange(len(values)) + 1, side="right") - 1
-        return known[np.maximum(last, 0)] if len(known) else values
+        known = np.flatnonzero(~np.isnan(values))
+        last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
+        return values[known[np.maximum(last, 0)]] if len(known) else values
 
     def measured(self, metric: str) -> tuple[Episodes, Numbers]:
         """Episodes, counted from 1, after which a metric was measured, and its values there."""
