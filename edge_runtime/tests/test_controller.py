@@ -6,23 +6,13 @@ import numpy as np
 import pytest
 
 from edge_runtime.controller import Controller, Received
-from edge_runtime.limiter import LimitRow, limit_rows
+from edge_runtime.limiter import LimitRow
 from edge_runtime.safety import Mode
+from edge_runtime.tests.controllers import GOOD, QUICK_NS, answer, make
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import PEDAL, STEERING
 
-GOOD = np.array([0.5], np.float32)
 NAN = np.array([np.nan], np.float32)
-QUICK_NS = 1_000_000
-
-
-def make(needs_rearm=False, actions=(PEDAL,), **options):
-    return Controller(limit_rows(actions, {}), needs_rearm, **options)
-
-
-def answer(controller, step, now_s, output=GOOD, **changes):
-    controller.begin(Received(make_state(step, **changes), now_s, 0), now_s)
-    return controller.finish(output, QUICK_NS, now_s + 0.001)
 
 
 def test_the_first_state_is_answered_with_drive():
@@ -115,88 +105,11 @@ def test_between_episodes_there_is_no_watchdog():
     assert controller.safety.safe_stops == 0
 
 
-def test_a_vehicle_stands_at_the_end_of_an_episode_and_drives_in_the_next():
-    controller = make(needs_rearm=True)
-    answer(controller, 0, 0.0)
-    order = answer(controller, 1, 0.1, final=True)
-    assert (order.mode, order.reason, order.action) == ("safe_stop", "final_state", [-1.0])
-    assert controller.safety.mode is Mode.STANDBY
-    assert controller.safety.safe_stops == 0  # it is no fault
-    assert answer(controller, 2, 0.2).mode == "drive"
-
-
 def test_nothing_is_due_before_the_first_state():
     controller = make()
     assert controller.next_deadline_s() is None
     assert controller.tick(100.0) is None
     assert controller.farewell() is None
-
-
-def test_a_rearm_needs_a_vehicle_a_safe_stop_and_fresh_states():
-    assert "no vehicle" in stop(make()).rearm(0.3)
-    controller = make(needs_rearm=True)
-    answer(controller, 0, 0.0)
-    assert "nothing to re-arm" in controller.rearm(0.0)
-    controller = stop(make(needs_rearm=True))
-    assert "no fresh states" in controller.rearm(0.3)
-    assert controller.waits_for_rearm
-
-
-def test_a_rearm_with_fresh_states_drives_at_the_next():
-    controller = stop(make(needs_rearm=True))
-    modes = [answer(controller, step, 1 + step * 0.1).mode for step in range(1, 10)]
-    assert set(modes) == {"safe_stop"}
-    assert controller.rearm(1.95) == ""
-    assert answer(controller, 10, 2.0).mode == "drive"
-
-
-def test_a_vehicle_goes_on_between_two_episodes_of_one_drive():
-    controller = make(needs_rearm=True)
-    answer(controller, 0, 0.0, final=True)
-    assert answer(controller, 0, 9.9, episode=1).mode == "drive"
-    assert controller.safety.safe_stops == 0
-
-
-@pytest.mark.parametrize(
-    ("now_s", "session", "reason"),
-    [(10.1, "simulator-a", "pause_too_long"), (1.0, "simulator-b", "other_session")],
-)
-def test_a_vehicle_in_standby_moves_only_for_the_drive_it_was_armed_for(now_s, session, reason):
-    controller = make(needs_rearm=True)
-    answer(controller, 0, 0.0, final=True)
-    orders = [
-        answer(controller, step, now_s + step * 0.1, episode=1, session=session)
-        for step in range(8)
-    ]
-    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", reason)}
-    assert controller.waits_for_rearm
-    assert controller.rearm(now_s + 0.75) == ""
-    assert answer(controller, 8, now_s + 0.8, episode=1, session=session).mode == "drive"
-
-
-def test_without_a_vehicle_a_pause_and_another_simulator_are_no_fault():
-    controller = make()
-    answer(controller, 0, 0.0, final=True)
-    assert answer(controller, 0, 60.0, session="simulator-b").mode == "drive"
-
-
-def test_a_service_with_a_vehicle_waits_for_its_first_permission():
-    controller = make(needs_rearm=True, armed_at_start=False)
-    assert (controller.tick(5.0), controller.next_deadline_s()) == (None, None)
-    assert controller.waits_for_rearm
-    assert "no fresh states" in controller.rearm(5.0)
-    controller.begin(Received(make_state(0), 6.0, 0), 6.0)
-    assert controller.tick(6.0) is None  # the answer comes first
-    order = controller.finish(GOOD, QUICK_NS, 6.001)
-    assert (order.mode, order.reason) == ("safe_stop", "not_armed")
-    for step in range(1, 5):
-        assert answer(controller, step, 6.0 + step * 0.1).mode == "safe_stop"
-    assert controller.rearm(6.45) == ""
-    assert answer(controller, 5, 6.5).mode == "drive"
-
-
-def test_a_service_without_a_vehicle_needs_no_permission():
-    assert answer(make(armed_at_start=False), 0, 0.0).mode == "drive"
 
 
 def test_an_answer_to_a_state_older_than_two_periods_stops():
@@ -205,34 +118,6 @@ def test_an_answer_to_a_state_older_than_two_periods_stops():
     controller.begin(Received(make_state(0), 0.0, 0), 0.9)
     order = controller.finish(GOOD, QUICK_NS, 0.901)
     assert (order.mode, order.reason) == ("safe_stop", "inference_too_long")
-
-
-def test_only_a_stopped_vehicle_without_permission_waits_for_the_operator():
-    for needs_rearm in (False, True):
-        controller = make(needs_rearm=needs_rearm)
-        assert not controller.waits_for_rearm
-        answer(controller, 0, 0.0)
-        assert not controller.waits_for_rearm
-        stop(controller)
-        assert controller.waits_for_rearm == needs_rearm
-    answer(controller, 1, 0.35)
-    assert controller.rearm(0.4) == ""
-    assert not controller.waits_for_rearm
-
-
-def test_a_vehicle_fault_between_two_states_takes_the_permission_back():
-    controller = make(needs_rearm=True)
-    answer(controller, 0, 0.0)
-    stop(controller)
-    for step in range(1, 5):
-        answer(controller, step, 0.4 + step * 0.1)
-    assert controller.rearm(0.81) == ""
-    controller.vehicle_fault = "vehicle_lying"
-    controller.tick(0.85)
-    controller.vehicle_fault = ""
-    assert controller.waits_for_rearm
-    orders = [answer(controller, step, 0.4 + step * 0.1) for step in range(5, 12)]
-    assert {(order.mode, order.reason) for order in orders} == {("safe_stop", "vehicle_fault")}
 
 
 def test_a_safe_stop_holds_the_last_steering():
@@ -336,33 +221,3 @@ def test_a_rate_limit_counts_from_the_last_order_whatever_its_mode():
     controller.tick(0.4)
     actions = [answer(controller, step, step * 0.1 + 0.2).action for step in range(2, 8)]
     assert actions == [[-1.0]] * 4 + [[-0.75], [-0.5]]
-
-
-def stop(controller):
-    answer(controller, 0, 0.0)
-    controller.tick(0.3)
-    return controller
-
-
-def test_a_vehicle_at_fault_stops_at_the_next_tick_and_is_not_rearmed():
-    controller = make(needs_rearm=True)
-    answer(controller, 0, 0.0)
-    controller.vehicle_fault = "vehicle_silent"
-    order = controller.tick(0.01)
-    assert (order.mode, order.reason) == ("safe_stop", "vehicle_fault")
-    assert "vehicle_silent" in controller.rearm(0.02)
-    for step in range(1, 10):
-        assert answer(controller, step, step * 0.1).mode == "safe_stop"
-    controller.vehicle_fault = ""
-    assert answer(controller, 10, 1.0).mode == "safe_stop"  # nobody has allowed it
-    assert controller.rearm(1.01) == ""
-    modes = [answer(controller, step, step * 0.1).mode for step in range(11, 16)]
-    assert modes[-1] == "drive"
-
-
-def test_a_vehicle_at_fault_never_begins_to_drive():
-    controller = make(needs_rearm=True)
-    controller.vehicle_fault = "vehicle_lying"
-    assert controller.tick(0.0) is None
-    order = answer(controller, 0, 0.0)
-    assert (order.mode, order.reason) == ("safe_stop", "vehicle_fault")

@@ -30,13 +30,14 @@ _EXCLUDED = (
     "core/ReplaceComparisonOperator_(Lt|LtE|Gt|GtE|Eq|NotEq)_(Is|IsNot)$",
 )
 
+_CONTROLLER = ("test_controller", "test_controller_vehicle", "test_controller_properties")
 _HUNTER = ("test_hunter_enable", "test_hunter_stops", "test_hunter_drive", "test_hunter_table")
 # Each module with the tests that must notice a change of it, the quick ones first.
 TARGETS = {
-    "safety": ("test_safety", "test_controller", "test_controller_properties"),
+    "safety": ("test_safety", *_CONTROLLER),
     "latest": ("test_latest",),
     "wire": ("test_wire",),
-    "controller": ("test_controller", "test_controller_properties"),
+    "controller": _CONTROLLER,
     "vehicles/hunter/states": _HUNTER,
     "vehicles/hunter/core": _HUNTER,
 }
