@@ -73,8 +73,12 @@ class OnnxDriver:
         return np.clip(self.policy.act(observation), -1.0, 1.0)
 
 
-def make_environment(scenario: str, condition: str = "nominal") -> Any:
+def make_environment(
+    scenario: str, condition: str = "nominal", printed_reward: bool = False
+) -> Any:
     """The scenario's environment, without wrappers, in the scene of a test condition.
+
+    With ``printed_reward`` it pays what eq. 31 or 32 says, without the scenario's weight.
 
     Raises:
         UserError: no such scenario.
@@ -83,7 +87,10 @@ def make_environment(scenario: str, condition: str = "nominal") -> Any:
         raise UserError(f"unknown scenario {scenario!r}; there is {', '.join(SCENARIOS)}")
     # Noise disturbs the command, not the scene: evaluation.py adds it.
     scene = "variant" if condition == "variant" else "nominal"
-    return gymnasium.make(SCENARIOS[scenario], scene=scene).unwrapped
+    env: Any = gymnasium.make(SCENARIOS[scenario], scene=scene).unwrapped
+    if printed_reward:
+        env.config = env.config.with_printed_reward()
+    return env
 
 
 def load_driver(policy: str, env: Any) -> tuple[Driver, str]:

@@ -24,6 +24,7 @@ from trainer.experiments.plan import (
     NORMAL,
     POOR,
     PRINTED_RATES,
+    PRINTED_REWARD,
     REMEDY,
     SCENARIO_TITLES,
     TOUGH,
@@ -155,8 +156,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         by_metric=False,
     ),
     "switches": _curves(
-        "what the paper leaves open: loss form, importance weights, learning rates, actor judged",
-        _lines(("phil_td3",), NORMAL, EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, LAST_ACTOR),
+        "what the paper leaves open: losses, weights, learning rates, reward scale, actor judged",
+        _lines(
+            ("phil_td3",),
+            *(NORMAL, EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, PRINTED_REWARD, LAST_ACTOR),
+        ),
         ours.judge_switches,
         by_metric=False,
     ),

@@ -11,13 +11,17 @@ HUMAN_MODEL = "human_model"
 
 SETTINGS = (
     "normal", "tough", "poor", "remedy",
-    "exact_losses", "importance", "printed_rates", "last_actor", "network",
+    "exact_losses", "importance", "printed_rates", "printed_reward", "last_actor", "network",
 )  # fmt: skip
-NORMAL, TOUGH, POOR, REMEDY, EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, LAST_ACTOR, NETWORK = SETTINGS
+(
+    NORMAL, TOUGH, POOR, REMEDY,
+    EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, PRINTED_REWARD, LAST_ACTOR, NETWORK,
+) = SETTINGS  # fmt: skip
 """Section VI's definition; one frame instead of two; one third of the demonstrations random; a
 price on the action before tanh, for algorithms whose policy saturates; losses as eq. 22 and 23 are
 printed; the importance weights that the paper calls optional; table A5's learning rates, which the
-authors' code has the other way round; the actor as it stands judged, not its average;
+authors' code has the other way round; weight 1 on the reward's term of speed or steering; the actor
+as it stands judged, not its average;
 training behind ``NETWORK_SPEC``."""
 
 POOR_SHARE = 1.0 / 3.0

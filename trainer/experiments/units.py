@@ -12,6 +12,7 @@ from typing import Any
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from trainer.drivers import EXPERTS, TRIGGERS, make_environment
+from trainer.evaluation import COMMAND_NOISE
 from trainer.experiments.plan import (
     HUMAN_MODEL,
     LAST_ACTOR,
@@ -20,6 +21,7 @@ from trainer.experiments.plan import (
     NETWORK_SPEC,
     POOR,
     POOR_SHARE,
+    PRINTED_REWARD,
     SETTINGS,
     Plan,
 )
@@ -34,7 +36,13 @@ ID_LENGTH = 12
 NOT_DECIDING = ("device", "threads", "checkpoint_every")
 """Fields of a run that change where and how fast it is computed. A unit always learns on one
 thread; a GPU sums in another order, as another processor does, and is written beside the result."""
-NEUTRAL: dict[str, Any] = {"poor_guidance_share": 0.0, "latency": "none"}
+NEUTRAL: dict[str, Any] = {
+    "poor_guidance_share": 0.0,
+    "latency": "none",
+    "printed_reward": False,
+    "left_turn_tests": "b1b2df6847a6",
+    "congestion_tests": "082f423f4a49",
+}
 """Fields that came after the first results, with the value that means what was before them: left
 out of the id while they hold it, so that no result is lost. Add a row with each new field."""
 
@@ -101,6 +109,7 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
         device=device,
         threads=1,
         averaged_actor=unit.setting != LAST_ACTOR,
+        printed_reward=unit.setting == PRINTED_REWARD,
         poor_guidance_share=POOR_SHARE if unit.setting == POOR else 0.0,
         latency=NETWORK_SPEC if unit.setting == NETWORK else "none",
         learner=learner,
@@ -112,7 +121,7 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
 
     The human model counts by the contents of its file, when it takes over by the numbers of guide,
     trigger and the expert behind it, and neither where no human guides; the scenario by every
-    number of its config.
+    number of its config, and the tests by theirs.
     """
     human = _fingerprint(human_file(unit.scenario, humans)) if unit.needs_human else "nobody"
     values: dict[str, Any] = {
@@ -120,6 +129,7 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
         "human": human,
         "test_runs": plan.test_runs,
         "scenario": _numbers_of(unit.scenario),
+        f"{unit.scenario}_tests": _tests_of(unit.scenario),
     }
     if unit.trained:
         run = run_config(unit, plan, humans).as_dict()
@@ -158,8 +168,13 @@ def human_file(scenario: str, humans: Path) -> Path:
 
 
 @cache
-def _numbers_of(scenario: str) -> dict[str, Any]:
-    return asdict(make_environment(scenario).config)
+def _numbers_of(scenario: str, condition: str = "nominal") -> dict[str, Any]:
+    return asdict(make_environment(scenario, condition).config)
+
+
+def _tests_of(scenario: str) -> str:
+    """What decides the tests beside the nominal scene."""
+    return digest({"noise": COMMAND_NOISE, "variant": _numbers_of(scenario, "variant")})
 
 
 def _constants_of(kind: Any) -> dict[str, Any]:

@@ -15,11 +15,14 @@ from typing import Any
 import torch
 
 from edge_runtime.episode_report import EpisodeResult
-from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_driver, make_environment
+from trainer.benches.machine import processor_model
+from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver, make_environment
 from trainer.evaluation import CONDITIONS, drive_episodes
 from trainer.experiments.store import TESTS_FILE, UNIT_FILE, Store
 from trainer.experiments.units import Unit, deciding, run_config
 from trainer.files import make_directory
+from trainer.learner.kernel import load as load_kernel
+from trainer.learner.precision import multiplies_bfloat16
 from trainer.revision import source_revision
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics
 from trainer.training.run import TrainingRun
@@ -35,6 +38,7 @@ KEPT_METRICS = (
     "human_steps",
     "validation_success",
     "validation_distance_m",
+    "validation_reward",
 )
 """Columns of a run's metrics that are committed."""
 KEPT_TESTS = (
@@ -161,16 +165,23 @@ def _about(task: Task, run_dir: Path) -> dict[str, Any]:
     if task.device == "cpu":
         names.append("waiting_s")  # elsewhere a part of acting
     seconds = sum(float(row.get(name) or 0.0) for row in rows for name in names)
-    return {
+    about = {
         "id": task.store.id(task.unit),
         **deciding(task.unit, task.store.plan, task.store.humans),
         "computed": {
             "device": task.device,
+            "processor": processor_model(),
+            "bfloat16": multiplies_bfloat16(task.device),
+            "compiled_kernel": load_kernel("trunk") is not None,
             "torch": torch.__version__,
             "source_revision": source_revision(),
             "training_s": round(seconds),
         },
     }
+    if task.unit.trained:
+        # Counted from 1, as everywhere in the results: the actor after so many episodes.
+        about["tested_actor_of_episode"] = load_actor(run_dir)[1]["episode"]
+    return about
 
 
 def _csv_of(rows: Sequence[dict[str, str]]) -> bytes:

@@ -61,6 +61,10 @@ class VehicleEnd:
                 self._link.answer(arrival, _command(arrival.step, policy(arrival.message)))
         return self._decide()
 
+    def release_brake(self) -> None:
+        """Until the next tick: whoever is in the car has taken over."""
+        self._press_brake(False)
+
     def _decide(self) -> Held:
         decision = self._link.decide()
         braking = bool(decision.brake_reason)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from trainer.scenarios.environment import Range, Scene
 from trainer.scenarios.vehicle_types import CARS_ONLY, MIXED, Mix
@@ -72,6 +72,10 @@ class CongestionConfig:
     """The picture shows 30 m x 16.9 m of ground, all three lanes. It moves along the road with the
     ego car, and neither turns nor moves aside: place and heading show as they are, and other cars'
     movement between the two frames is their speed relative to the ego car's."""
+
+    def with_printed_reward(self) -> CongestionConfig:
+        """The same with eq. 32 as it is printed, but for the sign."""
+        return replace(self, steer_weight=1.0)
 
     @staticmethod
     def of(scene: Scene) -> CongestionConfig:

@@ -6,7 +6,7 @@ road crosses the path from the left and never yields.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,6 +80,10 @@ class LeftTurnConfig:
     metres_per_pixel: float = 0.5
     """The picture shows 40 m x 22.5 m of ground and does not move: 30 m of the main road to the
     left, so that a car at 6 m/s is seen for longer than the turn takes."""
+
+    def with_printed_reward(self) -> LeftTurnConfig:
+        """The same with eq. 31 as it is printed."""
+        return replace(self, speed_weight=1.0)
 
     @staticmethod
     def of(scene: Scene) -> LeftTurnConfig:

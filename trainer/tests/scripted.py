@@ -34,11 +34,17 @@ class ScriptedEnv:
     config = SimpleNamespace(control_period_s=0.1)
     observation_space = spaces.Box(0, 255, (2, 45, 80), np.uint8)
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    brake_action = np.array([0.0], np.float32)
 
     def __init__(self, length: int, outcome: str) -> None:
         self.length, self.outcome = length, outcome
         self.steps = 0
         self.actions: list[float] = []
+        self.braking = False
+        self.braked: list[bool] = []
+
+    def press_brake(self, pressed: bool) -> None:
+        self.braking = pressed
 
     def reset(self, *, seed: int | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         self.steps = 0
@@ -47,6 +53,7 @@ class ScriptedEnv:
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.steps += 1
         self.actions.append(float(action[0]))
+        self.braked.append(self.braking)
         info: dict[str, Any] = {
             "distance_m": float(self.steps),
             "lateral_acceleration_mps2": 0.0,

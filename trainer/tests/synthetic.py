@@ -24,6 +24,7 @@ FACTORS = {
     "exact_losses": 0.9,
     "importance": 0.9,
     "printed_rates": 0.9,
+    "printed_reward": 0.5,
     "last_actor": 0.95,
     "network": 0.95,
 }
@@ -45,6 +46,7 @@ def outcome(unit: Unit, episodes: int = 100, runs: int = 50, conditions=CONDITIO
             "distance_m": full_m * np.clip(learned + noise, 0.0, 1.0),
             "validation_success": success,
             "validation_distance_m": full_m * success,
+            "validation_reward": 20.0 * success - 10.0,
         }
     tests = {}
     for place, condition in enumerate(conditions):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
+from trainer.drivers import make_environment
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.congestion_config import CongestionConfig
 from trainer.scenarios.geometry import corners, overlap
@@ -61,6 +62,12 @@ def test_straight_from_mid_lane_reaches_the_goal_behind_the_car_ahead():
     gap_m = leader.position[0] - env.ego.position[0] - 2.5 - 0.5 * leader.LENGTH
     assert 2.0 < gap_m < 12.0
     assert env.ego.speed == pytest.approx(leader.speed, abs=0.3)
+
+
+def test_the_printed_reward_is_eq_32_without_a_weight():
+    env = make_environment("congestion", printed_reward=True)
+    env.reset(seed=0)
+    assert [env.step(action)[1] for action in (STRAIGHT, 0.5 * LEFT, 0.5 * LEFT)] == [0, -0.5, 0]
 
 
 def test_zero_steering_succeeds_in_less_than_half_and_random_rarely():

@@ -79,6 +79,16 @@ def test_how_often_checkpoints_are_written_changes_no_id(humans):
     assert unit_id(GUIDED, plan, humans) == unit_id(GUIDED, TINY, humans)
 
 
+def test_what_the_tests_are_counts_as_soon_as_it_is_another(humans, monkeypatch):
+    """The tests of the first results are left out of the ids."""
+    before = unit_id(GUIDED, TINY, humans)
+    assert "left_turn_tests" not in deciding(GUIDED, TINY, humans)
+    monkeypatch.setattr(units, "COMMAND_NOISE", 0.2)
+    noisier = unit_id(GUIDED, TINY, humans)
+    monkeypatch.setattr(units, "_numbers_of", lambda *place: {"cars": place})
+    assert len({before, noisier, unit_id(GUIDED, TINY, humans)}) == 3
+
+
 def test_device_and_threads_are_not_among_what_decides(humans):
     assert run_config(GUIDED, TINY, humans, "cuda").device == "cuda"
     assert not {"device", "threads", "checkpoint_every"} & set(
@@ -145,6 +155,12 @@ def test_poor_guidance_is_one_third_and_leaves_other_ids_alone(humans):
     # The field came later: while it says nothing, ids are those of the time without it.
     assert "poor_guidance_share" not in deciding(GUIDED, TINY, humans)["run"]
     assert unit_id(GUIDED, TINY, humans) == before
+
+
+def test_the_printed_reward_is_a_setting_and_leaves_other_ids_alone(humans):
+    config = run_config(replace(GUIDED, setting="printed_reward"), TINY, humans)
+    assert config == replace(run_config(GUIDED, TINY, humans), printed_reward=True)
+    assert "printed_reward" not in deciding(GUIDED, TINY, humans)["run"]
 
 
 @pytest.mark.parametrize(

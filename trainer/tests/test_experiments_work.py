@@ -15,6 +15,7 @@ from trainer.experiments.units import Unit
 from trainer.experiments.work import FINISHED, KEPT_TESTS, STOPPED, Task, compute
 from trainer.human.model import HumanModel, HumanModelConfig
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in
+from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun
 
 
@@ -46,6 +47,9 @@ def test_a_unit_ends_as_a_small_result_and_an_actor(straight):
     about = json.loads(kept(straight, "config.json"))
     assert about["id"] == straight.id(UNIT)
     assert about["run"]["learner"]["batch_size"] == TINY.learner["batch_size"]
+    validated = [row for row in read_metrics(straight.result_dir(UNIT)) if row["validation_reward"]]
+    assert about["tested_actor_of_episode"] in [int(row["episode"]) + 1 for row in validated]
+    assert about["computed"]["processor"]
     # Neither a machine's path nor more digits than anyone needs.
     assert str(straight.runs.parent) not in kept(straight, "config.json").decode()
     numbers = re.findall(r"[\d.]+", kept(straight, "tests.json").decode())

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
+from trainer.drivers import make_environment
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 
 FULL, NOTHING, BRAKE = (np.array([pedal], np.float32) for pedal in (1.0, 0.0, -1.0))
@@ -51,6 +52,15 @@ def test_the_brake_stops_the_car_and_does_not_reverse_it():
     # Eq. 31 with its scale: standing costs 0.02 x |0 - 5| a step.
     assert rewards[-1] == pytest.approx(-0.1)
     assert len(rewards) == env.config.max_steps
+
+
+def test_the_printed_reward_is_eq_31_without_a_weight():
+    config = replace(EMPTY_ROAD, max_steps=50)
+    own, info = drive(LeftTurnEnv(config), BRAKE)
+    printed, _ = drive(LeftTurnEnv(config.with_printed_reward()), BRAKE)
+    assert info["outcome"] == "timeout"
+    assert printed == pytest.approx(np.array(own) / config.speed_weight)
+    assert make_environment("left_turn", printed_reward=True).config.speed_weight == 1.0
 
 
 def test_a_crash_is_a_failure():

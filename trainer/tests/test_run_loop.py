@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge_runtime.latency.model import parse_spec
 from trainer.learner import equations
 from trainer.tests.scripted import CONFIG, HUMAN, LEARNER, POLICY, scripted_run
+from trainer.training.wheel import make_wheel
 
 
 @pytest.mark.parametrize(
@@ -95,6 +97,13 @@ def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):
     stds = [0.5, 0.25, 0.125, 0.1, 0.1]
     assert reported == pytest.approx(stds)
     assert run.env.actions == pytest.approx([POLICY + std for std in stds])
+
+
+def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_network(tmp_path):
+    run = scripted_run(tmp_path, CONFIG, length=7, human_steps=(4, 5))
+    run.wheel = make_wheel(run.learning, run.env, parse_spec("up.loss=100%"))
+    run.train()
+    assert run.env.braked == [False, False, True, False, False, True, True]
 
 
 def test_the_human_watches_one_episode_in_guided_share(tmp_path):

@@ -44,6 +44,9 @@ class RunConfig:
     (Polyak and Juditsky, 1992) of the actor that learns, which swings from episode to episode."""
     poor_guidance_share: float = 0.0
     """Share of the human's actions that are replaced by random ones (section VII-E: one third)."""
+    printed_reward: bool = False
+    """Weight 1 on the term of eq. 31 or 32, as the equations are printed, instead of the scenario's
+    own (``LeftTurnConfig.speed_weight``, ``CongestionConfig.steer_weight``)."""
     evaluate_every: int = 20
     """Episodes between two evaluations on the validation seeds; 0: never."""
     evaluation_runs: int = 20
@@ -69,7 +72,11 @@ class RunConfig:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> RunConfig:
         """The inverse of ``as_dict``."""
-        # A config of before the network has no field for it.
-        values = {"latency": RunConfig.latency, **values}
+        # Configs of before the network, or before the switch of the reward, have no such field.
+        values = {
+            "latency": RunConfig.latency,
+            "printed_reward": RunConfig.printed_reward,
+            **values,
+        }
         known = {name: values[name] for name in RunConfig.__dataclass_fields__}
         return RunConfig(**{**known, "learner": LearnerConfig(**values["learner"])})

@@ -55,6 +55,9 @@ class EpisodeMetrics:
     validation_success: float
     """Success rate on the validation seeds (nan where the episode ended without one)."""
     validation_distance_m: float
+    validation_reward: float
+    """Mean of the episodes' sums of rewards: between equal success rates it decides which actor is
+    kept."""
 
 
 NAMES = [f.name for f in fields(EpisodeMetrics)]

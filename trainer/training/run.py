@@ -53,8 +53,10 @@ class TrainingRun:
     def __init__(self, config: RunConfig, run_dir: Path, resume: bool = False) -> None:
         self.config, self.run_dir = config, run_dir
         self.algorithm = ALGORITHMS[config.algorithm]
-        self.env = make_environment(config.scenario)
-        self.validation_env = make_environment(config.scenario)
+        self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
+        self.validation_env = make_environment(
+            config.scenario, printed_reward=config.printed_reward
+        )
         action_size = self.env.action_space.shape[0]
         self.learning = self._make_learning(action_size)
         self.network = parse_spec(config.latency)
@@ -185,6 +187,8 @@ class TrainingRun:
         if guided and self.guide is not None:
             intervention = self._spoil(self.guide.watch(observation, policy_action))
         human_action = None if intervention is None else intervention.action
+        if intervention is not None:
+            self.wheel.yield_to_human()
         action = equations.masked_action(policy_action, human_action)
         next_observation, reward, terminated, truncated, info = self.env.step(action)
         moved_s = time.perf_counter()
@@ -255,8 +259,9 @@ class TrainingRun:
         results = drive_episodes(self.validation_env, driver, chosen, latency=self.network)
         success = float(np.mean([result.outcome == GOAL for result in results]))
         distance_m = float(np.mean([result.distance_m for result in results]))
-        metrics.validation_success, metrics.validation_distance_m = success, distance_m
         reward = float(np.mean([result.reward for result in results]))
+        metrics.validation_success, metrics.validation_distance_m = success, distance_m
+        metrics.validation_reward = reward
         if (success, reward) >= self.best_validation:
             self.best_validation = (success, reward)
             kept = getattr(self.learning.learner, self._kept_actor)

@@ -53,4 +53,5 @@ class Tally:
             waiting_s=learned.waiting_s,
             validation_success=float("nan"),
             validation_distance_m=float("nan"),
+            validation_reward=float("nan"),
         )

@@ -36,6 +36,9 @@ class Wheel(Protocol):
         """What the vehicle is told in the tick of this observation."""
         ...
 
+    def yield_to_human(self) -> None:
+        """A human has taken over in this tick: only what they do moves the vehicle."""
+
     def store(
         self, action: Action, reward: float, observation: Observation, ends: Ends, human: bool
     ) -> None:
@@ -63,6 +66,9 @@ class DirectWheel:
     def act(self, observation: Observation, policy: Policy) -> Action:
         """The policy's action."""
         return policy(observation)
+
+    def yield_to_human(self) -> None:
+        """The policy's action is not carried out; nothing else holds the vehicle."""
 
     def store(
         self, action: Action, reward: float, observation: Observation, ends: Ends, human: bool
@@ -93,6 +99,10 @@ class RemoteWheel:
             self._learning.start_episode(self._known[0])
             self._storing = True
         return self._vehicle_end.tick(observation, policy).action
+
+    def yield_to_human(self) -> None:
+        """The vehicle lets go of the brake that it may have pressed for want of commands."""
+        self._vehicle_end.release_brake()
 
     def store(
         self, action: Action, reward: float, observation: Observation, ends: Ends, human: bool

@@ -19,7 +19,7 @@ from trainer.experiments.figures.style import (
     other_colour,
 )
 from trainer.experiments.gathered import Episodes, Gathered, Numbers, Outcome
-from trainer.experiments.plan import FULL_PATH_M, NORMAL, SCENARIO_TITLES
+from trainer.experiments.plan import FULL_PATH_M, NORMAL, PRINTED_REWARD, SCENARIO_TITLES
 from trainer.experiments.statistics import WINDOW, smoothed
 
 METRICS = {"episode_return": "training reward", "distance_m": "surviving distance, m"}
@@ -81,6 +81,8 @@ def _draw_panel(
     panel: Any, gathered: Gathered, lines: Sequence[Line], scenario: str, metric: str
 ) -> None:
     for line in lines:
+        if metric == "episode_return" and line.setting == PRINTED_REWARD:
+            continue  # Its rewards are on another scale.
         outcomes = gathered.of(scenario, line.algorithm, line.setting)
         named = f"{line.label} ({len(outcomes)} of {gathered.seeds} seeds)"
         shade, style = _look(line, lines)
