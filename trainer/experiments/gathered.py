@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
-from trainer.experiments.plan import NORMAL, Scene
+from trainer.experiments.plan import FULL_PATH_M, NORMAL, Scene
 from trainer.experiments.store import TESTS_FILE, Store
 from trainer.experiments.units import Unit
 from trainer.training.metrics import METRICS_FILE
@@ -34,8 +34,9 @@ class Drives:
     columns: Mapping[str, Any]
 
     def __getitem__(self, name: str) -> Numbers:
-        """One quantity, a value an episode."""
-        return np.asarray(self.columns[name], dtype=float)
+        """One quantity, a value an episode; of ``reached`` 1 or 0."""
+        values = self.reached if name == "reached" else self.columns[name]
+        return np.asarray(values, dtype=float)
 
     @cached_property
     def reached(self) -> NDArray[np.bool_]:
@@ -53,19 +54,11 @@ class Outcome:
     tests: Mapping[str, Drives]
     """Condition -> test episodes."""
 
-    def curve(self, metric: str) -> Numbers:
-        """A training metric, a value an episode.
-
-        Where it is measured now and then only, as validation is, the last value holds until the
-        next; the first one holds before it, too.
-        """
-        values = np.asarray(self.metrics[metric], dtype=float)
-        known = np.flatnonzero(~np.isnan(values))
-        last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
-        return values[known[np.maximum(last, 0)]] if len(known) else values
-
     def measured(self, metric: str) -> tuple[Episodes, Numbers]:
-        """Episodes, counted from 1, after which a metric was measured, and its values there."""
+        """Episodes, counted from 1, after which a metric was measured, and its values there.
+
+        Most are measured after each one, a validation now and then.
+        """
         values = np.asarray(self.metrics[metric], dtype=float)
         at = np.flatnonzero(~np.isnan(values))
         return at + 1, values[at]
@@ -73,7 +66,7 @@ class Outcome:
     @property
     def best_validation(self) -> float:
         """Success of the actor that was tested, on the validation seeds of its run."""
-        return float(np.nanmax(self.curve("validation_success")))
+        return float(self.measured("validation_success")[1].max())
 
 
 class Gathered:
@@ -152,6 +145,13 @@ def pooled(
         tests = outcome.tests[condition]
         values.append(tests[quantity][tests.reached] if arrived else tests[quantity])
     return np.concatenate([np.zeros(0), *values])
+
+
+def within_path(scene: Scene, distances_m: Numbers) -> Numbers:
+    """Surviving distances without what was driven beyond the goal: at most one step, and a matter
+    of the speed there. Comparisons leave it out.
+    """
+    return np.minimum(distances_m, FULL_PATH_M[scene.scenario])
 
 
 def gather(store: Store, units: Iterable[Unit], seeds: int) -> Gathered:

@@ -21,7 +21,7 @@ from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.experiments.runner import FAILED, Tally, episodes_of, say
 from trainer.experiments.store import Store
 from trainer.experiments.units import Unit, human_file
-from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task, advance
+from trainer.experiments.work import BUSY, FINISHED, PATIENCE_S, STOPPED, Task, advance
 from trainer.files import make_directory
 from trainer.progress import ProgressBar
 from trainer.training.metrics import METRICS_FILE
@@ -72,7 +72,7 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Tally:
         with ExitStack() as locks, bar:
             waiting = {}
             for task in tasks:
-                if not locks.enter_context(task.store.lock(task.unit)):
+                if not locks.enter_context(task.store.lock(task.unit, PATIENCE_S)):
                     say(f"left to {task.store.holder(task.unit)}: {task.unit}")
                     tally.add(BUSY)
                     continue

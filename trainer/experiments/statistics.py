@@ -1,4 +1,4 @@
-"""Means, intervals and tests, and how fast one curve gets where another one ends."""
+"""Means, intervals and tests."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ class Estimate(NamedTuple):
     """Values behind it."""
 
     def text(self, digits: int = 2, unit: str = "") -> str:
-        """As in "0.97 [0.93, 0.99]"."""
+        """As in "0.97 [0.93, 0.99]"; a dash for nothing."""
+        if not self.size:
+            return "–"
         shown = f"{self.value:.{digits}f}{unit}"
         if not np.isfinite([self.low, self.high]).all():
             return shown
@@ -90,64 +92,6 @@ def stars(p_value: float) -> str:
     return next((mark for limit, mark in marks if p_value < limit), "n.s.")
 
 
-def smoothed(curves: Sequence[Numbers]) -> Numbers:
-    """Curves of several seeds, each a moving average: float [seeds, episodes]."""
-    shortest = min(len(curve) for curve in curves)
-    return np.stack([moving_average(curve[:shortest], WINDOW) for curve in curves])
-
-
-def final_average(curve: Numbers) -> float:
-    """Mean over the last episodes."""
-    return float(np.mean(curve[-WINDOW:]))
-
-
-def episodes_to_reach(curve: Numbers, level: float) -> float:
-    """Episodes until a smoothed curve first reaches a level; infinite where it never does.
-
-    The first episodes count only once the average is one of ``WINDOW`` values: before, one lucky
-    episode would do.
-    """
-    start = min(WINDOW, len(curve)) - 1
-    reached = np.flatnonzero(curve[start:] >= level - 1e-9)
-    return float(reached[0] + start + 1) if len(reached) else float("inf")
-
-
-class Efficiency(NamedTuple):
-    """How much sooner a learner gets where the best baseline ends."""
-
-    ratio: Estimate
-    """The baseline's episodes over the learner's; 95 % bootstrap interval over the seeds."""
-    episodes: float
-    baseline_episodes: float
-
-
-def efficiency(ours: Numbers, baseline: Numbers, common: bool = False) -> Efficiency:
-    """Compare smoothed curves float [seeds, episodes] by the episodes that their means need.
-
-    The level is the final value of the baseline's mean, or the lower of both where it is to be a
-    ``common`` one. A learner that never gets there has the ratio 0. The bootstrap draws whole
-    seeds, of both independently, 2000 times; with few seeds it understates the spread.
-    """
-
-    def needed(own: Numbers, other: Numbers) -> tuple[float, float]:
-        curves = (own.mean(axis=0), other.mean(axis=0))
-        level = min(curve[-1] for curve in curves) if common else curves[1][-1]
-        first, second = (episodes_to_reach(curve, level) for curve in curves)
-        return first, second
-
-    episodes, baseline_episodes = needed(ours, baseline)
-    count = min(len(ours), len(baseline))
-    low, high = float("-inf"), float("inf")
-    if count > 1:
-        random = np.random.default_rng(0)
-        ratios = []
-        for _ in range(RESAMPLES):
-            own = ours[random.integers(len(ours), size=len(ours))]
-            other = baseline[random.integers(len(baseline), size=len(baseline))]
-            first, second = needed(own, other)
-            ratios.append(second / first)
-        tail = 0.5 * (1.0 - CONFIDENCE)
-        low, high = (float(x) for x in np.quantile(ratios, (tail, 1.0 - tail)))
-    return Efficiency(
-        Estimate(baseline_episodes / episodes, low, high, count), episodes, baseline_episodes
-    )
+def smoothed(curves: Numbers) -> Numbers:
+    """Curves of several seeds, float [seeds, episodes], each as a moving average."""
+    return np.stack([moving_average(curve, WINDOW) for curve in curves])

@@ -110,19 +110,18 @@ class Store:
         _sweep(target.parent)
 
     @contextmanager
-    def lock(self, unit: Unit) -> Iterator[bool]:
+    def lock(self, unit: Unit, patience_s: float = 0.0) -> Iterator[bool]:
         """Hold the unit against other processes; gives whether that was possible.
 
         The lock is the kernel's, on a file that names its holder: when a process dies, however it
-        dies, its lock is gone with it, and the next one takes over.
+        dies, its lock is gone with it, and the next one takes over. Whoever wants to work is
+        patient for a moment: ``state`` takes the lock, too, to see whether it can be had.
         """
         path = self.lock_file(unit)
         make_directory(path.parent)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not _locked(descriptor, patience_s):
                 yield False
                 return
             os.ftruncate(descriptor, 0)
@@ -144,6 +143,19 @@ class Store:
         except (OSError, ValueError):
             return "another process"
         return f"process {who['pid']} on {who['host']}"
+
+
+def _locked(descriptor: int, patience_s: float) -> bool:
+    """Whether the file's lock could be had."""
+    end_s = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            if time.monotonic() >= end_s:
+                return False
+            time.sleep(0.01)
 
 
 _TEMPORARY = ".unfinished-"

@@ -48,11 +48,9 @@ def claim(
     interval = None
     if decisive is not None and math.isfinite(decisive.low) and math.isfinite(decisive.high):
         interval = (decisive.low, decisive.high)
-    if seeds == 0:
-        ours = "not measured"
     if not complete:
         holds, rule = "undecided", f"{rule}; units are missing"
-    return Claim(text, paper, ours, holds, seeds, rule, interval)
+    return Claim(text, paper, ours or "not measured", holds, seeds, rule, interval)
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,9 @@ FINISHED, STOPPED, BUSY = "finished", "stopped", "busy"
 """How work on a unit ends: with its result; at a checkpoint, for lack of time; at once, since
 another process has it."""
 
+PATIENCE_S = 1.0
+"""How long a unit may be held before it counts as another process's work."""
+
 OnEpisode = Callable[[int], None]
 """Told how many episodes of the unit are done."""
 
@@ -73,7 +76,7 @@ class Task:
 
 def compute(task: Task, on_episode: OnEpisode) -> str:
     """Compute a unit into its store, from where it stands; how that ended."""
-    with task.store.lock(task.unit) as free:
+    with task.store.lock(task.unit, PATIENCE_S) as free:
         if not free:
             return BUSY
         if task.store.done(task.unit):

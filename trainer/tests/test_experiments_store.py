@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -113,6 +114,21 @@ def hold(store, ready) -> None:
     with store.lock(UNIT) as free:
         ready.send(free)
         time.sleep(60.0)
+
+
+def test_who_wants_to_work_outwaits_a_look(tmp_path):
+    """``state`` takes the lock for a moment; who begins just then must not be sent away."""
+    store = store_in(tmp_path)
+    with ThreadPoolExecutor() as pool:
+        with store.lock(UNIT):
+            patient = pool.submit(_lock_once, store, 30.0)
+            assert not pool.submit(_lock_once, store, 0.05).result()
+        assert patient.result()
+
+
+def _lock_once(store, patience_s):
+    with store.lock(UNIT, patience_s) as free:
+        return free
 
 
 def test_a_lock_holds_others_off_and_falls_with_its_process(tmp_path):

@@ -60,8 +60,8 @@ def test_a_result_is_gathered_as_it_was_stored(straight):
     gathered = gather(straight, [UNIT, replace(UNIT, seed=2)], 2)
     assert gathered.missing == [replace(UNIT, seed=2)]
     (outcome,) = gathered.of("left_turn", "per_td3")
-    assert len(outcome.curve("distance_m")) == 3
-    assert outcome.curve("episode")[-1] == 2.0
+    assert len(outcome.metrics["distance_m"]) == 3
+    assert outcome.metrics["episode"][-1] == 2.0
     assert 0.0 <= outcome.best_validation <= 1.0
     assert not gathered.complete("left_turn", ["per_td3"])
 

@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-from trainer.experiments.claims.compare import (
-    BY_VALUE,
-    BY_WILSON,
+from dataclasses import replace
+
+from trainer.experiments.claims.compare import BY_VALUE
+from trainer.experiments.claims.learning import HI, IA, PER, PHIL
+from trainer.experiments.claims.scenes import (
+    DISTANCE,
+    SUCCESS,
+    path_by_seed,
     scene_claim,
-    seeds_of,
-    spread,
+    shown_of,
     success,
     tested_all,
 )
-from trainer.experiments.claims.learning import HI, IA, PER, PHIL
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.figures.spread import BOXES
-from trainer.experiments.gathered import Gathered, Outcome, pooled
-from trainer.experiments.plan import (
-    FULL_PATH_M,
-    HUMAN_MODEL,
-    SCENES,
-    Scene,
-)
-from trainer.experiments.statistics import Holds, all_of, mean_estimate
+from trainer.experiments.gathered import Gathered
+from trainer.experiments.plan import FULL_PATH_M, HUMAN_MODEL, SCENES, Scene
+from trainer.experiments.statistics import mean_estimate
 from trainer.experiments.verdict import Claim, claim
 
 HUMAN = Line(HUMAN_MODEL)
 SUCCESS_BARS = {"L": 1.0, "L-N": 0.98, "L-V": 0.96, "C": 0.98, "C-N": 0.96, "C-V": 0.92}
 """What this project asks of PHIL-TD3 in each scene."""
+FURTHEST = {"C-V": "furthest; but in table II IA-TD3 78.39 m, PHIL-TD3 77.29 m"}
+"""Where the paper's text and its tables disagree about who survives furthest."""
 HUMAN_SHARE = 0.97
 """Of the full distance, asked of the human model."""
 PATH_SHARE = 0.99
@@ -50,76 +50,44 @@ PAPER_TABLES: dict[str, dict[str, tuple[tuple[float, float], ...]]] = {
 
 def judge_fig9(gathered: Gathered) -> list[Claim]:
     """Success and surviving distance in the six scenes."""
-    others = [IA, HI, PER, HUMAN]
+    others = [IA, HI, PER]
     claims = []
     for scene in SCENES:
-        claims.append(_success_bar(gathered, scene))
-        claims.append(_success_claim(gathered, scene, others))
-        claims.append(
-            scene_claim(
-                gathered,
-                scene,
-                "distance_m",
-                PHIL,
-                others,
-                "PHIL-TD3 survives furthest, the human model included",
-                "furthest",
-            )
-        )
+        claims += [
+            _success_bar(gathered, scene),
+            scene_claim(gathered, scene, SUCCESS, PHIL, others,
+                        "PHIL-TD3 has the highest success rate", "highest"),
+            scene_claim(gathered, scene, DISTANCE, PHIL, others,
+                        "PHIL-TD3 survives furthest", FURTHEST.get(scene.label, "furthest")),
+            scene_claim(gathered, scene, SUCCESS, PHIL, [HUMAN],
+                        "PHIL-TD3 succeeds more often than the human model (this project's bar)",
+                        "–"),
+        ]  # fmt: skip
     return claims
 
 
 def _success_bar(gathered: Gathered, scene: Scene) -> Claim:
-    """Success of the seed that validated best: the policy one would deploy."""
+    """Mean success of all seeds, each of which is shown."""
     outcomes = gathered.tested(scene, PHIL.algorithm)
     bar = SUCCESS_BARS[scene.label]
-    best = success(outcomes and [max(outcomes, key=_validated)], scene.condition)
     everything = success(outcomes, scene.condition)
-    each = ", ".join(f"{success([one], scene.condition).value:.0%}" for one in outcomes)
-    holds: Holds = "yes" if best.value >= bar else "no"
     return claim(
         f"{scene.title}: bar of this project, success of PHIL-TD3 at least {bar:.0%}",
         "highest of all",
-        f"best validated seed {best.text()}; all seeds {everything.text()} ({each})",
-        holds,
+        f"{shown_of(gathered, scene, PHIL, SUCCESS)}, all drives {everything.text()}",
+        "yes" if everything.value >= bar else "no",
         len(outcomes),
-        f"{BY_VALUE} of the best validated seed, {best.size} episodes",
-        best,
+        f"{BY_VALUE}; Wilson's interval shown",
+        everything,
         tested_all(gathered, scene, [PHIL]),
     )
 
 
-def _validated(outcome: Outcome) -> tuple[float, int]:
-    """Best on the validation seeds; of equals, the lower seed. Tests decide nothing here."""
-    return (outcome.best_validation, -outcome.unit.seed)
-
-
-def _success_claim(gathered: Gathered, scene: Scene, others: list[Line]) -> Claim:
-    shares = {
-        line: success(gathered.tested(scene, line.algorithm), scene.condition)
-        for line in (PHIL, *others)
-    }
-    own = shares.pop(PHIL)
-    answers: list[Holds] = []
-    for other in shares.values():
-        separate: Holds = "no" if own.high < other.low else "undecided"
-        answers.append("yes" if own.low > other.high else separate)
-    first = all(own.value >= other.value for other in shares.values() if other.size)
-    shown = [f"{line.label} {each.text()}" for line, each in {PHIL: own, **shares}.items()]
-    return claim(
-        f"{scene.title}: PHIL-TD3 has the highest success rate, the human model included",
-        "highest",
-        f"{', '.join(shown)}; PHIL-TD3 {'first or equal' if first else 'not first'} by value",
-        all_of(answers),
-        seeds_of(gathered, scene, [PHIL, *others]),
-        BY_WILSON,
-        own,
-        tested_all(gathered, scene, [PHIL, *others]),
-    )
-
-
 def judge_fig10(gathered: Gathered) -> list[Claim]:
-    """Time in the left turn and smoothness in the congestion."""
+    """Time in the left turn and smoothness in the congestion, of drives that arrive.
+
+    The paper's boxes of smoothness have the others, too; but who crashes at once was smooth.
+    """
     claims = []
     for scene in SCENES:
         quantity = BOXES[scene.scenario]
@@ -128,12 +96,14 @@ def judge_fig10(gathered: Gathered) -> list[Claim]:
             what = "takes the least time" if scene.scenario == "left_turn" else "is the smoothest"
             claims.append(
                 scene_claim(*place, PHIL, [IA, HI, PER], f"PHIL-TD3 {what}", "least",
-                            -1.0, quantity.arrived)
+                            -1.0, arrived=True)
             )  # fmt: skip
         else:
             for line in (PHIL, IA, HI):
                 text = f"{line.label}, guided by the human, is smoother than vanilla TD3"
-                claims.append(scene_claim(*place, line, [PER], text, "smoother", -1.0))
+                claims.append(
+                    scene_claim(*place, line, [PER], text, "smoother", -1.0, arrived=True)
+                )
     return claims
 
 
@@ -146,11 +116,11 @@ def judge_table(gathered: Gathered, scenario: str) -> list[Claim]:
         numbers = [f"{line.label} {'{:.2f}±{:.2f}'.format(*paper[line.algorithm][place])}"
                    for line in lines]  # fmt: skip
         one = scene_claim(
-            gathered, scene, "distance_m", PHIL, [HUMAN],
+            gathered, scene, DISTANCE, PHIL, [HUMAN],
             "PHIL-TD3 survives further than the human model that taught it", ", ".join(numbers),
         )  # fmt: skip
-        ours = [f"{line.label} {spread(gathered, scene, line, 'distance_m')}" for line in lines]
-        claims.append(Claim(**{**vars(one), "ours": ", ".join(ours)}))
+        ours = [f"{line.label} {shown_of(gathered, scene, line, DISTANCE)}" for line in lines]
+        claims.append(replace(one, ours=", ".join(ours)))
         if scenario == "left_turn":
             claims.append(_distance_bar(gathered, scene, PHIL, PATH_SHARE, "PHIL-TD3"))
     nominal = next(scene for scene in SCENES if scene.scenario == scenario)
@@ -159,19 +129,19 @@ def judge_table(gathered: Gathered, scenario: str) -> list[Claim]:
 
 
 def _distance_bar(gathered: Gathered, scene: Scene, line: Line, share: float, who: str) -> Claim:
-    outcomes = gathered.tested(scene, line.algorithm)
-    distances_m = pooled(outcomes, scene.condition, "distance_m")
-    found = mean_estimate(distances_m)
+    means_m = path_by_seed(gathered, scene, line)
+    found = mean_estimate(means_m)
     least_m = share * FULL_PATH_M[scene.scenario]
     mean_m = PAPER_TABLES[scene.scenario][line.algorithm][_place(scene)][0]
+    each = f" ({' '.join(f'{mean_m:.2f}' for mean_m in means_m)})" if len(means_m) > 1 else ""
     return claim(
         f"{scene.title}: bar of this project, {who} survives {share:.0%} of the full path "
         f"({least_m:.2f} m)",
         f"{mean_m:.2f} m",
-        f"{found.text()} m over {found.size} episodes",
+        f"{found.text()} m{each}",
         "yes" if found.value >= least_m else "no",
-        len(outcomes),
-        BY_VALUE,
+        len(means_m),
+        f"{BY_VALUE}, nothing beyond the goal counted",
         found,
         tested_all(gathered, scene, [line]),
     )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from trainer.experiments.figures.curves import METRICS
 from trainer.experiments.figures.style import colour, letter, new_figure, note_missing, short
-from trainer.experiments.gathered import Gathered, pairs, pooled
+from trainer.experiments.gathered import Gathered, pairs, pooled, within_path
 from trainer.experiments.plan import (
     FULL_PATH_M,
     NORMAL,
@@ -20,18 +20,18 @@ from trainer.experiments.plan import (
     TOUGH,
     Scene,
 )
-from trainer.experiments.statistics import final_average, paired_t, stars
+from trainer.experiments.progress import TITLES, final
+from trainer.experiments.statistics import paired_t, stars
 
 
 def draw_difficulty(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
     """Final averages in the normal and the tough setting, with the ratio of the two."""
-    figure = new_figure(10.0, 6.6)
-    panels = figure.subplots(2, 2)
-    for row, scenario in enumerate(SCENARIO_TITLES):
-        for column, metric in enumerate(METRICS):
-            panel = panels[row, column]
-            letter(panel, 2 * row + column, f"{METRICS[metric]}, {SCENARIO_TITLES[scenario]}")
-            _difficulty_panel(panel, gathered, algorithms, scenario, metric)
+    figure = new_figure(15.0, 6.6)
+    panels = figure.subplots(len(SCENARIO_TITLES), len(TITLES))
+    for number, (scenario, metric) in enumerate(product(SCENARIO_TITLES, TITLES)):
+        panel = panels.flat[number]
+        letter(panel, number, f"{TITLES[metric]}, {SCENARIO_TITLES[scenario]}")
+        _difficulty_panel(panel, gathered, algorithms, scenario, metric)
     return figure
 
 
@@ -46,7 +46,7 @@ def _difficulty_panel(
             counts.append(len(outcomes))
             if not outcomes:
                 continue
-            finals = [final_average(outcome.curve(metric)) for outcome in outcomes]
+            finals = [final(outcome, metric) for outcome in outcomes]
             means[setting] = float(np.mean(finals))
             panel.bar(
                 place + side, means[setting], 0.38, yerr=np.std(finals), capsize=3,
@@ -115,6 +115,7 @@ def _distance_bars(
                 color=colour(algorithm), label=short(algorithm), error_kw={"lw": 0.8},
             )  # fmt: skip
             first, second = pairs(own, outcomes, scene.condition, "distance_m")
+            first, second = (within_path(scene, values) for values in (first, second))
             if place and len(first):
                 panel.text(x, 1.16 * full_m, stars(paired_t(first, second)),
                            ha="center", va="bottom", fontsize=8, rotation=90)  # fmt: skip
@@ -129,7 +130,9 @@ def _distance_bars(
             bbox_to_anchor=(0.5, -0.12),
         )  # fmt: skip
     panel.set_xlabel(
-        "error bar: standard deviation; stars: paired t-test against PHIL-TD3", fontsize=8
+        "error bar: standard deviation; stars: paired t-test against PHIL-TD3\n"
+        "over all drives of all seeds, nothing beyond the goal counted",
+        fontsize=8,
     )
 
 
@@ -149,6 +152,8 @@ def draw_guidance(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
                 means_m.append(float(distances_m.mean()) if len(distances_m) else float("nan"))
                 counts.append(len(outcomes))
             if np.isnan(means_m).any():
+                continue
+            if not sum(means_m):
                 continue
             good, poor = (mean_m / sum(means_m) for mean_m in means_m)
             panel.bar(place, good, color=colour(algorithm))

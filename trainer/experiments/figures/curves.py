@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 from itertools import chain
 from typing import Any, NamedTuple
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from trainer.experiments.figures.style import (
@@ -18,16 +16,10 @@ from trainer.experiments.figures.style import (
     note_missing,
     other_colour,
 )
-from trainer.experiments.gathered import Episodes, Gathered, Numbers, Outcome
+from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import FULL_PATH_M, NORMAL, PRINTED_REWARD, SCENARIO_TITLES
-from trainer.experiments.statistics import WINDOW, smoothed
-
-METRICS = {"episode_return": "training reward", "distance_m": "surviving distance, m"}
-"""What the paper's learning curves show: episodes in which the human may take over."""
-ALONE = "validation_distance_m"
-"""The policy alone, now and then."""
-TITLES = {**METRICS, ALONE: "surviving distance without help, m"}
-"""What ours show."""
+from trainer.experiments.progress import TITLES, progress
+from trainer.experiments.statistics import WINDOW
 
 STYLES = ("-", "--", ":", "-.")
 """Of an algorithm's settings, the normal one first."""
@@ -70,8 +62,8 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
     for panel in panels[-1] if by_metric else panels[:, -1]:
         panel.legend(fontsize=8, **legend)
     figure.supxlabel(
-        f"training episode (with help: mean of {WINDOW}; without: where validated; "
-        "band: standard deviation of seeds)",
+        f"training episode; in training the human may take over, and lines are means of {WINDOW}; "
+        "without help: where validated; band: standard deviation of seeds",
         fontsize=9,
     )
     return figure
@@ -86,30 +78,20 @@ def _draw_panel(
         outcomes = gathered.of(scenario, line.algorithm, line.setting)
         named = f"{line.label} ({len(outcomes)} of {gathered.seeds} seeds)"
         shade, style = _look(line, lines)
-        if not outcomes:
+        found = progress(outcomes, metric)
+        if found is None:
             panel.plot([], [], style, color=shade, alpha=0.4, label=named)
             continue
-        episodes, curves = _curves(outcomes, metric)
-        mean, deviation = curves.mean(axis=0), curves.std(axis=0)
-        panel.plot(episodes, mean, style, color=shade, label=named)
+        mean, deviation = found.curves.mean(axis=0), found.curves.std(axis=0)
+        panel.plot(found.episodes, mean, style, color=shade, label=named)
         panel.fill_between(
-            episodes, mean - deviation, mean + deviation, color=shade, alpha=0.18, lw=0
+            found.episodes, mean - deviation, mean + deviation, color=shade, alpha=0.18, lw=0
         )
     if metric != "episode_return":
         panel.axhline(FULL_PATH_M[scenario], color="0.6", lw=0.8, ls=":")
     if not panel.has_data():
         note_missing(panel)
     panel.grid(alpha=0.3)
-
-
-def _curves(outcomes: Sequence[Outcome], metric: str) -> tuple[Episodes, Numbers]:
-    """Episodes counted from 1, and a curve a seed there: smoothed, or just where validated."""
-    if metric != ALONE:
-        curves = smoothed([outcome.curve(metric) for outcome in outcomes])
-        return np.arange(curves.shape[1]) + 1, curves
-    measured = [outcome.measured(metric) for outcome in outcomes]
-    shared = reduce(np.intersect1d, [episodes for episodes, _ in measured])
-    return shared, np.stack([values[np.isin(episodes, shared)] for episodes, values in measured])
 
 
 def _look(line: Line, lines: Sequence[Line]) -> tuple[str, str]:

@@ -1,0 +1,57 @@
+"""How training went: curves over the episodes, with the human's help and without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trainer.experiments.gathered import Episodes, Numbers, Outcome
+from trainer.experiments.statistics import WINDOW, smoothed
+
+METRICS = {
+    "episode_return": "reward in training",
+    "distance_m": "surviving distance in training, m",
+}
+"""What the paper's learning curves show: episodes in which the human may take over, so that whoever
+is guided looks good from the first one on."""
+ALONE = "validation_distance_m"
+"""The policy alone, now and then."""
+TITLES = {**METRICS, ALONE: "surviving distance without help, m"}
+"""What ours show."""
+
+
+class Progress(NamedTuple):
+    """One metric of an algorithm's seeds."""
+
+    episodes: Episodes
+    """Where there is a value, counted from 1: [n]."""
+    curves: Numbers
+    """Moving averages, or what was measured now and then: [seeds, n]."""
+    whole: NDArray[np.bool_]
+    """Which values count as reached, [n]: before, an average is one of too few episodes, and one
+    lucky episode would do."""
+    ends: Numbers
+    """Final average of each seed, [seeds]."""
+
+
+def progress(outcomes: Sequence[Outcome], metric: str) -> Progress | None:
+    """The progress of some seeds; None without any."""
+    if not outcomes:
+        return None
+    ends = np.array([final(outcome, metric) for outcome in outcomes])
+    measured = [outcome.measured(metric) for outcome in outcomes]
+    shared = reduce(np.intersect1d, [episodes for episodes, _ in measured])
+    curves = np.stack([values[np.isin(episodes, shared)] for episodes, values in measured])
+    if metric == ALONE:
+        return Progress(shared, curves, np.ones(len(shared), dtype=bool), ends)
+    return Progress(shared, smoothed(curves), shared >= min(WINDOW, len(shared)), ends)
+
+
+def final(outcome: Outcome, metric: str) -> float:
+    """Mean of what was measured in the last ``WINDOW`` episodes."""
+    episodes, values = outcome.measured(metric)
+    return float(values[episodes > episodes[-1] - WINDOW].mean())

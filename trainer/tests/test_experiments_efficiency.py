@@ -1,0 +1,94 @@
+"""Progress and learning efficiency against curves whose answer is known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from trainer.experiments.efficiency import efficiency, episodes_to_reach
+from trainer.experiments.gathered import Outcome
+from trainer.experiments.progress import ALONE, Progress, final, progress
+from trainer.experiments.statistics import above
+from trainer.experiments.units import Unit
+
+
+def outcome(metric: str, values, seed: int = 1) -> Outcome:
+    return Outcome(Unit("left_turn", "phil_td3", "normal", seed), {metric: np.array(values)}, {})
+
+
+def validated(*values: float, every: int = 10) -> Outcome:
+    """Each after so many episodes."""
+    rows = np.full(every * len(values), np.nan)
+    rows[every - 1 :: every] = values
+    return outcome(ALONE, rows)
+
+
+def made(*outcomes: Outcome) -> Progress:
+    (metric,) = outcomes[0].metrics
+    found = progress(outcomes, metric)
+    assert found is not None
+    return found
+
+
+def ramp(length: int, height: float = 1.0, seeds: int = 3) -> Progress:
+    """Rises from 0 in ``length`` of 200 episodes, in every seed alike; as it was measured."""
+    curve = height * np.minimum(np.arange(1, 201) / length, 1.0)
+    return Progress(
+        np.arange(200) + 1, np.tile(curve, (seeds, 1)), np.ones(200, bool), np.full(seeds, height)
+    )
+
+
+def test_in_training_curves_are_averages_and_reaching_counts_from_the_first_whole_one_on():
+    found = made(outcome("distance_m", np.concatenate([np.full(10, 9.0), np.arange(40.0)])))
+    assert found.episodes.tolist() == list(range(1, 51))
+    assert np.flatnonzero(found.whole)[0] + 1 == 20
+    assert found.curves[0, 0] == 9.0  # by luck
+    assert episodes_to_reach(found, found.curves[0], 9.0) == 29  # (9 + ... of twenty)
+    assert episodes_to_reach(found, found.curves[0], 99.0) == math.inf
+    assert found.ends.tolist() == [29.5]
+
+
+def test_what_was_validated_now_and_then_is_taken_where_it_was_measured():
+    found = made(validated(0.0, 5.0, 7.0, 8.0), validated(2.0, 7.0, 9.0, 6.0, 1.0))
+    assert found.episodes.tolist() == [10, 20, 30, 40]
+    assert found.curves.mean(axis=0).tolist() == [1.0, 6.0, 8.0, 7.0]
+    assert episodes_to_reach(found, found.curves.mean(axis=0), 6.0) == 20
+    # Two validations are within the last twenty episodes.
+    assert found.ends.tolist() == [7.5, 3.5]
+
+
+def test_a_single_validation_is_an_end():
+    assert final(validated(4.0), ALONE) == 4.0
+    assert progress([], ALONE) is None
+
+
+def test_a_step_at_ten_against_one_at_seventy_is_seven_times():
+    soon, late = (validated(*(20.0 * (n >= step) for n in range(1, 21))) for step in (1, 7))
+    found = efficiency(made(soon, soon), made(late, late))
+    assert (found.episodes, found.baseline_episodes) == (10.0, 70.0)
+    assert found.ratio[:3] == (7.0, 7.0, 7.0)
+
+
+def test_one_that_never_gets_there_has_the_ratio_nothing():
+    assert efficiency(ramp(25, 0.5), ramp(100)).ratio.value == 0.0
+    # On the common level, which both reach, it is twice as soon.
+    assert efficiency(ramp(25, 0.5), ramp(100), common=True).ratio.value == 2.0
+
+
+def test_one_seed_has_no_interval():
+    ratio = efficiency(ramp(25, seeds=1), ramp(100)).ratio
+    assert ratio.value == 4.0
+    assert above(ratio) == "undecided"
+
+
+def test_the_bootstrap_shows_the_spread_of_the_seeds():
+    curves = np.concatenate([ramp(length, seeds=1).curves for length in (25, 50, 100)])
+    ratio = efficiency(ramp(25)._replace(curves=curves), ramp(100)).ratio
+    assert (ratio.low, ratio.high) == (1.0, 4.0)
+
+
+@pytest.mark.parametrize("metric", ["distance_m", ALONE])
+def test_who_is_compared_with_itself_is_as_soon(metric):
+    values = np.random.default_rng(0).random((3, 60))
+    own = made(*(outcome(metric, row, seed) for seed, row in enumerate(values)))
+    assert efficiency(own, own).ratio.value == 1.0

@@ -1,0 +1,147 @@
+"""Claims about test drives against made-up drives whose answer is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from trainer.experiments.catalogue import EXPERIMENTS
+from trainer.experiments.claims.scenes import DISTANCE, SUCCESS, scene_claim
+from trainer.experiments.claims.testing import SUCCESS_BARS
+from trainer.experiments.figures.curves import Line
+from trainer.experiments.gathered import Drives, Gathered, Outcome, pairs, pooled
+from trainer.experiments.plan import SCENES
+from trainer.experiments.units import Unit
+from trainer.tests.synthetic import gathered
+
+PHIL, IA, HUMAN = Line("phil_td3"), Line("ia_td3"), Line("human_model")
+SEEDS = 3
+
+
+def driven(algorithm: str, seed: int, distances_m) -> tuple[Unit, Outcome]:
+    unit = Unit("left_turn", algorithm, "normal", seed)
+    outcomes = ["goal" if distance_m > 20.0 else "collision" for distance_m in distances_m]
+    columns = {
+        "seed": list(range(len(distances_m))),
+        "outcome": outcomes,
+        "distance_m": distances_m,
+    }
+    return unit, Outcome(unit, {}, {"nominal": Drives(columns)})
+
+
+def test_test_episodes_are_paired_by_training_seed_and_test_seed():
+    first = [driven("phil_td3", seed, [21.0, 20.0 + seed, 5.0])[1] for seed in (1, 2)]
+    second = [driven("ia_td3", seed, [10.0 * seed, 21.0, 21.0])[1] for seed in (2, 3)]
+    ours, theirs = pairs(first, second, "nominal", "distance_m")
+    assert ours.tolist() == [21.0, 22.0, 5.0]
+    assert theirs.tolist() == [20.0, 21.0, 21.0]
+    ours, theirs = pairs(first, second, "nominal", "distance_m", arrived=True)
+    assert (ours.tolist(), theirs.tolist()) == ([22.0], [21.0])
+    assert pooled(first, "nominal", "distance_m", arrived=True).tolist() == [21.0, 21.0, 21.0, 22.0]
+
+
+def test_the_one_human_model_is_paired_with_every_seed():
+    human = [driven("human_model", 0, [1.0, 2.0])[1]]
+    first = [driven("phil_td3", seed, [21.0, 20.0 + seed])[1] for seed in (1, 2)]
+    ours, theirs = pairs(first, human, "nominal", "distance_m")
+    assert ours.tolist() == [21.0, 21.0, 21.0, 22.0]
+    assert theirs.tolist() == [1.0, 2.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize(("sign", "holds"), [(1.0, "yes"), (-1.0, "no")])
+def test_a_scene_is_judged_by_its_test_episodes(sign, holds):
+    random = np.random.default_rng(1)
+    units = [driven("phil_td3", s, (21.0 - random.random(20)).tolist()) for s in (1, 2, 3)]
+    units += [driven("ia_td3", s, (15.0 - random.random(20)).tolist()) for s in (1, 2, 3)]
+    made = Gathered(dict(units), dict(units), SEEDS)
+    one = scene_claim(made, SCENES[0], "distance_m", PHIL, [IA], "further", "–", sign)
+    assert (one.holds, one.seeds) == (holds, 3)
+    variant = scene_claim(made, SCENES[2], "distance_m", PHIL, [IA], "further", "–", sign)
+    assert (variant.holds, variant.ours) == ("undecided", "PHIL-TD3 –, IA-TD3 –")
+
+
+def of_drives(**drives) -> Gathered:
+    """Distances of each algorithm's seeds; the human model's seed is 0."""
+    found = dict(
+        driven(name, seed, distances_m)
+        for name, seeds in drives.items()
+        for seed, distances_m in enumerate(seeds, 0 if name == "human_model" else 1)
+    )
+    return Gathered(found, found, SEEDS)
+
+
+def test_what_is_driven_beyond_the_goal_decides_nothing():
+    made = of_drives(phil_td3=[[21.3, 21.4]] * 3, human_model=[[21.1, 21.2]])
+    one = scene_claim(made, SCENES[0], DISTANCE, PHIL, [HUMAN], "further", "–")
+    assert (one.holds, one.interval) == ("undecided", (0.0, 0.0))
+    assert "PHIL-TD3 21.35±0.05, human model 21.15±0.05" in one.ours  # shown as it was
+
+
+def test_many_drives_of_few_seeds_are_few_seeds():
+    """Two seeds a little ahead in each of 200 drives, one far behind: about the algorithm, nothing
+    is known.
+    """
+    random = np.random.default_rng(0)
+    ia = 15.0 + random.random((3, 200))
+    phil = ia + np.array([[2.0], [2.0], [-0.5]])
+    made = of_drives(phil_td3=phil.tolist(), ia_td3=ia.tolist())
+    one = scene_claim(made, SCENES[0], DISTANCE, PHIL, [IA], "further", "–")
+    assert (one.holds, one.seeds) == ("undecided", 3)
+
+
+@pytest.mark.parametrize(("ia", "holds"), [(0.2, "yes"), (0.8, "undecided"), (1.0, "undecided")])
+def test_success_is_compared_seed_by_seed(ia, holds):
+    def reached(share: float) -> list[float]:
+        return [21.0] * round(10 * share) + [5.0] * round(10 * (1 - share))
+
+    made = of_drives(
+        phil_td3=[reached(share) for share in (1.0, 0.8, 1.0)],
+        ia_td3=[reached(ia)] * 3,
+    )
+    one = scene_claim(made, SCENES[0], SUCCESS, PHIL, [IA], "more often", "–")
+    assert one.holds == holds
+    assert "PHIL-TD3 93.3 % (100 80 100)" in one.ours
+
+
+def test_who_never_arrives_is_left_out_by_name_and_who_crashes_early_is_not_smooth():
+    made = of_drives(
+        phil_td3=[[21.0, 21.0, 5.0]] * 3, ia_td3=[[21.0, 5.0, 21.0]] * 3, hi_td3=[[5.0] * 3] * 3
+    )
+    shaking = {"phil_td3": [1.0, 9.0, 9.0], "ia_td3": [2.0, 0.0, 0.0], "hi_td3": [0.0] * 3}
+    for unit, outcome in made.found.items():
+        columns = {**outcome.tests["nominal"].columns, "shaking": shaking[unit.algorithm]}
+        made.found[unit] = replace(outcome, tests={"nominal": Drives(columns)})
+    place = (made, SCENES[0], "shaking", PHIL)
+    one = scene_claim(*place, [IA, Line("hi_td3")], "smoother", "–", -1.0, arrived=True)
+    assert one.holds == "yes"  # 1 against 2 where both arrive
+    assert one.interval == (-1.0, -1.0)
+    assert one.ours.endswith("left out: HI-TD3, no common arrival")
+    alone = scene_claim(*place, [Line("hi_td3")], "smoother", "–", -1.0, arrived=True)
+    assert (alone.holds, alone.interval) == ("undecided", None)
+
+
+def test_bars_are_decided_by_the_mean_of_all_seeds():
+    units = EXPERIMENTS["fig9"].units(SEEDS)
+    made = gathered(units, SEEDS)
+    bars = [one for one in EXPERIMENTS["fig9"].judge(made) if "bar of this project, su" in one.text]
+    assert len(bars) == len(SUCCESS_BARS)
+    for one, scene in zip(bars, SCENES, strict=True):
+        tests = [o.tests[scene.condition] for o in made.of(scene.scenario, "phil_td3")]
+        share = float(np.mean([drives.reached for drives in tests]))
+        assert one.ours.startswith(f"{100 * share:.1f} % (")
+        assert one.holds == ("yes" if share >= SUCCESS_BARS[scene.label] else "no")
+
+
+def test_poor_guidance_is_a_change_of_the_mean_distance():
+    units = EXPERIMENTS["fig14"].units(SEEDS)
+    made = gathered(units, SEEDS)
+    for unit, outcome in made.found.items():
+        scale = 0.9 + 0.001 * unit.seed if unit.setting == "poor" else 1.0
+        tests = {
+            name: Drives({**drives.columns, "distance_m": np.full(50, 20.0 * scale)})
+            for name, drives in outcome.tests.items()
+        }
+        made.found[unit] = replace(outcome, tests=tests)
+    phil, ia, hi, robust = EXPERIMENTS["fig14"].judge(made)
+    assert [one.holds for one in (phil, ia, hi, robust)] == ["no", "yes", "no", "undecided"]
+    assert "-9.8 [-10.0, -9.6] %" in phil.ours
