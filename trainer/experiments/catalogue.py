@@ -140,8 +140,11 @@ EXPERIMENTS: dict[str, Experiment] = {
     "table2": _table("surviving distance beside the human model, congestion", "congestion"),
     "ablation": _curves(
         "PHIL-TD3 without each of its parts",
-        # Without TDQA it is IA-TD3.
-        _lines(("phil_td3", "phil_without_cloning", "ia_td3", "phil_without_shaping")),
+        (
+            *_lines(("phil_td3", "phil_without_cloning")),
+            Line("ia_td3", name="without TDQA (IA-TD3)"),
+            Line("phil_without_shaping"),
+        ),
         learning.judge_ablation,
         by_metric=False,
     ),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trainer.experiments.gathered import Numbers
+from trainer.experiments.outcome import Numbers
 from trainer.experiments.progress import Progress
 from trainer.experiments.statistics import CONFIDENCE, RESAMPLES, Estimate
 

@@ -2,71 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from edge_runtime.episode_report import GOAL
-from edge_runtime.errors import UserError
+from trainer.experiments.outcome import Numbers, Outcome, read_outcome
 from trainer.experiments.plan import FULL_PATH_M, NORMAL, Scene
-from trainer.experiments.store import TESTS_FILE, Store
+from trainer.experiments.store import Store
 from trainer.experiments.units import Unit
-from trainer.training.metrics import METRICS_FILE
-
-Numbers = NDArray[np.float64]
-Episodes = NDArray[np.int64]
-"""Counted from 1."""
-TEXT = ("outcome",)
-"""Columns that are no numbers."""
-
-
-@dataclass(frozen=True)
-class Drives:
-    """A policy's test episodes in one scene, in the order of their seeds."""
-
-    columns: Mapping[str, Any]
-
-    def __getitem__(self, name: str) -> Numbers:
-        """One quantity, a value an episode; of ``reached`` 1 or 0."""
-        values = self.reached if name == "reached" else self.columns[name]
-        return np.asarray(values, dtype=float)
-
-    @cached_property
-    def reached(self) -> NDArray[np.bool_]:
-        """Which episodes reached the goal."""
-        return np.array([outcome == GOAL for outcome in self.columns["outcome"]])
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What is kept of a unit."""
-
-    unit: Unit
-    metrics: Mapping[str, Any]
-    """Column -> a value a training episode; nothing for the human model."""
-    tests: Mapping[str, Drives]
-    """Condition -> test episodes."""
-
-    def measured(self, metric: str) -> tuple[Episodes, Numbers]:
-        """Episodes, counted from 1, after which a metric was measured, and its values there.
-
-        Most are measured after each one, a validation now and then.
-        """
-        values = np.asarray(self.metrics[metric], dtype=float)
-        at = np.flatnonzero(~np.isnan(values))
-        return at + 1, values[at]
-
-    @property
-    def best_validation(self) -> float:
-        """Success of the actor that was tested, on the validation seeds of its run."""
-        return float(self.measured("validation_success")[1].max())
 
 
 class Gathered:
@@ -160,30 +103,3 @@ def gather(store: Store, units: Iterable[Unit], seeds: int) -> Gathered:
     finished = [unit for unit in wanted if store.state(unit) == "done"]
     found = {unit: read_outcome(unit, store.result_dir(unit)) for unit in finished}
     return Gathered(wanted, found, seeds)
-
-
-def read_outcome(unit: Unit, directory: Path) -> Outcome:
-    """A unit's result.
-
-    Raises:
-        UserError: the files are not what this project writes.
-    """
-    try:
-        metrics = _read_csv(directory / METRICS_FILE) if unit.trained else {}
-        tests = json.loads((directory / TESTS_FILE).read_bytes())
-        return Outcome(unit, metrics, {name: Drives(columns) for name, columns in tests.items()})
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"the result in {directory} cannot be read: {error}") from error
-
-
-def _read_csv(path: Path) -> dict[str, Any]:
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ValueError(f"{path.name} has no rows")
-    return {
-        name: [row[name] for row in rows]
-        if name in TEXT
-        else np.array([float(row[name] or "nan") for row in rows])
-        for name in rows[0]
-    }

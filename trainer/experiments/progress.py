@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.experiments.gathered import Episodes, Numbers, Outcome
+from trainer.experiments.outcome import Episodes, Numbers, Outcome
 from trainer.experiments.statistics import WINDOW, smoothed
 
 METRICS = {

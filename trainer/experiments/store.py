@@ -72,12 +72,15 @@ class Store:
 
     def done(self, unit: Unit) -> bool:
         """Whether the result is there, with tests in every condition that this version knows."""
+        path = self.result_dir(unit) / TESTS_FILE
         try:
-            tests = json.loads((self.result_dir(unit) / TESTS_FILE).read_bytes())
+            tests = json.loads(path.read_bytes())
         except (FileNotFoundError, NotADirectoryError):
             return False
-        except ValueError as error:
-            raise UserError(f"{self.result_dir(unit) / TESTS_FILE} is broken: {error}") from error
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path} is broken: {error}") from error
+        if not isinstance(tests, dict):
+            raise UserError(f"{path} is broken: it names no conditions")
         return set(CONDITIONS) <= set(tests)
 
     def state(self, unit: Unit) -> str:

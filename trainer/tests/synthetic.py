@@ -5,7 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from edge_runtime.episode_report import COLLISION, GOAL
-from trainer.experiments.gathered import Drives, Gathered, Outcome
+from trainer.experiments.gathered import Gathered
+from trainer.experiments.outcome import Drives, Outcome
 from trainer.experiments.plan import FULL_PATH_M
 from trainer.experiments.units import Unit
 

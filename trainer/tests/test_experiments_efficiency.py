@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trainer.experiments.efficiency import efficiency, episodes_to_reach
-from trainer.experiments.gathered import Outcome
+from trainer.experiments.outcome import Outcome
 from trainer.experiments.progress import ALONE, Progress, final, progress
 from trainer.experiments.statistics import above
 from trainer.experiments.units import Unit

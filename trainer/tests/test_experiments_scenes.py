@@ -9,7 +9,8 @@ from trainer.experiments.catalogue import EXPERIMENTS
 from trainer.experiments.claims.scenes import DISTANCE, SUCCESS, scene_claim
 from trainer.experiments.claims.testing import SUCCESS_BARS
 from trainer.experiments.figures.curves import Line
-from trainer.experiments.gathered import Drives, Gathered, Outcome, pairs, pooled
+from trainer.experiments.gathered import Gathered, pairs, pooled
+from trainer.experiments.outcome import Drives, Outcome
 from trainer.experiments.plan import SCENES
 from trainer.experiments.units import Unit
 from trainer.tests.synthetic import gathered

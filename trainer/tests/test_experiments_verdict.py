@@ -7,7 +7,8 @@ from trainer.experiments import timing
 from trainer.experiments.catalogue import EXPERIMENTS, NAMES, units_of
 from trainer.experiments.claims.compare import final_claim, speed_claim
 from trainer.experiments.figures.curves import Line
-from trainer.experiments.gathered import Gathered, Outcome
+from trainer.experiments.gathered import Gathered
+from trainer.experiments.outcome import Outcome
 from trainer.experiments.progress import TITLES
 from trainer.experiments.units import Unit
 from trainer.tests.synthetic import gathered

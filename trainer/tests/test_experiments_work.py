@@ -2,10 +2,12 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import pytest
 
+from edge_runtime.errors import UserError
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.evaluation import CONDITIONS
 from trainer.experiments.gathered import gather
@@ -64,6 +66,40 @@ def test_a_result_is_gathered_as_it_was_stored(straight):
     assert outcome.metrics["episode"][-1] == 2.0
     assert 0.0 <= outcome.best_validation <= 1.0
     assert not gathered.complete("left_turn", ["per_td3"])
+
+
+def _cut(text: str) -> str:
+    return "\n".join(text.splitlines()[:-1]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "words"),
+    [
+        ("metrics.csv", _cut, "2 of 3 episodes"),
+        ("metrics.csv", lambda text: text[:-9], "row of another length"),
+        ("metrics.csv", lambda text: text.replace("distance_m", "way_m"), "lacks distance_m"),
+        ("metrics.csv", lambda text: text.replace(",", "\0,", 1), "cannot be read"),
+        ("tests.json", lambda text: "3", "names no conditions"),
+        ("tests.json", lambda text: '["nominal", "noise", "variant"]', "names no conditions"),
+        ("tests.json", lambda text: '{"nominal": 1, "noise": 2, "variant": 3}', "in place of"),
+        ("tests.json", lambda text: text.replace('"seed": [0, 1]', '"seed": [0]'), "2 values of"),
+        ("tests.json", lambda text: text.replace("time_s", "time"), "lacks time_s"),
+        ("config.json", lambda text: "{}", "'test_runs' is missing"),
+    ],
+)
+def test_a_damaged_result_is_refused_in_one_line(straight, tmp_path, name, damage, words):
+    """Nothing is drawn or judged from a part of it."""
+    damaged = replace(straight, results=tmp_path / "results")
+    shutil.copytree(straight.result_dir(UNIT), damaged.result_dir(UNIT))
+    path = damaged.result_dir(UNIT) / name
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(UserError, match=words) as refused:
+        gather(damaged, [UNIT], 1)
+    assert "\n" not in str(refused.value)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(UserError):
+        gather(damaged, [UNIT], 1)
 
 
 def test_a_finished_unit_is_not_computed_again(straight, monkeypatch):

@@ -69,9 +69,11 @@ def potential_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
 
 
 def intervention_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
-    """Eq. 17 as the trainer has it: the human takes over where an unacceptable state comes next.
+    """Eq. 17 as the proof reads it: whoever enters an unacceptable state pays, and goes there.
 
-    The human stays in control while the car is in one, so that only entering is penalised.
+    The human stays in control while the car is in one, so that only entering is penalised. The
+    trainer stores something else: the overruled action is never carried out, and the penalty stands
+    beside the human's. What that changes, the last test shows.
     """
     rewards = mdp.rewards.copy()
     for state, action, following in np.ndindex(rewards.shape):
@@ -140,3 +142,18 @@ def test_a_human_whose_judgement_wavers_changes_the_optimum(detour):
     wavering = intervention_shaped(detour, np.arange(STATES) == 1)
     mixed = detour._replace(rewards=0.2 * detour.rewards + 0.8 * wavering.rewards)
     assert optimal_actions(optimal_values(mixed))[0].tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("share", "best"), [(0.0, [True, False, False]), (0.1, [True, False, False]),
+                        (0.8, [False, True, False])]
+)  # fmt: skip
+def test_a_penalty_beside_the_humans_own_action_keeps_the_optimum_while_take_overs_are_rare(
+    detour, share, best
+):
+    """As the trainer stores it: in state 0 the policy asks for what the human refuses, the human
+    takes action 0 instead, and of the transitions with that action this share is penalised.
+    """
+    rewards = detour.rewards.copy()
+    rewards[0, 0, 1] += share * equations.shaped_reward(0.0, PENALTY, True, False)
+    assert optimal_actions(optimal_values(detour._replace(rewards=rewards)))[0].tolist() == best

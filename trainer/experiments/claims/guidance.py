@@ -11,7 +11,8 @@ from trainer.experiments.claims.learning import HI, IA, PHIL
 from trainer.experiments.claims.scenes import scene_claim
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.figures.spread import SMOOTHNESS
-from trainer.experiments.gathered import Gathered, Outcome
+from trainer.experiments.gathered import Gathered
+from trainer.experiments.outcome import Outcome
 from trainer.experiments.plan import POOR, SCENARIO_TITLES, SCENES, Scene
 from trainer.experiments.statistics import Estimate, Holds, above, mean_estimate
 from trainer.experiments.verdict import Claim, claim

@@ -12,7 +12,8 @@ import numpy as np
 
 from trainer.experiments.claims.compare import BY_SEED, complete
 from trainer.experiments.figures.curves import Line
-from trainer.experiments.gathered import Drives, Gathered, Outcome, pairs, pooled, within_path
+from trainer.experiments.gathered import Gathered, pairs, pooled, within_path
+from trainer.experiments.outcome import Drives, Outcome
 from trainer.experiments.plan import HUMAN_MODEL, Scene
 from trainer.experiments.statistics import (
     Estimate,

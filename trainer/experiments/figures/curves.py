@@ -30,11 +30,14 @@ class Line(NamedTuple):
 
     algorithm: str
     setting: str = NORMAL
+    name: str = ""
+    """What it stands for here, where that is not the algorithm's own name."""
 
     @property
     def label(self) -> str:
         """As in the legend."""
-        return label(self.algorithm) + ("" if self.setting == NORMAL else f", {self.setting}")
+        setting = "" if self.setting == NORMAL else f", {self.setting}"
+        return (self.name or label(self.algorithm)) + setting
 
 
 def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = False) -> Figure:
