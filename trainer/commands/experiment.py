@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -25,7 +26,8 @@ from trainer.experiments.report import (
 )
 from trainer.experiments.runner import FAILED, Tally, run_units
 from trainer.experiments.store import Store
-from trainer.experiments.summary import BEGIN, write_summary
+from trainer.experiments.summary import CLAIMS, UNITS, claim_lines, has_place, write_table
+from trainer.experiments.unit_table import unit_lines
 from trainer.experiments.units import Unit
 from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task
 from trainer.parallel import cores
@@ -48,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         choices=[*NAMES, ALL, STATUS, SUMMARY],
         help=f"{', '.join(NAMES)}; {ALL}; {STATUS}: what is done, running and missing; "
-        f"{SUMMARY}: write the table of RESULTS/README.md again",
+        f"{SUMMARY}: write the tables of RESULTS/README.md again",
     )
     parser.add_argument(
         "--seeds", type=positive, default=DEFAULT_SEEDS, help="seeds of each training run"
@@ -116,12 +118,22 @@ def run(arguments: argparse.Namespace) -> int:
             store, name, arguments.seeds, arguments.device, arguments.draw_only or untimed
         )
         print(outcome_line(verdict, directory_of(store, name)))
-    if write_summary(store.results, NAMES):
-        print(f"table of all verdicts: {store.results / 'README.md'}")
-    elif SUMMARY in arguments.names:
-        raise UserError(f"{store.results / 'README.md'} has no line {BEGIN!r} for the table")
+    _write_tables(store, arguments.seeds, wanted=SUMMARY in arguments.names)
     _say_what_is_left(tally)
     return 1 if tally.count(FAILED) else 0
+
+
+def _write_tables(store: Store, seeds: int, wanted: bool) -> None:
+    readme = store.results / "README.md"
+    for place, lines in (
+        (UNITS, partial(unit_lines, store, seeds)),
+        (CLAIMS, partial(claim_lines, store.results, NAMES)),
+    ):
+        if has_place(readme, place):
+            write_table(readme, place, lines())
+            print(f"{place.what}: {readme}")
+        elif wanted:
+            raise UserError(f"{readme} has no line {place.begin!r} for the table")
 
 
 def _check_scenario(arguments: argparse.Namespace, names: list[str]) -> None:

@@ -1,61 +1,81 @@
-"""The side-by-side table of results/README.md, made from the verdicts."""
+"""The tables of results/README.md: where they stand, and the claims, made from the verdicts."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes, write_atomic
 from trainer.experiments.verdict import VERDICT_FILE
 
-BEGIN = "[//]: # (begin of the table that `python -m trainer experiment summary` writes)"
-END = "[//]: # (end of the table)"
-"""Comments of Markdown; what stands between them is replaced."""
 HEADER = ("what", "claim", "paper", "ours", "seeds", "holds", "command")
 
 
-def write_summary(results: Path, names: Iterable[str]) -> bool:
-    """Refresh the table in ``results/README.md``; whether the file has a place for it.
+class Place(NamedTuple):
+    """Where a table stands in ``results/README.md``: between two comments of Markdown."""
+
+    what: str
+
+    @property
+    def begin(self) -> str:
+        """The comment before it."""
+        command = "`python -m trainer experiment summary`"
+        return f"[//]: # (begin of the {self.what} that {command} writes)"
+
+    @property
+    def end(self) -> str:
+        """The comment after it."""
+        return f"[//]: # (end of the {self.what})"
+
+
+UNITS, CLAIMS = Place("table of units"), Place("table of claims")
+
+
+def has_place(readme: Path, place: Place) -> bool:
+    """Whether there is a file with the comment before the table."""
+    return readme.is_file() and place.begin in readme.read_text()
+
+
+def write_table(readme: Path, place: Place, lines: Iterable[str]) -> None:
+    """Replace a table for which the file has a place.
+
+    Raises:
+        UserError: the second comment is missing.
+    """
+    text = readme.read_text()
+    before, _, rest = text.partition(place.begin)
+    _, end, after = rest.partition(place.end)
+    if not end:
+        raise UserError(f"{readme} lacks the line {place.end!r} after {place.begin!r}")
+    table = "\n".join(lines)
+    write_atomic(readme, f"{before}{place.begin}\n\n{table}\n\n{place.end}{after}".encode())
+
+
+def claim_lines(results: Path, names: Iterable[str]) -> list[str]:
+    """The table of claims; an experiment that was never drawn has a row that says so.
 
     Args:
         results: directory with ``experiments/<name>/verdict.json``.
         names: experiments, in the order in which they are shown.
 
     Raises:
-        UserError: a verdict cannot be read, or the second comment is missing.
+        UserError: a verdict cannot be read.
     """
-    path = results / "README.md"
-    if not path.is_file():
-        return False
-    text = path.read_text()
-    if BEGIN not in text:
-        return False
-    before, _, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not end:
-        raise UserError(f"{path} lacks the line {END!r} after {BEGIN!r}")
-    table = "\n".join(summary_lines(results, names))
-    write_atomic(path, f"{before}{BEGIN}\n\n{table}\n\n{END}{after}".encode())
-    return True
-
-
-def summary_lines(results: Path, names: Iterable[str]) -> list[str]:
-    """The table: one row a claim, one that says so for an experiment that was never drawn."""
-    lines = [_row(HEADER), _row(["---"] * len(HEADER))]
+    lines = [row(HEADER), row(["---"] * len(HEADER))]
     for name in names:
         verdict = _read(results / "experiments" / name / VERDICT_FILE)
         command = f"`python -m trainer experiment {name}`"
         if verdict is None:
-            lines.append(_row([name, "not run yet", "", "", "0", "undecided", command]))
+            lines.append(row([name, "not run yet", "", "", "0", "undecided", command]))
             continue
         command = f"`{verdict['command']}`"
         link = f"[{name}](experiments/{name}/verdict.md)"
         for one in verdict["claims"]:
             cells = (one["text"], one["paper"], one["ours"], str(one["seeds"]), one["holds"])
-            lines.append(_row([link, *cells, command]))
+            lines.append(row([link, *cells, command]))
             link = command = ""
     return lines
 
@@ -73,5 +93,6 @@ def _read(path: Path) -> dict[str, Any] | None:
     return dict(verdict)
 
 
-def _row(cells: Iterable[str]) -> str:
+def row(cells: Iterable[str]) -> str:
+    """A row of a table in Markdown."""
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

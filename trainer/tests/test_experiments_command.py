@@ -8,7 +8,7 @@ import pytest
 from trainer.commands import experiment
 from trainer.experiments import timing
 from trainer.experiments.catalogue import EXPERIMENTS, NAMES
-from trainer.experiments.summary import BEGIN, END
+from trainer.experiments.summary import CLAIMS, UNITS
 from trainer.tests.experiments import TINY
 from trainer.tests.test_commands import call
 
@@ -49,7 +49,8 @@ def test_every_figure_and_table_of_the_paper_has_a_name():
 
 def test_everything_can_be_drawn_from_nothing(capsys, places, tmp_path):
     (tmp_path / "results").mkdir()
-    (tmp_path / "results" / "README.md").write_text(f"{BEGIN}\n{END}\n")
+    places_of_tables = "".join(f"{place.begin}\n{place.end}\n" for place in (UNITS, CLAIMS))
+    (tmp_path / "results" / "README.md").write_text(places_of_tables)
     status, out, _ = call(capsys, "experiment", "all", "--draw-only", *places)
     assert status == 0
     for name in NAMES:

@@ -1,14 +1,17 @@
 """Verdicts on disk, and the summary of them all."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from edge_runtime.errors import UserError
+from trainer.experiments import unit_table
 from trainer.experiments.gathered import Gathered
-from trainer.experiments.summary import BEGIN, END, write_summary
+from trainer.experiments.summary import CLAIMS, claim_lines, has_place, write_table
 from trainer.experiments.units import Unit
 from trainer.experiments.verdict import claim, markdown, verdict_of, write_verdict
+from trainer.tests.experiments import store_in
 from trainer.tests.synthetic import outcome
 
 
@@ -27,18 +30,18 @@ def test_a_verdict_is_written_for_programs_and_for_people(tmp_path):
     assert markdown(verdict_of("t", "t", [one], Gathered([], {}, 1), "t.png")).count("Missing") == 0
 
 
-def test_the_summary_stands_between_its_comments_and_can_be_refreshed(tmp_path):
+def test_a_table_stands_between_its_comments_and_can_be_refreshed(tmp_path):
     readme = tmp_path / "README.md"
-    readme.write_text(f"# Results\n\n{BEGIN}\nan earlier table\n{END}\n\nThe rest.\n")
+    readme.write_text(f"# Results\n\n{CLAIMS.begin}\nan earlier table\n{CLAIMS.end}\n\nThe rest.\n")
     directory = tmp_path / "experiments" / "fig7"
     directory.mkdir(parents=True)
     claims = [claim(text, "7", "8", "no", 3, "by hand") for text in ("first", "second")]
     write_verdict(verdict_of("fig7", "t", claims, Gathered([], {}, 3), "fig7.png"), directory)
     for _ in range(2):
-        assert write_summary(tmp_path, ["fig7", "fig8"])
+        write_table(readme, CLAIMS, claim_lines(tmp_path, ["fig7", "fig8"]))
     text = readme.read_text()
-    assert text.startswith(f"# Results\n\n{BEGIN}\n\n| what |")
-    assert text.endswith(f"\n\n{END}\n\nThe rest.\n")
+    assert text.startswith(f"# Results\n\n{CLAIMS.begin}\n\n| what |")
+    assert text.endswith(f"\n\n{CLAIMS.end}\n\nThe rest.\n")
     assert "an earlier table" not in text
     command = "`python -m trainer experiment fig7 --seeds 3`"
     link = "[fig7](experiments/fig7/verdict.md)"
@@ -46,17 +49,33 @@ def test_the_summary_stands_between_its_comments_and_can_be_refreshed(tmp_path):
     assert "| fig8 | not run yet |" in text
 
 
-def test_the_summary_needs_its_place_and_whole_verdicts(tmp_path):
+def test_a_table_needs_its_place_and_whole_verdicts(tmp_path):
     readme = tmp_path / "README.md"
-    assert not write_summary(tmp_path, ["fig7"])
+    assert not has_place(readme, CLAIMS)
     readme.write_text("# Results\n")
-    assert not write_summary(tmp_path, ["fig7"])
-    readme.write_text(f"{BEGIN}\n")
+    assert not has_place(readme, CLAIMS)
+    readme.write_text(f"{CLAIMS.begin}\n")
     with pytest.raises(UserError, match="lacks the line"):
-        write_summary(tmp_path, ["fig7"])
-    readme.write_text(f"{BEGIN}\n{END}\n")
+        write_table(readme, CLAIMS, [])
     verdict = tmp_path / "experiments" / "fig7" / "verdict.json"
     verdict.parent.mkdir(parents=True)
     verdict.write_text('{"claims": [{}]}')
     with pytest.raises(UserError, match="no verdict of this project"):
-        write_summary(tmp_path, ["fig7"])
+        claim_lines(tmp_path, ["fig7"])
+
+
+def test_the_table_of_units_has_a_row_a_kind_with_each_seed(tmp_path, monkeypatch):
+    one = Unit("left_turn", "phil_td3", "normal", 1)
+    units = [one, replace(one, setting="tough"), replace(one, seed=2)]
+    units.append(Unit("congestion", "human_model", "normal", 0))
+    made = Gathered(units, {unit: outcome(unit) for unit in units}, 3)
+    monkeypatch.setattr(unit_table, "gather", lambda store, wanted, seeds: made)
+    _, _, *rows = unit_table.unit_lines(store_in(tmp_path), 3)
+    assert [row.split(" | ")[:2] for row in rows] == [
+        ["| left turn, PHIL-TD3", "2"],
+        ["| left turn, PHIL-TD3, tough", "1"],
+        ["| congestion, human model", "1"],
+    ]
+    drives = [made.found[unit].tests["nominal"] for unit in (units[0], units[2])]
+    shares = " ".join(f"{100 * each.reached.mean():.0f}" for each in drives)
+    assert f" % ({shares}), " in rows[0]
