@@ -76,21 +76,18 @@ class Recording:
     def _read(self, records: Records) -> Iterator[Stored]:
         if not records.is_mcap():
             raise UserError(f"{self.path} is no MCAP recording")
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        # The index repeats every name: the chunk in which a name stood first may be broken.
-        for record in records.summary():
-            _learn(record, schemas, channels)
+        names = _Names(records)
         for record in records.walk():
-            _learn(record, schemas, channels)
-            if isinstance(record, Metadata):
+            if isinstance(record, Schema | Channel):
+                names.learn(record)
+            elif isinstance(record, Metadata):
                 self.metadata |= record.metadata
             elif isinstance(record, Message):
-                channel = channels.get(record.channel_id)
-                if channel is None:
+                stored = names.name(record)
+                if stored is None:
                     self.nameless_messages += 1
                 else:
-                    yield Stored(channel, schemas.get(channel.schema_id), record)
+                    yield stored
         self.cut_off = records.is_cut_off
         self.damaged_places = records.damaged_places
         self.damaged_bytes = records.damaged_bytes
@@ -105,8 +102,34 @@ def _open(path: Path) -> IO[bytes]:
     return path.open("rb")
 
 
-def _learn(record: McapRecord, schemas: dict[int, Schema], channels: dict[int, Channel]) -> None:
-    if isinstance(record, Schema):
-        schemas[record.id] = record
-    elif isinstance(record, Channel):
-        channels[record.id] = record
+class _Names:
+    """What the channels are called, as far as the file has been read."""
+
+    def __init__(self, records: Records) -> None:
+        self._records = records
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._has_looked = False
+
+    def learn(self, record: McapRecord) -> None:
+        """Take a schema or a channel; of two the first, which is from a chunk with a checksum."""
+        if isinstance(record, Schema):
+            self._schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            self._channels.setdefault(record.id, record)
+
+    def name(self, message: Message) -> Stored | None:
+        """Find out what the message is; None where the file does not say."""
+        if not self._knows(message.channel_id) and not self._has_looked:
+            # The chunk that said so is broken: the index may.
+            self._has_looked = True
+            for record in self._records.names():
+                self.learn(record)
+        channel = self._channels.get(message.channel_id)
+        if channel is None:
+            return None
+        return Stored(channel, self._schemas.get(channel.schema_id), message)
+
+    def _knows(self, channel_id: int) -> bool:
+        channel = self._channels.get(channel_id)
+        return channel is not None and channel.schema_id in (0, *self._schemas)

@@ -18,7 +18,7 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Chunk, Footer, McapRecord
+from mcap.records import Channel, Chunk, Footer, McapRecord, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
@@ -39,8 +39,6 @@ LANDMARK = re.compile(
 """How what can be found by itself begins."""
 LANDMARK_BYTES = 45
 SCAN_BYTES = 1 << 20
-END_BYTES = 37
-"""The footer and the closing magic: one without the other is no end."""
 _HEAD = struct.Struct("<BQ")
 _CRC_BYTES = 4
 
@@ -74,22 +72,15 @@ class Records:
                 at = self._pass_over(at)
                 continue
             parts, at = found
-            self.is_complete = _is_end(parts)
+            self.is_complete = any(isinstance(part, Footer) for part in parts)
             self.is_cut_off = at >= self._size and not self.is_complete
             yield from parts
 
-    def summary(self) -> Iterator[McapRecord]:
-        """Yield the records of the index at the file's end, if it is there and whole."""
-        end = self._size - END_BYTES
-        found = self._read(end) if end >= MAGIC_SIZE else None
-        if found is None or not _is_end(found[0]):
-            return
-        (footer,) = found[0]
-        assert isinstance(footer, Footer)
-        at = footer.summary_start or end
-        while at < end and (found := self._read(at)) is not None:
-            parts, at = found
-            yield from parts
+    def names(self) -> Iterator[McapRecord]:
+        """Yield every schema and channel of the file; the index repeats them all at its end."""
+        for record in Records(self._stream, self._size).walk():
+            if isinstance(record, Schema | Channel):
+                yield record
 
     def _pass_over(self, at: int) -> int:
         """Count what is broken there; return where the next record begins, or the file's end."""
@@ -138,6 +129,7 @@ class Records:
         if len(head) < _HEAD.size:
             return None
         opcode, length = _HEAD.unpack(head)
+        # The closing magic belongs to the footer: one without the other is no end.
         end: int = at + _HEAD.size + length + (MAGIC_SIZE if opcode == Opcode.FOOTER else 0)
         return end if length <= MAX_RECORD_BYTES and end <= self._size else None
 
@@ -164,7 +156,3 @@ def _written(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return builder.end() + (MCAP0_MAGIC if isinstance(record, Footer) else b"")
-
-
-def _is_end(parts: list[McapRecord]) -> bool:
-    return len(parts) == 1 and isinstance(parts[0], Footer)

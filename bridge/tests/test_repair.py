@@ -123,6 +123,13 @@ def test_a_broken_index_is_written_anew_and_no_message_is_lost(copy, capsys):
         assert len(list(make_reader(stream).iter_messages())) == MESSAGES
 
 
+def test_bytes_that_are_gone_take_no_more_with_them(copy):
+    """The index is not where it says; its names are good all the same."""
+    data = copy.read_bytes()
+    copy.write_bytes(data[:300] + data[320:])
+    assert read(copy) == without_chunk(0)
+
+
 def test_of_a_cut_file_with_a_broken_first_chunk_the_nameless_messages_are_counted(copy, capsys):
     data = copy.read_bytes()
     copy.write_bytes(data[: chunks(copy)[20].chunk_start_offset])
