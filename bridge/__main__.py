@@ -13,7 +13,7 @@ SUBCOMMANDS = {
     "relay": "put an injected network between a simulator and an edge runtime",
     "record": "write everything on the wire to an MCAP recording",
     "replay": "run recorded states through a policy or runtime, and compare its commands",
-    "repair": "give a recording that was cut off its index back",
+    "repair": "save what is whole of a recording that was cut off or damaged",
     "ros2": "show the wire to ROS 2, through a zenoh-bridge-ros2dds",
     "view": "show the wire in rerun, live or in a file",
 }

@@ -10,10 +10,10 @@ from typing import Any
 
 from bridge.arguments import add_connect, add_span, add_tls, non_negative_seconds
 from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
+from bridge.recording.flushed_file import check_new
 from bridge.recording.writer import RecordingWriter
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, UserError, examples
-from edge_runtime.files import check_writable
+from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
@@ -56,9 +56,7 @@ def record(arguments: Any) -> int:
     vehicle_id = arguments.vehicle_id
     vehicle_id = ANY_VEHICLE if vehicle_id is None else check_vehicle_id(vehicle_id)
     path = Path(arguments.out)
-    check_writable(path)
-    if path.exists():
-        raise UserError(f"{path} exists; choose another name: no recording is lost")
+    check_new(path)
     with (
         sigterm_as_interrupt(),
         open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,

@@ -1,17 +1,25 @@
-"""``python -m bridge repair``: give a recording that was cut off its index back."""
+"""``python -m bridge repair``: save what is whole of a recording that was cut off or damaged."""
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
+from bridge.recording.flushed_file import check_new
 from bridge.recording.reader import Recording
 from bridge.recording.writer import CHUNK_BYTES, METADATA
 from edge_runtime.cli import ArgumentParser, UserError, examples
-from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.file_lock import try_to_hold
+from edge_runtime.files import behind_link, check_writable, write_atomic
+
+KEPT = ".damaged"
+"""Ends the name under which a damaged recording is kept beside the repaired one."""
 
 EXAMPLE = examples(
     "python -m bridge repair drive.mcap",
@@ -21,27 +29,84 @@ EXAMPLE = examples(
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("recording", metavar="F.mcap", help="the recording that was cut off")
     parser.add_argument(
-        "--out", metavar="G.mcap", help="write here instead of over the recording itself"
+        "recording",
+        metavar="F.mcap",
+        help="the recording; where more than a torn end is left out of it, the file as it was is"
+        f" kept as F.mcap{KEPT}",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="G.mcap",
+        help="write here instead of over the recording itself; it must not exist yet",
     )
 
 
 def repair(arguments: Any) -> int:
     """Rewrite what can be read; the file is replaced only once the new one is whole."""
     source = Path(arguments.recording)
-    target = Path(arguments.out or source)
-    check_writable(target)
-    recording = Recording(source)
-    data, messages = _rewrite(recording)
-    if not messages:
-        raise UserError(f"{source} holds no whole message; there is nothing to repair")
-    if not recording.cut_off and arguments.out is None:
-        print(f"{source} is whole: {messages} messages; nothing done")
-        return 0
-    write_atomic(target, data)
-    print(f"wrote {target}: {messages} messages")
+    if arguments.out is None:
+        check_writable(source)
+    else:
+        check_new(Path(arguments.out))
+    with _held(source):
+        recording = Recording(source)
+        data, messages = _rewrite(recording)
+        if not messages:
+            raise UserError(f"{source} holds no whole message; there is nothing to repair")
+        if not recording.trouble() and arguments.out is None:
+            print(f"{source} is whole: {messages} messages; nothing done")
+            return 0
+        kept = _write(data, recording, arguments.out)
+    left_out = recording.missing() and f"; left out: {recording.missing()}"
+    print(f"wrote {arguments.out or source}: {messages} messages{left_out}{kept}")
     return 0
+
+
+@contextlib.contextmanager
+def _held(source: Path) -> Iterator[None]:
+    """Refuse a recording that is still growing: what comes later would go into the old file."""
+    try:
+        descriptor = os.open(source, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise UserError(f"recording {source} cannot be read: {error.strerror}") from None
+    try:
+        if not try_to_hold(descriptor):
+            raise UserError(f"{source} is being written; repair it when its writer has ended")
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _write(data: bytes, recording: Recording, out: str | None) -> str:
+    """Write the new file, over the recording or to ``out``; say where the old one is kept."""
+    if out is not None or not recording.is_damaged:
+        write_atomic(out or recording.path, data)
+        return ""
+    file = behind_link(recording.path)
+    kept = file.with_name(file.name + KEPT)
+    _link(file, kept)
+    try:
+        write_atomic(file, data)
+    except UserError:  # Nothing was replaced. (After an interrupt nobody knows: it stays.)
+        kept.unlink()
+        raise
+    return f"; the file as it was: {kept}"
+
+
+def _link(file: Path, kept: Path) -> None:
+    try:
+        os.link(file, kept)
+    except FileExistsError:
+        # A repair that was killed leaves its link.
+        if not (kept.exists() and kept.samefile(file)):
+            raise UserError(
+                f"{kept} exists; move it away, or name another file with --out"
+            ) from None
+    except OSError as error:
+        raise UserError(
+            f"cannot keep {file} as {kept}: {error.strerror}; name another file with --out"
+        ) from None
 
 
 def _rewrite(recording: Recording) -> tuple[bytes, int]:
@@ -57,7 +122,7 @@ def _rewrite(recording: Recording) -> tuple[bytes, int]:
             schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
         if channel.id not in channels:
             channels[channel.id] = writer.register_channel(
-                channel.topic, channel.message_encoding, schemas[channel.schema_id]
+                channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0)
             )
         writer.add_message(
             channels[channel.id],

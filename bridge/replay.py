@@ -87,12 +87,19 @@ def replay(arguments: Any) -> int:
         "policy_id": policy_id,
         "recorded_policy_ids": drive.policy_ids,
         "cut_off": drive.recording.cut_off,
+        "damaged_places": drive.recording.damaged_places,
+        "damaged_bytes": drive.recording.damaged_bytes,
         "dropped": int(drive.recording.metadata.get("dropped", 0)),
         **compare(drive.exchanges, replayed, states, arguments.tolerance),
     }
     if report["compared"] == 0:
         raise UserError(f"{arguments.recording} holds answers, but none of the states they answer")
     write_json_out(arguments.out, report)
+    if drive.recording.trouble():
+        print(
+            f"the recording {drive.recording.trouble()}; what is whole of it was replayed",
+            file=sys.stderr,
+        )
     _say(report)
     return DIFFERENT if report["different"] else 0
 
@@ -113,8 +120,6 @@ def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:
 
 
 def _say(report: dict[str, Any]) -> None:
-    if report["cut_off"]:
-        print("the recording was cut off; what is whole of it was replayed", file=sys.stderr)
     print(
         f"{report['compared']} commands compared, {report['different']} differ; largest difference"
         f" {report['largest_difference']:.3g}, tolerance {report['tolerance']:g};"

@@ -12,6 +12,7 @@ from typing import Any
 
 from bridge.arguments import add_connect, add_span, add_tls
 from bridge.feed import Feed, Heard, open_feed
+from bridge.recording.reader import Recording
 from bridge.scene import decode_scene
 from bridge.signals import sigterm_as_interrupt, wait_to_be_told
 from bridge.viewer.blueprint import APPLICATION, make_blueprint
@@ -93,7 +94,8 @@ def _sink(arguments: Any) -> Sink:
 
 def _show_recording(arguments: Any, sink: Sink) -> None:
     """Draw all of it; a page is served until somebody interrupts."""
-    heard = read_heard(Path(arguments.recording), arguments.vehicle_id)
+    file = Recording(Path(arguments.recording))
+    heard = read_heard(file, arguments.vehicle_id)
     first = next(heard, None)  # Says what is wrong with the file before anything is opened.
     with (
         sigterm_as_interrupt(),
@@ -103,6 +105,9 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
         log = WireLog(recording)
         for each in chain([first] if first else [], heard):
             _write(log, each)
+        if file.trouble():
+            text = f"the recording {file.trouble()}; what is whole of it is shown"
+            print(text, file=sys.stderr, flush=True)
         if sink.kind == SERVE:
             recording.flush()
             print("all of it is there; ^C ends", flush=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import tempfile
 from pathlib import Path
 from typing import Any, Union
@@ -30,11 +31,10 @@ def read_bytes(path: PathLike, what: str) -> bytes:
 def write_atomic(path: PathLike, data: bytes) -> None:
     """Write `data` so that a reader or a crash sees the old file or the new one, nothing between.
 
-    Raises UserError when the directory does not exist or cannot be written.
+    A symbolic link stays, and the file behind it is written. Raises UserError when the directory
+    does not exist or cannot be written, and for a path that is there and is no regular file.
     """
-    target = Path(path)
-    if target.is_dir():
-        raise UserError(f"{target} is a directory, not a file")
+    target = _checked(path)
     try:
         descriptor, temporary = tempfile.mkstemp(dir=str(target.parent), prefix=f".{target.name}.")
     except OSError as error:
@@ -53,11 +53,14 @@ def write_atomic(path: PathLike, data: bytes) -> None:
         raise
 
 
+def behind_link(path: PathLike) -> Path:
+    """The file that a symbolic link leads to, there or not; any other path as it is."""
+    return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+
+
 def check_writable(path: PathLike) -> None:
     """Raise UserError now if `write_atomic(path)` would fail later, after the long work."""
-    target = Path(path)
-    if target.is_dir():
-        raise UserError(f"{target} is a directory, not a file")
+    target = _checked(path)
     if not target.parent.is_dir():
         raise UserError(f"cannot write {target}: the directory {target.parent} does not exist")
     if not os.access(str(target.parent), os.W_OK | os.X_OK):
@@ -67,6 +70,23 @@ def check_writable(path: PathLike) -> None:
 def write_json(path: PathLike, value: Any) -> None:
     """`write_atomic` of indented JSON. NaN and infinity are refused (they are not JSON)."""
     write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _checked(path: PathLike) -> Path:
+    """What to replace. A rename would put a plain file in the place of a device or a pipe."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        return behind_link(path)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from None
+    except ValueError as error:  # a NUL inside the name
+        raise UserError(f"cannot write {path!r}: {error}") from None
+    if stat.S_ISDIR(mode):
+        raise UserError(f"{path} is a directory, not a file")
+    if not stat.S_ISREG(mode):
+        raise UserError(f"cannot write {path}: it is no regular file")
+    return behind_link(path)
 
 
 def _umask() -> int:

@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 from urllib.parse import quote
@@ -20,7 +19,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable
+from edge_runtime.files import behind_link, check_writable
 
 LOOPBACK = "127.0.0.1"
 GRPC_PORT = 9876
@@ -108,7 +107,7 @@ def save_to(
     recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
     """Record into a file that appears under its name when it is complete."""
-    target = Path(path)
+    target = behind_link(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         recording.save(temporary, default_blueprint=blueprint)

@@ -7,14 +7,25 @@ import os
 from pathlib import Path
 
 from edge_runtime.errors import UserError
+from edge_runtime.file_lock import hold
+from edge_runtime.files import check_writable
 
 MAX_PENDING_BYTES = 4 << 20
+NEVER_OVER = "choose another name: no recording is lost"
+
+
+def check_new(path: Path) -> None:
+    """Raise UserError now if a recording could not be begun there later."""
+    check_writable(path)
+    if path.exists():
+        raise UserError(f"{path} exists; {NEVER_OVER}")
 
 
 class FlushedFile:
     """Collects bytes and writes them out on ``flush``; where that fails, it cuts off the torn part.
 
-    Made for ``mcap.writer.Writer``, which needs ``write``, ``tell`` and ``flush``.
+    It holds the file's lock until it is closed: ``bridge repair`` keeps away meanwhile. Made for
+    ``mcap.writer.Writer``, which needs ``write``, ``tell`` and ``flush``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -23,9 +34,10 @@ class FlushedFile:
         try:
             self._descriptor = os.open(path, flags, 0o666)
         except FileExistsError:
-            raise UserError(f"{path} exists; choose another name: no recording is lost") from None
+            raise UserError(f"{path} exists; {NEVER_OVER}") from None
         except OSError as error:
             raise UserError(f"cannot write {path}: {error.strerror}") from None
+        hold(self._descriptor)
         self.flushed_bytes = 0
         self._pending = bytearray()
 

@@ -1,26 +1,17 @@
-"""Reads recordings: whole ones, and ones that a kill or a full disk has cut off."""
+"""Reads recordings: whole ones, ones that a kill or a full disk has cut off, and damaged ones."""
 
 from __future__ import annotations
 
-import struct
+import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
+from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 
+from bridge.recording.records import Records
 from edge_runtime.errors import UserError
-
-MAX_RECORD_BYTES = 64 << 20
-"""A torn length must not ask for more memory than any chunk of ours needs."""
-TORN = (
-    McapError, struct.error, zstandard.ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
-    MemoryError,
-)  # fmt: skip
-"""What the libraries raise for bytes that are no MCAP."""
 
 
 class Stored(NamedTuple):
@@ -38,48 +29,107 @@ class Recording:
         self.path = path
         self.cut_off = False
         """The file ends without its index: what was written last may be lost."""
+        self.damaged_places = 0
+        """Broken parts before the end; all that is whole between them is read."""
+        self.damaged_bytes = 0
+        self.torn_bytes = 0
+        """Of what was being written when the file was cut off."""
+        self.nameless_messages = 0
+        """Whole ones whose topic stood in a broken part alone."""
         self.metadata: dict[str, str] = {}
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether more is amiss than a kill leaves behind."""
+        return self.damaged_places > 0 or self.nameless_messages > 0
 
     def messages(self) -> Iterator[Stored]:
         """Yield the messages as they stand in the file, which is the order of their arrival.
 
-        UserError for a file that is not there, or no MCAP at all.
+        UserError for a file that is not there, cannot be read, or is no MCAP at all.
         """
-        self.cut_off, self.metadata = True, {}
+        self.cut_off, self.nameless_messages, self.metadata = True, 0, {}
         try:
-            stream = self.path.open("rb")
+            with _open(self.path) as stream:
+                yield from self._read(Records(stream, os.fstat(stream.fileno()).st_size))
         except OSError as error:
             raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None
-        with stream:
-            yield from self._read(stream)
 
-    def _read(self, stream: IO[bytes]) -> Iterator[Stored]:
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        for record in self._records(stream):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
+    def missing(self) -> str:
+        """Say what could not be read; empty where all of the file could."""
+        parts = []
+        if self.damaged_places:
+            places = "place" if self.damaged_places == 1 else "places"
+            parts.append(f"{self.damaged_places} damaged {places} of {self.damaged_bytes} bytes")
+        if self.nameless_messages:
+            parts.append(f"{self.nameless_messages} messages whose topic was in a damaged place")
+        if self.torn_bytes:
+            parts.append(f"a torn end of {self.torn_bytes} bytes")
+        return ", ".join(parts)
+
+    def trouble(self) -> str:
+        """Say what is wrong with the file, as a verb with its object; empty: nothing."""
+        if self.is_damaged:
+            return f"is damaged ({self.missing()})"
+        return "was cut off" if self.cut_off else ""
+
+    def _read(self, records: Records) -> Iterator[Stored]:
+        if not records.is_mcap():
+            raise UserError(f"{self.path} is no MCAP recording")
+        names = _Names(records)
+        for record in records.walk():
+            if isinstance(record, Schema | Channel):
+                names.learn(record)
             elif isinstance(record, Metadata):
                 self.metadata |= record.metadata
-            elif isinstance(record, Message) and record.channel_id in channels:
-                channel = channels[record.channel_id]
-                yield Stored(channel, schemas.get(channel.schema_id), record)
+            elif isinstance(record, Message):
+                stored = names.name(record)
+                if stored is None:
+                    self.nameless_messages += 1
+                else:
+                    yield stored
+        self.cut_off = records.is_cut_off
+        self.damaged_places = records.damaged_places
+        self.damaged_bytes = records.damaged_bytes
+        self.torn_bytes = records.torn_bytes
 
-    def _records(self, stream: IO[bytes]) -> Iterator[McapRecord]:
-        """Yield every record up to the end, or up to where the file is torn."""
-        reader = StreamReader(stream, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records
-        while True:
-            try:
-                record = next(reader)
-                parts = breakup_chunk(record, True) if isinstance(record, Chunk) else [record]
-            except StopIteration:
-                return
-            except TORN:
-                if stream.tell() <= MAGIC_SIZE:
-                    raise UserError(f"{self.path} is no MCAP recording") from None
-                return
-            # The footer comes with the closing magic: only then is the file whole.
-            self.cut_off = self.cut_off and not isinstance(record, Footer)
-            yield from parts
+
+def _open(path: Path) -> IO[bytes]:
+    """Open a file to go back and forth in; a pipe would be waited for."""
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise UserError(f"recording {path} cannot be read: it is no regular file")
+    return path.open("rb")
+
+
+class _Names:
+    """What the channels are called, as far as the file has been read."""
+
+    def __init__(self, records: Records) -> None:
+        self._records = records
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._has_looked = False
+
+    def learn(self, record: McapRecord) -> None:
+        """Take a schema or a channel; of two the first, which is from a chunk with a checksum."""
+        if isinstance(record, Schema):
+            self._schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            self._channels.setdefault(record.id, record)
+
+    def name(self, message: Message) -> Stored | None:
+        """Find out what the message is; None where the file does not say."""
+        if not self._knows(message.channel_id) and not self._has_looked:
+            # The chunk that said so is broken: the index may.
+            self._has_looked = True
+            for record in self._records.names():
+                self.learn(record)
+        channel = self._channels.get(message.channel_id)
+        if channel is None:
+            return None
+        return Stored(channel, self._schemas.get(channel.schema_id), message)
+
+    def _knows(self, channel_id: int) -> bool:
+        channel = self._channels.get(channel_id)
+        return channel is not None and channel.schema_id in (0, *self._schemas)

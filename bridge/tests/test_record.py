@@ -108,6 +108,7 @@ def record_and_kill(folder: Path) -> tuple[Path, float]:
         start_edge(endpoint, make_policy(folder)),
     ):
         wait_until(lambda: recording.exists() and len(states_in(recording)) > 10, "a second")
+        assert refuse(["repair", str(recording)]) == 2  # Not while it grows.
         run.process.send_signal(signal.SIGKILL)
         killed_ns = time.time_ns()
         run.process.wait()
@@ -130,6 +131,7 @@ def test_a_kill_loses_at_most_the_last_second_and_repair_gives_the_index_back(tm
         ):
             count += 1
     assert count == len(states)
+    assert "is being written" in capsys.readouterr().err
     assert refuse(["repair", str(recording)]) == 0
     with recording.open("rb") as stream:
         summary = make_reader(stream).get_summary()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -16,6 +16,7 @@ from bridge.__main__ import main
 from bridge.port import open_port
 from bridge.scene import Scene, Stamps, decode_scene, encode_scene
 from bridge.tests.commands import make_command
+from bridge.tests.damage import LEFT_TURN, flip_chunk
 from bridge.tests.processes import (
     SLOW_TOY,
     BridgeProcess,
@@ -28,8 +29,6 @@ from bridge.tests.toy import ToyEnv
 from bridge.viewer.wire_log import WireLog
 from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import free_endpoint
-
-LEFT_TURN = Path(__file__).parents[2] / "hil_tests" / "recordings" / "left_turn.mcap"
 
 
 def verify(recording):
@@ -147,6 +146,16 @@ def test_a_recording_is_shown_without_a_drive(tmp_path, capsys):
                 "latency/inference", "mode/reason", "rejected/edge/all")  # fmt: skip
     assert [entity for entity in entities if entity not in found] == []
     assert capsys.readouterr().out == f"wrote {out}\n"
+
+
+def test_a_damaged_recording_is_shown_without_what_is_broken(tmp_path, capsys):
+    damaged, out = tmp_path / "drive.mcap", tmp_path / "drive.rrd"
+    shutil.copy(LEFT_TURN, damaged)
+    flip_chunk(damaged, 3)
+    assert main(["view", str(damaged), "--save", str(out)]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is damaged (1 damaged place of" in line
+    assert "road/ego/body" in verify(out)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from bridge.feed import Heard
 from bridge.recording.reader import Recording, Stored
@@ -11,18 +10,18 @@ from bridge.recording.writer import WIRE_ENCODING
 from edge_runtime.errors import UserError
 
 
-def read_heard(path: Path, vehicle_id: str | None) -> Iterator[Heard]:
+def read_heard(recording: Recording, vehicle_id: str | None) -> Iterator[Heard]:
     """Every wire message of one vehicle, in order of arrival.
 
     Args:
-        path: the recording, which may be cut off.
+        recording: it may be cut off or damaged, and says so afterwards.
         vehicle_id: which one; None: the only one in it.
 
     Raises:
         UserError: no recording, no such vehicle in it, or several and none is named.
     """
-    chosen = _choose(path, vehicle_id)
-    for stored in Recording(path).messages():
+    chosen = _choose(recording, vehicle_id)
+    for stored in recording.messages():
         vehicle, topic = _wire_topic(stored)
         if vehicle == chosen:
             message = stored.message
@@ -30,13 +29,13 @@ def read_heard(path: Path, vehicle_id: str | None) -> Iterator[Heard]:
             yield Heard(key, topic, message.data, message.log_time, len(message.data))
 
 
-def _choose(path: Path, vehicle_id: str | None) -> str:
-    there = {vehicle for vehicle, _ in map(_wire_topic, Recording(path).messages()) if vehicle}
+def _choose(recording: Recording, vehicle_id: str | None) -> str:
+    there = {vehicle for vehicle, _ in map(_wire_topic, recording.messages()) if vehicle}
     names = ", ".join(sorted(there)) or "none"
     if vehicle_id is not None and vehicle_id not in there:
-        raise UserError(f"{path} holds no vehicle {vehicle_id} (vehicles in it: {names})")
+        raise UserError(f"{recording.path} holds no vehicle {vehicle_id} (vehicles in it: {names})")
     if vehicle_id is None and len(there) != 1:
-        raise UserError(f"{path} holds vehicles {names}; name one with --vehicle-id")
+        raise UserError(f"{recording.path} holds vehicles {names}; name one with --vehicle-id")
     return vehicle_id or there.pop()
 
 

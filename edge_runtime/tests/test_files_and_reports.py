@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 import os
+import socket
+import stat
 
 import pytest
 
@@ -36,6 +38,51 @@ def test_where_nothing_can_be_written(tmp_path):
         with pytest.raises(UserError):
             write_atomic(bad, b"x")
     check_writable(tmp_path / "new.json")
+
+
+def test_what_is_no_regular_file_is_refused_and_stays(tmp_path):
+    """Devices are spared: a test that fails must not take the machine's away."""
+    pipe, link, place = tmp_path / "pipe", tmp_path / "link", tmp_path / "socket"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(place))
+        for path in (pipe, link, place):
+            with pytest.raises(UserError, match="no regular file"):
+                check_writable(path)
+            with pytest.raises(UserError, match="no regular file"):
+                write_atomic(path, b"x")
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert link.is_symlink()
+    assert stat.S_ISSOCK(place.stat().st_mode)
+    assert sorted(os.listdir(tmp_path)) == ["link", "pipe", "socket"]
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["there", "not yet there"])
+def test_a_link_stays_and_the_file_behind_it_is_written(tmp_path, there):
+    target, link = tmp_path / "kept" / "out.json", tmp_path / "link.json"
+    target.parent.mkdir()
+    if there:
+        target.write_text("old")
+    link.symlink_to("kept/out.json")
+    check_writable(link)
+    write_json_out(link, {"a": 1})
+    assert os.readlink(link) == "kept/out.json"
+    assert json.loads(target.read_text()) == {"a": 1}
+    assert sorted(os.listdir(tmp_path)) == ["kept", "link.json"]
+    assert os.listdir(target.parent) == ["out.json"]
+
+
+def test_a_link_that_leads_nowhere_is_refused(tmp_path):
+    lost, circle = tmp_path / "lost", tmp_path / "circle"
+    lost.symlink_to(tmp_path / "no" / "out.json")
+    circle.symlink_to(circle)
+    for path in (lost, circle):
+        with pytest.raises(UserError, match="cannot write"):
+            check_writable(path)
+        with pytest.raises(UserError, match="cannot write"):
+            write_atomic(path, b"x")
+        assert path.is_symlink()
 
 
 def test_run_cli_turns_errors_into_one_line(capsys):

@@ -10,6 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from bridge.recording.reader import Recording
 from bridge.scene import Scene, decode_scene
 from bridge.viewer.recorded import read_heard
 from edge_runtime import wire
@@ -102,7 +103,7 @@ def _messages(recording: Path) -> Iterator[Any]:
         "command": wire.decode_command,
         "scene": decode_scene,
     }
-    for heard in read_heard(recording, VEHICLE):
+    for heard in read_heard(Recording(recording), VEHICLE):
         if heard.topic in decoders:
             yield decoders[heard.topic](heard.payload)
 

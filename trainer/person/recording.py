@@ -25,6 +25,7 @@ from zstandard import ZstdError
 
 from edge_runtime import __version__
 from edge_runtime.errors import UserError
+from edge_runtime.file_lock import hold
 from trainer.files import make_directory
 from trainer.person.interface import Control
 
@@ -110,6 +111,7 @@ class Recorder:
             self._file: IO[bytes] = self.path.open("xb")
         except OSError as error:
             raise UserError(f"cannot write {self.path}: {error.strerror}") from None
+        hold(self._file.fileno())  # `bridge repair` keeps away meanwhile.
         self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
         self._mcap.start(profile="", library=f"phil-hil {__version__}")
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)

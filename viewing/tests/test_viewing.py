@@ -98,6 +98,15 @@ def test_sigterm_finishes_the_file(tmp_path):
     assert "/speed" in found
 
 
+def test_a_link_to_a_file_stays_and_the_file_is_written(tmp_path):
+    target, link = tmp_path / "kept.rrd", tmp_path / "link.rrd"
+    link.symlink_to(target)
+    with open_sink(Sink("save", str(link)), "test", rrb.Blueprint()):
+        pass
+    assert link.is_symlink()
+    assert target.stat().st_size > 0
+
+
 def test_a_command_with_another_use_for_sigterm_keeps_it(tmp_path):
     def quit_softly(*_):
         pass

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from edge_runtime.errors import UserError
+from edge_runtime.file_lock import try_to_hold
 from trainer.person.recording import Recorder, Step, find_recordings, read_steps, sittings
 from trainer.person.tests.steps import recorded_step
 
@@ -64,6 +65,15 @@ def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_p
     recorder.close()
     with pytest.raises(UserError, match="recorded by another version: Object missing"):
         list(read_steps(recorder.path))
+
+
+def test_a_sitting_is_held_until_it_is_closed(tmp_path):
+    recorder = Recorder(tmp_path)
+    recorder.write(recorded_step(1, 0))
+    with recorder.path.open("rb") as other:
+        assert not try_to_hold(other.fileno())
+        recorder.close()
+        assert try_to_hold(other.fileno())
 
 
 def test_every_step_is_there_before_the_next_is_taken(tmp_path):
