@@ -8,6 +8,8 @@ from typing import Any
 from trainer.learner.config import LearnerConfig
 from trainer.ranges import FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
+MOST_THREADS = 1024
+"""More than a machine could use. Torch dies where the system has fewer than it asks for."""
 RANGES = {
     "seed": (0, 2**63 - 1),
     "episodes": FROM_ONE,
@@ -16,7 +18,7 @@ RANGES = {
     "evaluate_every": FROM_ZERO,
     "evaluation_runs": FROM_ONE,
     "checkpoint_every": FROM_ONE,
-    "threads": FROM_ZERO,
+    "threads": (0, MOST_THREADS),
 }
 """What each number may be."""
 
