@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edge_runtime.cli import examples
 from trainer.commands.options import file_name
-from trainer.person.recording import find_recordings
+from trainer.person.recording import find_recordings, read_steps
 
 EXAMPLE = examples(
     "python -m trainer view runs/drives --serve",
@@ -47,6 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.save is not None:
         sink = Sink("save", arguments.save)
     check_sink(sink)
+    for path in paths:  # Before a window opens, or a file takes another's place.
+        next(read_steps(path), None)
     with show_sittings(paths, sink) as shown:
         road = f"; {shown.without_road} without their road" if shown.without_road else ""
         print(
