@@ -1,5 +1,8 @@
 """A run's metrics, whatever a kill, a full disk or a stranger left of them."""
 
+import csv
+from typing import Any
+
 import pytest
 
 from edge_runtime.errors import UserError
@@ -7,6 +10,11 @@ from trainer.tests.test_commands import call
 from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics
 
 OLDER = [name for name in NAMES if name != "validation_reward"]
+
+
+def metrics_of(episode: int) -> EpisodeMetrics:
+    values: dict[str, Any] = dict.fromkeys(NAMES, 2.5)
+    return EpisodeMetrics(**{**values, "episode": episode, "outcome": "goal"})
 
 
 def write(run_dir, lines: list[str]) -> None:
@@ -27,7 +35,7 @@ def test_a_row_that_was_cut_off_is_left_out(kept, tmp_path):
 def test_what_goes_on_after_a_cut_begins_a_new_row(tmp_path):
     write(tmp_path, [row(0), row(1), row(2)[:40]])
     writer = MetricsWriter(tmp_path, 2)
-    writer.add(EpisodeMetrics(**{**dict.fromkeys(NAMES, 2.5), "episode": 2, "outcome": "goal"}))
+    writer.add(metrics_of(2))
     writer.close()
     rows = read_metrics(tmp_path)
     assert [each["episode"] for each in rows] == ["0", "1", "2"]
@@ -68,8 +76,8 @@ def test_anything_else_is_refused_in_a_line_that_names_it(content, capsys, tmp_p
 def test_a_curve_needs_no_value_that_a_row_may_go_without(capsys, tmp_path):
     names = ("validation_success", "validation_distance_m", "validation_reward")
     values = {**dict.fromkeys(NAMES, "1.5"), **dict.fromkeys(names, ""), "outcome": "goal"}
-    write(tmp_path, [",".join({**values, "episode": str(number)}.values()) for number in (0, 1)])
-    (tmp_path / "metrics.csv").open("a").write("\n")
+    rows = [",".join({**values, "episode": str(number)}.values()) for number in (0, 1)]
+    write(tmp_path, [*rows, ""])
     assert call(capsys, "plot", str(tmp_path))[0] == 0
 
 
@@ -77,8 +85,7 @@ def test_a_full_disk_is_one_line(tmp_path):
     writer = MetricsWriter(tmp_path)
     writer._file.close()
     writer._file = open("/dev/full", "w")  # noqa: SIM115 - the writer closes it
-    writer._csv.writer = __import__("csv").writer(writer._file)
-    metrics = EpisodeMetrics(**{**dict.fromkeys(NAMES, 2.5), "episode": 0, "outcome": "goal"})
+    writer._csv = csv.DictWriter(writer._file, NAMES)
     with pytest.raises(UserError, match="No space left on device"):
-        writer.add(metrics)
+        writer.add(metrics_of(0))
     writer.close()
