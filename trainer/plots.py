@@ -80,7 +80,8 @@ def _columns(run_dir: Path) -> dict[str, Values]:
         raise UserError(f"{run_dir} holds no metrics to draw")
 
     def column(name: str) -> Values:
-        return np.array([row[name] for row in rows], dtype=float)
+        # Kept results have nothing where there was no number.
+        return np.array([row.get(name) or "nan" for row in rows], dtype=float)
 
     return {
         "episode": column("episode") + 1,

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
+INSTALL = "make install"
 TIMEOUT_S = 60.0
 """For a program that a probe starts."""
 
@@ -48,15 +51,35 @@ class Finding:
 
 def examine(group: str, check: Check) -> Finding:
     """Make a check; whatever goes wrong in it is its finding."""
+    remedy = check.remedy
     try:
         ok, detail = True, check.probe()
+    # Whatever it is that was to be tried: it was not come to.
+    except ModuleNotFoundError as error:
+        ok, detail, remedy = False, f"Python finds no module {error.name}", INSTALL
     except MissingError as error:
         ok, detail = False, str(error)
     # A broken library may raise anything at all, and the checks after it are still wanted.
     except Exception as error:
         ok, detail = False, f"{type(error).__name__}: {error}"
     text = " ".join(detail.split())
-    return Finding(group, check.name, ok, text, check.basic, check.without, check.remedy)
+    return Finding(group, check.name, ok, text, check.basic, check.without, remedy)
+
+
+def output_of_python(script: str) -> str:
+    """What a script prints, in a process of its own.
+
+    Raises:
+        ModuleNotFoundError: it imports what is not installed.
+        MissingError: it fails in another way.
+    """
+    try:
+        return output_of(sys.executable, "-c", script)
+    except MissingError as error:
+        absent = re.search(r"ModuleNotFoundError: No module named '([\w.]+)'", str(error))
+        if absent is None:
+            raise
+        raise ModuleNotFoundError(name=absent[1]) from None
 
 
 def output_of(*command: str, name: str = "") -> str:

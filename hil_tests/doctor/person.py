@@ -5,12 +5,11 @@ from __future__ import annotations
 import functools
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
-from hil_tests.doctor.check import MissingError, output_of
+from hil_tests.doctor.check import MissingError, output_of_python
 
 _EVENTS = Path("/dev/input")
 _SDL = """
@@ -73,5 +72,5 @@ def controller() -> str:
 @functools.lru_cache(maxsize=None)  # noqa: UP033
 def _sdl() -> dict[str, Any]:
     # In a process of its own: a display that is gone may end it.
-    facts: dict[str, Any] = json.loads(output_of(sys.executable, "-c", _SDL).splitlines()[-1])
+    facts: dict[str, Any] = json.loads(output_of_python(_SDL).splitlines()[-1])
     return facts

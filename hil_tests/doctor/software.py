@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from hil_tests.doctor.check import MissingError, output_of
+from hil_tests.doctor.check import MissingError, output_of_python
 
 ROOT = Path(__file__).parents[2]
 LOCK = ROOT / "requirements" / "workstation.txt"
@@ -90,5 +90,5 @@ def _installed(name: str) -> str | None:
 @functools.lru_cache(maxsize=None)  # noqa: UP033
 def _torch_facts() -> dict[str, Any]:
     # A driver that does not fit may end the process that asks for it.
-    facts: dict[str, Any] = json.loads(output_of(sys.executable, "-c", _TORCH).splitlines()[-1])
+    facts: dict[str, Any] = json.loads(output_of_python(_TORCH).splitlines()[-1])
     return facts

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from hil_tests.doctor import boards, links, machine, person, software
-from hil_tests.doctor.check import Check
-
-INSTALL = "make install"
+from hil_tests.doctor.check import INSTALL, Check
 
 CHECKS: dict[str, tuple[Check, ...]] = {
     "basics": (

@@ -1,5 +1,6 @@
 """``python -m hil_tests doctor``: its checks find what is there, and what is not."""
 
+import importlib
 import json
 import os
 import socket
@@ -12,7 +13,7 @@ import pytest
 from edge_runtime.cli import run_cli
 from hil_tests.__main__ import main
 from hil_tests.doctor import links, machine, person, software
-from hil_tests.doctor.check import Check, MissingError, examine, output_of
+from hil_tests.doctor.check import Check, MissingError, examine, output_of, output_of_python
 from hil_tests.doctor.command import basics_work, lines, summary
 from hil_tests.doctor.table import CHECKS
 from trainer.benches.chromium import find_chromium
@@ -41,6 +42,20 @@ def test_without_packages_it_still_runs_and_says_what_is_missing():
     (packages,) = (line for line in done.stdout.splitlines() if "missing  packages: " in line)
     assert {"cryptography", "numpy", "torch"} <= set(packages.replace(",", "").split())
     assert done.stdout.endswith("The basics do not work here: packages, loopback.\n")
+    assert "  missing  loopback: Python finds no module " in done.stdout
+    assert "firewall" not in done.stdout
+
+
+def test_a_missing_package_is_installed_whatever_was_to_be_tried():
+    def here():
+        return importlib.import_module("no_such_package")
+
+    for probe in (here, lambda: output_of_python("import no_such_package.part")):
+        finding = found(probe)
+        assert finding.detail == "Python finds no module no_such_package"
+        assert finding.remedy == "make install"
+    with pytest.raises(MissingError, match="ZeroDivisionError"):
+        output_of_python("1 / 0")
 
 
 def test_every_line_says_what_is_lost_and_how_to_get_it():

@@ -7,7 +7,14 @@ from pathlib import Path
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
+from trainer.commands.options import (
+    add_scenario,
+    add_threads,
+    file_name,
+    not_negative,
+    positive,
+    set_threads,
+)
 from trainer.drivers import load_driver, make_environment
 from trainer.person.options import add_person, person_options
 from trainer.person.recording import Recorder
@@ -31,15 +38,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--policy",
+        type=file_name,
         metavar="POLICY",
         help="who drives until you take over: see `trainer evaluate` (default: you drive alone)",
     )
     goal = parser.add_mutually_exclusive_group(required=True)
     goal.add_argument(
-        "--out", metavar="REC_DIR", help="directory of the recordings; sittings add up there"
+        "--out",
+        type=file_name,
+        metavar="REC_DIR",
+        help="directory of the recordings; sittings add up there",
     )
     goal.add_argument(
         "--calibrate",
+        type=file_name,
         metavar="F.toml",
         help="do not drive: ask for a wheel's or gamepad's axes and buttons, write a profile",
     )

@@ -12,7 +12,7 @@ import torch
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from trainer.commands.options import not_negative, positive, positive_float
+from trainer.commands.options import file_name, not_negative, positive, positive_float
 from trainer.experiments import timing
 from trainer.experiments.catalogue import NAMES, TIME, units_of
 from trainer.experiments.plan import PLAN, QUICK
@@ -85,13 +85,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--draw-only", action="store_true", help="draw and judge what is there; compute nothing"
     )
     parser.add_argument(
-        "--results", default="results", metavar="DIR", help="results and figures, to be committed"
+        "--results",
+        type=file_name,
+        default="results",
+        metavar="DIR",
+        help="results and figures, to be committed",
     )
     parser.add_argument(
-        "--runs", default="runs", metavar="DIR", help="checkpoints and actors, not committed"
+        "--runs",
+        type=file_name,
+        default="runs",
+        metavar="DIR",
+        help="checkpoints and actors, not committed",
     )
     parser.add_argument(
         "--humans",
+        type=file_name,
         metavar="DIR",
         help="holds a human model for each scenario: DIR/left_turn, ... (default: RESULTS/humans)",
     )

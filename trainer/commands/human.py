@@ -8,11 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from edge_runtime.cli import UserError, examples, write_json_out
-from trainer.commands.options import add_scenario, add_threads, not_negative, positive, set_threads
+from trainer.commands.options import (
+    add_scenario,
+    add_threads,
+    file_name,
+    not_negative,
+    positive,
+    set_threads,
+)
 from trainer.drivers import make_environment
-from trainer.files import make_directory
 from trainer.human.dagger import HumanTraining
-from trainer.human.model import HumanModel, HumanModelConfig
+from trainer.human.model import MODEL_FILE, HumanModel, HumanModelConfig
+from trainer.locks import claimed
 from trainer.person.imitation import demonstrate
 from trainer.person.recording import find_recordings
 from trainer.progress import ProgressBar
@@ -28,7 +35,9 @@ DEFAULTS = HumanModelConfig()
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_scenario(parser)
-    parser.add_argument("--out", required=True, metavar="HUMAN_DIR", help="directory of the model")
+    parser.add_argument(
+        "--out", type=file_name, required=True, metavar="HUMAN_DIR", help="directory of the model"
+    )
     parser.add_argument("--seed", type=not_negative, default=0, help="of everything")
     parser.add_argument(
         "--episodes", type=positive, default=DEFAULTS.episodes, help="episodes (table A7)"
@@ -75,6 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--from",
         dest="recordings",
+        type=file_name,
         nargs="+",
         metavar="RECORDING",
         help="imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
@@ -101,25 +111,32 @@ def run(arguments: argparse.Namespace) -> int:
         unaided_share=arguments.unaided_share,
         refining_updates=arguments.refining_updates,
     )
-    model, about = (_from_expert if scripted else _from_person)(arguments, config)
+    directory = Path(arguments.out)
+    with claimed(directory):
+        if (directory / MODEL_FILE).exists():
+            raise UserError(f"{directory} holds a human model; choose another --out")
+        _train(arguments, config, directory)
+    return 0
+
+
+def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
+    from_whom = _from_expert if arguments.recordings is None else _from_person
+    model, about = from_whom(arguments, config)
     if config.refining_updates:
         with ProgressBar("refining", config.refining_parts) as bar:
             for loss in model.refine():
                 bar.advance({"loss": f"{loss:.3f}"})
-    directory = Path(arguments.out)
     about = {"scenario": arguments.scenario, "seed": arguments.seed, **about}
     model.save(directory, {**about, "config": asdict(config)})
     report = {**about, "config": asdict(config), "demonstrations": model.demonstrations}
     write_json_out(str(directory / "human.json"), report)
     print(f"human model from {model.demonstrations} demonstrated steps: {directory}")
-    return 0
 
 
 def _from_expert(
     arguments: argparse.Namespace, config: HumanModelConfig
 ) -> tuple[HumanModel, dict[str, Any]]:
     """A model of the scripted expert, which takes over from it while it drives."""
-    make_directory(Path(arguments.out))
     training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)
     with ProgressBar("human model", config.episodes) as bar:
         for episode in training.episodes():
@@ -141,7 +158,6 @@ def _from_person(
     recordings = find_recordings([Path(place) for place in arguments.recordings])
     model = HumanModel(config, arguments.seed)
     interventions = demonstrate(model, recordings, arguments.scenario)
-    make_directory(Path(arguments.out))
     with ProgressBar("human model", config.episodes) as bar:
         for _ in range(config.episodes):
             loss = model.learn(config.updates_per_episode)

@@ -12,6 +12,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.latency.model import GRAMMAR
 from trainer.scenarios import SCENARIOS
+from trainer.training.config import MOST_THREADS
 
 
 def add_scenario(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +26,7 @@ def add_threads(parser: argparse.ArgumentParser) -> None:
     """``--threads``."""
     parser.add_argument(
         "--threads",
-        type=not_negative,
+        type=_threads,
         default=0,
         metavar="N",
         help="processor threads of the learner; 0: all cores",
@@ -50,6 +51,14 @@ def set_threads(count: int) -> None:
         torch.set_num_threads(count)
 
 
+def _threads(text: str) -> int:
+    """An argparse type: torch asks the system for as many at once, and dies where it has none."""
+    value = not_negative(text)
+    if value > MOST_THREADS:
+        raise argparse.ArgumentTypeError(f"{text} is more than {MOST_THREADS}")
+    return value
+
+
 def positive(text: str) -> int:
     """An argparse type: an integer above zero."""
     value = int(text)
@@ -72,6 +81,26 @@ def positive_float(text: str) -> float:
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is not a finite number above zero")
     return value
+
+
+def file_name(text: str) -> str:
+    """An argparse type: the name of a file or directory; an empty one would be where one stands."""
+    if not text:
+        raise argparse.ArgumentTypeError("an empty name is no file and no directory")
+    return text
+
+
+def check_picture(out: str, film: bool = False) -> None:
+    """Refuse a name that says something else than what will be in it; raises UserError.
+
+    Args:
+        out: the file.
+        film: whether the command also makes films.
+    """
+    if film and not out.endswith((".png", ".gif")):
+        raise UserError(f"--out {out}: a picture is a .png, a film a .gif")
+    if not film and not out.endswith(".png"):
+        raise UserError(f"--out {out}: a picture is a .png")
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:

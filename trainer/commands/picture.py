@@ -12,7 +12,13 @@ from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
 from trainer.animation import draw_moment, drive_moments, encode_gif
-from trainer.commands.options import add_scenario, not_negative, positive_float
+from trainer.commands.options import (
+    add_scenario,
+    check_picture,
+    file_name,
+    not_negative,
+    positive_float,
+)
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver, HumanGuide
 
@@ -26,7 +32,7 @@ ACTIONS = {"left_turn": "pedal", "congestion": "steering"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("policy", help="who drives: see `trainer evaluate`")
+    parser.add_argument("policy", type=file_name, help="who drives: see `trainer evaluate`")
     add_scenario(parser)
     parser.add_argument("--seed", type=not_negative, default=0, help="of the episode")
     parser.add_argument(
@@ -38,19 +44,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--human",
+        type=file_name,
         metavar="expert|HUMAN_DIR",
         help="who takes over, where the scripted human would; in a film (default: nobody)",
     )
     parser.add_argument(
-        "--out", required=True, metavar="F.png|F.gif", help="the picture, or the film"
+        "--out",
+        type=file_name,
+        required=True,
+        metavar="F.png|F.gif",
+        help="the picture, or the film",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Drive to the moment and draw it, or film the way there; returns the exit status."""
+    check_picture(arguments.out, film=True)
     is_film = arguments.out.endswith(".gif")
-    if not (is_film or arguments.out.endswith(".png")):
-        raise UserError(f"--out {arguments.out}: a picture is a .png, a film a .gif")
     if arguments.human is not None and not is_film:
         raise UserError("--human takes over in a film: --out F.gif")
     check_writable(arguments.out)

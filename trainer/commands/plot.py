@@ -8,7 +8,7 @@ from pathlib import Path
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
-from trainer.commands.options import existing_directory
+from trainer.commands.options import check_picture, existing_directory, file_name
 from trainer.plots import CURVE_FILE, write_learning_curves
 
 EXAMPLE = examples(
@@ -22,11 +22,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "run_dirs",
         metavar="RUN_DIR",
+        type=file_name,
         nargs="+",
         help="directory of a training run; several are drawn thinly, and their mean",
     )
     parser.add_argument(
-        "--out", metavar="F.png", help=f"the picture (default: RUN_DIR/{CURVE_FILE})"
+        "--out",
+        type=file_name,
+        metavar="F.png",
+        help=f"the picture (default: RUN_DIR/{CURVE_FILE})",
     )
 
 
@@ -35,6 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
     run_dirs = [existing_directory(path, "run directory") for path in arguments.run_dirs]
     if arguments.out is None and len(run_dirs) > 1:
         raise UserError("several runs go into one picture: --out F.png")
+    if arguments.out is not None:
+        check_picture(arguments.out)
     out = run_dirs[0] / CURVE_FILE if arguments.out is None else Path(arguments.out)
     check_writable(out)
     write_learning_curves(run_dirs, out)

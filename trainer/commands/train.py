@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,23 +20,23 @@ from trainer.commands.options import (
     add_latency,
     add_scenario,
     add_threads,
+    file_name,
     not_negative,
     positive,
     positive_float,
-    read_json,
     set_threads,
 )
-from trainer.drivers import CHECKPOINT_FILE
-from trainer.files import make_directory
+from trainer.commands.resuming import check_directory
+from trainer.commands.settings import DEFAULTS, settings, with_setting
 from trainer.learner.algorithms import ALGORITHMS
-from trainer.learner.config import LearnerConfig
+from trainer.locks import claimed
 from trainer.person.options import PERSON, add_person, check_no_person
 from trainer.person.registry import HUMANS
 from trainer.plots import write_learning_curve
 from trainer.progress import ProgressBar
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
-from trainer.training.run import CONFIG_FILE, TrainingRun
+from trainer.training.run import TrainingRun
 
 EXAMPLE = examples(
     "python -m trainer train --scenario left_turn --episodes 120 --out runs/phil_1",
@@ -46,7 +45,6 @@ EXAMPLE = examples(
     "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
     "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
 )
-DEFAULTS = RunConfig()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,12 +59,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--human",
+        type=file_name,
         default=DEFAULTS.human,
         metavar=f"expert|HUMAN_DIR|{'|'.join(HUMANS)}",
         help="who guides: the scripted expert, a model trained by `trainer human`, or you",
     )
     add_person(parser)
-    parser.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
+    parser.add_argument(
+        "--out", type=file_name, required=True, metavar="RUN_DIR", help="directory of the run"
+    )
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learner's device")
     add_latency(parser, "network between policy and vehicle, also in validation")
@@ -82,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help=f"change a setting: {', '.join(_settings())}",
+        help=f"change a setting: {', '.join(settings())}",
     )
     parser.add_argument(
         "--rerun",
@@ -100,7 +101,13 @@ def run(arguments: argparse.Namespace) -> int:
     _check_human(arguments.human)
     config = _config(arguments)
     run_dir = Path(arguments.out)
-    _check_directory(run_dir, config, arguments.resume)
+    with claimed(run_dir):
+        check_directory(run_dir, config, arguments.resume)
+        _train(arguments, config, run_dir)
+    return 0
+
+
+def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> None:
     sink = _sink(arguments.rerun)
     with _training(arguments, config, run_dir) as training:
         deadline_s = (
@@ -114,7 +121,6 @@ def run(arguments: argparse.Namespace) -> int:
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
     print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
-    return 0
 
 
 def _check_human(human: str) -> None:
@@ -135,9 +141,7 @@ def _training(
             yield guided
     else:
         check_no_person(arguments)
-        training = TrainingRun(config, run_dir, arguments.resume)
-        make_directory(run_dir)
-        yield training
+        yield TrainingRun(config, run_dir, arguments.resume)
 
 
 def _sink(word: str | None) -> Any:
@@ -206,45 +210,5 @@ def _config(arguments: argparse.Namespace) -> RunConfig:
         threads=arguments.threads,
     )
     for assignment in arguments.set:
-        config = _with_setting(config, assignment)
+        config = with_setting(config, assignment)
     return config
-
-
-def _settings() -> dict[str, Any]:
-    """Every setting that ``--set`` may change, with its default."""
-    run = ("guided_share", "penalise_stuck", "poor_guidance_share", "evaluate_every")
-    own = {name: getattr(DEFAULTS, name) for name in (*run, "evaluation_runs", "checkpoint_every")}
-    return own | {f.name: getattr(DEFAULTS.learner, f.name) for f in fields(LearnerConfig)}
-
-
-def _with_setting(config: RunConfig, assignment: str) -> RunConfig:
-    name, _, text = assignment.partition("=")
-    settings = _settings()
-    if name not in settings:
-        raise UserError(f"--set {assignment}: no setting {name!r}; there is {', '.join(settings)}")
-    kind = type(settings[name])
-    try:
-        value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
-    except (ValueError, KeyError):
-        raise UserError(f"--set {assignment}: {text!r} is no {kind.__name__}") from None
-    if name in {f.name for f in fields(LearnerConfig)}:
-        return replace(config, learner=replace(config.learner, **{name: value}))
-    return replace(config, **{name: value})
-
-
-def _check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
-    """Refuse to overwrite a run, or to resume one under other settings."""
-    started = (run_dir / CHECKPOINT_FILE).is_file()
-    if started and not resume:
-        raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
-    if resume and not started:
-        raise UserError(f"{run_dir} holds no checkpoint to resume from")
-    if resume:
-        # A config of before the network has no field for it.
-        saved = {"latency": DEFAULTS.latency, **read_json(run_dir / CONFIG_FILE, "run config")}
-        wanted = config.as_dict()
-        changed = [key for key in wanted if key != "episodes" and saved.get(key) != wanted[key]]
-        if changed:
-            raise UserError(f"{run_dir} was trained with another {', '.join(changed)}")
-        if config.episodes < saved["episodes"]:
-            raise UserError(f"{run_dir} is a run of {saved['episodes']} episodes, not fewer")

@@ -7,7 +7,8 @@ import time
 from pathlib import Path
 
 from edge_runtime.cli import examples
-from trainer.person.recording import find_recordings
+from trainer.commands.options import file_name
+from trainer.person.recording import find_recordings, read_steps
 
 EXAMPLE = examples(
     "python -m trainer view runs/drives --serve",
@@ -22,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings",
         metavar="RECORDING",
+        type=file_name,
         nargs="+",
         help="sitting-NNNN.mcap, a directory of such, or a run that a person guided",
     )
@@ -30,7 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where.add_argument(
         "--serve", action="store_true", help="serve a web page on this machine's loopback only"
     )
-    where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
+    where.add_argument(
+        "--save", type=file_name, metavar="F.rrd", help="write a recording instead of showing it"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -43,6 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.save is not None:
         sink = Sink("save", arguments.save)
     check_sink(sink)
+    for path in paths:  # Before a window opens, or a file takes another's place.
+        next(read_steps(path), None)
     with show_sittings(paths, sink) as shown:
         road = f"; {shown.without_road} without their road" if shown.without_road else ""
         print(

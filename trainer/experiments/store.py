@@ -6,11 +6,8 @@ what the figures need and is. A result appears there in one rename, whole.
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import shutil
-import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -24,6 +21,7 @@ from trainer.evaluation import CONDITIONS
 from trainer.experiments.plan import Plan
 from trainer.experiments.units import Unit, obstacle, unit_id
 from trainer.files import make_directory
+from trainer.locks import held, holder
 from trainer.training.metrics import METRICS_FILE
 
 UNIT_FILE = "config.json"
@@ -116,49 +114,22 @@ class Store:
     def lock(self, unit: Unit, patience_s: float = 0.0) -> Iterator[bool]:
         """Hold the unit against other processes; gives whether that was possible.
 
-        The lock is the kernel's, on a file that names its holder: when a process dies, however it
-        dies, its lock is gone with it, and the next one takes over. Whoever wants to work is
-        patient for a moment: ``state`` takes the lock, too, to see whether it can be had.
+        Whoever wants to work is patient for a moment: ``state`` takes the lock, too, to see whether
+        it can be had.
         """
         path = self.lock_file(unit)
         make_directory(path.parent)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            if not _locked(descriptor, patience_s):
-                yield False
-                return
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, json.dumps(_me()).encode(), 0)
-            yield True
-            os.ftruncate(descriptor, 0)
-        finally:
-            os.close(descriptor)
+        with held(path, patience_s) as free:
+            yield free
 
     def lock_file(self, unit: Unit) -> Path:
-        """Beside the working directory; it stays, since removing it would let two in."""
+        """Beside the working directory."""
         run_dir = self.run_dir(unit)
         return run_dir.with_name(f"{run_dir.name}.lock")
 
     def holder(self, unit: Unit) -> str:
         """Who holds the unit's lock, in words."""
-        try:
-            who = json.loads(self.lock_file(unit).read_bytes())
-        except (OSError, ValueError):
-            return "another process"
-        return f"process {who['pid']} on {who['host']}"
-
-
-def _locked(descriptor: int, patience_s: float) -> bool:
-    """Whether the file's lock could be had."""
-    end_s = time.monotonic() + patience_s
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-        except BlockingIOError:
-            if time.monotonic() >= end_s:
-                return False
-            time.sleep(0.01)
+        return holder(self.lock_file(unit))
 
 
 _TEMPORARY = ".unfinished-"
@@ -178,7 +149,3 @@ def _abandoned(path: Path) -> bool:
         return (path / "old").exists() or time.time() - path.stat().st_mtime > _ABANDONED_S
     except FileNotFoundError:
         return False
-
-
-def _me() -> dict[str, object]:
-    return {"pid": os.getpid(), "host": socket.gethostname()}

@@ -99,7 +99,7 @@ RANGES = {
     "exploration_final": FROM_ZERO,
     "exploration_decay": SHARE,
     "exploration_bound": FROM_ZERO,
-    "replay_capacity": FROM_ONE,
+    "replay_capacity": (1, 10**9),
     "alpha": SHARE,
     "priority_offset": ABOVE_ZERO,
     "advantage_bound": FROM_ZERO,

@@ -17,7 +17,7 @@ from typing import IO
 import msgspec
 import numpy as np
 from mcap.exceptions import McapError
-from mcap.records import Chunk, McapRecord, Message
+from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ from trainer.files import make_directory
 from trainer.person.interface import Control
 
 TOPIC = "person/step"
+WIRE = ("phil/", "view/")
+"""How the topics of the wire's recordings begin, and those of their copies for viewers."""
 DIRECTORY = "sittings"
 """Where a training run keeps its recordings."""
 MAGIC = b"\x89MCAP0\r\n"
@@ -187,7 +189,7 @@ def read_steps(path: Path) -> Iterator[Step]:
             raise UserError(f"{path} is no recording of a sitting")
         stream.seek(0)
         try:
-            for message in _messages(stream):
+            for message in _messages(stream, path):
                 yield msgspec.msgpack.decode(message.data, type=Step)
         # Of a chunk whose checksum is right: no kill does that.
         except msgspec.DecodeError as error:
@@ -196,13 +198,27 @@ def read_steps(path: Path) -> Iterator[Step]:
             return
 
 
-def _messages(stream: IO[bytes]) -> Iterator[Message]:
+def _messages(stream: IO[bytes], path: Path) -> Iterator[Message]:
     reader = StreamReader(stream, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
     for record in reader.records:
         parts: Sequence[McapRecord] = (
             breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
         )
-        yield from (part for part in parts if isinstance(part, Message))
+        for part in parts:
+            if isinstance(part, Channel) and part.topic != TOPIC and isinstance(record, Chunk):
+                raise UserError(_foreign(path, part.topic))
+            if isinstance(part, Message):
+                yield part
+
+
+def _foreign(path: Path, topic: str) -> str:
+    """Why a whole MCAP file of somebody else's is not read."""
+    if topic.startswith(WIRE):
+        return (
+            f"{path} is a recording of the wire, as `bridge record` makes them: "
+            f"`python -m bridge view {path}` shows it"
+        )
+    return f"{path} is no recording of a sitting: it holds {topic}"
 
 
 def _number(path: Path) -> int:

@@ -19,6 +19,7 @@ from trainer.person.sitting import Sitting, SittingOver
 from trainer.person.unhurried import UnhurriedLearning
 from trainer.person.watched import WatchedEnv
 from trainer.training.config import RunConfig
+from trainer.training.divergence import divergence_said
 from trainer.training.learning import Learning, ProcessorLearning
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
@@ -90,7 +91,8 @@ class PersonRun(TrainingRun):
         """Write the checkpoint, which the person sees."""
         self.sitting.announce("saving")
         began_s = time.perf_counter()
-        super().save()
+        with divergence_said(self.episode):  # The update under way may be the one.
+            super().save()
         self.longest_save_s = max(self.longest_save_s, time.perf_counter() - began_s)
 
     def _make_learning(self, action_size: int) -> Learning:

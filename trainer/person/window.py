@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
 from trainer.person.interface import View
+from trainer.person.quiet import quiet_stderr
 from trainer.scenarios.scene import draw_scene
 
 SIZE = (1040, 680)
@@ -49,11 +50,12 @@ class Window:
 
     def __init__(self, title: str = "PHIL-TD3: at the wheel") -> None:
         try:
-            pygame.display.init()
-            _check_visible()
-            pygame.joystick.init()
-            pygame.font.init()
-            self._screen = pygame.display.set_mode(SIZE)
+            with quiet_stderr():
+                pygame.display.init()
+                _check_visible()
+                pygame.joystick.init()
+                pygame.font.init()
+                self._screen = pygame.display.set_mode(SIZE)
         except pygame.error as error:
             pygame.quit()
             raise UserError(

@@ -97,7 +97,7 @@ def test_losses_that_are_no_numbers_end_the_run():
     with torch.no_grad():
         next(learning.learner.critics.parameters()).fill_(torch.nan)
     learning.begin(0.0)
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(FloatingPointError, match="no longer finite"):
         learning.end_episode()
 
 

@@ -53,6 +53,20 @@ WRONG = [
     ("picture", "{tmp}/nobody", "--out", "{tmp}/p.png"),
     ("human", "--out", "{tmp}/file"),
     ("bench", "--threads", "-1"),
+    ("train", "--out", "{tmp}/x", "--threads", "1025"),
+    ("train", "--out", "{tmp}/x", "--set", "replay_capacity=99999999999999"),
+    ("plot", "{tmp}", "--out", "{tmp}/c.pdf"),
+    ("plot", "{tmp}", "--out", "{tmp}/c.txt"),
+    ("train", "--out", ""),
+    ("drive", "--out", ""),
+    ("human", "--out", ""),
+    ("evaluate", "expert", "--out", ""),
+    ("export", "{tmp}", "--out", ""),
+    ("plot", "{tmp}", "--out", ""),
+    ("picture", "expert", "--out", ""),
+    ("view", "{tmp}", "--save", ""),
+    ("bench", "--out", ""),
+    ("experiment", "status", "--results", ""),
     ("bench", "--out", "{tmp}/no/such/b.json"),
     (),
 ]
@@ -130,7 +144,21 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path):
     other = ("train", "--out", run, "--human", human, "--episodes", "4", "--seed", "8", "--resume")
     status, _, err = call(capsys, *other)
     assert status == 2
-    assert "seed" in err
+    assert "--seed 0 (now 8), --set evaluation_runs=1 (now 20), --set batch_size=4 (now 128)" in err
+    status, _, err = call(capsys, *steps[0])
+    assert status == 2
+    assert "holds a human model" in err
+
+
+def test_a_replay_buffer_beyond_the_memory_is_one_line(capsys, tmp_path, monkeypatch):
+    def too_much(*_):
+        raise MemoryError("Unable to allocate 3.4 TiB")
+
+    monkeypatch.setattr("trainer.learner.replay.np.empty", too_much)
+    status, _, err = call(capsys, "train", "--out", str(tmp_path / "x"), "--episodes", "1")
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "no memory for a replay buffer of 100000 transitions: --set replay_capacity=N" in err
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("content", ["[]", "{", "null"])

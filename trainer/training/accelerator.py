@@ -119,7 +119,7 @@ class AcceleratorLearning:
         found = torch.cat([self._loss_sums, self.replay.priority_means()]).cpu().numpy()
         self._loss_sums.zero_()
         if np.isinf(found).any() or np.isnan(found[:4]).any():
-            raise ValueError("a loss or a priority is not finite")
+            raise FloatingPointError("its losses are no longer finite")
         mean_losses = found[:4] / self._updates if self._updates else NO_LOSSES
         learned = EpisodeLearning(
             self._clock.take_total_s(),

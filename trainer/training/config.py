@@ -8,6 +8,8 @@ from typing import Any
 from trainer.learner.config import LearnerConfig
 from trainer.ranges import FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
+MOST_THREADS = 1024
+"""More than a machine could use. Torch dies where the system has fewer than it asks for."""
 RANGES = {
     "seed": (0, 2**63 - 1),
     "episodes": FROM_ONE,
@@ -16,7 +18,7 @@ RANGES = {
     "evaluate_every": FROM_ZERO,
     "evaluation_runs": FROM_ONE,
     "checkpoint_every": FROM_ONE,
-    "threads": FROM_ZERO,
+    "threads": (0, MOST_THREADS),
 }
 """What each number may be."""
 
@@ -70,13 +72,14 @@ class RunConfig:
         return asdict(self)
 
     @staticmethod
+    def completed(values: dict[str, Any]) -> dict[str, Any]:
+        """A config of before the network, or before the switch of the reward, with their fields."""
+        later = {"latency": RunConfig.latency, "printed_reward": RunConfig.printed_reward}
+        return {**later, **values}
+
+    @staticmethod
     def from_dict(values: dict[str, Any]) -> RunConfig:
         """The inverse of ``as_dict``."""
-        # Configs of before the network, or before the switch of the reward, have no such field.
-        values = {
-            "latency": RunConfig.latency,
-            "printed_reward": RunConfig.printed_reward,
-            **values,
-        }
+        values = RunConfig.completed(values)
         known = {name: values[name] for name in RunConfig.__dataclass_fields__}
         return RunConfig(**{**known, "learner": LearnerConfig(**values["learner"])})

@@ -58,11 +58,19 @@ class Learning(Protocol):
         """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
 
     def finish(self) -> float:
-        """Wait until the update that was begun is done, if one was; the seconds waited."""
+        """Wait until the update that was begun is done, if one was; the seconds waited.
+
+        Raises:
+            FloatingPointError: what it has learned is not finite; it may come out later, too.
+        """
         ...
 
     def end_episode(self) -> EpisodeLearning:
-        """What was learned since the last call; learning rates decay (table A5)."""
+        """What was learned since the last call; learning rates decay (table A5).
+
+        Raises:
+            FloatingPointError: it is not finite.
+        """
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -180,13 +188,15 @@ class ProcessorLearning:
     def finish(self) -> float:
         """Wait until the update that was begun is done, if one was; the seconds waited.
 
-        What the update raised comes out here.
+        What the update raised comes out here; FloatingPointError where learning has diverged.
         """
         if self._begun is None:
             return 0.0
         began_s = time.perf_counter()
         (batch, update), self._begun = self._begun, None
         losses, learning_s = update.result()
+        if not np.isfinite(losses.priorities).all():
+            raise FloatingPointError("its losses are no longer finite")
         waited_s = time.perf_counter() - began_s
         self._waiting_s += waited_s
         self._learning_s += learning_s

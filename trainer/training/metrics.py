@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import csv
 import io
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
 
 from edge_runtime.episode_report import GOAL
-from edge_runtime.files import write_atomic
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes, write_atomic
 
 METRICS_FILE = "metrics.csv"
+ALWAYS = (
+    "episode",
+    "total_steps",
+    "steps",
+    "episode_return",
+    "distance_m",
+    "interventions",
+    "human_steps",
+)
+"""Columns that every row has a number in; the others may be empty, as those that a run began
+without."""
 
 
 @dataclass
@@ -79,10 +92,13 @@ class MetricsWriter:
         self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=from_episode)
 
     def add(self, metrics: EpisodeMetrics) -> None:
-        """Write one episode's row."""
+        """Write one episode's row; UserError where the disk is full."""
         row = asdict(metrics)
-        self._csv.writerow(row)
-        self._file.flush()
+        try:
+            self._csv.writerow(row)
+            self._file.flush()
+        except OSError as error:
+            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
         row["success"] = float(metrics.outcome == GOAL)
         for name, value in row.items():
             if isinstance(value, (int, float)) and value == value:
@@ -90,14 +106,53 @@ class MetricsWriter:
 
     def close(self) -> None:
         """Flush and close both."""
-        self._file.close()
+        with suppress(OSError):  # What could not be written is tried once more, and was said.
+            self._file.close()
         self._board.close()
 
 
 def read_metrics(run_dir: Path) -> list[dict[str, str]]:
-    """The rows of a run; empty where it has none."""
+    """The rows of a run; empty where it has none.
+
+    A row that was cut off at the end is left out: no checkpoint comes before its row is whole.
+
+    Raises:
+        UserError: the file is damaged, or not of this project.
+    """
     path = run_dir / METRICS_FILE
-    if not path.is_file():
+    if not path.exists():
         return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    try:
+        return _rows(read_bytes(path, "metrics").decode())
+    except (ValueError, csv.Error) as error:
+        raise UserError(f"{path} is no metrics of a training, or damaged: {error}") from None
+
+
+def _rows(text: str) -> list[dict[str, str]]:
+    """Of the whole lines; ValueError where one is not as ``MetricsWriter`` has it."""
+    lines = text.splitlines(keepends=True)
+    if lines and not lines[-1].endswith(("\r", "\n")):
+        lines.pop()
+    reader = csv.DictReader(lines, strict=True)
+    names = reader.fieldnames or []
+    if not {*ALWAYS, "outcome"} <= set(names) <= set(NAMES):
+        raise ValueError("its columns are others")
+    rows = list(reader)
+    for number, row in enumerate(rows, start=1):
+        if not _whole(row):
+            raise ValueError(f"row {number} is broken")
+    return rows
+
+
+def _whole(row: dict[str, str]) -> bool:
+    """Whether a row has a value in each column, and a number wherever there must be one."""
+    if None in row or None in row.values():  # More of them than columns, or fewer.
+        return False
+    try:
+        int(row["episode"])
+        for name, value in row.items():
+            if name in ALWAYS or (value and name != "outcome"):
+                float(value)
+    except ValueError:
+        return False
+    return True

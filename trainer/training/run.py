@@ -31,6 +31,7 @@ from trainer.learner import equations
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.revision import source_revision
 from trainer.training.config import RunConfig
+from trainer.training.divergence import check_weights, divergence_said, finite_action
 from trainer.training.learning import Learning, LearningDriver
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 from trainer.training.placement import make_learning
@@ -101,8 +102,10 @@ class TrainingRun:
             self.learning.close()
 
     def advance(self) -> EpisodeMetrics:
-        """Train one episode, without validation and checkpoint."""
-        metrics = self._episode()
+        """Train one episode, without validation and checkpoint; UserError where it diverges."""
+        with divergence_said(self.episode):
+            metrics = self._episode()
+            check_weights(self.learning.learner)
         self.episode += 1
         return metrics
 
@@ -218,7 +221,7 @@ class TrainingRun:
         return replace(intervention, action=random.astype(np.float32))
 
     def _explore(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
-        action = self.learning.act(observation)
+        action = finite_action(self.learning.act(observation))
         noise = equations.exploration_noise(
             self._exploration_std(),
             self.config.learner.exploration_bound,

@@ -22,6 +22,7 @@ from trainer.training.run import TrainingRun
 DRIVE = ("drive", "--out", "{tmp}/rec")
 TRAIN = ("train", "--out", "{tmp}/run")
 SHIPPED = str(Path(__file__).parents[3] / "results/policies/left_turn.onnx")
+WIRE = str(Path(__file__).parents[3] / "hil_tests/recordings/left_turn.mcap")
 WRONG = [
     (DRIVE, ("--human", "telepathy"), "invalid choice"),
     (DRIVE, ("--human", "wheel", "--profile", "{tmp}/none.toml"), "does not exist"),
@@ -48,6 +49,8 @@ WRONG = [
     (TRAIN, ("--human", "keyboard", "--resume"), "no checkpoint"),
     (("human", "--out", "{tmp}/h", "--from", "{tmp}"), (), "no recording in"),
     (("human", "--out", "{tmp}/h", "--from", "{tmp}/file"), (), "no recording of a sitting"),
+    (("human", "--out", "{tmp}/h", "--from", WIRE), (), f"`python -m bridge view {WIRE}` shows it"),
+    (("view", WIRE, "--save", "{tmp}/v.rrd"), (), "is a recording of the wire"),
 ]
 
 
@@ -63,11 +66,11 @@ def test_a_mistake_is_one_line_and_status_2(
     assert status == 2
     assert complaint in errors
     assert errors.count("\n") == 1
-    assert not (tmp_path / "run").exists()
+    assert {path.name for path in tmp_path.iterdir()} <= {"bad.toml", "file"}
 
 
 @pytest.mark.parametrize("driver", ["x11", None])
-def test_without_a_screen_it_says_what_to_do(capsys, tmp_path, monkeypatch, driver):
+def test_without_a_screen_it_says_what_to_do(capfd, tmp_path, monkeypatch, driver):
     """Left to itself, SDL would draw into memory, and nobody would see it drive."""
     if driver is None:
         monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
@@ -75,7 +78,8 @@ def test_without_a_screen_it_says_what_to_do(capsys, tmp_path, monkeypatch, driv
         monkeypatch.setenv("SDL_VIDEODRIVER", driver)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":9999")
-    status, _, errors = call(capsys, "drive", "--out", str(tmp_path / "rec"))
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    status, _, errors = call(capfd, "drive", "--out", str(tmp_path / "rec"))
     assert status == 2
     assert "--human web needs none" in errors
     assert errors.count("\n") == 1

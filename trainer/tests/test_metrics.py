@@ -1,0 +1,91 @@
+"""A run's metrics, whatever a kill, a full disk or a stranger left of them."""
+
+import csv
+from typing import Any
+
+import pytest
+
+from edge_runtime.errors import UserError
+from trainer.tests.test_commands import call
+from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics
+
+OLDER = [name for name in NAMES if name != "validation_reward"]
+
+
+def metrics_of(episode: int) -> EpisodeMetrics:
+    values: dict[str, Any] = dict.fromkeys(NAMES, 2.5)
+    return EpisodeMetrics(**{**values, "episode": episode, "outcome": "goal"})
+
+
+def write(run_dir, lines: list[str]) -> None:
+    (run_dir / "metrics.csv").write_text("\r\n".join([",".join(NAMES), *lines]), newline="")
+
+
+def row(episode: int, names: list[str] = NAMES) -> str:
+    values = {**dict.fromkeys(names, "1.5"), "episode": str(episode), "outcome": "goal"}
+    return ",".join(values[name] for name in names)
+
+
+@pytest.mark.parametrize("kept", [1, 30, len(row(2)) - 1, len(row(2))])
+def test_a_row_that_was_cut_off_is_left_out(kept, tmp_path):
+    write(tmp_path, [row(0), row(1), row(2)[:kept]])
+    assert [each["episode"] for each in read_metrics(tmp_path)] == ["0", "1"]
+
+
+def test_what_goes_on_after_a_cut_begins_a_new_row(tmp_path):
+    write(tmp_path, [row(0), row(1), row(2)[:40]])
+    writer = MetricsWriter(tmp_path, 2)
+    writer.add(metrics_of(2))
+    writer.close()
+    rows = read_metrics(tmp_path)
+    assert [each["episode"] for each in rows] == ["0", "1", "2"]
+    assert rows[2]["distance_m"] == "2.5"
+
+
+def test_a_run_from_before_a_column_is_read_and_goes_on(tmp_path):
+    lines = [",".join(OLDER), row(0, OLDER), row(1, OLDER), ""]
+    (tmp_path / "metrics.csv").write_text("\r\n".join(lines), newline="")
+    MetricsWriter(tmp_path, 1).close()
+    (kept,) = read_metrics(tmp_path)
+    assert (list(kept), kept["validation_reward"], kept["steps"]) == (NAMES, "", "1.5")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        bytes(range(256)) * 9,
+        b"",
+        b"a,b\r\n1,2\r\n",
+        (",".join(OLDER) + ",other\r\n" + row(0)).encode(),
+        (",".join(NAMES) + "\r\n" + row(0)[:40] + "\r\n" + row(1) + "\r\n").encode(),
+        (",".join(NAMES) + "\r\n" + row(0) + ",9\r\n").encode(),
+        (",".join(NAMES) + "\r\n" + row(0).replace("1.5", "", 1) + "\r\n").encode(),
+        (",".join(NAMES) + "\r\n" + row(0).replace("1.5", "many", 1) + "\r\n").encode(),
+        (",".join(NAMES) + "\r\n" + '"' * 3 + row(0) + "\r\n").encode(),
+    ],
+)
+def test_anything_else_is_refused_in_a_line_that_names_it(content, capsys, tmp_path):
+    (tmp_path / "metrics.csv").write_bytes(content)
+    with pytest.raises(UserError, match=r"metrics\.csv is no metrics of a training, or damaged"):
+        read_metrics(tmp_path)
+    status, _, err = call(capsys, "plot", str(tmp_path))
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert (tmp_path / "metrics.csv").read_bytes() == content
+
+
+def test_a_curve_needs_no_value_that_a_row_may_go_without(capsys, tmp_path):
+    names = ("validation_success", "validation_distance_m", "validation_reward")
+    values = {**dict.fromkeys(NAMES, "1.5"), **dict.fromkeys(names, ""), "outcome": "goal"}
+    rows = [",".join({**values, "episode": str(number)}.values()) for number in (0, 1)]
+    write(tmp_path, [*rows, ""])
+    assert call(capsys, "plot", str(tmp_path))[0] == 0
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    writer = MetricsWriter(tmp_path)
+    writer._file.close()
+    writer._file = open("/dev/full", "w")  # noqa: SIM115 - the writer closes it
+    writer._csv = csv.DictWriter(writer._file, NAMES)
+    with pytest.raises(UserError, match="No space left on device"):
+        writer.add(metrics_of(0))
+    writer.close()
