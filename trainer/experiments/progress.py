@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trainer.experiments.outcome import Episodes, Numbers, Outcome
+from trainer.experiments.plan import FULL_PATH_M
 from trainer.experiments.statistics import WINDOW, smoothed
 
 METRICS = {
@@ -22,6 +23,9 @@ ALONE = "validation_distance_m"
 """The policy alone, now and then."""
 TITLES = {**METRICS, ALONE: "surviving distance without help, m"}
 """What ours show."""
+
+
+DISTANCES = ("distance_m", ALONE)
 
 
 class Progress(NamedTuple):
@@ -43,7 +47,7 @@ def progress(outcomes: Sequence[Outcome], metric: str) -> Progress | None:
     if not outcomes:
         return None
     ends = np.array([final(outcome, metric) for outcome in outcomes])
-    measured = [outcome.measured(metric) for outcome in outcomes]
+    measured = [_measured(outcome, metric) for outcome in outcomes]
     shared = reduce(np.intersect1d, [episodes for episodes, _ in measured])
     curves = np.stack([values[np.isin(episodes, shared)] for episodes, values in measured])
     if metric == ALONE:
@@ -53,5 +57,15 @@ def progress(outcomes: Sequence[Outcome], metric: str) -> Progress | None:
 
 def final(outcome: Outcome, metric: str) -> float:
     """Mean of what was measured in the last ``WINDOW`` episodes."""
-    episodes, values = outcome.measured(metric)
+    episodes, values = _measured(outcome, metric)
     return float(values[episodes > episodes[-1] - WINDOW].mean())
+
+
+def _measured(outcome: Outcome, metric: str) -> tuple[Episodes, Numbers]:
+    """What was measured; no distance beyond the goal, or two who always arrive would be told apart
+    by how fast they cross its line. A validation's distance is a mean, and cut as one.
+    """
+    episodes, values = outcome.measured(metric)
+    if metric in DISTANCES:
+        values = np.minimum(values, FULL_PATH_M[outcome.unit.scenario])
+    return episodes, values

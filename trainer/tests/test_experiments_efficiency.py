@@ -39,7 +39,7 @@ def ramp(length: int, height: float = 1.0, seeds: int = 3) -> Progress:
 
 
 def test_in_training_curves_are_averages_and_reaching_counts_from_the_first_whole_one_on():
-    found = made(outcome("distance_m", np.concatenate([np.full(10, 9.0), np.arange(40.0)])))
+    found = made(outcome("episode_return", np.concatenate([np.full(10, 9.0), np.arange(40.0)])))
     assert found.episodes.tolist() == list(range(1, 51))
     assert np.flatnonzero(found.whole)[0] + 1 == 20
     assert found.curves[0, 0] == 9.0  # by luck
@@ -55,6 +55,12 @@ def test_what_was_validated_now_and_then_is_taken_where_it_was_measured():
     assert episodes_to_reach(found, found.curves.mean(axis=0), 6.0) == 20
     # Two validations are within the last twenty episodes.
     assert found.ends.tolist() == [7.5, 3.5]
+
+
+def test_how_fast_the_goal_is_crossed_makes_no_difference():
+    own, other = made(validated(21.1, 21.2, 21.3)), made(validated(21.4, 21.4, 21.4))
+    assert efficiency(own, other).ratio.value == 1.0
+    assert own.ends.tolist() == [21.0]
 
 
 def test_a_single_validation_is_an_end():

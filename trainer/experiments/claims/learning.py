@@ -19,7 +19,7 @@ from trainer.experiments.claims.compare import (
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES, TOUGH
-from trainer.experiments.progress import ALONE, TITLES
+from trainer.experiments.progress import ALONE, DISTANCES, TITLES
 from trainer.experiments.statistics import Holds, above, mean_estimate
 from trainer.experiments.verdict import Claim, claim
 
@@ -36,7 +36,6 @@ SPEEDS = {
     ("congestion", "distance_m"): 2.2, ("congestion", ALONE): 2.2,
 }  # fmt: skip
 """The paper's learning efficiency, where it gives one, and what is asked of the policy alone."""
-DISTANCES = ("distance_m", ALONE)
 SAME_LEVEL = 0.05
 """Two ends are on one level if they differ by no more than this share."""
 

@@ -66,7 +66,7 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
         panel.legend(fontsize=8, **legend)
     figure.supxlabel(
         f"training episode; in training the human may take over, and lines are means of {WINDOW}; "
-        "without help: where validated; band: standard deviation of seeds",
+        "without help: where validated; nothing beyond the goal counted; band: standard deviation",
         fontsize=9,
     )
     return figure
@@ -92,6 +92,7 @@ def _draw_panel(
         )
     if metric != "episode_return":
         panel.axhline(FULL_PATH_M[scenario], color="0.6", lw=0.8, ls=":")
+        panel.set_ylim(0.0, 1.05 * FULL_PATH_M[scenario])
     if not panel.has_data():
         note_missing(panel)
     panel.grid(alpha=0.3)
