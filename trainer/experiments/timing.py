@@ -25,7 +25,7 @@ from trainer.benches.machine import about
 from trainer.experiments.figures.style import colour, label, new_figure, note_missing
 from trainer.experiments.plan import NORMAL, Plan
 from trainer.experiments.statistics import CONFIDENCE, RESAMPLES, Estimate, Holds
-from trainer.experiments.units import Unit, run_config
+from trainer.experiments.units import Unit, obstacle, run_config, unit_id
 from trainer.experiments.verdict import Claim, claim
 from trainer.files import make_directory
 from trainer.progress import ProgressBar
@@ -50,14 +50,27 @@ def measure(plan: Plan, humans: Path, device: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as directory, ExitStack() as closing:
         runs = {}
         for algorithm in PAPER_S:
-            config = run_config(Unit(SCENARIO, algorithm, NORMAL, 1), plan, humans, device)
+            config = run_config(_unit(algorithm), plan, humans, device)
             run_dir = Path(directory) / algorithm
             make_directory(run_dir)
             runs[algorithm] = TrainingRun(replace(config, evaluate_every=0), run_dir)
             closing.callback(runs[algorithm].learning.close)
         turns = take_turns(runs, plan)
     torch.set_num_threads(before)
-    return {**about(), "threads": 1, "device": device, "turns": turns}
+    return {
+        **about(), "threads": 1, "device": device, "units": _ids(plan, humans), "turns": turns
+    }  # fmt: skip
+
+
+def _unit(algorithm: str) -> Unit:
+    return Unit(SCENARIO, algorithm, NORMAL, 1)
+
+
+def _ids(plan: Plan, humans: Path) -> dict[str, str]:
+    """What decides each training that is timed, as an id; nothing without its human model."""
+    if any(obstacle(_unit(algorithm), humans) for algorithm in PAPER_S):
+        return {}
+    return {algorithm: unit_id(_unit(algorithm), plan, humans) for algorithm in PAPER_S}
 
 
 def take_turns(runs: Mapping[str, TrainingRun], plan: Plan) -> Turns:
@@ -119,7 +132,7 @@ def load_or_measure(
     """The turns in the experiment's directory, measured first where there are none.
 
     Raises:
-        UserError: the file there is not one of these.
+        UserError: the file there is not one of these, or of other settings.
     """
     path = directory / MEASURED_FILE
     if not path.is_file():
@@ -128,7 +141,12 @@ def load_or_measure(
         make_directory(directory)
         write_json(path, measure(plan, humans, device))
     try:
-        turns = json.loads(read_bytes(path, "measurement"))["turns"]
+        measured = json.loads(read_bytes(path, "measurement"))
+        turns = measured["turns"]
+        # The first measurement does not say what it was of.
+        ids = _ids(plan, humans)
+        if ids and measured.get("units", ids) != ids:
+            raise UserError(f"{path} was measured with other settings; remove it to measure again")
         return {name: [(int(n), float(s)) for n, s in turns[name]] for name in PAPER_S}
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} is no measurement of this project") from error
