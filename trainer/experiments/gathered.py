@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from trainer.experiments.outcome import Numbers, Outcome, read_outcome
-from trainer.experiments.plan import FULL_PATH_M, NORMAL, Scene
+from trainer.experiments.plan import NORMAL, Scene
 from trainer.experiments.store import Store
 from trainer.experiments.units import Unit
 
@@ -88,13 +88,6 @@ def pooled(
         tests = outcome.tests[condition]
         values.append(tests[quantity][tests.reached] if arrived else tests[quantity])
     return np.concatenate([np.zeros(0), *values])
-
-
-def within_path(scene: Scene, distances_m: Numbers) -> Numbers:
-    """Surviving distances without what was driven beyond the goal: at most one step, and a matter
-    of the speed there. Comparisons leave it out.
-    """
-    return np.minimum(distances_m, FULL_PATH_M[scene.scenario])
 
 
 def gather(store: Store, units: Iterable[Unit], seeds: int) -> Gathered:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
+from trainer.experiments.plan import FULL_PATH_M
 from trainer.experiments.store import TESTS_FILE, UNIT_FILE
 from trainer.experiments.units import Unit
 from trainer.experiments.work import KEPT_METRICS, KEPT_TESTS
@@ -65,10 +66,12 @@ class Outcome:
         at = np.flatnonzero(~np.isnan(values))
         return at + 1, values[at]
 
-    @property
-    def best_validation(self) -> float:
-        """Success of the actor that was tested, on the validation seeds of its run."""
-        return float(self.measured("validation_success")[1].max())
+
+def within_path(scenario: str, distances_m: Numbers) -> Numbers:
+    """Surviving distances without what was driven beyond the goal: at most one step, and a matter
+    of the speed there. Comparisons leave it out.
+    """
+    return np.minimum(distances_m, FULL_PATH_M[scenario])
 
 
 def read_outcome(unit: Unit, directory: Path) -> Outcome:

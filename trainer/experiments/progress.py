@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.experiments.outcome import Episodes, Numbers, Outcome
-from trainer.experiments.plan import FULL_PATH_M
+from trainer.experiments.outcome import Episodes, Numbers, Outcome, within_path
 from trainer.experiments.statistics import WINDOW, smoothed
 
 METRICS = {
@@ -67,5 +66,5 @@ def _measured(outcome: Outcome, metric: str) -> tuple[Episodes, Numbers]:
     """
     episodes, values = outcome.measured(metric)
     if metric in DISTANCES:
-        values = np.minimum(values, FULL_PATH_M[outcome.unit.scenario])
+        values = within_path(outcome.unit.scenario, values)
     return episodes, values

@@ -28,6 +28,11 @@ class Estimate(NamedTuple):
     size: int
     """Values behind it."""
 
+    def times(self, factor: float) -> Estimate:
+        """The number and its interval multiplied."""
+        low, high = sorted((factor * self.low, factor * self.high))
+        return Estimate(factor * self.value, low, high, self.size)
+
     def text(self, digits: int = 2, unit: str = "") -> str:
         """As in "0.97 [0.93, 0.99]"; a dash for nothing."""
         if not self.size:

@@ -1,6 +1,7 @@
 """A run's metrics, whatever a kill, a full disk or a stranger left of them."""
 
 import csv
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -84,8 +85,8 @@ def test_a_curve_needs_no_value_that_a_row_may_go_without(capsys, tmp_path):
 def test_a_full_disk_is_one_line(tmp_path):
     writer = MetricsWriter(tmp_path)
     writer._file.close()
-    writer._file = open("/dev/full", "w")  # noqa: SIM115 - the writer closes it
-    writer._csv = csv.DictWriter(writer._file, NAMES)
-    with pytest.raises(UserError, match="No space left on device"):
-        writer.add(metrics_of(0))
-    writer.close()
+    with Path("/dev/full").open("w") as writer._file:
+        writer._csv = csv.DictWriter(writer._file, NAMES)
+        with pytest.raises(UserError, match="No space left on device"):
+            writer.add(metrics_of(0))
+        writer.close()

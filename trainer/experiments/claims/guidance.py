@@ -34,7 +34,7 @@ def judge_fig14(gathered: Gathered) -> list[Claim]:
         ),
         _cost_claim(
             gathered, IA, changes[IA], "poor guidance degrades IA-TD3",
-            lambda found: above(_negative(found)), OVER_SEEDS,
+            lambda found: above(found.times(-1.0)), OVER_SEEDS,
         ),
         _cost_claim(
             gathered, HI, changes[HI],
@@ -48,7 +48,7 @@ def judge_fig14(gathered: Gathered) -> list[Claim]:
         claim(
             "PHIL-TD3 is more robust to poor guidance than IA-TD3",
             "more",
-            f"difference of the changes {_percent(found).text(1)} percentage points",
+            f"difference of the changes {found.times(100.0).text(1)} percentage points",
             above(found),
             found.size,
             BY_SEED,
@@ -68,7 +68,7 @@ def _cost_claim(
     rule: str,
 ) -> Claim:
     found = mean_estimate(list(changes.values()))
-    percent = _percent(found)
+    percent = found.times(100.0)
     return claim(
         f"{text}, mean over the scenes",
         PAPER_CHANGES[line.algorithm],
@@ -79,14 +79,6 @@ def _cost_claim(
         percent,
         _guided_complete(gathered, line),
     )
-
-
-def _percent(estimate: Estimate) -> Estimate:
-    return Estimate(100 * estimate.value, 100 * estimate.low, 100 * estimate.high, estimate.size)
-
-
-def _negative(estimate: Estimate) -> Estimate:
-    return Estimate(-estimate.value, -estimate.high, -estimate.low, estimate.size)
 
 
 def _changes(gathered: Gathered, line: Line) -> dict[int, float]:

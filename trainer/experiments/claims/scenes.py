@@ -12,8 +12,8 @@ import numpy as np
 
 from trainer.experiments.claims.compare import BY_SEED, complete
 from trainer.experiments.figures.curves import Line
-from trainer.experiments.gathered import Gathered, pairs, pooled, within_path
-from trainer.experiments.outcome import Drives, Outcome
+from trainer.experiments.gathered import Gathered, pairs, pooled
+from trainer.experiments.outcome import Drives, Outcome, within_path
 from trainer.experiments.plan import HUMAN_MODEL, Scene
 from trainer.experiments.statistics import (
     Estimate,
@@ -60,7 +60,7 @@ def scene_claim(
         if arrived and not found[line] and gathered.tested(scene, line.algorithm, line.setting)
     ]
     differences = [mean_estimate(found[line]) for line in others if line not in left_out]
-    signed = [_signed(difference, sign) for difference in differences]
+    signed = [difference.times(sign) for difference in differences]
     decisive = min(signed, key=lambda each: each.low, default=None)
     shown = [f"{line.label} {shown_of(gathered, scene, line, quantity, arrived)}" for line in lines]
     ours_text = ", ".join(shown)
@@ -70,7 +70,7 @@ def scene_claim(
         f"{scene.title}: {text}", paper, ours_text,
         all_of([above(each) for each in signed]),
         seeds_of(gathered, scene, lines), _rule(quantity, arrived),
-        _signed(decisive, sign) if decisive else None,
+        decisive.times(sign) if decisive else None,
         tested_all(gathered, scene, lines),
     )  # fmt: skip
 
@@ -121,7 +121,7 @@ def _by_seed(
         if not len(values):
             continue
         if quantity == DISTANCE:
-            values, others = within_path(scene, values), within_path(scene, others)
+            values, others = (within_path(scene.scenario, each) for each in (values, others))
         means.append(float((values - others).mean()))
     return means
 
@@ -131,7 +131,7 @@ def _column(quantity: str) -> str:
 
 
 def _mean(scene: Scene, drives: Drives) -> float:
-    return float(within_path(scene, drives[DISTANCE]).mean())
+    return float(within_path(scene.scenario, drives[DISTANCE]).mean())
 
 
 def _rule(quantity: str, arrived: bool) -> str:
@@ -141,8 +141,3 @@ def _rule(quantity: str, arrived: bool) -> str:
     if arrived:
         notes.append("drives in which both arrived")
     return "; ".join(notes)
-
-
-def _signed(estimate: Estimate, sign: float) -> Estimate:
-    low, high = sorted((sign * estimate.low, sign * estimate.high))
-    return Estimate(sign * estimate.value, low, high, estimate.size)

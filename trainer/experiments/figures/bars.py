@@ -10,7 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from trainer.experiments.figures.style import colour, letter, new_figure, note_missing, short
-from trainer.experiments.gathered import Gathered, pairs, pooled, within_path
+from trainer.experiments.gathered import Gathered, pairs, pooled
+from trainer.experiments.outcome import within_path
 from trainer.experiments.plan import (
     FULL_PATH_M,
     NORMAL,
@@ -115,7 +116,7 @@ def _distance_bars(
                 color=colour(algorithm), label=short(algorithm), error_kw={"lw": 0.8},
             )  # fmt: skip
             first, second = pairs(own, outcomes, scene.condition, "distance_m")
-            first, second = (within_path(scene, values) for values in (first, second))
+            first, second = (within_path(scene.scenario, values) for values in (first, second))
             if place and len(first):
                 panel.text(x, 1.16 * full_m, stars(paired_t(first, second)),
                            ha="center", va="bottom", fontsize=8, rotation=90)  # fmt: skip
