@@ -37,9 +37,10 @@ pictures: $(STAMP)  ## every picture of the READMEs, into docs
 demo: $(STAMP)  ## train with a human's guidance, export, and drive through a separate edge runtime
 	$(BIN)/python -m hil_tests demo
 
-# Tests mostly wait for processes: a second worker takes a third off their time.
+# Tests mostly wait for processes: a second worker takes a third off their time. A test's networks are
+# small: where each process computes with all cores, threads only wait for each other.
 test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'

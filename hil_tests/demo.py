@@ -9,16 +9,15 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand, run_command
+from hil_tests.drives_table import drives_table
 from hil_tests.operator import Operator
 from trainer.commands.options import file_name, not_negative, positive, positive_float
 
@@ -32,8 +31,8 @@ GOOD_SUCCESS = 0.8
 FIRST_SEED = 0
 RECORDED_RUNS = 2
 TRAINING_EPISODES = 150
+HUMAN_MINUTES = 1.5
 TRAINING_MINUTES = 4.5
-COLUMNS = ("drive", "success", "distance, m", "p50, ms", "p99, ms", "safe stops")
 
 EXAMPLE = examples(
     "python -m hil_tests demo",
@@ -56,6 +55,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--human-episodes", type=positive, default=60, help="of the human model's training"
+    )
+    parser.add_argument(
+        "--human-minutes",
+        type=positive_float,
+        default=HUMAN_MINUTES,
+        help="limit of the human model's training",
     )
     parser.add_argument(
         "--minutes",
@@ -142,7 +147,7 @@ class Demo:
             run_command(
                 "trainer", "human", "--out", str(self.human_dir), "--seed", seed,
                 "--episodes", str(arguments.human_episodes), "--frames", "2", "--label-every-step",
-                "--refining-updates", "1000",
+                "--refining-updates", "1000", "--max-minutes", f"{arguments.human_minutes:g}",
             )  # fmt: skip
         heading("2  PHIL-TD3 learns to drive; the human model takes over when it must")
         run_command(
@@ -181,20 +186,14 @@ class Demo:
 
     def show(self) -> bool:
         """The table, where everything is, and whether the policy drives as well as it should."""
-        table = Table(
-            title="Left turn, the same seeds; latency from state sent to command received"
-        )
-        for column in COLUMNS:
-            table.add_column(column, justify="left" if column == COLUMNS[0] else "right")
-        success: list[float] = []
-        for name, path in self.reports.items():
-            report = json.loads(read_bytes(path, "report"))
-            success.append(report["success_rate"])
-            table.add_row(name, *summary_cells(report))
-        Console().print("\n", table)
+        reports = {
+            name: json.loads(read_bytes(path, "report")) for name, path in self.reports.items()
+        }
+        Console().print("\n", drives_table(reports))
         print(f"learning curve  {self.directory}/learning_curve.png")
         print(f"recording       {self.recording}   (see it: .venv/bin/rerun {self.recording})")
         print(f"policy          {self.policy}")
+        success = [report["success_rate"] for report in reports.values()]
         good = min(success[:2]) >= GOOD_SUCCESS
         if not good:
             print(f"The policy reaches the goal in fewer than {GOOD_SUCCESS:.0%} of the episodes.")
@@ -237,15 +236,3 @@ class Demo:
 def heading(text: str) -> None:
     """Announce a step."""
     Console().print(f"\n[bold]{text}[/bold]")
-
-
-def summary_cells(report: dict[str, Any]) -> list[str]:
-    """A report's row of the table."""
-    distance, latency = report["surviving_distance_m"], report.get("latency_ms")
-    return [
-        f"{report['success_rate']:.0%}",
-        f"{distance['mean']:.2f} ± {distance['std']:.2f}",
-        f"{latency['p50']:.1f}" if latency else "-",
-        f"{latency['p99']:.1f}" if latency else "-",
-        str(report.get("safe_stops", "-")),
-    ]

@@ -13,7 +13,10 @@ from hil_tests.__main__ import main
 from hil_tests.commands import BackgroundCommand
 from hil_tests.demo import Demo
 
-SMALL = ("--episodes", "2", "--human-episodes", "2", "--runs", "1", "--minutes", "1")
+SMALL = (
+    "--episodes", "2", "--human-episodes", "2", "--human-minutes", "0.05", "--runs", "1",
+    "--minutes", "1",
+)  # fmt: skip
 
 
 def demo(out: Path) -> subprocess.CompletedProcess:

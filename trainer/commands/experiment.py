@@ -12,7 +12,8 @@ import torch
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from trainer.commands.options import file_name, not_negative, positive, positive_float
+from trainer.commands.options import file_name, not_negative, positive
+from trainer.commands.time_limit import add_time_limit
 from trainer.experiments import timing
 from trainer.experiments.catalogue import NAMES, TIME, units_of
 from trainer.experiments.plan import PLAN, QUICK
@@ -67,13 +68,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=list(SCENARIOS),
         help="compute what there is in this one only (default: in both)",
     )
-    parser.add_argument(
-        "--max-minutes",
-        type=positive_float,
-        default=None,
-        metavar="MIN",
-        help="begin nothing after this time, and stop what runs at its next checkpoint, five "
-        "episodes apart; the same command goes on from there (default: no limit)",
+    add_time_limit(
+        parser,
+        "begin nothing after this time, and stop what runs at its next checkpoint, five "
+        "episodes apart; the same command goes on from there",
     )
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learners' device")
     parser.add_argument(

@@ -16,6 +16,7 @@ from trainer.commands.options import (
     positive,
     set_threads,
 )
+from trainer.commands.time_limit import add_time_limit, deadline_s, until
 from trainer.drivers import make_environment
 from trainer.human.dagger import HumanTraining
 from trainer.human.model import MODEL_FILE, HumanModel, HumanModelConfig
@@ -90,6 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
         "their directories, or such a training run (default: the scripted expert)",
     )
+    add_time_limit(parser, "end episodes and refining after the one that passes this time")
     add_threads(parser)
 
 
@@ -120,11 +122,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
+    end_s = deadline_s(arguments)
     from_whom = _from_expert if arguments.recordings is None else _from_person
-    model, about = from_whom(arguments, config)
+    model, about = from_whom(arguments, config, end_s)
     if config.refining_updates:
         with ProgressBar("refining", config.refining_parts) as bar:
-            for loss in model.refine():
+            for loss in until(end_s, model.refine()):
                 bar.advance({"loss": f"{loss:.3f}"})
     about = {"scenario": arguments.scenario, "seed": arguments.seed, **about}
     model.save(directory, {**about, "config": asdict(config)})
@@ -134,12 +137,12 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
 
 
 def _from_expert(
-    arguments: argparse.Namespace, config: HumanModelConfig
+    arguments: argparse.Namespace, config: HumanModelConfig, end_s: float
 ) -> tuple[HumanModel, dict[str, Any]]:
     """A model of the scripted expert, which takes over from it while it drives."""
     training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)
     with ProgressBar("human model", config.episodes) as bar:
-        for episode in training.episodes():
+        for episode in until(end_s, training.episodes()):
             bar.advance(
                 {
                     "demonstrations": str(episode.demonstrations),
@@ -148,19 +151,23 @@ def _from_expert(
                     "outcome": episode.outcome,
                 }
             )
-    return training.model, {}
+    return training.model, {"episodes": bar.done}
 
 
 def _from_person(
-    arguments: argparse.Namespace, config: HumanModelConfig
+    arguments: argparse.Namespace, config: HumanModelConfig, end_s: float
 ) -> tuple[HumanModel, dict[str, Any]]:
     """A model of a person, from recordings: as many gradient steps as with the expert."""
     recordings = find_recordings([Path(place) for place in arguments.recordings])
     model = HumanModel(config, arguments.seed)
     interventions = demonstrate(model, recordings, arguments.scenario)
     with ProgressBar("human model", config.episodes) as bar:
-        for _ in range(config.episodes):
+        for _ in until(end_s, range(config.episodes)):
             loss = model.learn(config.updates_per_episode)
             bar.advance({"demonstrations": str(model.demonstrations), "loss": f"{loss:.3f}"})
-    about = {"recordings": [str(path) for path in recordings], "interventions": interventions}
+    about = {
+        "recordings": [str(path) for path in recordings],
+        "interventions": interventions,
+        "episodes": bar.done,
+    }
     return model, about

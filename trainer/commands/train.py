@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,11 +22,11 @@ from trainer.commands.options import (
     file_name,
     not_negative,
     positive,
-    positive_float,
     set_threads,
 )
 from trainer.commands.resuming import check_directory
 from trainer.commands.settings import DEFAULTS, settings, with_setting
+from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.locks import claimed
 from trainer.person.options import PERSON, add_person, check_no_person
@@ -71,13 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learner's device")
     add_latency(parser, "network between policy and vehicle, also in validation")
-    parser.add_argument(
-        "--max-minutes",
-        type=positive_float,
-        default=None,
-        metavar="MIN",
-        help="stop after the episode that passes this time (default: no limit)",
-    )
+    add_time_limit(parser, "stop after the episode that passes this time")
     parser.add_argument(
         "--set",
         action="append",
@@ -110,14 +103,12 @@ def run(arguments: argparse.Namespace) -> int:
 def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> None:
     sink = _sink(arguments.rerun)
     with _training(arguments, config, run_dir) as training:
-        deadline_s = (
-            time.monotonic() + 60.0 * arguments.max_minutes if arguments.max_minutes else None
-        )
+        end_s = deadline_s(arguments)
         with (
             ProgressBar("training", config.episodes, training.episode) as bar,
             _watched(training, sink) as watch,
         ):
-            training.train(_both(_Reporter(bar), watch), deadline_s)
+            training.train(_both(_Reporter(bar), watch), end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
     print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
