@@ -62,6 +62,20 @@ class ArgumentParser(argparse.ArgumentParser):
         kwargs.setdefault("allow_abbrev", False)
         super().__init__(*args, **kwargs)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse, but an empty value is an error: no option here means anything by it.
+
+        A shell makes one of a variable that is not set; as a file's name it is the directory where
+        one stands.
+        """
+        given = sys.argv[1:] if args is None else list(args)
+        for before, value in zip(["", *given], given):
+            if not value:
+                self.error(f"an empty value after {before}" if before else "an empty value")
+            if value.startswith("--") and value.find("=") == len(value) - 1:
+                self.error(f"an empty value after {value}")
+        return super().parse_known_args(given, namespace)
+
     def error(self, message: str) -> NoReturn:
         """Print "prog: what is wrong (see prog --help)" and exit with status 2."""
         line = " ".join(message.split())

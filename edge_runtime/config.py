@@ -67,6 +67,7 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     if path is None:
         config = msgspec.structs.replace(Config(), **given)
         _check(config)
+        _check_flags(given, config)
         return config
     from_file = _read(path)
     config = msgspec.structs.replace(from_file, **given)
@@ -76,7 +77,14 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
         if not _is_wrong(from_file):
             raise  # the flag is wrong, not the file
         raise UserError(f"config file {path}: {error}") from None
+    _check_flags(given, config)
     return config
+
+
+def _check_flags(given: Dict[str, Any], config: Config) -> None:
+    """Who names a bus means a vehicle to move; a file may hold the bus of one that is off."""
+    if "bus" in given and config.vehicle != "hunter":
+        raise UserError(f"--bus is of --vehicle hunter; the vehicle here is {config.vehicle}")
 
 
 def _read(path: PathLike) -> Config:

@@ -19,7 +19,7 @@ from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand, run_command
 from hil_tests.drives_table import drives_table
 from hil_tests.operator import Operator
-from trainer.commands.options import file_name, not_negative, positive, positive_float
+from trainer.commands.options import not_negative, positive, positive_float
 
 MARKER = ".phil-demo"
 """Says that a directory is a demo's, so that the demo may replace what is in it."""
@@ -42,7 +42,7 @@ EXAMPLE = examples(
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--out", type=file_name, default="demo", help="directory of all it makes")
+    parser.add_argument("--out", default="demo", help="directory of all it makes")
     parser.add_argument(
         "--fresh", action="store_true", help="train anew even where a trained policy is kept"
     )

@@ -58,6 +58,8 @@ def test_policies_that_may_not_drive(tmp_path, command):
         (["run", "--policy", "absent.onnx"], ["absent.onnx", "does not exist"]),
         (["run", "--policy", "p.onnx", "--vehicle", "tank"], ["tank", "none, mock, hunter"]),
         (["run", "--policy", "p.onnx", "--bus", "can0"], ["can0", "socketcan:can0"]),
+        (["run", "--policy", "p.onnx", "--bus", "socketcan:can0"], ["--vehicle hunter", "none"]),
+        (["run", "--policy", "p.onnx", "--bus", ""], ["empty value after --bus"]),
         (["run", "--policy", "p.onnx", "--connect", "localhost"], ["tcp/127.0.0.1:7447"]),
         (["run", "--policy", "p.onnx", "--vehicle-id", "a/b"], ["a/b"]),
         (["run", "--policy", "p.onnx", "--config", "absent.toml"], ["absent.toml"]),
@@ -135,6 +137,17 @@ def test_flags_win_over_the_file(tmp_path):
     config = load_config(path, {"policy": "flag.onnx", "connect": None, "allow_unsigned": None})
     assert (config.policy, config.vehicle_id) == ("flag.onnx", "from_file")
     assert config.allow_unsigned
+
+
+def test_a_bus_in_the_file_may_be_of_a_vehicle_that_is_off_but_not_on_the_command_line(tmp_path):
+    path = tmp_path / "edge.toml"
+    path.write_text("policy = 'p.onnx'\nbus = 'socketcan:can1'")
+    assert load_config(path, {}).vehicle == "none"
+    for file in (path, None):
+        flags = {"policy": "p.onnx", "bus": "socketcan:can0"}
+        with pytest.raises(UserError, match="--bus is of --vehicle hunter"):
+            load_config(file, flags)
+        assert load_config(file, {**flags, "vehicle": "hunter"}).bus == "socketcan:can0"
 
 
 def test_the_example_config_holds_every_key_at_its_default():

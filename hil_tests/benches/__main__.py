@@ -21,7 +21,7 @@ from hil_tests.benches.lockstep import lockstep
 from hil_tests.benches.table import show
 from hil_tests.faults.campaign import POLICY, PUBLIC_KEY
 from trainer.benches.machine import processor_model
-from trainer.commands.options import file_name, positive
+from trainer.commands.options import positive
 from trainer.revision import source_revision
 
 STARTS = 5
@@ -43,9 +43,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--states", type=positive, default=500, help="in each block")
     parser.add_argument("--steps", type=positive, default=100_000, help="of the memory's run")
     parser.add_argument("--episodes", type=positive, default=20, help="of the lock-step drive")
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="write the report to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="write the report to this file")
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_writable(arguments.out)

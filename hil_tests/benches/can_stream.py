@@ -33,7 +33,7 @@ from hil_tests.faults.processes import Process
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.slow_policy import write_steady
 from trainer.benches.machine import processor_model
-from trainer.commands.options import file_name, not_negative, positive
+from trainer.commands.options import not_negative, positive
 from trainer.revision import source_revision
 
 P99_BAR_MS = 25.0
@@ -61,9 +61,7 @@ def main(argv: list[str]) -> int:
         metavar="1..99",
         help="of both senders, as the edge runtime's; 0: none, that of the busy processes",
     )
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="write the report to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="write the report to this file")
     arguments = parser.parse_args(argv)
     if not 0.0 < arguments.minutes < 24 * 60:
         parser.error(f"--minutes {arguments.minutes} is not between 0 and a day")

@@ -25,7 +25,6 @@ from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write
 from edge_runtime.signature import SIGNATURE_SUFFIX
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint, open_session
-from trainer.commands.options import file_name
 
 VEHICLE_ID = "hunter01"
 PACE_S = 0.004
@@ -153,9 +152,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         "--blocks", type=int, default=12, help=f"blocks of {BLOCK} round trips on each link"
     )
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="write the result to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="write the result to this file")
     arguments = parser.parse_args(argv)
     if arguments.blocks < 1:
         raise UserError(f"--blocks {arguments.blocks} is too few: at least 1")

@@ -28,7 +28,7 @@ from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import State, encode
 from hil_tests.commands import BackgroundCommand
 from trainer.benches.machine import processor_model
-from trainer.commands.options import file_name, positive, set_threads
+from trainer.commands.options import positive, set_threads
 from trainer.revision import source_revision
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
@@ -174,9 +174,7 @@ def main(argv: list[str]) -> int:
         "--scenario", choices=("left_turn", "congestion"), default="left_turn", help="which drive"
     )
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="0: all cores")
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="write the report to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="write the report to this file")
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_writable(arguments.out)

@@ -20,7 +20,6 @@ from hil_tests.board.proof import prove_emulated, prove_twin
 from hil_tests.board.rootfs import DEFAULT_CACHE
 from hil_tests.board.service import prove_booted, why_not_booted
 from trainer.benches.machine import processor_model
-from trainer.commands.options import file_name
 
 BOARDS = ("aarch64", "python38", "systemd")
 FIRST_COMMAND_LIMIT_S, INSTALL_LIMIT_S = 180.0, 20.0
@@ -41,9 +40,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--wheels", metavar="DIR", default=DEFAULT_FOLDER, help="keeps the bundles' wheels"
     )
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="write the reports to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="write the reports to this file")
 
 
 def run(arguments: argparse.Namespace) -> int:

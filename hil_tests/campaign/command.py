@@ -17,7 +17,7 @@ from hil_tests.campaign.figures import write_figures
 from hil_tests.campaign.latency import run_latency
 from hil_tests.campaign.render import render_latency
 from hil_tests.options import several, share, this_command
-from trainer.commands.options import add_scenario, file_name, not_negative, positive
+from trainer.commands.options import add_scenario, not_negative, positive
 from trainer.parallel import cores
 from trainer.progress import ProgressBar
 
@@ -35,7 +35,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "--out",
-        type=file_name,
         required=True,
         metavar="R.json",
         help="the report; R.md, pictures and R_rows/ (what is done already) go beside it",

@@ -8,7 +8,7 @@ from pathlib import Path
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from hil_tests.faults import render_faults, run_faults
-from trainer.commands.options import file_name, positive
+from trainer.commands.options import positive
 
 
 def main(argv: list[str]) -> int:
@@ -24,9 +24,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--rows", help="names or patterns (hunter_*), commas between")
     parser.add_argument("--policy", type=Path, help="policy file (the left turn's if not given)")
     parser.add_argument("--jobs", type=positive, default=2, help="rigs at once")
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="write the report to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="write the report to this file")
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_writable(arguments.out)

@@ -20,7 +20,7 @@ from hil_tests.fleet.rules import certificates_ms, measure_rules
 from hil_tests.fleet.scale import per_vehicle, project
 from hil_tests.fleet.usage import why_not_counted
 from trainer.benches.machine import processor_model
-from trainer.commands.options import file_name, positive
+from trainer.commands.options import positive
 
 _SIZES = (1, 5, 10, 20)
 _RULES = (10, 100, 1_000)
@@ -45,9 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--rules", metavar="N", nargs="+", type=positive, default=list(_RULES),
         help="vehicles with rights in a router's file that nobody connects to",
     )  # fmt: skip
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="write the numbers to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="write the numbers to this file")
 
 
 def run(arguments: argparse.Namespace) -> int:

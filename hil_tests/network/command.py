@@ -22,7 +22,7 @@ from hil_tests.commands import end_children
 from hil_tests.network.cells import KERNEL, TRANSPORTS, Cell, Drive, run_cell
 from hil_tests.network.namespaces import why_not
 from hil_tests.network.report import write_report
-from trainer.commands.options import file_name, not_negative, positive
+from trainer.commands.options import not_negative, positive
 
 SPECS = {
     "perfect": "none",
@@ -43,12 +43,9 @@ EXAMPLE = examples(
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="write the numbers to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="write the numbers to this file")
     parser.add_argument(
         "--report",
-        type=file_name,
         metavar="DIR",
         help="write table.md and quantiles.png to this directory",
     )

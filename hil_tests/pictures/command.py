@@ -12,7 +12,6 @@ from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from hil_tests.pictures import curves, loop, rerun_view, scenes
-from trainer.commands.options import file_name
 from trainer.files import make_directory
 
 PICTURES: dict[str, Callable[[Path, Path], None]] = {
@@ -41,12 +40,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "names", metavar="NAME", nargs="*", help=f"of {', '.join(PICTURES)} (default: all)"
     )
-    parser.add_argument(
-        "--out", type=file_name, metavar="DIR", default="docs", help="where they go"
-    )
+    parser.add_argument("--out", metavar="DIR", default="docs", help="where they go")
     parser.add_argument(
         "--work",
-        type=file_name,
         metavar="DIR",
         help="keep what is made on the way (default: thrown away)",
     )

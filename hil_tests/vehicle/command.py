@@ -22,7 +22,7 @@ from hil_tests.vehicle.lag_axes import LAGS, Lag
 from hil_tests.vehicle.render import lag_sentence, render_comparison, render_sweep, verdict
 from hil_tests.vehicle.rigs import VEHICLE, Drive
 from hil_tests.vehicle.sweep import MODEL, SweepTask, run_sweep
-from trainer.commands.options import add_scenario, file_name, not_negative, positive
+from trainer.commands.options import add_scenario, not_negative, positive
 from trainer.parallel import cores
 from trainer.progress import ProgressBar
 
@@ -38,7 +38,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "--out",
-        type=file_name,
         required=True,
         metavar="R.json",
         help="the report; R.md, pictures and R_rows/ (points that are done) go beside it",

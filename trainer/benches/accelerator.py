@@ -23,7 +23,7 @@ import torch
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from trainer.benches.machine import about
-from trainer.commands.options import file_name, positive
+from trainer.commands.options import positive
 from trainer.learner.config import LearnerConfig
 from trainer.training.metrics import read_metrics
 
@@ -147,9 +147,7 @@ def main(argv: list[str]) -> int:
         epilog=examples("python -m trainer.benches.accelerator --runs 8 --out accelerator.json"),
     )
     parser.add_argument("--runs", type=positive, default=8, metavar="N", help="runs at once")
-    parser.add_argument(
-        "--out", type=file_name, metavar="F.json", help="also write the figures to this file"
-    )
+    parser.add_argument("--out", metavar="F.json", help="also write the figures to this file")
     arguments = parser.parse_args(argv)
     if arguments.out:
         check_writable(arguments.out)

@@ -26,7 +26,7 @@ from edge_runtime.files import check_writable, write_atomic
 from trainer.benches.chromium import Browser, find_chromium, open_browser
 from trainer.benches.cockpit_run import CockpitRun, cockpit_run
 from trainer.benches.machine import about
-from trainer.commands.options import file_name, not_negative, positive
+from trainer.commands.options import not_negative, positive
 from trainer.person.recording import Step, find_recordings, read_steps
 
 OPENING_BAR_S, KEY_BAR_MS = 2.0, 150.0
@@ -212,12 +212,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--loads", type=positive, default=10, metavar="N", help="pages opened")
     parser.add_argument("--scenario", choices=["left_turn", "congestion"], default="left_turn")
     parser.add_argument("--seed", type=not_negative, default=1, help="of run and presses")
-    parser.add_argument(
-        "--out", type=file_name, metavar="F.json", help="also write the figures to this file"
-    )
-    parser.add_argument(
-        "--picture", type=file_name, metavar="F.png", help="take this picture instead of measuring"
-    )
+    parser.add_argument("--out", metavar="F.json", help="also write the figures to this file")
+    parser.add_argument("--picture", metavar="F.png", help="take this picture instead of measuring")
     arguments = parser.parse_args(argv)
     if find_chromium() is None:
         raise UserError("no Chromium is installed (Debian: apt-get install chromium)")

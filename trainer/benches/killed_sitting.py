@@ -25,7 +25,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
-from trainer.commands.options import file_name, not_negative, positive, positive_float
+from trainer.commands.options import not_negative, positive, positive_float
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.files import load_torch
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
@@ -172,7 +172,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch-size", type=positive, default=8, help="of the learner")
     parser.add_argument("--longest", type=positive_float, default=40.0, help="s until a kill")
     parser.add_argument("--seed", type=not_negative, default=0, help="of the moments")
-    parser.add_argument("--out", type=file_name, metavar="F.json", help="the figures")
+    parser.add_argument("--out", metavar="F.json", help="the figures")
 
 
 if __name__ == "__main__":

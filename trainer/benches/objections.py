@@ -12,7 +12,7 @@ from typing import Any
 from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
 from edge_runtime.episode_report import GOAL
 from edge_runtime.files import check_writable
-from trainer.commands.options import file_name, positive
+from trainer.commands.options import positive
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver
 from trainer.revision import source_revision
@@ -45,10 +45,8 @@ def main(argv: list[str]) -> int:
         epilog="example: python -m trainer.benches.objections --out objections.json",
     )
     parser.add_argument("--drives", type=positive, default=200, help="of each driver")
-    parser.add_argument(
-        "--humans", type=file_name, default="results/humans", help="directory of human models"
-    )
-    parser.add_argument("--out", type=file_name, metavar="F.json", help="the counts")
+    parser.add_argument("--humans", default="results/humans", help="directory of human models")
+    parser.add_argument("--out", metavar="F.json", help="the counts")
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_writable(arguments.out)

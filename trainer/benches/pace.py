@@ -24,7 +24,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
-from trainer.commands.options import add_scenario, file_name, not_negative, positive_float
+from trainer.commands.options import add_scenario, not_negative, positive_float
 from trainer.person.pacing import LATE_S
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
 from trainer.training.metrics import read_metrics
@@ -117,7 +117,7 @@ def main(argv: list[str]) -> int:
     add_scenario(parser)
     parser.add_argument("--seconds", type=positive_float, default=120.0, help="of training")
     parser.add_argument("--threads", type=not_negative, default=0, help="the learner's; 0: all")
-    parser.add_argument("--out", type=file_name, metavar="F.json", help="the figures")
+    parser.add_argument("--out", metavar="F.json", help="the figures")
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_writable(arguments.out)

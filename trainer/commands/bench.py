@@ -19,7 +19,7 @@ from trainer.benches.replay import measure_replay
 from trainer.benches.table import show
 from trainer.benches.training import measure_training
 from trainer.benches.turns import Tick
-from trainer.commands.options import add_threads, file_name, set_threads
+from trainer.commands.options import add_threads, set_threads
 from trainer.progress import ProgressBar
 from trainer.scenarios import SCENARIOS
 
@@ -40,9 +40,7 @@ ROUNDS: dict[str, Callable[[Effort], int]] = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "--out", type=file_name, metavar="R.json", help="also write the figures to this file"
-    )
+    parser.add_argument("--out", metavar="R.json", help="also write the figures to this file")
     parser.add_argument(
         "--only",
         type=_parts,
@@ -52,7 +50,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--peers",
-        type=file_name,
         metavar="PYTHON",
         help="an interpreter that has stable-baselines3 (`make bench` makes one); "
         "without it that peer is left out",

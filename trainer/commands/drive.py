@@ -10,7 +10,6 @@ from edge_runtime.errors import UserError
 from trainer.commands.options import (
     add_scenario,
     add_threads,
-    file_name,
     not_negative,
     positive,
     set_threads,
@@ -38,20 +37,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--policy",
-        type=file_name,
         metavar="POLICY",
         help="who drives until you take over: see `trainer evaluate` (default: you drive alone)",
     )
     goal = parser.add_mutually_exclusive_group(required=True)
     goal.add_argument(
         "--out",
-        type=file_name,
         metavar="REC_DIR",
         help="directory of the recordings; sittings add up there",
     )
     goal.add_argument(
         "--calibrate",
-        type=file_name,
         metavar="F.toml",
         help="do not drive: ask for a wheel's or gamepad's axes and buttons, write a profile",
     )

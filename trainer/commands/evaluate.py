@@ -12,7 +12,6 @@ from edge_runtime.latency.model import parse_spec
 from trainer.commands.options import (
     add_latency,
     add_scenario,
-    file_name,
     not_negative,
     positive,
     set_threads,
@@ -31,9 +30,7 @@ EXAMPLE = examples(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "policy", type=file_name, help="an .onnx file, a RUN_DIR, a HUMAN_DIR or the word expert"
-    )
+    parser.add_argument("policy", help="an .onnx file, a RUN_DIR, a HUMAN_DIR or the word expert")
     add_scenario(parser)
     parser.add_argument(
         "--condition",
@@ -57,7 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out",
-        type=file_name,
         metavar="R.json",
         help="write the report, with each episode, to this file instead of printing it",
     )

@@ -12,7 +12,7 @@ import torch
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from trainer.commands.options import file_name, not_negative, positive
+from trainer.commands.options import not_negative, positive
 from trainer.commands.time_limit import add_time_limit
 from trainer.experiments import timing
 from trainer.experiments.catalogue import NAMES, TIME, units_of
@@ -84,21 +84,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--results",
-        type=file_name,
         default="results",
         metavar="DIR",
         help="results and figures, to be committed",
     )
     parser.add_argument(
         "--runs",
-        type=file_name,
         default="runs",
         metavar="DIR",
         help="checkpoints and actors, not committed",
     )
     parser.add_argument(
         "--humans",
-        type=file_name,
         metavar="DIR",
         help="holds a human model for each scenario: DIR/left_turn, ... (default: RESULTS/humans)",
     )

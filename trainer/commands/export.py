@@ -8,7 +8,7 @@ from pathlib import Path
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
-from trainer.commands.options import existing_directory, file_name, read_json
+from trainer.commands.options import existing_directory, read_json
 from trainer.drivers import load_actor
 from trainer.export import export_policy, load_private_key, write_policy
 from trainer.training.run import CONFIG_FILE
@@ -20,15 +20,9 @@ EXAMPLE = examples(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "run_dir", type=file_name, metavar="RUN_DIR", help="directory of a training run"
-    )
-    parser.add_argument(
-        "--out", type=file_name, required=True, metavar="POLICY.onnx", help="the policy file"
-    )
-    parser.add_argument(
-        "--key", type=file_name, metavar="KEY", help="private key (PEM) to sign with"
-    )
+    parser.add_argument("run_dir", metavar="RUN_DIR", help="directory of a training run")
+    parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
+    parser.add_argument("--key", metavar="KEY", help="private key (PEM) to sign with")
 
 
 def run(arguments: argparse.Namespace) -> int:

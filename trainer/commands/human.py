@@ -11,7 +11,6 @@ from edge_runtime.cli import UserError, examples, write_json_out
 from trainer.commands.options import (
     add_scenario,
     add_threads,
-    file_name,
     not_negative,
     positive,
     set_threads,
@@ -36,9 +35,7 @@ DEFAULTS = HumanModelConfig()
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_scenario(parser)
-    parser.add_argument(
-        "--out", type=file_name, required=True, metavar="HUMAN_DIR", help="directory of the model"
-    )
+    parser.add_argument("--out", required=True, metavar="HUMAN_DIR", help="directory of the model")
     parser.add_argument("--seed", type=not_negative, default=0, help="of everything")
     parser.add_argument(
         "--episodes", type=positive, default=DEFAULTS.episodes, help="episodes (table A7)"
@@ -85,7 +82,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--from",
         dest="recordings",
-        type=file_name,
         nargs="+",
         metavar="RECORDING",
         help="imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "

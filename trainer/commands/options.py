@@ -83,13 +83,6 @@ def positive_float(text: str) -> float:
     return value
 
 
-def file_name(text: str) -> str:
-    """An argparse type: the name of a file or directory; an empty one would be where one stands."""
-    if not text:
-        raise argparse.ArgumentTypeError("an empty name is no file and no directory")
-    return text
-
-
 def check_picture(out: str, film: bool = False) -> None:
     """Refuse a name that says something else than what will be in it; raises UserError.
 

@@ -15,7 +15,6 @@ from trainer.animation import draw_moment, drive_moments, encode_gif
 from trainer.commands.options import (
     add_scenario,
     check_picture,
-    file_name,
     not_negative,
     positive_float,
 )
@@ -32,7 +31,7 @@ ACTIONS = {"left_turn": "pedal", "congestion": "steering"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("policy", type=file_name, help="who drives: see `trainer evaluate`")
+    parser.add_argument("policy", help="who drives: see `trainer evaluate`")
     add_scenario(parser)
     parser.add_argument("--seed", type=not_negative, default=0, help="of the episode")
     parser.add_argument(
@@ -44,13 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--human",
-        type=file_name,
         metavar="expert|HUMAN_DIR",
         help="who takes over, where the scripted human would; in a film (default: nobody)",
     )
     parser.add_argument(
         "--out",
-        type=file_name,
         required=True,
         metavar="F.png|F.gif",
         help="the picture, or the film",

@@ -8,7 +8,7 @@ from pathlib import Path
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
-from trainer.commands.options import check_picture, existing_directory, file_name
+from trainer.commands.options import check_picture, existing_directory
 from trainer.plots import CURVE_FILE, write_learning_curves
 
 EXAMPLE = examples(
@@ -22,13 +22,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "run_dirs",
         metavar="RUN_DIR",
-        type=file_name,
         nargs="+",
         help="directory of a training run; several are drawn thinly, and their mean",
     )
     parser.add_argument(
         "--out",
-        type=file_name,
         metavar="F.png",
         help=f"the picture (default: RUN_DIR/{CURVE_FILE})",
     )

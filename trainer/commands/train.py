@@ -19,7 +19,6 @@ from trainer.commands.options import (
     add_latency,
     add_scenario,
     add_threads,
-    file_name,
     not_negative,
     positive,
     set_threads,
@@ -58,15 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--human",
-        type=file_name,
         default=DEFAULTS.human,
         metavar=f"expert|HUMAN_DIR|{'|'.join(HUMANS)}",
         help="who guides: the scripted expert, a model trained by `trainer human`, or you",
     )
     add_person(parser)
-    parser.add_argument(
-        "--out", type=file_name, required=True, metavar="RUN_DIR", help="directory of the run"
-    )
+    parser.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
     parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learner's device")
     add_latency(parser, "network between policy and vehicle, also in validation")

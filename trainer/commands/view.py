@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 from edge_runtime.cli import examples
-from trainer.commands.options import file_name
 from trainer.person.recording import find_recordings, read_steps
 
 EXAMPLE = examples(
@@ -23,7 +22,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings",
         metavar="RECORDING",
-        type=file_name,
         nargs="+",
         help="sitting-NNNN.mcap, a directory of such, or a run that a person guided",
     )
@@ -32,9 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where.add_argument(
         "--serve", action="store_true", help="serve a web page on this machine's loopback only"
     )
-    where.add_argument(
-        "--save", type=file_name, metavar="F.rrd", help="write a recording instead of showing it"
-    )
+    where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from edge_runtime.errors import UserError
-from trainer.commands.options import file_name, positive_float
+from trainer.commands.options import positive_float
 from trainer.person.registry import PersonOptions
 
 PERSON = "person"
@@ -19,7 +19,6 @@ def add_person(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("a person at the wheel (--human keyboard and so on)")
     group.add_argument(
         "--profile",
-        type=file_name,
         metavar="F.toml",
         help="what the axes and buttons of --human gamepad or wheel mean (default: as shipped)",
     )
