@@ -90,7 +90,7 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
 
 def test_validation_acts_in_the_learners_thread(tmp_path):
     run = scripted_run(tmp_path, replace(CONFIG, evaluate_every=1, evaluation_runs=2), length=3)
-    run.validation_env = ScriptedEnv(3, "goal")
+    run.validation.env = ScriptedEnv(3, "goal")
     act, threads = run.learning.learner.act, []
 
     def spy(seen, averaged):

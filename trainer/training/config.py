@@ -71,6 +71,20 @@ class RunConfig:
         """Plain values, for JSON."""
         return asdict(self)
 
+    @property
+    def kept_actor(self) -> str:
+        """The learner's network that is validated and kept."""
+        return "target_actor" if self.averaged_actor else "actor"
+
+    def label(self, episode: int) -> dict[str, Any]:
+        """What a file of the run says of whose it is, and of when."""
+        return {
+            "scenario": self.scenario,
+            "algorithm": self.algorithm,
+            "seed": self.seed,
+            "episode": episode,
+        }
+
     @staticmethod
     def completed(values: dict[str, Any]) -> dict[str, Any]:
         """A config of before the network, or before the switch of the reward, with their fields."""

@@ -11,20 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_json
 from edge_runtime.latency.model import parse_spec
 from trainer import seeds
 from trainer.drivers import (
-    BEST_FILE,
     CHECKPOINT_FILE,
     EXPERTS,
     TRIGGERS,
     load_driver,
     make_environment,
 )
-from trainer.evaluation import drive_episodes
 from trainer.files import load_torch, save_torch
 from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
@@ -32,11 +29,12 @@ from trainer.learner.algorithms import ALGORITHMS
 from trainer.revision import source_revision
 from trainer.training.config import RunConfig
 from trainer.training.divergence import check_weights, divergence_said, finite_action
-from trainer.training.learning import Learning, LearningDriver
+from trainer.training.learning import Learning
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 from trainer.training.placement import make_learning
 from trainer.training.seen import OnStep, Seen
 from trainer.training.tally import Tally
+from trainer.training.validation import Validation
 from trainer.training.wheel import Ends, make_wheel
 
 CONFIG_FILE = "config.json"
@@ -55,12 +53,10 @@ class TrainingRun:
         self.config, self.run_dir = config, run_dir
         self.algorithm = ALGORITHMS[config.algorithm]
         self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
-        self.validation_env = make_environment(
-            config.scenario, printed_reward=config.printed_reward
-        )
         action_size = self.env.action_space.shape[0]
         self.learning = self._make_learning(action_size)
         self.network = parse_spec(config.latency)
+        self.validation = Validation(config, run_dir, self.learning, self.network)
         self.wheel = make_wheel(self.learning, self.env, self.network)
         self.guide = self._make_guide()
         self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
@@ -68,7 +64,6 @@ class TrainingRun:
         self.episode = 0
         self.on_step: OnStep | None = None
         """Called at the end of each control period, if anybody looks on."""
-        self.best_validation = (-1.0, -1.0)
         if resume:
             self._load()
 
@@ -114,13 +109,13 @@ class TrainingRun:
         save_torch(
             self.run_dir / CHECKPOINT_FILE,
             {
-                **self._label(),
+                **self.config.label(self.episode),
                 **self._more_state(),
                 "learning": self.learning.state_dict(),
-                "kept_actor": self._kept_actor,
+                "kept_actor": self.config.kept_actor,
                 "exploration": self.exploration.bit_generator.state,
                 "guidance": self.guidance.bit_generator.state,
-                "best_validation": self.best_validation,
+                "best_validation": self.validation.best,
             },
         )
 
@@ -140,7 +135,7 @@ class TrainingRun:
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
         self.guidance.bit_generator.state = state["guidance"]
-        self.best_validation = tuple(state["best_validation"])
+        self.validation.best = tuple(state["best_validation"])
 
     def _must_stop(self, deadline_s: float | None) -> bool:
         """Whether the episode just driven is the last of this call."""
@@ -250,37 +245,7 @@ class TrainingRun:
         )
 
     def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
-        """Evaluate on the validation seeds where due, and keep the best actor."""
+        """Judge the policy where that is due, and keep it if it is the best one."""
         every = self.config.evaluate_every
-        if not every or not (at_end or self.episode % every == 0):
-            return
-        chosen = [
-            seeds.episode_seed(self.config.seed, seeds.VALIDATION, run)
-            for run in range(self.config.evaluation_runs)
-        ]
-        driver = LearningDriver(self.learning, self.config.averaged_actor)
-        results = drive_episodes(self.validation_env, driver, chosen, latency=self.network)
-        success = float(np.mean([result.outcome == GOAL for result in results]))
-        distance_m = float(np.mean([result.distance_m for result in results]))
-        reward = float(np.mean([result.reward for result in results]))
-        metrics.validation_success, metrics.validation_distance_m = success, distance_m
-        metrics.validation_reward = reward
-        if (success, reward) >= self.best_validation:
-            self.best_validation = (success, reward)
-            kept = getattr(self.learning.learner, self._kept_actor)
-            state = {**self._label(), "actor": kept.state_dict()}
-            save_torch(self.run_dir / BEST_FILE, state)
-
-    @property
-    def _kept_actor(self) -> str:
-        """The learner's network that is validated and kept."""
-        return "target_actor" if self.config.averaged_actor else "actor"
-
-    def _label(self) -> dict[str, Any]:
-        c = self.config
-        return {
-            "scenario": c.scenario,
-            "algorithm": c.algorithm,
-            "seed": c.seed,
-            "episode": self.episode,
-        }
+        if every and (at_end or self.episode % every == 0):
+            self.validation.judge(metrics, self.episode)

@@ -1,0 +1,58 @@
+"""What a training policy is worth alone, on seeds of their own; the best one is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from edge_runtime.episode_report import GOAL
+from edge_runtime.latency.model import LatencySpec
+from trainer import seeds
+from trainer.drivers import BEST_FILE, make_environment
+from trainer.evaluation import drive_episodes
+from trainer.files import save_torch
+from trainer.training.config import RunConfig
+from trainer.training.learning import Learning, LearningDriver
+from trainer.training.metrics import EpisodeMetrics
+
+
+class Validation:
+    """Drives the policy as it stands, without help, and keeps the best actor so far.
+
+    Args:
+        config: of the run.
+        run_dir: where the actor goes.
+        learning: whose policy it is.
+        network: between policy and vehicle, as in the training.
+    """
+
+    def __init__(
+        self, config: RunConfig, run_dir: Path, learning: Learning, network: LatencySpec
+    ) -> None:
+        self.config, self.run_dir = config, run_dir
+        self.learning, self.network = learning, network
+        self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
+        self.best = (-1.0, -1.0)
+        """Success and return of the actor that is kept."""
+        self._seeds = [
+            seeds.episode_seed(config.seed, seeds.VALIDATION, run)
+            for run in range(config.evaluation_runs)
+        ]
+
+    def judge(self, metrics: EpisodeMetrics, episode: int) -> None:
+        """Add to ``metrics`` how the policy drives after ``episode`` episodes."""
+        driver = LearningDriver(self.learning, self.config.averaged_actor)
+        results = drive_episodes(self.env, driver, self._seeds, latency=self.network)
+        success = float(np.mean([result.outcome == GOAL for result in results]))
+        reward = float(np.mean([result.reward for result in results]))
+        metrics.validation_success, metrics.validation_reward = success, reward
+        metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
+        if (success, reward) >= self.best:
+            self.best = (success, reward)
+            self._keep(episode)
+
+    def _keep(self, episode: int) -> None:
+        actor = getattr(self.learning.learner, self.config.kept_actor)
+        state = {**self.config.label(episode), "actor": actor.state_dict()}
+        save_torch(self.run_dir / BEST_FILE, state)
