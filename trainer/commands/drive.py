@@ -18,8 +18,8 @@ from trainer.drivers import load_driver, make_environment
 from trainer.person.options import add_person, person_options
 from trainer.person.recording import Recorder
 from trainer.person.registry import HUMANS
-from trainer.person.signals import quit_on_signals
 from trainer.person.sitting import Sitting
+from trainer.signals import quit_on_signals
 
 EXAMPLE = examples(
     "python -m trainer drive --human keyboard --out runs/drives",
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         recorder = Recorder(Path(arguments.out))
         sitting = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
         try:
-            with quit_on_signals(sitting):
+            with quit_on_signals(sitting.quit):
                 outcomes = drive(sitting, policy, arguments.seed, arguments.episodes)
         finally:
             sitting.close()

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from edge_runtime.cli import examples
+from edge_runtime.cli import INTERRUPTED, examples
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.latency.model import parse_spec
@@ -32,6 +35,7 @@ from trainer.person.options import PERSON, add_person, check_no_person
 from trainer.person.registry import HUMANS
 from trainer.plots import write_learning_curve
 from trainer.progress import ProgressBar
+from trainer.signals import quit_on_signals
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
@@ -43,6 +47,8 @@ EXAMPLE = examples(
     "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
     "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
 )
+
+_STDERR = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,11 +98,10 @@ def run(arguments: argparse.Namespace) -> int:
     run_dir = Path(arguments.out)
     with claimed(run_dir):
         check_directory(run_dir, config, arguments.resume)
-        _train(arguments, config, run_dir)
-    return 0
+        return _train(arguments, config, run_dir)
 
 
-def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> None:
+def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> int:
     sink = _sink(arguments.rerun)
     with _training(arguments, config, run_dir) as training:
         end_s = deadline_s(arguments)
@@ -108,6 +113,10 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> N
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
     print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
+    if training.quitting and training.episode < config.episodes:
+        print("interrupted; the same command with --resume goes on", file=sys.stderr)
+        return INTERRUPTED
+    return 0
 
 
 def _check_human(human: str) -> None:
@@ -128,7 +137,16 @@ def _training(
             yield guided
     else:
         check_no_person(arguments)
-        yield TrainingRun(config, run_dir, arguments.resume)
+        training = TrainingRun(config, run_dir, arguments.resume)
+        with quit_on_signals(partial(_quit, training)):
+            yield training
+
+
+def _quit(training: TrainingRun) -> bool:
+    training.quit()
+    # Not print: a signal may come in the midst of one, which takes no other.
+    os.write(_STDERR, b"ending after this episode; a second time: at once, without a checkpoint\n")
+    return True
 
 
 def _sink(word: str | None) -> Any:

@@ -12,7 +12,7 @@ from trainer.files import make_directory
 from trainer.person.options import person_options
 from trainer.person.registry import HUMANS
 from trainer.person.run import PersonRun, check_settings
-from trainer.person.signals import quit_on_signals
+from trainer.signals import quit_on_signals
 from trainer.training.config import RunConfig
 
 
@@ -32,7 +32,7 @@ def training_with_person(
                 f"{steps} recorded steps after the checkpoint, {human} of them yours, are back",
                 file=sys.stderr,
             )
-        with quit_on_signals(training.sitting):
+        with quit_on_signals(training.sitting.quit):
             yield training
         print(summary(training), file=sys.stderr)
     finally:

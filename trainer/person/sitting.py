@@ -127,6 +127,11 @@ class Sitting:
         """Show a line before something that takes a moment."""
         self._show(message)
 
+    def quit(self) -> bool:
+        """Ask for the end of the sitting; False where it is over already."""
+        self.stop = self.stop or not self.closed
+        return not self.closed
+
     def close(self) -> None:
         """Close the person's devices and the recording; twice is once."""
         self.closed = True

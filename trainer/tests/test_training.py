@@ -1,5 +1,6 @@
 import csv
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from edge_runtime.cli import INTERRUPTED
 from edge_runtime.errors import UserError
 from trainer import seeds
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
@@ -109,22 +111,53 @@ def command(directory: Path, *extra: str) -> list[str]:
     ]  # fmt: skip
 
 
-def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path):
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
-    process = subprocess.Popen(command(killed), stderr=subprocess.DEVNULL)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A run in one go."""
+    directory = tmp_path_factory.mktemp("runs") / "whole"
+    subprocess.run(command(directory), check=True, capture_output=True)
+    return directory
+
+
+def begin(directory: Path, *extra: str, episodes: int) -> subprocess.Popen[str]:
+    """The same run, some episodes far."""
+    process = subprocess.Popen(command(directory, *extra), stderr=subprocess.PIPE, text=True)
     end_s = time.monotonic() + 120
-    while len(read_metrics(killed)) < 3 and time.monotonic() < end_s:
+    while len(read_metrics(directory)) < episodes and time.monotonic() < end_s:
         time.sleep(0.02)
-    process.kill()
-    process.wait()
-    assert 3 <= len(read_metrics(killed)) < 8, "killed too late to mean anything"
-    for arguments in (command(killed, "--resume"), command(whole)):
-        subprocess.run(arguments, check=True, capture_output=True)
-    a, b = (load_torch(d / CHECKPOINT_FILE) for d in (killed, whole))
+    return process
+
+
+def resume_and_compare(directory: Path, whole: Path, *extra: str) -> None:
+    subprocess.run(command(directory, "--resume", *extra), check=True, capture_output=True)
+    a, b = (load_torch(d / CHECKPOINT_FILE) for d in (directory, whole))
     assert a["episode"] == b["episode"] == 8
     for name, weights in a["learning"]["learner"]["actor"].items():
         assert torch.equal(weights, b["learning"]["learner"]["actor"][name])
-    assert len(read_metrics(killed)) == 8
+    assert len(read_metrics(directory)) == 8
+
+
+def test_a_killed_run_resumes_and_ends_like_one_never_killed(tmp_path, whole):
+    process = begin(tmp_path, episodes=3)
+    process.kill()
+    process.communicate()
+    assert 3 <= len(read_metrics(tmp_path)) < 8, "killed too late to mean anything"
+    resume_and_compare(tmp_path, whole)
+
+
+def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, whole):
+    """Far from its next checkpoint."""
+    seldom = ("--set", "checkpoint_every=100")
+    process = begin(tmp_path, *seldom, episodes=2)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == INTERRUPTED
+    assert "ending after this episode" in said
+    assert said.splitlines()[-1] == "interrupted; the same command with --resume goes on"
+    driven = len(read_metrics(tmp_path))
+    assert 2 <= driven < 8
+    assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == driven
+    resume_and_compare(tmp_path, whole, *seldom)
 
 
 def test_an_unguided_algorithm_never_meets_the_human(tmp_path):

@@ -64,6 +64,8 @@ class TrainingRun:
         self.episode = 0
         self.on_step: OnStep | None = None
         """Called at the end of each control period, if anybody looks on."""
+        self.quitting = False
+        """The episode under way is to be the last of this call."""
         if resume:
             self._load()
 
@@ -87,10 +89,12 @@ class TrainingRun:
                 late = self._must_stop(deadline_s)
                 self._validate(metrics, at_end=last or late)
                 metrics_writer.add(metrics)
-                if last or late or self.episode % self.config.checkpoint_every == 0:
+                due = self.episode % self.config.checkpoint_every == 0
+                # Who quits is not kept waiting for a validation, and who resumes has it when due.
+                if last or late or self.quitting or due:
                     self.save()
                 on_episode(metrics)
-                if late:
+                if late or self.quitting:
                     break
         finally:
             metrics_writer.close()
@@ -103,6 +107,10 @@ class TrainingRun:
             check_weights(self.learning.learner)
         self.episode += 1
         return metrics
+
+    def quit(self) -> None:
+        """End after the episode under way, with a checkpoint."""
+        self.quitting = True
 
     def save(self) -> None:
         """Write the checkpoint."""

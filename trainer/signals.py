@@ -1,32 +1,32 @@
-"""^C and SIGTERM end a sitting as quitting does: with everything kept."""
+"""^C and SIGTERM end long work as quitting does: with everything kept."""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
-
-from trainer.person.sitting import Sitting
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
-def quit_on_signals(sitting: Sitting) -> Iterator[None]:
-    """Let the first signal ask the sitting to stop.
+def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
+    """Let the first signal ask for the end.
 
-    A second one, or one when it is over, ends the process as ever.
+    A second one ends the process as ever, and so does the first if nobody heeds it any more.
+
+    Args:
+        ask: asks for it; whether somebody will heed.
     """
     before = {number: signal.getsignal(number) for number in SIGNALS}
 
     def stop(number: int, frame: Any) -> None:
         for name, handler in before.items():
             signal.signal(name, handler)
-        if sitting.closed:
+        if not ask():
             os.kill(os.getpid(), number)
-        sitting.stop = True
 
     for number in SIGNALS:
         signal.signal(number, stop)
