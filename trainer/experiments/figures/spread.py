@@ -37,7 +37,10 @@ SMOOTHNESS = {
 
 
 def draw_boxes(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
-    """Box plots of both scenarios' secondary targets, with paired t-tests against the first."""
+    """Box plots of both scenarios' secondary targets, with paired t-tests against the first.
+
+    Below a box: of how many drives it is.
+    """
     figure = new_figure(12.0, 4.8)
     for number, (panel, scenario) in enumerate(zip(figure.subplots(1, 2), BOXES, strict=True)):
         letter(panel, number, BOXES[scenario].title)
@@ -70,13 +73,17 @@ def _box_panel(
             )  # fmt: skip
             boxes["boxes"][0].set(facecolor=colour(algorithm), alpha=0.7)
             drawn = True
+            panel.text(
+                x, 0.01, str(len(values)), transform=panel.get_xaxis_transform(),
+                ha="center", va="bottom", fontsize=6,
+            )  # fmt: skip
             first, second = pairs(own, outcomes, scene.condition, quantity.column, quantity.arrived)
             if place and len(first):
                 marks.append((x, stars(paired_t(first, second))))
     low, high = panel.get_ylim()
     for x, mark in marks:
         panel.text(x, high, mark, ha="center", va="bottom", fontsize=8, rotation=90)
-    panel.set_ylim(low, high + 0.2 * (high - low))
+    panel.set_ylim(low - 0.06 * (high - low), high + 0.2 * (high - low))
     panel.set_xticks(range(len(scenes)), [scene.label for scene in scenes])
     panel.set_xlim(-0.6, len(scenes) - 0.4)
     panel.grid(alpha=0.3, axis="y")
