@@ -105,7 +105,8 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--bus",
         metavar="INTERFACE:CHANNEL",
-        help=f"the hunter's CAN bus, as python-can names it (default: {_DEFAULTS.bus})",
+        help="with --vehicle hunter: its CAN bus, as python-can names it"
+        f" (default: {_DEFAULTS.bus})",
     )
     parser.add_argument(
         "--config", metavar="FILE.toml", help="settings; flags on the command line win over it"

@@ -69,17 +69,23 @@ class ArgumentParser(argparse.ArgumentParser):
         one stands.
         """
         given = sys.argv[1:] if args is None else list(args)
-        for before, value in zip(["", *given], given):
-            if not value:
-                self.error(f"an empty value after {before}" if before else "an empty value")
-            if value.startswith("--") and value.find("=") == len(value) - 1:
-                self.error(f"an empty value after {value}")
+        if self._subparsers is None:  # else it is for the command's own parser to say
+            refuse_empty(given, self.error)
         return super().parse_known_args(given, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print "prog: what is wrong (see prog --help)" and exit with status 2."""
         line = " ".join(message.split())
         self.exit(BAD_INPUT, f"{self.prog}: {line} (see {self.prog} --help)\n")
+
+
+def refuse_empty(arguments: List[str], error: Callable[[str], NoReturn]) -> None:
+    """Call ``error`` at the first argument that is empty, or has nothing behind its = (--out=)."""
+    for before, value in zip(["", *arguments], arguments):
+        if not value:
+            error(f"an empty value after {before}" if before else "an empty value")
+        if value.startswith("--") and value.find("=") == len(value) - 1:
+            error(f"an empty value after {value[:-1]}")
 
 
 def examples(*commands: str) -> str:

@@ -64,27 +64,18 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     the value stands in the file, the error names it.
     """
     given = {name: value for name, value in flags.items() if value is not None}
-    if path is None:
-        config = msgspec.structs.replace(Config(), **given)
-        _check(config)
-        _check_flags(given, config)
-        return config
-    from_file = _read(path)
+    from_file = Config() if path is None else _read(path)
     config = msgspec.structs.replace(from_file, **given)
     try:
         _check(config)
     except UserError as error:
-        if not _is_wrong(from_file):
+        if path is None or not _is_wrong(from_file):
             raise  # the flag is wrong, not the file
         raise UserError(f"config file {path}: {error}") from None
-    _check_flags(given, config)
-    return config
-
-
-def _check_flags(given: Dict[str, Any], config: Config) -> None:
-    """Who names a bus means a vehicle to move; a file may hold the bus of one that is off."""
+    # Who types a bus means a vehicle to move; a file may hold the bus of one that is off.
     if "bus" in given and config.vehicle != "hunter":
-        raise UserError(f"--bus is of --vehicle hunter; the vehicle here is {config.vehicle}")
+        raise UserError(f"--bus needs --vehicle hunter; the vehicle is {config.vehicle}")
+    return config
 
 
 def _read(path: PathLike) -> Config:

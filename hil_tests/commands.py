@@ -26,7 +26,16 @@ def run_command(*arguments: str) -> None:
         UserError: it failed; it has said why.
     """
     print(f"\n$ python -m {shlex.join(arguments)}", flush=True)
-    status = subprocess.run([sys.executable, "-m", *arguments], check=False).returncode
+    process = subprocess.Popen([sys.executable, "-m", *arguments])
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:
+        # It has had the same ^C, and may have something to keep. A second one is for good.
+        try:
+            process.wait()
+        finally:
+            process.kill()
+        raise
     if status:
         raise UserError(f"python -m {arguments[0]} {arguments[1]} ended with status {status}")
 

@@ -32,6 +32,7 @@ FIRST_SEED = 0
 RECORDED_RUNS = 2
 TRAINING_EPISODES = 150
 HUMAN_MINUTES = 1.5
+"""With them, the training and what follows a demo takes eight at most, on a slow machine, too."""
 TRAINING_MINUTES = 4.5
 
 EXAMPLE = examples(

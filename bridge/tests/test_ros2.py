@@ -128,7 +128,7 @@ def test_a_sigterm_ends_it_with_its_counts(tmp_path):
         (["--wait-s", "0"], "nobody answers"),
         (["--vehicle-id", "a/b"], "vehicle id"),
         (["--namespace", "9/x"], "namespace '9/x'"),
-        (["--namespace", ""], "namespace ''"),
+        (["--namespace", ""], "empty value after --namespace"),
         (["--ros2-listen", "tls/127.0.0.1:7448"], "plain text"),
         (["--ros2-listen", "nowhere"], "endpoint 'nowhere'"),
         (["--ros2-listen", "tcp/a:1", "--ros2-connect", "tcp/a:1"], "not allowed with"),

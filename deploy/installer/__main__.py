@@ -32,7 +32,13 @@ UNHEALTHY, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse with an error of one line."""
+    """argparse with an error of one line, and no empty value: as a root, it is where one stands."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        for value in sys.argv[1:] if args is None else args:
+            if not value or (value.startswith("--") and value.endswith("=")):
+                self.error("an empty value")
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {' '.join(message.split())} (see {self.prog} --help)\n")

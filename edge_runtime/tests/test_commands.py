@@ -145,7 +145,7 @@ def test_a_bus_in_the_file_may_be_of_a_vehicle_that_is_off_but_not_on_the_comman
     assert load_config(path, {}).vehicle == "none"
     for file in (path, None):
         flags = {"policy": "p.onnx", "bus": "socketcan:can0"}
-        with pytest.raises(UserError, match="--bus is of --vehicle hunter"):
+        with pytest.raises(UserError, match="--bus needs --vehicle hunter"):
             load_config(file, flags)
         assert load_config(file, {**flags, "vehicle": "hunter"}).bus == "socketcan:can0"
 

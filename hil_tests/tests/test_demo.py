@@ -14,7 +14,7 @@ from hil_tests.commands import BackgroundCommand
 from hil_tests.demo import Demo
 
 SMALL = (
-    "--episodes", "2", "--human-episodes", "2", "--human-minutes", "0.05", "--runs", "1",
+    "--episodes", "2", "--human-episodes", "20", "--human-minutes", "0.001", "--runs", "1",
     "--minutes", "1",
 )  # fmt: skip
 

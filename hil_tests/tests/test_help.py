@@ -99,7 +99,7 @@ def test_an_empty_name_of_what_is_written_is_refused(program, empty, only_parse)
         with pytest.raises(SystemExit) as ended:
             main_of(program)([name, *empty])
         assert ended.value.code == 2
-        assert "an empty value after --out" in only_parse[-1], name
+        assert f"{name}: an empty value after --out (see" in only_parse[-1]
 
 
 def test_a_wrong_example_is_found_out(only_parse):
@@ -121,6 +121,15 @@ def test_the_installer_shows_examples_that_it_takes():
         text = " ".join(one.format_help().split())
         _, _, example = text.partition("example: sudo python3 install.pyz ")
         parser.parse_args(shlex.split(example))
+
+
+@pytest.mark.parametrize("empty", [["--root", ""], ["--root="]], ids=" ".join)
+def test_the_installer_takes_no_empty_root(empty, capsys):
+    """It would be the directory where one stands."""
+    with pytest.raises(SystemExit) as ended:
+        installer.main(["uninstall", *empty])
+    assert ended.value.code == 2
+    assert "an empty value" in capsys.readouterr().err
 
 
 def test_examples_and_paragraphs_keep_their_lines():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from trainer.commands.options import (
 from trainer.commands.time_limit import add_time_limit, deadline_s, until
 from trainer.drivers import make_environment
 from trainer.human.dagger import HumanTraining
-from trainer.human.model import MODEL_FILE, HumanModel, HumanModelConfig
+from trainer.human.model import MODEL_FILE, HumanModel, HumanModelConfig, refining_parts
 from trainer.locks import claimed
 from trainer.person.imitation import demonstrate
 from trainer.person.recording import find_recordings
@@ -87,7 +88,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
         "their directories, or such a training run (default: the scripted expert)",
     )
-    add_time_limit(parser, "end episodes and refining after the one that passes this time")
+    add_time_limit(
+        parser,
+        "begin no episode after this time; those refining steps are taken that the episodes driven "
+        "are worth",
+    )
     add_threads(parser)
 
 
@@ -118,24 +123,32 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
-    end_s = deadline_s(arguments)
     from_whom = _from_expert if arguments.recordings is None else _from_person
-    model, about = from_whom(arguments, config, end_s)
-    if config.refining_updates:
-        with ProgressBar("refining", config.refining_parts) as bar:
-            for loss in until(end_s, model.refine()):
+    model, about, episodes = from_whom(arguments, config, deadline_s(arguments))
+    if episodes < config.episodes:
+        print(f"the time is over after {episodes} of {config.episodes} episodes", file=sys.stderr)
+    # In proportion: a part of the episodes has shown a part of the examples, in a part of the time.
+    updates = config.refining_updates * episodes // config.episodes
+    if updates:
+        with ProgressBar("refining", refining_parts(updates)) as bar:
+            for loss in model.refine(updates):
                 bar.advance({"loss": f"{loss:.3f}"})
     about = {"scenario": arguments.scenario, "seed": arguments.seed, **about}
     model.save(directory, {**about, "config": asdict(config)})
-    report = {**about, "config": asdict(config), "demonstrations": model.demonstrations}
+    report = {
+        **about,
+        "config": asdict(config),
+        "episodes": episodes,
+        "demonstrations": model.demonstrations,
+    }
     write_json_out(str(directory / "human.json"), report)
     print(f"human model from {model.demonstrations} demonstrated steps: {directory}")
 
 
 def _from_expert(
     arguments: argparse.Namespace, config: HumanModelConfig, end_s: float
-) -> tuple[HumanModel, dict[str, Any]]:
-    """A model of the scripted expert, which takes over from it while it drives."""
+) -> tuple[HumanModel, dict[str, Any], int]:
+    """A model of the scripted expert, who takes over while it drives; and in how many episodes."""
     training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)
     with ProgressBar("human model", config.episodes) as bar:
         for episode in until(end_s, training.episodes()):
@@ -147,13 +160,16 @@ def _from_expert(
                     "outcome": episode.outcome,
                 }
             )
-    return training.model, {"episodes": bar.done}
+    return training.model, {}, bar.done
 
 
 def _from_person(
     arguments: argparse.Namespace, config: HumanModelConfig, end_s: float
-) -> tuple[HumanModel, dict[str, Any]]:
-    """A model of a person, from recordings: as many gradient steps as with the expert."""
+) -> tuple[HumanModel, dict[str, Any], int]:
+    """A model of a person, from recordings: as many gradient steps as with the expert.
+
+    An episode is as many of them as follow one of the expert's.
+    """
     recordings = find_recordings([Path(place) for place in arguments.recordings])
     model = HumanModel(config, arguments.seed)
     interventions = demonstrate(model, recordings, arguments.scenario)
@@ -161,9 +177,5 @@ def _from_person(
         for _ in until(end_s, range(config.episodes)):
             loss = model.learn(config.updates_per_episode)
             bar.advance({"demonstrations": str(model.demonstrations), "loss": f"{loss:.3f}"})
-    about = {
-        "recordings": [str(path) for path in recordings],
-        "interventions": interventions,
-        "episodes": bar.done,
-    }
-    return model, about
+    about = {"recordings": [str(path) for path in recordings], "interventions": interventions}
+    return model, about, bar.done

@@ -30,9 +30,9 @@ def deadline_s(arguments: argparse.Namespace) -> float:
     return math.inf if limit is None else time.monotonic() + 60.0 * limit
 
 
-def until(deadline_s: float, parts: Iterable[Part]) -> Iterator[Part]:
+def until(end_s: float, parts: Iterable[Part]) -> Iterator[Part]:
     """The parts that begin by then, as of ``time.monotonic()``, and the first in any case."""
     for part in parts:
         yield part
-        if time.monotonic() > deadline_s:
+        if time.monotonic() > end_s:
             return

@@ -7,7 +7,7 @@ import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,7 @@ EXAMPLE = examples(
 )
 
 _STDERR = 2
+_ENDING = b"ending after this episode; a second time: at once, back to the last checkpoint\n"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,6 +109,8 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
         with (
             ProgressBar("training", config.episodes, training.episode) as bar,
             _watched(training, sink) as watch,
+            # The last: behind the first signal is what a viewer makes of them.
+            quit_on_signals(partial(_quit, training)),
         ):
             training.train(_both(_Reporter(bar), watch), end_s)
     if training.episode:  # a person may quit before the first
@@ -137,16 +140,17 @@ def _training(
             yield guided
     else:
         check_no_person(arguments)
-        training = TrainingRun(config, run_dir, arguments.resume)
-        with quit_on_signals(partial(_quit, training)):
-            yield training
+        yield TrainingRun(config, run_dir, arguments.resume)
 
 
 def _quit(training: TrainingRun) -> bool:
-    training.quit()
-    # Not print: a signal may come in the midst of one, which takes no other.
-    os.write(_STDERR, b"ending after this episode; a second time: at once, without a checkpoint\n")
-    return True
+    heeded = training.quit()
+    if training.quitting:
+        # Not print: a signal may come in the midst of one, which takes no other. And whoever read
+        # it, as `tee`, may have had the same ^C.
+        with suppress(OSError):
+            os.write(_STDERR, _ENDING)
+    return heeded
 
 
 def _sink(word: str | None) -> Any:

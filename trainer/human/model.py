@@ -69,10 +69,10 @@ class HumanModelConfig:
         if self.unaided_share and not self.label_every_step:
             raise UserError("--unaided-share needs --label-every-step: nothing else teaches there")
 
-    @property
-    def refining_parts(self) -> int:
-        """Steps in which the learning rate falls."""
-        return min(self.refining_updates, 20)
+
+def refining_parts(updates: int) -> int:
+    """Steps in which the learning rate falls while a model is refined."""
+    return min(updates, 20)
 
 
 class HumanModel:
@@ -127,17 +127,17 @@ class HumanModel:
             self.optimiser.step()
         return loss.item()
 
-    def refine(self) -> Iterator[float]:
+    def refine(self, updates: int) -> Iterator[float]:
         """Learn on after the last episode, part by part, each at a lower rate; yields the loss.
 
         The rate falls linearly, so that what was learned settles.
         """
-        parts = self.config.refining_parts
+        parts = refining_parts(updates)
         for part in range(parts):
             for group in self.optimiser.param_groups:
                 group["lr"] = self.config.learning_rate * (1.0 - part / parts)
-            updates, rest = divmod(self.config.refining_updates, parts)
-            yield self.learn(updates + (part < rest))
+            each, rest = divmod(updates, parts)
+            yield self.learn(each + (part < rest))
 
     def save(self, directory: Path, about: dict[str, Any]) -> None:
         """Write the model to ``directory`` with what it was trained on."""

@@ -12,7 +12,6 @@ from trainer.files import make_directory
 from trainer.person.options import person_options
 from trainer.person.registry import HUMANS
 from trainer.person.run import PersonRun, check_settings
-from trainer.signals import quit_on_signals
 from trainer.training.config import RunConfig
 
 
@@ -32,8 +31,7 @@ def training_with_person(
                 f"{steps} recorded steps after the checkpoint, {human} of them yours, are back",
                 file=sys.stderr,
             )
-        with quit_on_signals(training.sitting.quit):
-            yield training
+        yield training
         print(summary(training), file=sys.stderr)
     finally:
         person.close()

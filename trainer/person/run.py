@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -63,7 +64,7 @@ class PersonRun(TrainingRun):
     def train(
         self,
         on_episode: Callable[[EpisodeMetrics], None] = lambda metrics: None,
-        deadline_s: float | None = None,
+        deadline_s: float = math.inf,
     ) -> None:
         """Train until the person quits, or as ``TrainingRun`` does."""
         try:
@@ -74,6 +75,10 @@ class PersonRun(TrainingRun):
             self.save()
         finally:
             self.sitting.close()
+
+    def quit(self) -> bool:
+        """Ask for the end of the sitting; False where it is over already."""
+        return self.sitting.quit()
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, and rest."""
@@ -105,7 +110,7 @@ class PersonRun(TrainingRun):
     def _make_guide(self) -> Guide | None:
         return None  # The sitting is opened when all else is known to work.
 
-    def _must_stop(self, deadline_s: float | None) -> bool:
+    def _must_stop(self, deadline_s: float) -> bool:
         return self.sitting.stop or super()._must_stop(deadline_s)
 
     def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:

@@ -56,7 +56,7 @@ def test_refining_takes_its_updates_under_a_falling_learning_rate():
         model.add(np.full((2, 45, 80), shade, np.uint8), FULL if number % 2 else BRAKE)
     before = [parameter.clone() for parameter in model.actor.parameters()]
     rates, losses = [], []
-    for loss in model.refine():
+    for loss in model.refine(config.refining_updates):
         losses.append(loss)
         rates.append(model.optimiser.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-3 * (1 - part / 20) for part in range(20)])

@@ -36,11 +36,14 @@ def test_nothing_is_begun_after_the_deadline():
     assert begun == [0]
 
 
-def test_a_human_model_whose_time_is_up_is_kept(tmp_path):
+def test_a_human_model_whose_time_is_up_is_refined_in_proportion_and_kept(tmp_path, capsys):
     out = tmp_path / "human"
     arguments = ["human", "--out", str(out), "--max-minutes", "1e-6", "--updates-per-episode", "1"]
-    assert main([*arguments, "--refining-updates", "40"]) == 0
+    assert main([*arguments, "--refining-updates", "100"]) == 0
     report = json.loads((out / "human.json").read_text())
     assert report["episodes"] == 1
     assert report["config"]["episodes"] == 50
+    said = capsys.readouterr().err
+    assert "the time is over after 1 of 50 episodes" in said
+    assert "refining: 2/2" in said  # 100 steps are for 50 episodes
     assert (out / "human_model.pt").is_file()

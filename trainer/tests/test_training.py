@@ -14,6 +14,7 @@ import torch
 from edge_runtime.cli import INTERRUPTED
 from edge_runtime.errors import UserError
 from trainer import seeds
+from trainer.commands.train import _quit as ask_to_quit
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.files import load_torch, save_torch
 from trainer.learner.config import LearnerConfig
@@ -21,7 +22,7 @@ from trainer.learner.replay import ReplayBuffer
 from trainer.plots import moving_average, write_learning_curve
 from trainer.training.config import RunConfig
 from trainer.training.learning import ProcessorLearning
-from trainer.training.metrics import NAMES, read_metrics
+from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import TrainingRun
 
 TINY = RunConfig(
@@ -158,6 +159,40 @@ def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, whole):
     assert 2 <= driven < 8
     assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == driven
     resume_and_compare(tmp_path, whole, *seldom)
+
+
+def test_who_quits_late_gets_one_more_episode_and_its_checkpoint(tmp_path):
+    run = TrainingRun(replace(TINY, checkpoint_every=100), tmp_path)
+
+    def late(_: EpisodeMetrics) -> None:
+        run.quit()
+
+    run.train(late)
+    assert run.episode == 2
+    assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == 2
+
+
+def test_a_reader_of_stderr_that_is_gone_ends_no_training(tmp_path, monkeypatch):
+    """As `tee`, which has had the same ^C."""
+
+    def broken(*_):
+        raise BrokenPipeError
+
+    run = TrainingRun(TINY, tmp_path)
+    monkeypatch.setattr("os.write", broken)
+    assert ask_to_quit(run)
+    assert run.quitting
+
+
+def test_a_watched_run_that_is_told_twice_ends_at_once_with_its_recording(tmp_path):
+    shown = tmp_path / "run.rrd"
+    process = begin(tmp_path / "run", "--rerun", str(shown), episodes=1)
+    for _ in range(2):
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.3)  # a signal that waits to be looked at is no second one
+    process.communicate(timeout=60)
+    assert process.returncode == INTERRUPTED
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["run.rrd"]
 
 
 def test_an_unguided_algorithm_never_meets_the_human(tmp_path):

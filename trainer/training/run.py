@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -72,7 +73,7 @@ class TrainingRun:
     def train(
         self,
         on_episode: Callable[[EpisodeMetrics], None] = lambda metrics: None,
-        deadline_s: float | None = None,
+        deadline_s: float = math.inf,
     ) -> None:
         """Train until the configured number of episodes, or ``time.monotonic() > deadline_s``.
 
@@ -89,12 +90,13 @@ class TrainingRun:
                 late = self._must_stop(deadline_s)
                 self._validate(metrics, at_end=last or late)
                 metrics_writer.add(metrics)
-                due = self.episode % self.config.checkpoint_every == 0
-                # Who quits is not kept waiting for a validation, and who resumes has it when due.
-                if last or late or self.quitting or due:
+                # Looked at once: what ends without a checkpoint is lost. Who quits waits for no
+                # validation that is not due anyway, so that a resumed run has had the same ones.
+                ending = last or late or self.quitting
+                if ending or self.episode % self.config.checkpoint_every == 0:
                     self.save()
                 on_episode(metrics)
-                if late or self.quitting:
+                if ending:
                     break
         finally:
             metrics_writer.close()
@@ -108,9 +110,10 @@ class TrainingRun:
         self.episode += 1
         return metrics
 
-    def quit(self) -> None:
-        """End after the episode under way, with a checkpoint."""
+    def quit(self) -> bool:
+        """Ask for the end after the episode under way, with a checkpoint; True: it will come."""
         self.quitting = True
+        return True
 
     def save(self) -> None:
         """Write the checkpoint."""
@@ -145,9 +148,9 @@ class TrainingRun:
         self.guidance.bit_generator.state = state["guidance"]
         self.validation.best = tuple(state["best_validation"])
 
-    def _must_stop(self, deadline_s: float | None) -> bool:
+    def _must_stop(self, deadline_s: float) -> bool:
         """Whether the episode just driven is the last of this call."""
-        return deadline_s is not None and time.monotonic() > deadline_s
+        return time.monotonic() > deadline_s
 
     def _make_learning(self, action_size: int) -> Learning:
         return make_learning(self.config, self.algorithm, action_size)

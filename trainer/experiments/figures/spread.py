@@ -74,8 +74,8 @@ def _box_panel(
             boxes["boxes"][0].set(facecolor=colour(algorithm), alpha=0.7)
             drawn = True
             panel.text(
-                x, 0.01, str(len(values)), transform=panel.get_xaxis_transform(),
-                ha="center", va="bottom", fontsize=6,
+                x, 0.01, f"n={len(values)}", transform=panel.get_xaxis_transform(),
+                ha="center", va="bottom", fontsize=5,
             )  # fmt: skip
             first, second = pairs(own, outcomes, scene.condition, quantity.column, quantity.arrived)
             if place and len(first):

@@ -83,6 +83,16 @@ def test_quitting_ends_the_episode_and_keeps_its_last_step(tmp_path):
     assert steps[-1].outcome == STOPPED
 
 
+def test_a_sitting_that_is_over_has_nobody_to_heed(tmp_path):
+    sitting, _ = make_sitting(tmp_path, [])
+    assert sitting.quit()
+    assert sitting.stop
+    sitting.stop = False
+    sitting.close()
+    assert not sitting.quit()
+    assert not sitting.stop
+
+
 def test_restarting_begins_another_episode(tmp_path):
     readings = [LET_GO, LET_GO, wish("restart"), *[LET_GO] * 14]
     outcomes, steps, _ = drive_and_read(tmp_path, readings)
