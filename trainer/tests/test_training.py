@@ -191,7 +191,8 @@ def test_a_watched_run_that_is_told_twice_ends_at_once_with_its_recording(tmp_pa
         process.send_signal(signal.SIGTERM)
         time.sleep(0.3)  # a signal that waits to be looked at is no second one
     process.communicate(timeout=60)
-    assert process.returncode == INTERRUPTED
+    # Where the first one met an episode's end, all is closed already when the second one comes.
+    assert process.returncode in (INTERRUPTED, -signal.SIGTERM)
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["run.rrd"]
 
 
