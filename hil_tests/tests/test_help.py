@@ -15,6 +15,9 @@ from edge_runtime.cli import ArgumentParser, examples
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("edge_runtime", "bridge", "trainer", "deploy", "hil_tests")
 
+LEAST_WRITING = {"edge_runtime": 2, "bridge": 6, "trainer": 7, "deploy": 4, "hil_tests": 7}
+"""Commands with an --out of those packages."""
+
 
 def find_programs():
     """Every module with a parser of its own, as ``python -m`` names it."""
@@ -88,13 +91,13 @@ def test_every_command_shows_examples_that_it_takes(program, only_parse):
                 main_of(program)(example[1:])
 
 
-@pytest.mark.parametrize("program", PACKAGES)
+@pytest.mark.parametrize(("program", "least"), LEAST_WRITING.items())
 @pytest.mark.parametrize("empty", [("--out", ""), ("--out=",)], ids=" ".join)
-def test_an_empty_name_of_what_is_written_is_refused(program, empty, only_parse):
+def test_an_empty_name_of_what_is_written_is_refused(program, least, empty, only_parse):
     """It would be the directory where one stands, or, taken for no name, none at all."""
     commands = subcommands_in(help_of(program, [], only_parse))
     writing = [name for name in commands if "--out " in help_of(program, [name], only_parse)]
-    assert writing
+    assert len(writing) >= least
     for name in writing:
         with pytest.raises(SystemExit) as ended:
             main_of(program)([name, *empty])

@@ -59,6 +59,11 @@ def test_other_figures_have_their_panels(name, tmp_path):
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_each_box_says_of_how_many_drives_it_is():
+    boxes = sum(len(panel.patches) for panel in draw("fig10").axes)
+    assert texts(draw("fig10")).count("n=") == boxes > 0
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_a_missing_seed_is_said_in_the_figure(name, tmp_path):
     figure = draw(name, lambda unit: (unit.algorithm, unit.seed) == ("phil_td3", 2))
