@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from trainer.commands.options import not_negative, positive
-from trainer.commands.time_limit import add_time_limit
+from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.experiments import timing
 from trainer.experiments.catalogue import NAMES, TIME, units_of
 from trainer.experiments.plan import PLAN, QUICK
@@ -170,8 +169,8 @@ def _names(given: list[str]) -> list[str]:
 def _compute(arguments: argparse.Namespace, store: Store, units: list[Unit]) -> Tally:
     if arguments.device == "cuda" and not arguments.ray and not torch.cuda.is_available():
         raise UserError("no CUDA device is available; use --device cpu")
-    limit = arguments.max_minutes
-    stop_at_s = math.inf if limit is None else time.time() + 60.0 * limit
+    # The clock that other processes, perhaps on other machines, have, too.
+    stop_at_s = deadline_s(arguments, time.time)
     left = [unit for unit in warn_of_obstacles(store, units) if not store.done(unit)]
     if not left:
         return Tally(0)

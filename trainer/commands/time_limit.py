@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 from trainer.commands.options import positive_float
@@ -24,10 +24,10 @@ def add_time_limit(parser: argparse.ArgumentParser, what: str) -> None:
     )
 
 
-def deadline_s(arguments: argparse.Namespace) -> float:
-    """When the minutes from now are over, as of ``time.monotonic()``; infinity without a limit."""
+def deadline_s(arguments: argparse.Namespace, clock: Callable[[], float] = time.monotonic) -> float:
+    """When the minutes from now are over, as of ``clock``; infinity without a limit."""
     limit = arguments.max_minutes
-    return math.inf if limit is None else time.monotonic() + 60.0 * limit
+    return math.inf if limit is None else clock() + 60.0 * limit
 
 
 def until(end_s: float, parts: Iterable[Part]) -> Iterator[Part]:

@@ -16,13 +16,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import write_json
 from edge_runtime.latency.model import parse_spec
 from trainer import seeds
-from trainer.drivers import (
-    CHECKPOINT_FILE,
-    EXPERTS,
-    TRIGGERS,
-    load_driver,
-    make_environment,
-)
+from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.files import load_torch, save_torch
 from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
