@@ -190,9 +190,12 @@ class TD3Learner:
         # To pick samples is to wait for their number, which an accelerator must not.
         looked_at = human.nonzero()[:, 0] if self.device.type == "cpu" else slice(None)
         if row.advantage_weight and td_errors[looked_at].numel():
-            critic = self.target_critics.first
+            critic, frames = self.target_critics.first, batch.frames
+            if isinstance(looked_at, Tensor):
+                # Copies picture by picture; [looked_at] would go byte by byte, 25 times as slow.
+                frames = frames.index_select(0, looked_at)
             with self._precision():
-                picture = critic.embed(batch.frames[looked_at])
+                picture = critic.embed(frames)
             advantage[looked_at] = equations.q_advantage(
                 critic.value(picture, batch.actions[looked_at]),
                 critic.value(picture, own_actions[looked_at]),
