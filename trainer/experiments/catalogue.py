@@ -10,7 +10,7 @@ from itertools import product
 
 from matplotlib.figure import Figure
 
-from trainer.experiments.claims import guidance, learning, ours, testing
+from trainer.experiments.claims import difficulty, guidance, learning, ours, testing
 from trainer.experiments.figures.bars import draw_difficulty, draw_guidance, draw_tests
 from trainer.experiments.figures.curves import Line, draw_curves
 from trainer.experiments.figures.spread import draw_boxes, draw_distributions, draw_table
@@ -94,7 +94,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         "learning in the normal and the tough setting",
         _lines(PAPERS, NORMAL, TOUGH),
         partial(draw_difficulty, algorithms=PAPERS),
-        learning.judge_fig8,
+        difficulty.judge_fig8,
     ),
     "fig9": Experiment(
         "success and surviving distance in six scenes",

@@ -10,14 +10,28 @@ from trainer.experiments.outcome import Numbers
 from trainer.experiments.progress import Progress
 from trainer.experiments.statistics import CONFIDENCE, RESAMPLES, Estimate
 
+TAIL = 0.5 * (1.0 - CONFIDENCE)
+"""Outside each end of an interval."""
+
 
 class Efficiency(NamedTuple):
     """How much sooner a learner gets where the baseline ends."""
 
     ratio: Estimate
-    """The baseline's episodes over the learner's; 95 % bootstrap interval over the seeds."""
+    """The baseline's episodes over the learner's; 95 % bootstrap interval over the seeds, with
+    what lies between two measurements."""
     episodes: float
     baseline_episodes: float
+
+
+class Reached(NamedTuple):
+    """When a level was reached: after the episode ``before``, where it was not yet, and not later
+    than after ``at``, where it was measured. Who is there at the first measurement may have been
+    there all the time (0); who never is, may be after the last one (infinite).
+    """
+
+    before: float
+    at: float
 
 
 def efficiency(ours: Progress, baseline: Progress, common: bool = False) -> Efficiency:
@@ -25,30 +39,35 @@ def efficiency(ours: Progress, baseline: Progress, common: bool = False) -> Effi
 
     The level is the baseline's final average, or the lower of both where it is to be a ``common``
     one. A learner that never gets there has the ratio 0. The bootstrap draws whole seeds, of both
-    independently, 2000 times; with few seeds it understates the spread.
+    independently, 2000 times; with few seeds it understates the spread. Validations are ten
+    episodes apart, so the interval is from the least ratio that the measurements allow to the
+    largest.
     """
-    episodes, baseline_episodes = _needed(ours, baseline, common)
+    own, other = _needed(ours, baseline, common)
     count = min(len(ours.curves), len(baseline.curves))
     low, high = float("-inf"), float("inf")
     if count > 1:
         random = np.random.default_rng(0)
-        ratios = []
+        least, most = [], []
         for _ in range(RESAMPLES):
             first, second = _needed(_drawn(ours, random), _drawn(baseline, random), common)
-            ratios.append(_ratio(first, second))
-        tail = 0.5 * (1.0 - CONFIDENCE)
-        low, high = (float(x) for x in np.quantile(ratios, (tail, 1.0 - tail)))
-    value = _ratio(episodes, baseline_episodes)
-    return Efficiency(Estimate(value, low, high, count), episodes, baseline_episodes)
+            least.append(_ratio(first.at, second.before))
+            most.append(_ratio(first.before, second.at))
+        low, high = _quantile(least, TAIL), _quantile(most, 1.0 - TAIL)
+    value = _ratio(own.at, other.at)
+    return Efficiency(Estimate(value, low, high, count), own.at, other.at)
 
 
-def episodes_to_reach(learner: Progress, curve: Numbers, level: float) -> float:
-    """Episodes until a curve of the learner first reaches a level; infinite if it never does."""
-    reached = learner.episodes[learner.whole & (curve >= level - 1e-9)]
-    return float(reached[0]) if len(reached) else float("inf")
+def episodes_to_reach(learner: Progress, curve: Numbers, level: float) -> Reached:
+    """Episodes until a curve of the learner first reaches a level."""
+    measured = learner.episodes[learner.whole]
+    first = np.flatnonzero(curve[learner.whole] >= level - 1e-9)
+    times = [0.0, *measured.tolist(), float("inf")]
+    place = int(first[0]) if len(first) else len(measured)
+    return Reached(times[place], times[place + 1])
 
 
-def _needed(ours: Progress, baseline: Progress, common: bool) -> tuple[float, float]:
+def _needed(ours: Progress, baseline: Progress, common: bool) -> tuple[Reached, Reached]:
     level = float(baseline.ends.mean())
     if common:
         level = min(level, float(ours.ends.mean()))
@@ -65,4 +84,11 @@ def _drawn(learner: Progress, random: np.random.Generator) -> Progress:
 
 
 def _ratio(episodes: float, baseline_episodes: float) -> float:
-    return 0.0 if np.isinf(episodes) else baseline_episodes / episodes
+    if np.isinf(episodes):
+        return 0.0
+    return baseline_episodes / episodes if episodes else float("inf")
+
+
+def _quantile(ratios: list[float], share: float) -> float:
+    """The value below which at least this share is: nothing in between, as some are infinite."""
+    return sorted(ratios)[min(round(share * len(ratios)), len(ratios) - 1)]

@@ -49,6 +49,14 @@ class Gathered:
         return [outcome for outcome in outcomes if scene.condition in outcome.tests]
 
 
+def comparable(first: Outcome, second: Outcome) -> bool:
+    """Whether two policies are of one training seed; the human model, of which there is one, goes
+    with each.
+    """
+    trained = first.unit.trained and second.unit.trained
+    return first.unit.seed == second.unit.seed or not trained
+
+
 def pairs(
     first: list[Outcome],
     second: list[Outcome],
@@ -60,7 +68,7 @@ def pairs(
 
     Args:
         first: outcomes of one algorithm, tested in the condition.
-        second: of another. The human model, of which there is one, pairs with every seed.
+        second: of another.
         condition: of the scene.
         quantity: a column of the tests.
         arrived: only pairs in which both reached the goal.
@@ -69,7 +77,7 @@ def pairs(
     theirs: list[Numbers] = []
     for one in first:
         for other in second:
-            if one.unit.seed != other.unit.seed and one.unit.trained and other.unit.trained:
+            if not comparable(one, other):
                 continue
             a, b = one.tests[condition], other.tests[condition]
             kept = a.reached & b.reached if arrived else np.ones(len(a.reached), dtype=bool)

@@ -38,9 +38,10 @@ class Estimate(NamedTuple):
         if not self.size:
             return "–"
         shown = f"{self.value:.{digits}f}{unit}"
-        if not np.isfinite([self.low, self.high]).all():
+        if np.isinf([self.low, self.high]).all():
             return shown
-        return f"{shown} [{self.low:.{digits}f}, {self.high:.{digits}f}]"
+        low, high = (f"{end:.{digits}f}".replace("inf", "∞") for end in (self.low, self.high))
+        return f"{shown} [{low}, {high}]"
 
 
 NOTHING = Estimate(float("nan"), float("-inf"), float("inf"), 0)
@@ -74,11 +75,27 @@ def above(difference: Estimate, least: float = 0.0) -> Holds:
     return "no" if difference.high < least else "undecided"
 
 
+def within(difference: Estimate, reach: float) -> Holds:
+    """Whether a difference is at most ``reach`` either way."""
+    if -reach <= difference.low and difference.high <= reach:
+        return "yes"
+    return "no" if difference.low > reach or difference.high < -reach else "undecided"
+
+
 def all_of(answers: Sequence[Holds]) -> Holds:
     """Yes where all are, no where one is not."""
     if "no" in answers or not answers:
         return "no" if answers else "undecided"
     return "yes" if set(answers) == {"yes"} else "undecided"
+
+
+def decisive(differences: Sequence[Estimate]) -> Estimate | None:
+    """Of differences that must all be above 0, the one that decides: where one is below for sure
+    the lowest of these, otherwise the one that comes closest to being not above.
+    """
+    if any(above(each) == "no" for each in differences):
+        return min(differences, key=lambda each: each.high)
+    return min(differences, key=lambda each: each.low, default=None)
 
 
 def paired_t(first: Numbers, second: Numbers) -> float:

@@ -179,8 +179,8 @@ def draw(turns: Turns | None) -> Figure:
 
 def judge(turns: Turns | None) -> list[Claim]:
     """Whether the priorities cost next to nothing."""
-    text = f"PHIL-TD3 takes at most {RATIO} times as long as IA-TD3"
-    paper = f"{PAPER_S['phil_td3'] / PAPER_S['ia_td3']:.3f}"
+    text = f"PHIL-TD3 takes at most {RATIO} times as long as IA-TD3 (bar of this project)"
+    paper = f"similar, {PAPER_S['phil_td3'] / PAPER_S['ia_td3']:.3f}"
     rule = "95 % bootstrap interval over the rounds, on one side of the bar"
     if turns is None:
         return [claim(text, paper, "", "undecided", 0, rule, None, False)]

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from trainer.experiments.catalogue import NAMES, units_of
 from trainer.experiments.claims.scenes import DISTANCE, SUCCESS, shown_of
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered, gather
-from trainer.experiments.plan import SCENARIO_TITLES, SCENES
+from trainer.experiments.outcome import Outcome
+from trainer.experiments.plan import NETWORK, SCENARIO_TITLES, SCENES
 from trainer.experiments.store import Store
 from trainer.experiments.summary import row
 
-HEADER = ("units", "seeds", "nominal", "noise", "variant")
+HEADER = ("units", "seeds", "nominal", "noise", "variant", "validated: best → last")
+REMARKS = {NETWORK: " (tested without it)"}
+"""What a setting's name would let one believe."""
 
 
 def unit_lines(store: Store, seeds: int) -> list[str]:
-    """One row an algorithm and setting of which there is a unit; success and distance a scene."""
+    """One row an algorithm and setting of which there is a unit: success and distance a scene, and
+    the success without help that chose the tested actor, beside that of the last one.
+    """
     gathered = gather(store, units_of(NAMES, seeds), seeds)
     kinds = dict.fromkeys((u.scenario, Line(u.algorithm, u.setting)) for u in gathered.found)
     lines = [row(HEADER), row(["---"] * len(HEADER))]
@@ -29,5 +36,13 @@ def _line(gathered: Gathered, scenario: str, line: Line) -> str:
         for scene in SCENES
         if scene.scenario == scenario
     ]
-    count = len(gathered.of(scenario, line.algorithm, line.setting))
-    return row([f"{SCENARIO_TITLES[scenario]}, {line.label}", str(count), *tests])
+    outcomes = gathered.of(scenario, line.algorithm, line.setting)
+    name = f"{SCENARIO_TITLES[scenario]}, {line.label}{REMARKS.get(line.setting, '')}"
+    return row([name, str(len(outcomes)), *tests, _validated(outcomes)])
+
+
+def _validated(outcomes: Sequence[Outcome]) -> str:
+    """Each seed's best and last success in validation, in percent."""
+    measured = [o.measured("validation_success")[1] for o in outcomes if o.unit.trained]
+    shown = [f"{100 * shares.max():.0f} → {100 * shares[-1]:.0f}" for shares in measured]
+    return f"{', '.join(shown)} %" if shown else "–"

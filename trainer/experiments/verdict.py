@@ -30,8 +30,8 @@ class Claim:
     """Training seeds behind our number; the fewest, where several algorithms are compared."""
     rule: str
     """How it was decided."""
-    interval: tuple[float, float] | None = None
-    """95 % interval of the number that decides."""
+    interval: tuple[float | None, float | None] | None = None
+    """95 % interval of the number that decides; None for an end that is infinite."""
 
 
 def claim(
@@ -46,8 +46,9 @@ def claim(
 ) -> Claim:
     """A claim; undecided wherever units are missing, whatever the numbers say so far."""
     interval = None
-    if decisive is not None and math.isfinite(decisive.low) and math.isfinite(decisive.high):
-        interval = (decisive.low, decisive.high)
+    if decisive is not None:
+        low, high = (end if math.isfinite(end) else None for end in (decisive.low, decisive.high))
+        interval = None if low is high is None else (low, high)
     if not complete:
         holds, rule = "undecided", f"{rule}; units are missing"
     return Claim(text, paper, ours or "not measured", holds, seeds, rule, interval)

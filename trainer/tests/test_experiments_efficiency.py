@@ -43,8 +43,9 @@ def test_in_training_curves_are_averages_and_reaching_counts_from_the_first_whol
     assert found.episodes.tolist() == list(range(1, 51))
     assert np.flatnonzero(found.whole)[0] + 1 == 20
     assert found.curves[0, 0] == 9.0  # by luck
-    assert episodes_to_reach(found, found.curves[0], 9.0) == 29  # (9 + ... of twenty)
-    assert episodes_to_reach(found, found.curves[0], 99.0) == math.inf
+    assert episodes_to_reach(found, found.curves[0], 9.0) == (28, 29)  # (9 + ... of twenty)
+    assert episodes_to_reach(found, found.curves[0], 0.0) == (0, 20)
+    assert episodes_to_reach(found, found.curves[0], 99.0) == (50, math.inf)
     assert found.ends.tolist() == [29.5]
 
 
@@ -52,7 +53,7 @@ def test_what_was_validated_now_and_then_is_taken_where_it_was_measured():
     found = made(validated(0.0, 5.0, 7.0, 8.0), validated(2.0, 7.0, 9.0, 6.0, 1.0))
     assert found.episodes.tolist() == [10, 20, 30, 40]
     assert found.curves.mean(axis=0).tolist() == [1.0, 6.0, 8.0, 7.0]
-    assert episodes_to_reach(found, found.curves.mean(axis=0), 6.0) == 20
+    assert episodes_to_reach(found, found.curves.mean(axis=0), 6.0) == (10, 20)
     # Two validations are within the last twenty episodes.
     assert found.ends.tolist() == [7.5, 3.5]
 
@@ -72,7 +73,23 @@ def test_a_step_at_ten_against_one_at_seventy_is_seven_times():
     soon, late = (validated(*(20.0 * (n >= step) for n in range(1, 21))) for step in (1, 7))
     found = efficiency(made(soon, soon), made(late, late))
     assert (found.episodes, found.baseline_episodes) == (10.0, 70.0)
-    assert found.ratio[:3] == (7.0, 7.0, 7.0)
+    # The first one may have been there after its first episode.
+    assert found.ratio[:3] == (7.0, 6.0, math.inf)
+
+
+def test_what_lies_between_two_validations_is_in_the_interval():
+    """Reached within episodes 11 to 20 and 21 to 30: from as soon to three times as soon."""
+    soon, late = (validated(*(20.0 * (n >= step) for n in range(1, 11))) for step in (2, 3))
+    found = efficiency(made(soon, soon), made(late, late))
+    assert found.ratio[:3] == (1.5, 1.0, 3.0)
+
+
+def test_two_who_are_there_from_the_first_measurement_on_cannot_be_told_apart():
+    own = made(*[outcome("distance_m", np.full(50, 21.0))] * 3)
+    found = efficiency(own, own)
+    assert (found.episodes, found.baseline_episodes) == (20, 20)
+    assert found.ratio[:3] == (1.0, 0.0, math.inf)
+    assert above(found.ratio, 2.2) == "undecided"
 
 
 def test_one_that_never_gets_there_has_the_ratio_nothing():
@@ -90,7 +107,7 @@ def test_one_seed_has_no_interval():
 def test_the_bootstrap_shows_the_spread_of_the_seeds():
     curves = np.concatenate([ramp(length, seeds=1).curves for length in (25, 50, 100)])
     ratio = efficiency(ramp(25)._replace(curves=curves), ramp(100)).ratio
-    assert (ratio.low, ratio.high) == (1.0, 4.0)
+    assert (ratio.low, ratio.high) == (99 / 100, 100 / 24)  # each to the episode
 
 
 @pytest.mark.parametrize("metric", ["distance_m", ALONE])

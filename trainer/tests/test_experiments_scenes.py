@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from trainer.experiments.catalogue import EXPERIMENTS
-from trainer.experiments.claims.scenes import DISTANCE, SUCCESS, scene_claim
+from trainer.experiments.claims.baselines import competitive_claim, degraded_claim
+from trainer.experiments.claims.scenes import DISTANCE, SUCCESS, scene_claim, spread_claim
 from trainer.experiments.claims.testing import SUCCESS_BARS
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered, pairs, pooled
@@ -114,9 +115,15 @@ def test_who_never_arrives_is_left_out_by_name_and_who_crashes_early_is_not_smoo
         made.found[unit] = replace(outcome, tests={"nominal": Drives(columns)})
     place = (made, SCENES[0], "shaking", PHIL)
     one = scene_claim(*place, [IA, Line("hi_td3")], "smoother", "–", -1.0, arrived=True)
-    assert one.holds == "yes"  # 1 against 2 where both arrive
-    assert one.interval == (-1.0, -1.0)
-    assert one.ours.endswith("left out: HI-TD3, no common arrival")
+    assert one.interval == (-1.0, -1.0)  # 1 against 2 where both arrive
+    assert one.holds == "undecided"  # about HI-TD3 nothing is known
+    assert one.ours.endswith(
+        "in which both arrived, by seed: IA-TD3 1 1 1, HI-TD3 0 0 0; "
+        "left out: HI-TD3, no common arrival"
+    )
+    assert scene_claim(*place, [IA], "smoother", "–", -1.0, arrived=True).holds == "yes"
+    rough = scene_claim(*place, [IA, Line("hi_td3")], "rougher", "–", 1.0, arrived=True)
+    assert rough.holds == "no"
     alone = scene_claim(*place, [Line("hi_td3")], "smoother", "–", -1.0, arrived=True)
     assert (alone.holds, alone.interval) == ("undecided", None)
 
@@ -143,6 +150,78 @@ def test_poor_guidance_is_a_change_of_the_mean_distance():
             for name, drives in outcome.tests.items()
         }
         made.found[unit] = replace(outcome, tests=tests)
-    phil, ia, hi, robust = EXPERIMENTS["fig14"].judge(made)
-    assert [one.holds for one in (phil, ia, hi, robust)] == ["no", "yes", "no", "undecided"]
+    phil, each, ia, hi, *robust = EXPERIMENTS["fig14"].judge(made)
+    assert [one.holds for one in (phil, each, ia, hi)] == ["no", "no", "yes", "no"]
+    assert [one.holds for one in robust] == ["undecided"] * 2
     assert "-9.8 [-10.0, -9.6] %" in phil.ours
+    assert each.ours.count("-9.8 [-10.0, -9.6] %") == 6
+
+
+def test_poor_guidance_that_two_scenes_take_two_ways_is_no_even_share():
+    units = EXPERIMENTS["fig14"].units(SEEDS)
+    made = gathered(units, SEEDS)
+    for unit, outcome in made.found.items():
+        poor = unit.setting == "poor"
+        tests = {
+            name: Drives(
+                {**drives.columns, "distance_m": np.full(50, 15.0 + poor * (name == "variant"))}
+            )
+            for name, drives in outcome.tests.items()
+        }
+        made.found[unit] = replace(outcome, tests=tests)
+    phil, each, *_ = EXPERIMENTS["fig14"].judge(made)
+    assert (phil.holds, each.holds) == ("yes", "no")
+    assert "L 0.0 [0.0, 0.0] %, L-N 0.0 [0.0, 0.0] %, L-V 6.7 [6.7, 6.7] %" in each.ours
+
+
+def test_as_often_as_the_human_model_is_not_more_often():
+    units = EXPERIMENTS["fig9"].units(SEEDS)
+    made = gathered(units, SEEDS)
+    for unit, outcome in made.found.items():
+        human = unit.algorithm == "human_model"
+        failures = {"nominal": 0, "noise": human, "variant": not human}
+        tests = {
+            name: Drives(
+                {
+                    **d.columns,
+                    "outcome": ["collision"] * failures[name] + ["goal"] * (50 - failures[name]),
+                }
+            )
+            for name, d in outcome.tests.items()
+        }
+        made.found[unit] = replace(outcome, tests=tests)
+    claims = [one for one in EXPERIMENTS["fig9"].judge(made) if "than the human model" in one.text]
+    assert [one.holds for one in claims] == ["no", "yes", "no"] * 2
+
+
+def test_the_steadiest_is_so_in_each_seed():
+    made = of_drives(phil_td3=[[15.0, 15.1], [17.0, 17.2], [19.0, 19.1]], ia_td3=[[10.0, 20.0]] * 3)
+    one = spread_claim(made, SCENES[0], PHIL, [IA], "steadiest", "lowest variance")
+    assert (one.holds, one.seeds) == ("yes", 3)
+    assert "IA-TD3 5.00 [5.00, 5.00] m" in one.ours
+    assert spread_claim(made, SCENES[0], IA, [PHIL], "steadiest", "–").holds == "no"
+
+
+@pytest.mark.parametrize(("hi", "holds"), [(18, "yes"), (16, "no")])
+def test_competitive_is_within_five_points_of_each(hi, holds):
+    def reached(count: int) -> list[float]:
+        return [21.0] * count + [5.0] * (20 - count)
+
+    made = of_drives(per_td3=[reached(18)] * 3, ia_td3=[reached(19)] * 3, hi_td3=[reached(hi)] * 3)
+    one = competitive_claim(made, SCENES[0], Line("per_td3"), [IA, Line("hi_td3")])
+    assert one.holds == holds
+
+
+@pytest.mark.parametrize(("lost", "holds"), [(0.2, "yes"), (0.0, "undecided"), (-0.2, "no")])
+def test_the_variant_degrades_who_succeeds_less_often_there(lost, holds):
+    units = EXPERIMENTS["fig9"].units(SEEDS)
+    made = gathered(units, SEEDS)
+    for unit, outcome in made.found.items():
+        tests = {}
+        for name, drives in outcome.tests.items():
+            count = round(50 * (0.7 - lost * (name == "variant"))) + unit.seed % 2
+            outcomes = ["goal"] * count + ["collision"] * (50 - count)
+            tests[name] = Drives({**drives.columns, "outcome": outcomes})
+        made.found[unit] = replace(outcome, tests=tests)
+    one = degraded_claim(made, "left_turn", [IA, Line("per_td3")])
+    assert (one.holds, one.seeds) == (holds, 3)

@@ -9,11 +9,13 @@ from trainer.experiments.statistics import (
     Estimate,
     above,
     all_of,
+    decisive,
     mean_estimate,
     paired_t,
     smoothed,
     stars,
     success_estimate,
+    within,
 )
 
 
@@ -69,6 +71,26 @@ def test_what_an_interval_decides():
     assert all_of(["yes", "undecided"]) == "undecided"
     assert all_of(["undecided", "no"]) == "no"
     assert all_of([]) == "undecided"
+
+
+def test_within_is_decided_by_the_whole_interval():
+    assert within(Estimate(0.0, -1.0, 2.0, 3), 2.0) == "yes"
+    assert within(Estimate(0.0, -1.0, 2.0, 3), 1.5) == "undecided"
+    assert within(Estimate(2.0, 1.6, 2.4, 3), 1.5) == "no"
+    assert within(Estimate(-2.0, -2.4, -1.6, 3), 1.5) == "no"
+
+
+def test_what_decides_is_the_one_that_says_no_or_the_nearest_to_it():
+    ahead, open_, behind = (
+        Estimate(1.0, 0.5, 1.5, 3), Estimate(0.0, -4.0, 4.0, 3), Estimate(-1.0, -1.5, -0.5, 3)
+    )  # fmt: skip
+    assert decisive([ahead, open_]) == open_
+    assert decisive([ahead, open_, behind]) == behind
+    assert decisive([]) is None
+
+
+def test_an_interval_may_be_open_at_one_end():
+    assert Estimate(2.0, 1.0, math.inf, 3).text(1) == "2.0 [1.0, ∞]"
 
 
 def test_smoothing_is_over_twenty_episodes():

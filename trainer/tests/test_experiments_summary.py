@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from edge_runtime.errors import UserError
@@ -67,15 +68,28 @@ def test_a_table_needs_its_place_and_whole_verdicts(tmp_path):
 def test_the_table_of_units_has_a_row_a_kind_with_each_seed(tmp_path, monkeypatch):
     one = Unit("left_turn", "phil_td3", "normal", 1)
     units = [one, replace(one, setting="tough"), replace(one, seed=2)]
-    units.append(Unit("congestion", "human_model", "normal", 0))
+    units += [replace(one, setting="network"), Unit("congestion", "human_model", "normal", 0)]
     made = Gathered(units, {unit: outcome(unit) for unit in units}, 3)
     monkeypatch.setattr(unit_table, "gather", lambda store, wanted, seeds: made)
     _, _, *rows = unit_table.unit_lines(store_in(tmp_path), 3)
     assert [row.split(" | ")[:2] for row in rows] == [
         ["| left turn, PHIL-TD3", "2"],
         ["| left turn, PHIL-TD3, tough", "1"],
+        ["| left turn, PHIL-TD3, network (tested without it)", "1"],
         ["| congestion, human model", "1"],
     ]
     drives = [made.found[unit].tests["nominal"] for unit in (units[0], units[2])]
     shares = " ".join(f"{100 * each.reached.mean():.0f}" for each in drives)
     assert f" % ({shares}), " in rows[0]
+    assert rows[0].endswith(" | 99 → 99, 99 → 99 % |")
+    assert rows[-1].endswith(" | – |")
+
+
+def test_a_policy_that_unlearns_shows_it(tmp_path, monkeypatch):
+    unit = Unit("congestion", "per_td3", "normal", 1)
+    shares = np.full(100, np.nan)
+    shares[9::10] = np.linspace(0.44, 0.0, 10)
+    found = outcome(unit)
+    found = replace(found, metrics={**found.metrics, "validation_success": shares})
+    monkeypatch.setattr(unit_table, "gather", lambda *_: Gathered([unit], {unit: found}, 3))
+    assert unit_table.unit_lines(store_in(tmp_path), 3)[-1].endswith(" | 44 → 0 % |")

@@ -10,13 +10,22 @@ from trainer.experiments.efficiency import efficiency
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES
-from trainer.experiments.progress import TITLES, final, progress
-from trainer.experiments.statistics import Estimate, above, all_of, mean_estimate
+from trainer.experiments.progress import ALONE, TITLES, final, progress
+from trainer.experiments.statistics import (
+    Estimate,
+    above,
+    all_of,
+    decisive,
+    mean_estimate,
+    within,
+)
 from trainer.experiments.verdict import Claim, claim
 
 BY_SEED = "95 % interval of the difference, paired by seed"
 BY_BOOTSTRAP = "95 % bootstrap interval over the seeds"
 BY_VALUE = "the mean of all seeds itself"
+SAME_LEVEL = 0.05
+"""Two ends are on one level if they differ by no more than this share."""
 
 
 def finals(gathered: Gathered, scenario: str, line: Line, metric: str) -> dict[int, float]:
@@ -43,23 +52,49 @@ def final_claim(
     others: Sequence[Line],
     text: str,
     paper: str = "highest",
+    sign: float = 1.0,
 ) -> Claim:
-    """Whether one line ends above each of the others."""
+    """Whether one line ends above (sign 1) or below (-1) each of the others."""
     own = finals(gathered, scenario, ours, metric)
     ends = {line: finals(gathered, scenario, line, metric) for line in others}
-    differences = [difference(own, end) for end in ends.values()]
+    differences = [difference(own, end).times(sign) for end in ends.values()]
+    deciding = decisive(differences)
     shown = [f"{line.label} {mean_estimate(list(end.values())).text()}"
              for line, end in {ours: own, **ends}.items()]  # fmt: skip
     return claim(
         f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}",
-        paper,
+        papers(paper, metric),
         ", ".join(shown),
         all_of([above(each) for each in differences]),
         min(each.size for each in differences),
         f"final averages; {BY_SEED}",
-        min(differences, key=lambda each: each.low),
+        deciding.times(sign) if deciding else None,
         complete(gathered, scenario, [ours, *others]),
     )
+
+
+def level_claim(
+    gathered: Gathered, scenario: str, metric: str, first: Line, second: Line, text: str
+) -> Claim:
+    """Whether two lines end on the same level."""
+    own, other = (finals(gathered, scenario, line, metric) for line in (first, second))
+    found = difference(own, other)
+    reach = SAME_LEVEL * abs(mean_estimate(list(own.values())).value)
+    return claim(
+        f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}",
+        papers("same level", metric),
+        f"difference {found.text()}, one level is ±{reach:.2f}" if found.size else "",
+        within(found, reach),
+        found.size,
+        f"within {SAME_LEVEL:.0%} of the end; {BY_SEED}",
+        found,
+        complete(gathered, scenario, [first, second]),
+    )
+
+
+def papers(paper: str, metric: str) -> str:
+    """The paper's number or word: where ours is of the policy alone, the paper's is not."""
+    return f"{paper}, in training" if metric == ALONE and paper != "–" else paper
 
 
 def speed_claim(
@@ -85,16 +120,16 @@ def speed_claim(
     )
     text = f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}"
     if own is None or theirs is None:
-        return claim(text, paper, "", "undecided", 0, BY_BOOTSTRAP, None, False)
+        return claim(text, papers(paper, metric), "", "undecided", 0, BY_BOOTSTRAP, None, False)
     found = efficiency(own, theirs, common)
     return claim(
         text,
-        paper,
+        papers(paper, metric),
         f"{found.ratio.text(1)} times as soon: {ours.label} {_counted(found.episodes)}, "
         f"{other.label} {_counted(found.baseline_episodes)}",
         above(found.ratio, least),
         found.ratio.size,
-        f"means of the seeds; {BY_BOOTSTRAP}",
+        f"means of the seeds; {BY_BOOTSTRAP}, with what lies between two measurements",
         found.ratio,
         complete(gathered, scenario, [ours, other, *also]),
     )

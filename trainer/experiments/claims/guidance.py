@@ -6,15 +6,22 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from trainer.experiments.claims.compare import BY_SEED, BY_VALUE, complete
-from trainer.experiments.claims.learning import HI, IA, PHIL
-from trainer.experiments.claims.scenes import scene_claim
+from trainer.experiments.claims.compare import BY_SEED, BY_VALUE, complete, difference
+from trainer.experiments.claims.lines import HI, IA, PHIL
+from trainer.experiments.claims.scenes import mean_path_m, scene_claim
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.figures.spread import SMOOTHNESS
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.outcome import Outcome
 from trainer.experiments.plan import POOR, SCENARIO_TITLES, SCENES, Scene
-from trainer.experiments.statistics import Estimate, Holds, above, mean_estimate
+from trainer.experiments.statistics import (
+    Estimate,
+    Holds,
+    above,
+    all_of,
+    mean_estimate,
+    within,
+)
 from trainer.experiments.verdict import Claim, claim
 
 POOR_LOSS = 0.02
@@ -26,37 +33,63 @@ PAPER_CHANGES = {"phil_td3": "nearly 0 %", "ia_td3": "loses 2.1 %", "hi_td3": "g
 def judge_fig14(gathered: Gathered) -> list[Claim]:
     """What poor guidance costs."""
     changes = {line: _changes(gathered, line) for line in (PHIL, IA, HI)}
-    claims = [
+    return [
         _cost_claim(
             gathered, PHIL, changes[PHIL],
             f"poor guidance costs PHIL-TD3 at most {POOR_LOSS:.0%} (bar of this project)",
             lambda found: "yes" if found.value >= -POOR_LOSS else "no", BY_VALUE,
         ),
+        _each_scene_claim(gathered),
         _cost_claim(
             gathered, IA, changes[IA], "poor guidance degrades IA-TD3",
             lambda found: above(found.times(-1.0)), OVER_SEEDS,
         ),
         _cost_claim(
             gathered, HI, changes[HI],
-            f"poor guidance does not degrade HI-TD3 (by over {POOR_LOSS:.0%})",
+            f"poor guidance does not degrade HI-TD3 (by more than this project's {POOR_LOSS:.0%})",
             lambda found: above(found, -POOR_LOSS), OVER_SEEDS,
         ),
+        *(
+            _robust_claim(gathered, line, changes,
+                          f"{line.label} is more robust to poor guidance than IA-TD3")
+            for line in (PHIL, HI)
+        ),
     ]  # fmt: skip
-    shared = [s for s in changes[PHIL] if s in changes[IA]]
-    found = mean_estimate([changes[PHIL][s] - changes[IA][s] for s in shared])
-    claims.append(
-        claim(
-            "PHIL-TD3 is more robust to poor guidance than IA-TD3",
-            "more",
-            f"difference of the changes {found.times(100.0).text(1)} percentage points",
-            above(found),
-            found.size,
-            BY_SEED,
-            None,
-            _guided_complete(gathered, PHIL) and _guided_complete(gathered, IA),
-        )
+
+
+def _each_scene_claim(gathered: Gathered) -> Claim:
+    """How near to 50:50 the stacked bars of each scene are."""
+    found = {
+        scene: mean_estimate(list(_relative(gathered, PHIL, scene).values())) for scene in SCENES
+    }
+    shown = [f"{scene.label} {each.times(100.0).text(1)} %" for scene, each in found.items()]
+    return claim(
+        f"poor guidance changes PHIL-TD3 next to nothing (by {POOR_LOSS:.0%}) in each scene",
+        "nearly 50:50 in all six",
+        f"change of the surviving distance: {', '.join(shown)}",
+        all_of([within(each, POOR_LOSS) for each in found.values()]),
+        min(each.size for each in found.values()),
+        OVER_SEEDS,
+        None,
+        _guided_complete(gathered, PHIL),
     )
-    return claims
+
+
+def _robust_claim(
+    gathered: Gathered, line: Line, changes: Mapping[Line, Mapping[int, float]], text: str
+) -> Claim:
+    found = difference(changes[line], changes[IA])
+    points = found.times(100.0)
+    return claim(
+        text,
+        "more",
+        f"difference of the changes {points.text(1)} percentage points",
+        above(found),
+        found.size,
+        BY_SEED,
+        points,
+        _guided_complete(gathered, line) and _guided_complete(gathered, IA),
+    )
 
 
 def _cost_claim(
@@ -87,16 +120,21 @@ def _changes(gathered: Gathered, line: Line) -> dict[int, float]:
     """
     by_seed: dict[int, list[float]] = {}
     for scene in SCENES:
-        good = _means(gathered.tested(scene, line.algorithm), scene)
-        poor = _means(gathered.tested(scene, line.algorithm, POOR), scene)
-        for seed in good.keys() & poor.keys():
-            if good[seed]:  # Who never moves has nothing to lose.
-                by_seed.setdefault(seed, []).append(poor[seed] / good[seed] - 1.0)
+        for seed, change in _relative(gathered, line, scene).items():
+            by_seed.setdefault(seed, []).append(change)
     return {seed: float(np.mean(changes)) for seed, changes in sorted(by_seed.items())}
 
 
+def _relative(gathered: Gathered, line: Line, scene: Scene) -> dict[int, float]:
+    """Training seed -> relative change of the distance in one scene."""
+    good = _means(gathered.tested(scene, line.algorithm), scene)
+    poor = _means(gathered.tested(scene, line.algorithm, POOR), scene)
+    # Who never moves has nothing to lose.
+    return {seed: poor[seed] / good[seed] - 1.0 for seed in good.keys() & poor if good[seed]}
+
+
 def _means(outcomes: list[Outcome], scene: Scene) -> Mapping[int, float]:
-    return {o.unit.seed: float(o.tests[scene.condition]["distance_m"].mean()) for o in outcomes}
+    return {o.unit.seed: mean_path_m(scene, o.tests[scene.condition]) for o in outcomes}
 
 
 def _guided_complete(gathered: Gathered, line: Line) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import product
 
 from trainer.experiments.claims.compare import final_claim
+from trainer.experiments.claims.lines import HI, PER, PHIL
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import (
@@ -20,7 +21,6 @@ from trainer.experiments.plan import (
 from trainer.experiments.progress import ALONE, TITLES
 from trainer.experiments.verdict import Claim
 
-PHIL, PER = Line("phil_td3"), Line("per_td3")
 HI_REMEDY, PER_REMEDY = Line("hi_td3", REMEDY), Line("per_td3", REMEDY)
 EXACT, WEIGHED = Line("phil_td3", EXACT_LOSSES), Line("phil_td3", IMPORTANCE)
 PRINTED, LAST = Line("phil_td3", PRINTED_RATES), Line("phil_td3", LAST_ACTOR)
@@ -35,7 +35,8 @@ def judge_remedy(gathered: Gathered) -> list[Claim]:
         place = (gathered, scenario, metric)
         claims += [
             final_claim(*place, PHIL, [HI_REMEDY, PER_REMEDY],
-                        "PHIL-TD3 stays first where the baselines have the remedy", "–"),
+                        "PHIL-TD3 ends above HI-TD3 and vanilla TD3 with the remedy", "–"),
+            final_claim(*place, HI_REMEDY, [HI], "the remedy helps HI-TD3", "–"),
             final_claim(*place, PER_REMEDY, [PER], "the remedy helps vanilla TD3", "–"),
         ]  # fmt: skip
     return claims

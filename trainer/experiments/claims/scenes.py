@@ -10,16 +10,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trainer.experiments.claims.compare import BY_SEED, complete
+from trainer.experiments.claims.compare import BY_SEED, complete, difference
 from trainer.experiments.figures.curves import Line
-from trainer.experiments.gathered import Gathered, pairs, pooled
+from trainer.experiments.gathered import Gathered, comparable, pairs, pooled
 from trainer.experiments.outcome import Drives, Outcome, within_path
-from trainer.experiments.plan import HUMAN_MODEL, Scene
+from trainer.experiments.plan import Scene
 from trainer.experiments.statistics import (
     Estimate,
+    Holds,
     Numbers,
     above,
     all_of,
+    decisive,
     mean_estimate,
     success_estimate,
 )
@@ -49,28 +51,58 @@ def scene_claim(
 ) -> Claim:
     """Whether one line's mean over test episodes is above (sign 1) or below (-1) all others'.
 
-    With ``arrived`` only pairs of drives count in which both reached the goal; who never arrives
-    where we do is left out, and named. What is shown is over all drives, or all that arrived.
+    With ``arrived`` only pairs of drives count in which both reached the goal. Who never arrives
+    where we do is left out, and named; that we are ahead of all others cannot be said then. What
+    is shown is over all drives, or all that arrived.
     """
-    lines = [ours, *others]
     found = {line: _by_seed(gathered, scene, ours, line, quantity, arrived) for line in others}
-    left_out = [
-        line
-        for line in others
-        if arrived and not found[line] and gathered.tested(scene, line.algorithm, line.setting)
-    ]
-    differences = [mean_estimate(found[line]) for line in others if line not in left_out]
-    signed = [difference.times(sign) for difference in differences]
-    decisive = min(signed, key=lambda each: each.low, default=None)
+    differences = {line: mean_estimate([d.mean() for d in found[line] if len(d)]) for line in found}
+    left_out = [line for line in others if found[line] and not differences[line].size]
+    signed = [differences[line].times(sign) for line in others if line not in left_out]
+    answers: list[Holds] = [above(each) for each in signed]
+    answers += ["undecided" for _ in left_out]
+    deciding = decisive(signed)
+    lines = [ours, *others]
     shown = [f"{line.label} {shown_of(gathered, scene, line, quantity, arrived)}" for line in lines]
     ours_text = ", ".join(shown)
+    if arrived and any(found.values()):
+        counts = [f"{line.label} {' '.join(str(len(d)) for d in found[line])}" for line in others]
+        ours_text += f"; drives in which both arrived, by seed: {', '.join(counts)}"
     if left_out:
         ours_text += f"; left out: {', '.join(line.label for line in left_out)}, no common arrival"
     return claim(
         f"{scene.title}: {text}", paper, ours_text,
-        all_of([above(each) for each in signed]),
-        seeds_of(gathered, scene, lines), _rule(quantity, arrived),
-        decisive.times(sign) if decisive else None,
+        all_of(answers),
+        min((each.size for each in signed), default=0), _rule(quantity, arrived),
+        deciding.times(sign) if deciding else None,
+        tested_all(gathered, scene, lines),
+    )  # fmt: skip
+
+
+def spread_claim(
+    gathered: Gathered, scene: Scene, ours: Line, others: Sequence[Line], text: str, paper: str
+) -> Claim:
+    """Whether one line's surviving distances differ less from drive to drive than all others'."""
+    lines = [ours, *others]
+    spreads = {
+        line: {
+            outcome.unit.seed: float(_path_m(scene, outcome.tests[scene.condition]).std())
+            for outcome in gathered.tested(scene, line.algorithm, line.setting)
+        }
+        for line in lines
+    }
+    differences = [difference(spreads[ours], spreads[line]).times(-1.0) for line in others]
+    deciding = decisive(differences)
+    shown = [
+        f"{line.label} {mean_estimate(list(of_line.values())).text()} m"
+        for line, of_line in spreads.items()
+    ]
+    return claim(
+        f"{scene.title}: {text}", paper, ", ".join(shown),
+        all_of([above(each) for each in differences]),
+        min(each.size for each in differences),
+        f"standard deviation over each seed's drives; {BY_SEED}; nothing beyond the goal counted",
+        deciding.times(-1.0) if deciding else None,
         tested_all(gathered, scene, lines),
     )  # fmt: skip
 
@@ -91,17 +123,13 @@ def shown_of(
 def path_by_seed(gathered: Gathered, scene: Scene, line: Line) -> Numbers:
     """Mean surviving distance of each seed, not counting what is beyond the goal."""
     outcomes = gathered.tested(scene, line.algorithm, line.setting)
-    return np.array([_mean(scene, outcome.tests[scene.condition]) for outcome in outcomes])
+    return np.array([mean_path_m(scene, outcome.tests[scene.condition]) for outcome in outcomes])
 
 
-def seeds_of(gathered: Gathered, scene: Scene, lines: Sequence[Line]) -> int:
-    """The fewest training seeds of these lines; of the human model there is one, and it counts."""
-    counts = [
-        len(gathered.tested(scene, line.algorithm, line.setting))
-        for line in lines
-        if line.algorithm != HUMAN_MODEL
-    ]
-    return min(counts) if counts else 0
+def success_by_seed(gathered: Gathered, scene: Scene, line: Line) -> dict[int, float]:
+    """Training seed -> share of its drives that reach the goal."""
+    outcomes = gathered.tested(scene, line.algorithm, line.setting)
+    return {o.unit.seed: float(o.tests[scene.condition].reached.mean()) for o in outcomes}
 
 
 def tested_all(gathered: Gathered, scene: Scene, lines: Sequence[Line]) -> bool:
@@ -112,26 +140,32 @@ def tested_all(gathered: Gathered, scene: Scene, lines: Sequence[Line]) -> bool:
 
 def _by_seed(
     gathered: Gathered, scene: Scene, first: Line, second: Line, quantity: str, arrived: bool
-) -> list[float]:
-    """Mean of first minus second for each training seed that has a pair of drives."""
+) -> list[Numbers]:
+    """First minus second in each pair of drives: an array for each training seed that both have."""
     own, theirs = (gathered.tested(scene, line.algorithm, line.setting) for line in (first, second))
-    means = []
+    differences = []
     for one in own:
-        values, others = pairs([one], theirs, scene.condition, _column(quantity), arrived)
-        if not len(values):
+        others = [other for other in theirs if comparable(one, other)]
+        if not others:
             continue
+        ours, rivals = pairs([one], others, scene.condition, _column(quantity), arrived)
         if quantity == DISTANCE:
-            values, others = (within_path(scene.scenario, each) for each in (values, others))
-        means.append(float((values - others).mean()))
-    return means
+            ours, rivals = (within_path(scene.scenario, each) for each in (ours, rivals))
+        differences.append(ours - rivals)
+    return differences
 
 
 def _column(quantity: str) -> str:
     return "reached" if quantity == SUCCESS else quantity
 
 
-def _mean(scene: Scene, drives: Drives) -> float:
-    return float(within_path(scene.scenario, drives[DISTANCE]).mean())
+def mean_path_m(scene: Scene, drives: Drives) -> float:
+    """Mean surviving distance of some drives, not counting what is beyond the goal."""
+    return float(_path_m(scene, drives).mean())
+
+
+def _path_m(scene: Scene, drives: Drives) -> Numbers:
+    return within_path(scene.scenario, drives[DISTANCE])
 
 
 def _rule(quantity: str, arrived: bool) -> str:

@@ -149,7 +149,9 @@ def draw_guidance(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
             means_m = []
             for setting in (NORMAL, POOR):
                 outcomes = gathered.tested(scene, algorithm, setting)
-                distances_m = pooled(outcomes, scene.condition, "distance_m")
+                distances_m = within_path(
+                    scene.scenario, pooled(outcomes, scene.condition, "distance_m")
+                )
                 means_m.append(float(distances_m.mean()) if len(distances_m) else float("nan"))
                 counts.append(len(outcomes))
             if np.isnan(means_m).any():
@@ -174,7 +176,9 @@ def draw_guidance(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
         fewest, most = min(counts), max(counts)
         seeds = f"{most} seeds" if fewest == most else f"{fewest} to {most} seeds"
         panel.set_xlabel(f"below: good guidance; hatched: poor; {seeds}", fontsize=8)
-    figure.supylabel("share of the two mean surviving distances", fontsize=9)
+    figure.supylabel(
+        "share of the two mean surviving distances\n(nothing beyond the goal counted)", fontsize=9
+    )
     return figure
 
 
