@@ -26,7 +26,7 @@ class Efficiency(NamedTuple):
 
 class Reached(NamedTuple):
     """When a level was reached: after the episode ``before``, where it was not yet, and not later
-    than after ``at``, where it was measured. Who is there at the first measurement may have been
+    than after ``at``, where it was measured. Who is there at the first validation may have been
     there all the time (0); who never is, may be after the last one (infinite).
     """
 
@@ -53,17 +53,20 @@ def efficiency(ours: Progress, baseline: Progress, common: bool = False) -> Effi
             first, second = _needed(_drawn(ours, random), _drawn(baseline, random), common)
             least.append(_ratio(first.at, second.before))
             most.append(_ratio(first.before, second.at))
-        low, high = _quantile(least, TAIL), _quantile(most, 1.0 - TAIL)
+        # Ratios as they are, nothing between two of them: some are infinite.
+        low, high = (
+            float(np.quantile(ratios, share, method="inverted_cdf"))
+            for ratios, share in ((least, TAIL), (most, 1.0 - TAIL))
+        )
     value = _ratio(own.at, other.at)
     return Efficiency(Estimate(value, low, high, count), own.at, other.at)
 
 
 def episodes_to_reach(learner: Progress, curve: Numbers, level: float) -> Reached:
     """Episodes until a curve of the learner first reaches a level."""
-    measured = learner.episodes[learner.whole]
-    first = np.flatnonzero(curve[learner.whole] >= level - 1e-9)
-    times = [0.0, *measured.tolist(), float("inf")]
-    place = int(first[0]) if len(first) else len(measured)
+    first = np.flatnonzero(learner.whole & (curve >= level - 1e-9))
+    place = int(first[0]) if len(first) else len(curve)
+    times = [0.0, *learner.episodes.tolist(), float("inf")]
     return Reached(times[place], times[place + 1])
 
 
@@ -87,8 +90,3 @@ def _ratio(episodes: float, baseline_episodes: float) -> float:
     if np.isinf(episodes):
         return 0.0
     return baseline_episodes / episodes if episodes else float("inf")
-
-
-def _quantile(ratios: list[float], share: float) -> float:
-    """The value below which at least this share is: nothing in between, as some are infinite."""
-    return sorted(ratios)[min(round(share * len(ratios)), len(ratios) - 1)]

@@ -89,13 +89,30 @@ def all_of(answers: Sequence[Holds]) -> Holds:
     return "yes" if set(answers) == {"yes"} else "undecided"
 
 
-def decisive(differences: Sequence[Estimate]) -> Estimate | None:
-    """Of differences that must all be above 0, the one that decides: where one is below for sure
-    the lowest of these, otherwise the one that comes closest to being not above.
-    """
-    if any(above(each) == "no" for each in differences):
-        return min(differences, key=lambda each: each.high)
-    return min(differences, key=lambda each: each.low, default=None)
+class Judged(NamedTuple):
+    """Whether all of some differences are above 0."""
+
+    holds: Holds
+    size: int
+    """Values behind the one that decides, or the fewest behind any where all count."""
+    decisive: Estimate | None
+    """The one that says no; of those that leave it open the lowest; the lowest end of those that
+    say yes."""
+
+
+def judge_all(differences: Sequence[Estimate], sign: float = 1.0) -> Judged:
+    """Judge whether all differences are above (sign 1) or below (-1) 0."""
+    signed = [difference.times(sign) for difference in differences]
+    holds = all_of([above(each) for each in signed])
+    if holds == "no":
+        decisive = min(signed, key=lambda each: each.high)
+        return Judged(holds, decisive.size, decisive.times(sign))
+    size = min((each.size for each in signed), default=0)
+    candidates = [each for each in signed if each.size and above(each) == holds]
+    if not candidates:
+        return Judged(holds, size, None)
+    decisive = min(candidates, key=lambda each: each.low if holds == "yes" else each.value)
+    return Judged(holds, size, decisive.times(sign))
 
 
 def paired_t(first: Numbers, second: Numbers) -> float:

@@ -47,8 +47,8 @@ def claim(
     """A claim; undecided wherever units are missing, whatever the numbers say so far."""
     interval = None
     if decisive is not None:
-        low, high = (end if math.isfinite(end) else None for end in (decisive.low, decisive.high))
-        interval = None if low is high is None else (low, high)
+        ends = [end if math.isfinite(end) else None for end in (decisive.low, decisive.high)]
+        interval = (ends[0], ends[1]) if any(end is not None for end in ends) else None
     if not complete:
         holds, rule = "undecided", f"{rule}; units are missing"
     return Claim(text, paper, ours or "not measured", holds, seeds, rule, interval)

@@ -44,7 +44,7 @@ def test_in_training_curves_are_averages_and_reaching_counts_from_the_first_whol
     assert np.flatnonzero(found.whole)[0] + 1 == 20
     assert found.curves[0, 0] == 9.0  # by luck
     assert episodes_to_reach(found, found.curves[0], 9.0) == (28, 29)  # (9 + ... of twenty)
-    assert episodes_to_reach(found, found.curves[0], 0.0) == (0, 20)
+    assert episodes_to_reach(found, found.curves[0], 0.0) == (19, 20)
     assert episodes_to_reach(found, found.curves[0], 99.0) == (50, math.inf)
     assert found.ends.tolist() == [29.5]
 
@@ -84,12 +84,19 @@ def test_what_lies_between_two_validations_is_in_the_interval():
     assert found.ratio[:3] == (1.5, 1.0, 3.0)
 
 
-def test_two_who_are_there_from_the_first_measurement_on_cannot_be_told_apart():
-    own = made(*[outcome("distance_m", np.full(50, 21.0))] * 3)
+def test_two_who_are_there_at_the_first_validation_cannot_be_told_apart():
+    own = made(*[validated(21.0, 21.0, 21.0)] * 3)
     found = efficiency(own, own)
-    assert (found.episodes, found.baseline_episodes) == (20, 20)
+    assert (found.episodes, found.baseline_episodes) == (10, 10)
     assert found.ratio[:3] == (1.0, 0.0, math.inf)
     assert above(found.ratio, 2.2) == "undecided"
+
+
+def test_two_who_arrive_in_every_training_episode_are_as_soon():
+    own = made(*[outcome("distance_m", np.full(50, 21.0))] * 3)
+    found = efficiency(own, own)
+    assert found.ratio[:3] == (1.0, 19 / 20, 20 / 19)
+    assert above(found.ratio, 2.2) == "no"
 
 
 def test_one_that_never_gets_there_has_the_ratio_nothing():

@@ -123,7 +123,7 @@ def test_who_never_arrives_is_left_out_by_name_and_who_crashes_early_is_not_smoo
     )
     assert scene_claim(*place, [IA], "smoother", "–", -1.0, arrived=True).holds == "yes"
     rough = scene_claim(*place, [IA, Line("hi_td3")], "rougher", "–", 1.0, arrived=True)
-    assert rough.holds == "no"
+    assert (rough.holds, rough.seeds) == ("no", 3)
     alone = scene_claim(*place, [Line("hi_td3")], "smoother", "–", -1.0, arrived=True)
     assert (alone.holds, alone.interval) == ("undecided", None)
 
@@ -138,40 +138,6 @@ def test_bars_are_decided_by_the_mean_of_all_seeds():
         share = float(np.mean([drives.reached for drives in tests]))
         assert one.ours.startswith(f"{100 * share:.1f} % (")
         assert one.holds == ("yes" if share >= SUCCESS_BARS[scene.label] else "no")
-
-
-def test_poor_guidance_is_a_change_of_the_mean_distance():
-    units = EXPERIMENTS["fig14"].units(SEEDS)
-    made = gathered(units, SEEDS)
-    for unit, outcome in made.found.items():
-        scale = 0.9 + 0.001 * unit.seed if unit.setting == "poor" else 1.0
-        tests = {
-            name: Drives({**drives.columns, "distance_m": np.full(50, 20.0 * scale)})
-            for name, drives in outcome.tests.items()
-        }
-        made.found[unit] = replace(outcome, tests=tests)
-    phil, each, ia, hi, *robust = EXPERIMENTS["fig14"].judge(made)
-    assert [one.holds for one in (phil, each, ia, hi)] == ["no", "no", "yes", "no"]
-    assert [one.holds for one in robust] == ["undecided"] * 2
-    assert "-9.8 [-10.0, -9.6] %" in phil.ours
-    assert each.ours.count("-9.8 [-10.0, -9.6] %") == 6
-
-
-def test_poor_guidance_that_two_scenes_take_two_ways_is_no_even_share():
-    units = EXPERIMENTS["fig14"].units(SEEDS)
-    made = gathered(units, SEEDS)
-    for unit, outcome in made.found.items():
-        poor = unit.setting == "poor"
-        tests = {
-            name: Drives(
-                {**drives.columns, "distance_m": np.full(50, 15.0 + poor * (name == "variant"))}
-            )
-            for name, drives in outcome.tests.items()
-        }
-        made.found[unit] = replace(outcome, tests=tests)
-    phil, each, *_ = EXPERIMENTS["fig14"].judge(made)
-    assert (phil.holds, each.holds) == ("yes", "no")
-    assert "L 0.0 [0.0, 0.0] %, L-N 0.0 [0.0, 0.0] %, L-V 6.7 [6.7, 6.7] %" in each.ours
 
 
 def test_as_often_as_the_human_model_is_not_more_often():
@@ -199,17 +165,41 @@ def test_the_steadiest_is_so_in_each_seed():
     one = spread_claim(made, SCENES[0], PHIL, [IA], "steadiest", "lowest variance")
     assert (one.holds, one.seeds) == ("yes", 3)
     assert "IA-TD3 5.00 [5.00, 5.00] m" in one.ours
+    assert one.interval is not None
+    assert max(filter(None, one.interval)) < 0.0  # as it is, not turned round
     assert spread_claim(made, SCENES[0], IA, [PHIL], "steadiest", "–").holds == "no"
 
 
-@pytest.mark.parametrize(("hi", "holds"), [(18, "yes"), (16, "no")])
-def test_competitive_is_within_five_points_of_each(hi, holds):
-    def reached(count: int) -> list[float]:
-        return [21.0] * count + [5.0] * (20 - count)
+def test_what_is_driven_beyond_the_goal_is_no_spread():
+    made = of_drives(phil_td3=[[21.0, 23.0]] * 3, ia_td3=[[21.0, 21.5]] * 3)
+    one = spread_claim(made, SCENES[0], PHIL, [IA], "steadiest", "–")
+    assert one.interval == (0.0, 0.0)
 
-    made = of_drives(per_td3=[reached(18)] * 3, ia_td3=[reached(19)] * 3, hi_td3=[reached(hi)] * 3)
+
+def test_seeds_are_those_that_have_a_common_arrival():
+    made = of_drives(
+        phil_td3=[[21.0, 5.0], [21.0, 5.0], [21.0, 5.0]],
+        ia_td3=[[21.0, 5.0], [21.5, 5.0], [5.0, 21.0]],
+    )
+    one = scene_claim(made, SCENES[0], DISTANCE, PHIL, [IA], "further", "–", arrived=True)
+    assert one.seeds == 2
+    assert "drives in which both arrived, by seed: IA-TD3 1 1 0" in one.ours
+
+
+@pytest.mark.parametrize(("hi", "holds"), [(48, "yes"), (50, "no"), (20, "yes")])
+def test_competitive_is_less_than_five_points_behind_each(hi, holds):
+    def reached(count: int) -> list[float]:
+        return [21.0] * count + [5.0] * (50 - count)
+
+    made = of_drives(per_td3=[reached(46)] * 3, ia_td3=[reached(48)] * 3, hi_td3=[reached(hi)] * 3)
     one = competitive_claim(made, SCENES[0], Line("per_td3"), [IA, Line("hi_td3")])
     assert one.holds == holds
+    assert one.ours.endswith(
+        f"percentage points ahead: -4.0 [-4.0, -4.0], {2 * (46 - hi):.1f} "
+        f"[{2 * (46 - hi):.1f}, {2 * (46 - hi):.1f}]"
+    )
+    assert one.interval is not None
+    assert one.interval[0] == pytest.approx(-8.0 if holds == "no" else -4.0)
 
 
 @pytest.mark.parametrize(("lost", "holds"), [(0.2, "yes"), (0.0, "undecided"), (-0.2, "no")])
@@ -225,3 +215,11 @@ def test_the_variant_degrades_who_succeeds_less_often_there(lost, holds):
         made.found[unit] = replace(outcome, tests=tests)
     one = degraded_claim(made, "left_turn", [IA, Line("per_td3")])
     assert (one.holds, one.seeds) == (holds, 3)
+    judged = [each for each in EXPERIMENTS["fig9"].judge(made) if "degrades" in each.text]
+    assert [each.holds for each in judged] == [holds] * 2
+
+
+def test_the_tests_of_all_six_scenes_are_judged_in_each_way():
+    claims = EXPERIMENTS["fig9"].judge(gathered(EXPERIMENTS["fig9"].units(SEEDS), SEEDS))
+    for text in ("highest success", "survives furthest", "differs least", "competitive"):
+        assert len([one for one in claims if text in one.text]) == 6

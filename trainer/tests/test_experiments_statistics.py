@@ -9,7 +9,7 @@ from trainer.experiments.statistics import (
     Estimate,
     above,
     all_of,
-    decisive,
+    judge_all,
     mean_estimate,
     paired_t,
     smoothed,
@@ -80,13 +80,27 @@ def test_within_is_decided_by_the_whole_interval():
     assert within(Estimate(-2.0, -2.4, -1.6, 3), 1.5) == "no"
 
 
-def test_what_decides_is_the_one_that_says_no_or_the_nearest_to_it():
-    ahead, open_, behind = (
-        Estimate(1.0, 0.5, 1.5, 3), Estimate(0.0, -4.0, 4.0, 3), Estimate(-1.0, -1.5, -0.5, 3)
-    )  # fmt: skip
-    assert decisive([ahead, open_]) == open_
-    assert decisive([ahead, open_, behind]) == behind
-    assert decisive([]) is None
+AHEAD = Estimate(1.0, 0.5, 1.5, 3)
+WIDE, OPEN, BEHIND = (
+    Estimate(20.0, -9.0, 50.0, 3), Estimate(-0.1, -0.4, 0.2, 3), Estimate(-1.0, -1.5, -0.5, 2)
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("differences", "holds", "size", "decisive"),
+    [
+        ([AHEAD, Estimate(9.0, 0.1, 18.0, 2)], "yes", 2, Estimate(9.0, 0.1, 18.0, 2)),
+        ([AHEAD, WIDE, OPEN], "undecided", 3, OPEN),
+        # Who says no decides, whatever is known of the others.
+        ([AHEAD, OPEN, BEHIND, Estimate(5.0, -math.inf, math.inf, 1)], "no", 2, BEHIND),
+        ([AHEAD, mean_estimate([])], "undecided", 0, None),
+        ([], "undecided", 0, None),
+    ],
+)
+def test_who_decides_a_comparison_with_all(differences, holds, size, decisive):
+    assert judge_all(differences) == (holds, size, decisive)
+    mirrored = judge_all([each.times(-1.0) for each in differences], sign=-1.0)
+    assert mirrored == (holds, size, decisive.times(-1.0) if decisive else None)
 
 
 def test_an_interval_may_be_open_at_one_end():

@@ -1,5 +1,7 @@
 """Claims against made-up results whose answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from trainer.experiments.claims.difficulty import kept_shares
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.outcome import Outcome
+from trainer.experiments.plan import FULL_PATH_M
 from trainer.experiments.progress import TITLES
 from trainer.experiments.units import Unit
 from trainer.tests.synthetic import gathered
@@ -57,6 +60,11 @@ def test_the_interval_is_of_the_one_who_decides():
     one = final_claim(made, "left_turn", "distance_m", PHIL, [IA, Line("hi_td3")], "highest")
     assert one.holds == "no"
     assert one.interval == pytest.approx((-2.0, -2.0))  # IA-TD3's begins lower
+    mirrored = final_claim(
+        made, "left_turn", "distance_m", Line("hi_td3"), [PHIL], "lowest", sign=-1.0
+    )
+    assert mirrored.holds == "no"
+    assert mirrored.interval == pytest.approx((2.0, 2.0))
 
 
 def test_the_lowest_is_below_all_others():
@@ -66,16 +74,44 @@ def test_the_lowest_is_below_all_others():
     assert final_claim(*place, PHIL, [IA], "lowest", sign=-1.0).holds == "no"
 
 
-@pytest.mark.parametrize(("ia", "holds"), [(20.0, "yes"), (19.0, "undecided"), (15.0, "no")])
+@pytest.mark.parametrize(("ia", "holds"), [(10.0, "yes"), (9.5, "undecided"), (9.0, "no")])
 def test_one_level_is_five_per_cent_of_the_end(ia, holds):
-    made = of_ends(phil_td3=[20.0, 20.1, 20.2], ia_td3=[ia, ia + 0.2, ia + 0.1])
-    assert level_claim(made, "left_turn", "distance_m", PHIL, IA, "level").holds == holds
+    made = of_ends(phil_td3=[9.9, 10.0, 10.1], ia_td3=[ia, ia + 0.2, ia + 0.1])
+    one = level_claim(made, "left_turn", "distance_m", PHIL, IA, "level", "comparable")
+    assert one.holds == holds
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "algorithm", "ends"),
+    [
+        ("fig13", "is the least favourable", "rd2_td3", {"normal": 1.0}),
+        ("fig8", "are degraded by", "per_td3", {"normal": 0.5, "tough": 0.9}),
+        ("remedy", "the remedy helps vanilla", "per_td3", {"normal": 0.9, "remedy": 0.5}),
+        ("remedy", "the remedy helps HI-TD3", "hi_td3", {"normal": 0.9, "remedy": 0.5}),
+    ],
+)
+def test_who_is_turned_round_is_told_no(name, text, algorithm, ends):
+    """One algorithm ends at another share of the path than the claim wants."""
+    made = gathered(EXPERIMENTS[name].units(SEEDS), SEEDS)
+    for unit, outcome in made.found.items():
+        if unit.algorithm == algorithm:
+            end = (ends[unit.setting] - 0.001 * unit.seed) * FULL_PATH_M[unit.scenario]
+            metrics = {metric: np.full(100, end) for metric in outcome.metrics}
+            made.found[unit] = replace(outcome, metrics=metrics)
+    claims = [one for one in EXPERIMENTS[name].judge(made) if text in one.text]
+    assert len(claims) >= 4
+    assert {one.holds for one in claims} == {"no"}
 
 
 def test_the_papers_words_about_training_are_marked_where_ours_is_without_help():
     made = gathered(EXPERIMENTS["fig7"].units(SEEDS), SEEDS)
     for one in EXPERIMENTS["fig7"].judge(made):
         assert one.paper.endswith(", in training") == ("without help" in one.text)
+
+
+def test_an_interval_without_ends_is_none():
+    of_one_seed = of_ends(phil_td3=[20.0], ia_td3=[18.0])
+    assert ends_above(of_one_seed).interval is None
 
 
 def test_nothing_is_decided_while_a_unit_is_missing():
@@ -137,18 +173,25 @@ def test_what_is_kept_in_the_tough_setting_is_a_ratio_of_means():
     assert kept_shares(of_ends(), "left_turn", PHIL, "distance_m") == {}
 
 
-@pytest.mark.parametrize(("ia", "holds"), [(0.7, "yes"), (0.4, "undecided"), (0.1, "no")])
-def test_who_clones_is_less_affected_only_if_each_of_them_is(ia, holds):
-    kept = {"phil_td3": 0.9, "ia_td3": ia, "hi_td3": 0.5, "per_td3": 0.2}
-    seeds = {name: [20.0, 20.0, 20.0] for name in kept}
-    seeds |= {
-        f"{name}_tough": [20.0 * share + nudge for nudge in (-1.0, 0.0, 1.0)]
-        for name, share in kept.items()
-    }
-    seeds["ia_td3_tough"] = [
-        20.0 * ia + 6.0 * nudge * (holds == "undecided") for nudge in (-1, 0, 1)
-    ]
-    claims = [one for one in EXPERIMENTS["fig8"].judge(ranked(**seeds)) if "left turn" in one.text]
+@pytest.mark.parametrize(
+    ("changed", "holds"),
+    [
+        ({}, "yes"),
+        ({"ia_td3": [0.1, 0.7, 1.3]}, "undecided"),
+        ({"ia_td3": [0.1, 0.11, 0.12]}, "no"),
+        ({"per_td3": [0.95, 0.96, 0.97]}, "no"),
+    ],
+)
+def test_who_clones_is_less_affected_only_if_each_is_less_than_each(changed, holds):
+    kept = {
+        "phil_td3": [0.9, 0.91, 0.92],
+        "ia_td3": [0.7, 0.71, 0.72],
+        "hi_td3": [0.5, 0.51, 0.52],
+        "per_td3": [0.2, 0.21, 0.22],
+    } | changed
+    ends = {name: [10.0, 10.0, 10.0] for name in kept}
+    ends |= {f"{name}_tough": [10.0 * share for share in kept[name]] for name in kept}
+    claims = [one for one in EXPERIMENTS["fig8"].judge(ranked(**ends)) if "left turn" in one.text]
     affected = [one for one in claims if "less affected" in one.text]
     assert [one.holds for one in affected] == [holds] * 2
 

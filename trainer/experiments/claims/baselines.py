@@ -14,7 +14,7 @@ from trainer.experiments.claims.scenes import (
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES, SCENES, Scene
-from trainer.experiments.statistics import above, all_of, decisive, within
+from trainer.experiments.statistics import Estimate, judge_all
 from trainer.experiments.verdict import Claim, claim
 
 COMPETITIVE = 0.05
@@ -24,22 +24,29 @@ COMPETITIVE = 0.05
 def competitive_claim(
     gathered: Gathered, scene: Scene, line: Line, others: Sequence[Line]
 ) -> Claim:
-    """Whether one line's success is much the same as each of the others'."""
+    """Whether one line's success is about that of each of the others, or above it."""
     lines = [line, *others]
     own = success_by_seed(gathered, scene, line)
-    differences = [difference(own, success_by_seed(gathered, scene, other)) for other in others]
+    ahead = [difference(own, success_by_seed(gathered, scene, other)) for other in others]
+    judged = judge_all([_moved(each, COMPETITIVE) for each in ahead])
     shown = [f"{one.label} {shown_of(gathered, scene, one, SUCCESS)}" for one in lines]
+    points = [each.times(100.0).text(1) for each in ahead]
     return claim(
         f"{scene.title}: {line.label} is competitive with "
         f"{' and '.join(other.label for other in others)} in success",
         "competitive",
-        ", ".join(shown),
-        all_of([within(each, COMPETITIVE) for each in differences]),
-        min(each.size for each in differences),
-        f"within {100 * COMPETITIVE:.0f} percentage points of each; {BY_SEED}",
-        None,
+        f"{', '.join(shown)}; percentage points ahead: {', '.join(points)}",
+        judged.holds,
+        judged.size,
+        f"less than {100 * COMPETITIVE:.0f} percentage points behind each; {BY_SEED}",
+        _moved(judged.decisive, -COMPETITIVE).times(100.0) if judged.decisive else None,
         tested_all(gathered, scene, lines),
     )
+
+
+def _moved(estimate: Estimate, by: float) -> Estimate:
+    value, low, high, size = estimate
+    return Estimate(value + by, low + by, high + by, size)
 
 
 def degraded_claim(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> Claim:
@@ -49,18 +56,16 @@ def degraded_claim(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> 
         for condition in ("nominal", "variant")
     )
     shares = [[success_by_seed(gathered, s, line) for s in (nominal, variant)] for line in lines]
-    losses = [difference(before, after) for before, after in shares]
-    shown = [
-        f"{line.label} {loss.times(100.0).text(1)}"
-        for line, loss in zip(lines, losses, strict=True)
-    ]
+    points = [difference(before, after).times(100.0) for before, after in shares]
+    judged = judge_all(points)
+    shown = [f"{line.label} {lost.text(1)}" for line, lost in zip(lines, points, strict=True)]
     return claim(
         f"{SCENARIO_TITLES[scenario]}: the variant scene degrades the baselines' success",
         "significantly",
         f"percentage points lost: {', '.join(shown)}",
-        all_of([above(loss) for loss in losses]),
-        min(loss.size for loss in losses),
+        judged.holds,
+        judged.size,
         BY_SEED,
-        decisive(losses),
+        judged.decisive,
         all(tested_all(gathered, scene, lines) for scene in (nominal, variant)),
     )

@@ -14,8 +14,7 @@ from trainer.experiments.progress import ALONE, TITLES, final, progress
 from trainer.experiments.statistics import (
     Estimate,
     above,
-    all_of,
-    decisive,
+    judge_all,
     mean_estimate,
     within,
 )
@@ -57,24 +56,29 @@ def final_claim(
     """Whether one line ends above (sign 1) or below (-1) each of the others."""
     own = finals(gathered, scenario, ours, metric)
     ends = {line: finals(gathered, scenario, line, metric) for line in others}
-    differences = [difference(own, end).times(sign) for end in ends.values()]
-    deciding = decisive(differences)
+    judged = judge_all([difference(own, end) for end in ends.values()], sign)
     shown = [f"{line.label} {mean_estimate(list(end.values())).text()}"
              for line, end in {ours: own, **ends}.items()]  # fmt: skip
     return claim(
         f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}",
         papers(paper, metric),
         ", ".join(shown),
-        all_of([above(each) for each in differences]),
-        min(each.size for each in differences),
+        judged.holds,
+        judged.size,
         f"final averages; {BY_SEED}",
-        deciding.times(sign) if deciding else None,
+        judged.decisive,
         complete(gathered, scenario, [ours, *others]),
     )
 
 
 def level_claim(
-    gathered: Gathered, scenario: str, metric: str, first: Line, second: Line, text: str
+    gathered: Gathered,
+    scenario: str,
+    metric: str,
+    first: Line,
+    second: Line,
+    text: str,
+    paper: str,
 ) -> Claim:
     """Whether two lines end on the same level."""
     own, other = (finals(gathered, scenario, line, metric) for line in (first, second))
@@ -82,7 +86,7 @@ def level_claim(
     reach = SAME_LEVEL * abs(mean_estimate(list(own.values())).value)
     return claim(
         f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}",
-        papers("same level", metric),
+        papers(paper, metric),
         f"difference {found.text()}, one level is ±{reach:.2f}" if found.size else "",
         within(found, reach),
         found.size,

@@ -17,11 +17,10 @@ from trainer.experiments.outcome import Drives, Outcome, within_path
 from trainer.experiments.plan import Scene
 from trainer.experiments.statistics import (
     Estimate,
-    Holds,
     Numbers,
     above,
     all_of,
-    decisive,
+    judge_all,
     mean_estimate,
     success_estimate,
 )
@@ -58,10 +57,9 @@ def scene_claim(
     found = {line: _by_seed(gathered, scene, ours, line, quantity, arrived) for line in others}
     differences = {line: mean_estimate([d.mean() for d in found[line] if len(d)]) for line in found}
     left_out = [line for line in others if found[line] and not differences[line].size]
-    signed = [differences[line].times(sign) for line in others if line not in left_out]
-    answers: list[Holds] = [above(each) for each in signed]
-    answers += ["undecided" for _ in left_out]
-    deciding = decisive(signed)
+    judged = judge_all([differences[line] for line in others if line not in left_out], sign)
+    # Of who is left out nothing is known, which leaves a yes open.
+    holds = all_of([judged.holds, *(above(differences[line]) for line in left_out)])
     lines = [ours, *others]
     shown = [f"{line.label} {shown_of(gathered, scene, line, quantity, arrived)}" for line in lines]
     ours_text = ", ".join(shown)
@@ -72,9 +70,7 @@ def scene_claim(
         ours_text += f"; left out: {', '.join(line.label for line in left_out)}, no common arrival"
     return claim(
         f"{scene.title}: {text}", paper, ours_text,
-        all_of(answers),
-        min((each.size for each in signed), default=0), _rule(quantity, arrived),
-        deciding.times(sign) if deciding else None,
+        holds, judged.size, _rule(quantity, arrived), judged.decisive,
         tested_all(gathered, scene, lines),
     )  # fmt: skip
 
@@ -91,18 +87,16 @@ def spread_claim(
         }
         for line in lines
     }
-    differences = [difference(spreads[ours], spreads[line]).times(-1.0) for line in others]
-    deciding = decisive(differences)
+    judged = judge_all([difference(spreads[ours], spreads[line]) for line in others], sign=-1.0)
     shown = [
         f"{line.label} {mean_estimate(list(of_line.values())).text()} m"
         for line, of_line in spreads.items()
     ]
     return claim(
         f"{scene.title}: {text}", paper, ", ".join(shown),
-        all_of([above(each) for each in differences]),
-        min(each.size for each in differences),
+        judged.holds, judged.size,
         f"standard deviation over each seed's drives; {BY_SEED}; nothing beyond the goal counted",
-        deciding.times(-1.0) if deciding else None,
+        judged.decisive,
         tested_all(gathered, scene, lines),
     )  # fmt: skip
 
@@ -145,10 +139,9 @@ def _by_seed(
     own, theirs = (gathered.tested(scene, line.algorithm, line.setting) for line in (first, second))
     differences = []
     for one in own:
-        others = [other for other in theirs if comparable(one, other)]
-        if not others:
+        if not any(comparable(one, other) for other in theirs):
             continue
-        ours, rivals = pairs([one], others, scene.condition, _column(quantity), arrived)
+        ours, rivals = pairs([one], theirs, scene.condition, _column(quantity), arrived)
         if quantity == DISTANCE:
             ours, rivals = (within_path(scene.scenario, each) for each in (ours, rivals))
         differences.append(ours - rivals)

@@ -20,7 +20,13 @@ from trainer.experiments.claims.scenes import (
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.figures.spread import BOXES
 from trainer.experiments.gathered import Gathered
-from trainer.experiments.plan import FULL_PATH_M, HUMAN_MODEL, SCENES, Scene
+from trainer.experiments.plan import (
+    FULL_PATH_M,
+    HUMAN_MODEL,
+    SCENARIO_TITLES,
+    SCENES,
+    Scene,
+)
 from trainer.experiments.statistics import mean_estimate
 from trainer.experiments.verdict import Claim, claim
 
@@ -68,7 +74,7 @@ def judge_fig9(gathered: Gathered) -> list[Claim]:
                          "drive to drive", STEADIEST.get(scene.label, "lowest variance")),
             competitive_claim(*place, PER, [IA, HI]),
         ]  # fmt: skip
-    claims += [degraded_claim(gathered, scenario, others) for scenario in PAPER_TABLES]
+    claims += [degraded_claim(gathered, scenario, others) for scenario in SCENARIO_TITLES]
     return claims
 
 
@@ -117,9 +123,13 @@ def judge_fig10(gathered: Gathered) -> list[Claim]:
         quantity = BOXES[scene.scenario]
         place = (gathered, scene, quantity.column)
         if scene.scenario == "left_turn" or scene.condition == "variant":
-            what = "takes the least time" if scene.scenario == "left_turn" else "is the smoothest"
+            what, paper = (
+                ("takes the least time", "least")
+                if scene.scenario == "left_turn"
+                else ("is the smoothest", "an advantage")
+            )
             claims.append(
-                scene_claim(*place, PHIL, [IA, HI, PER], f"PHIL-TD3 {what}", "least",
+                scene_claim(*place, PHIL, [IA, HI, PER], f"PHIL-TD3 {what}", paper,
                             -1.0, arrived=True)
             )  # fmt: skip
         else:
