@@ -66,8 +66,8 @@ def episodes_to_reach(learner: Progress, curve: Numbers, level: float) -> Reache
     """Episodes until a curve of the learner first reaches a level."""
     first = np.flatnonzero(learner.whole & (curve >= level - 1e-9))
     place = int(first[0]) if len(first) else len(curve)
-    times = [0.0, *learner.episodes.tolist(), float("inf")]
-    return Reached(times[place], times[place + 1])
+    before = float(learner.episodes[place - 1]) if place else 0.0
+    return Reached(before, float(learner.episodes[place]) if len(first) else float("inf"))
 
 
 def _needed(ours: Progress, baseline: Progress, common: bool) -> tuple[Reached, Reached]:

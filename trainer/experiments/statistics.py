@@ -90,7 +90,7 @@ def all_of(answers: Sequence[Holds]) -> Holds:
 
 
 class Judged(NamedTuple):
-    """Whether all of some differences are above 0."""
+    """Whether all of some differences are above a number."""
 
     holds: Holds
     size: int
@@ -100,15 +100,15 @@ class Judged(NamedTuple):
     say yes."""
 
 
-def judge_all(differences: Sequence[Estimate], sign: float = 1.0) -> Judged:
-    """Judge whether all differences are above (sign 1) or below (-1) 0."""
+def judge_all(differences: Sequence[Estimate], sign: float = 1.0, least: float = 0.0) -> Judged:
+    """Judge whether all differences, or with sign -1 their opposites, are above ``least``."""
     signed = [difference.times(sign) for difference in differences]
-    holds = all_of([above(each) for each in signed])
+    holds = all_of([above(each, least) for each in signed])
     if holds == "no":
         decisive = min(signed, key=lambda each: each.high)
         return Judged(holds, decisive.size, decisive.times(sign))
     size = min((each.size for each in signed), default=0)
-    candidates = [each for each in signed if each.size and above(each) == holds]
+    candidates = [each for each in signed if each.size and above(each, least) == holds]
     if not candidates:
         return Judged(holds, size, None)
     decisive = min(candidates, key=lambda each: each.low if holds == "yes" else each.value)

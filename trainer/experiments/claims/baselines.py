@@ -14,11 +14,11 @@ from trainer.experiments.claims.scenes import (
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES, SCENES, Scene
-from trainer.experiments.statistics import Estimate, judge_all
+from trainer.experiments.statistics import judge_all
 from trainer.experiments.verdict import Claim, claim
 
 COMPETITIVE = 0.05
-"""Shares of success that differ by no more are competitive; the paper gives no number."""
+"""Who succeeds less often by less than this share is competitive; the paper gives no number."""
 
 
 def competitive_claim(
@@ -28,7 +28,7 @@ def competitive_claim(
     lines = [line, *others]
     own = success_by_seed(gathered, scene, line)
     ahead = [difference(own, success_by_seed(gathered, scene, other)) for other in others]
-    judged = judge_all([_moved(each, COMPETITIVE) for each in ahead])
+    judged = judge_all(ahead, least=-COMPETITIVE)
     shown = [f"{one.label} {shown_of(gathered, scene, one, SUCCESS)}" for one in lines]
     points = [each.times(100.0).text(1) for each in ahead]
     return claim(
@@ -39,14 +39,9 @@ def competitive_claim(
         judged.holds,
         judged.size,
         f"less than {100 * COMPETITIVE:.0f} percentage points behind each; {BY_SEED}",
-        _moved(judged.decisive, -COMPETITIVE).times(100.0) if judged.decisive else None,
+        judged.decisive.times(100.0) if judged.decisive else None,
         tested_all(gathered, scene, lines),
     )
-
-
-def _moved(estimate: Estimate, by: float) -> Estimate:
-    value, low, high, size = estimate
-    return Estimate(value + by, low + by, high + by, size)
 
 
 def degraded_claim(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> Claim:

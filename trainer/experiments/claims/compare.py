@@ -123,12 +123,13 @@ def speed_claim(
         for line in (ours, other)
     )
     text = f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}"
+    paper = papers(paper, metric)
     if own is None or theirs is None:
-        return claim(text, papers(paper, metric), "", "undecided", 0, BY_BOOTSTRAP, None, False)
+        return claim(text, paper, "", "undecided", 0, BY_BOOTSTRAP, None, False)
     found = efficiency(own, theirs, common)
     return claim(
         text,
-        papers(paper, metric),
+        paper,
         f"{found.ratio.text(1)} times as soon: {ours.label} {_counted(found.episodes)}, "
         f"{other.label} {_counted(found.baseline_episodes)}",
         above(found.ratio, least),

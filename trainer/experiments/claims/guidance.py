@@ -8,11 +8,10 @@ import numpy as np
 
 from trainer.experiments.claims.compare import BY_SEED, BY_VALUE, complete, difference
 from trainer.experiments.claims.lines import HI, IA, PHIL
-from trainer.experiments.claims.scenes import mean_path_m, scene_claim
+from trainer.experiments.claims.scenes import path_by_seed, scene_claim
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.figures.spread import SMOOTHNESS
 from trainer.experiments.gathered import Gathered
-from trainer.experiments.outcome import Outcome
 from trainer.experiments.plan import POOR, SCENARIO_TITLES, SCENES, Scene
 from trainer.experiments.statistics import (
     Estimate,
@@ -128,14 +127,10 @@ def _changes(gathered: Gathered, line: Line) -> dict[int, float]:
 
 def _relative(gathered: Gathered, line: Line, scene: Scene) -> dict[int, float]:
     """Training seed -> relative change of the distance in one scene."""
-    good = _means(gathered.tested(scene, line.algorithm), scene)
-    poor = _means(gathered.tested(scene, line.algorithm, POOR), scene)
+    good = path_by_seed(gathered, scene, line)
+    poor = path_by_seed(gathered, scene, Line(line.algorithm, POOR))
     # Who never moves has nothing to lose.
     return {seed: poor[seed] / good[seed] - 1.0 for seed in good.keys() & poor if good[seed]}
-
-
-def _means(outcomes: list[Outcome], scene: Scene) -> Mapping[int, float]:
-    return {o.unit.seed: mean_path_m(scene, o.tests[scene.condition]) for o in outcomes}
 
 
 def _guided_complete(gathered: Gathered, line: Line) -> bool:

@@ -114,10 +114,10 @@ def shown_of(
     return f"{values.mean():.2f}±{values.std():.2f}" if len(values) else "–"
 
 
-def path_by_seed(gathered: Gathered, scene: Scene, line: Line) -> Numbers:
-    """Mean surviving distance of each seed, not counting what is beyond the goal."""
+def path_by_seed(gathered: Gathered, scene: Scene, line: Line) -> dict[int, float]:
+    """Training seed -> mean surviving distance, m, not counting what is beyond the goal."""
     outcomes = gathered.tested(scene, line.algorithm, line.setting)
-    return np.array([mean_path_m(scene, outcome.tests[scene.condition]) for outcome in outcomes])
+    return {o.unit.seed: float(_path_m(scene, o.tests[scene.condition]).mean()) for o in outcomes}
 
 
 def success_by_seed(gathered: Gathered, scene: Scene, line: Line) -> dict[int, float]:
@@ -150,11 +150,6 @@ def _by_seed(
 
 def _column(quantity: str) -> str:
     return "reached" if quantity == SUCCESS else quantity
-
-
-def mean_path_m(scene: Scene, drives: Drives) -> float:
-    """Mean surviving distance of some drives, not counting what is beyond the goal."""
-    return float(_path_m(scene, drives).mean())
 
 
 def _path_m(scene: Scene, drives: Drives) -> Numbers:

@@ -163,7 +163,7 @@ def judge_table(gathered: Gathered, scenario: str) -> list[Claim]:
 
 
 def _distance_bar(gathered: Gathered, scene: Scene, line: Line, share: float, who: str) -> Claim:
-    means_m = path_by_seed(gathered, scene, line)
+    means_m = list(path_by_seed(gathered, scene, line).values())
     found = mean_estimate(means_m)
     least_m = share * FULL_PATH_M[scene.scenario]
     mean_m = PAPER_TABLES[scene.scenario][line.algorithm][_place(scene)][0]
