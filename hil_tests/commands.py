@@ -19,6 +19,10 @@ START_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 10.0
 
 
+class CommandTimeoutError(UserError):
+    """A command had not ended when its time was over."""
+
+
 def run_command(*arguments: str) -> None:
     """Print ``python -m ...`` and run it to its end, its output passed through.
 
@@ -83,12 +87,14 @@ class BackgroundCommand:
         """Wait until it has ended by itself.
 
         Raises:
-            UserError: it failed, or it goes on.
+            CommandTimeoutError: it has not.
+            UserError: it failed.
         """
         try:
             status = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            raise UserError(f"python -m {self.name} did not end within {timeout_s} s") from None
+            said = f"python -m {self.name} did not end within {timeout_s:g} s"
+            raise CommandTimeoutError(said) from None
         if status:
             raise self._failure()
 

@@ -17,7 +17,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.transport import free_endpoint
 from hil_tests.campaign.chunks import Chunk, Task, halve, join_reports
-from hil_tests.commands import BackgroundCommand
+from hil_tests.commands import BackgroundCommand, CommandTimeoutError
 
 VEHICLE = "campaign01"
 ATTEMPTS = 6
@@ -88,9 +88,10 @@ class _Worker:
         try:
             return self._undisturbed(chunk, ATTEMPTS)
         except UserError as error:
-            if "is in use" not in str(error):
+            # Nobody listens between two chunks: any process of the machine may take the port. And
+            # lock-step crawls beside an edge runtime that has lost its wire: each step waits.
+            if not isinstance(error, CommandTimeoutError) and "is in use" not in str(error):
                 raise
-            # Nobody listens between two chunks: any process of the machine may take the port.
             self.close()
             self._start_edge()
             return self._undisturbed(chunk, ATTEMPTS)

@@ -7,10 +7,10 @@ import pytest
 
 from edge_runtime.cli import UserError, run_cli
 from hil_tests.__main__ import main
-from hil_tests.campaign import command, latency
+from hil_tests.campaign import command, latency, workers
 from hil_tests.campaign.axes import AXES, Axis
 from hil_tests.campaign.budget import budget, limit_of
-from hil_tests.campaign.chunks import Chunk, chunks_of
+from hil_tests.campaign.chunks import Chunk, Task, chunks_of
 from hil_tests.campaign.latency import agree
 from hil_tests.campaign.rows import make_row
 
@@ -163,3 +163,24 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
     Path(next((tmp_path / "r_rows").iterdir())).unlink()
     assert run_cli(main, arguments) == 2
     assert len(driven) == 1
+
+
+def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeypatch):
+    policy = Path("results/policies/left_turn.onnx")
+    task = Task(policy, "any", "left_turn", "nominal", "lockstep")
+    edges, limits_s = [], iter((0.1, 120.0))
+    start_edge, wait = workers._Worker._start_edge, workers.BackgroundCommand.wait
+
+    def note_edge(worker):
+        start_edge(worker)
+        edges.append(worker._edge)
+
+    monkeypatch.setattr(workers._Worker, "_start_edge", note_edge)
+    monkeypatch.setattr(
+        workers.BackgroundCommand, "wait", lambda self, _limit_s: wait(self, next(limits_s))
+    )
+    reports = []
+    chunk = Chunk("none", 1, 1)
+    workers.drive_chunks(task, [chunk], 1, lambda _chunk, report, _wall_s: reports.append(report))
+    assert [report["episodes"] for report in reports] == [1]
+    assert len(edges) == 2
