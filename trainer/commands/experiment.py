@@ -26,7 +26,15 @@ from trainer.experiments.report import (
 )
 from trainer.experiments.runner import FAILED, Tally, run_units
 from trainer.experiments.store import Store
-from trainer.experiments.summary import CLAIMS, UNITS, claim_lines, has_place, write_table
+from trainer.experiments.summary import (
+    CLAIMS,
+    COUNTS,
+    UNITS,
+    claim_lines,
+    count_lines,
+    has_place,
+    write_table,
+)
 from trainer.experiments.unit_table import unit_lines
 from trainer.experiments.units import Unit
 from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task
@@ -129,6 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _write_tables(store: Store, seeds: int, wanted: bool) -> None:
     readme = store.results / "README.md"
     for place, lines in (
+        (COUNTS, partial(count_lines, store.results, NAMES)),
         (UNITS, partial(unit_lines, store, seeds)),
         (CLAIMS, partial(claim_lines, store.results, NAMES)),
     ):

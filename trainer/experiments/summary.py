@@ -1,17 +1,22 @@
-"""The tables of results/README.md: where they stand, and the claims, made from the verdicts."""
+"""The tables of results/README.md: where they stand, and the two made from the verdicts."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes, write_atomic
+from trainer.experiments.statistics import Holds
 from trainer.experiments.verdict import VERDICT_FILE
 
-HEADER = ("what", "claim", "paper", "ours", "seeds", "holds", "command")
+CLAIMS_HEADER = ("what", "claim", "paper", "ours", "seeds", "holds")
+ANSWERS: tuple[Holds, ...] = ("yes", "no", "undecided")
+COUNTS_HEADER = ("experiment", "about", "runs", *ANSWERS, "command")
+NOT_RUN = "not run yet"
 
 
 class Place(NamedTuple):
@@ -31,7 +36,7 @@ class Place(NamedTuple):
         return f"[//]: # (end of the {self.what})"
 
 
-UNITS, CLAIMS = Place("table of units"), Place("table of claims")
+UNITS, CLAIMS, COUNTS = (Place(f"table of {what}") for what in ("units", "claims", "experiments"))
 
 
 def has_place(readme: Path, place: Place) -> bool:
@@ -54,8 +59,8 @@ def write_table(readme: Path, place: Place, lines: Iterable[str]) -> None:
     write_atomic(readme, f"{before}{place.begin}\n\n{table}\n\n{place.end}{after}".encode())
 
 
-def claim_lines(results: Path, names: Iterable[str]) -> list[str]:
-    """The table of claims; an experiment that was never drawn has a row that says so.
+def count_lines(results: Path, names: Iterable[str]) -> list[str]:
+    """The table of experiments: how many of each one's claims hold, and the command that says so.
 
     Args:
         results: directory with ``experiments/<name>/verdict.json``.
@@ -64,20 +69,49 @@ def claim_lines(results: Path, names: Iterable[str]) -> list[str]:
     Raises:
         UserError: a verdict cannot be read.
     """
-    lines = [row(HEADER), row(["---"] * len(HEADER))]
-    for name in names:
-        verdict = _read(results / "experiments" / name / VERDICT_FILE)
-        command = f"`python -m trainer experiment {name}`"
+    lines, total = [row(COUNTS_HEADER), row(["---"] * len(COUNTS_HEADER))], Counter[str]()
+    for name, verdict in _verdicts(results, names):
         if verdict is None:
-            lines.append(row([name, "not run yet", "", "", "0", "undecided", command]))
+            dashes = "–" * (1 + len(ANSWERS))
+            lines.append(row([name, NOT_RUN, *dashes, f"`python -m trainer experiment {name}`"]))
             continue
-        command = f"`{verdict['command']}`"
-        link = f"[{name}](experiments/{name}/verdict.md)"
+        counts = Counter(one["holds"] for one in verdict["claims"])
+        total += counts
+        runs = f"{verdict['wanted'] - len(verdict['missing'])} of {verdict['wanted']}"
+        cells = (_link(name), verdict["title"], runs, *_counted(counts), f"`{verdict['command']}`")
+        lines.append(row(cells))
+    return [*lines, row(["all", "", "", *_counted(total), "`python -m trainer experiment all`"])]
+
+
+def claim_lines(results: Path, names: Iterable[str]) -> list[str]:
+    """The table of claims; an experiment that was never drawn has a row that says so.
+
+    Arguments and errors as for ``count_lines``.
+    """
+    lines = [row(CLAIMS_HEADER), row(["---"] * len(CLAIMS_HEADER))]
+    for name, verdict in _verdicts(results, names):
+        if verdict is None:
+            lines.append(row([name, NOT_RUN, "", "", "0", "undecided"]))
+            continue
+        link = _link(name)
         for one in verdict["claims"]:
             cells = (one["text"], one["paper"], one["ours"], str(one["seeds"]), one["holds"])
-            lines.append(row([link, *cells, command]))
-            link = command = ""
+            lines.append(row([link, *cells]))
+            link = ""
     return lines
+
+
+def _link(name: str) -> str:
+    return f"[{name}](experiments/{name}/verdict.md)"
+
+
+def _counted(counts: Counter[str]) -> list[str]:
+    return [str(counts[answer]) for answer in ANSWERS]
+
+
+def _verdicts(results: Path, names: Iterable[str]) -> Iterator[tuple[str, dict[str, Any] | None]]:
+    for name in names:
+        yield name, _read(results / "experiments" / name / VERDICT_FILE)
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -87,7 +121,7 @@ def _read(path: Path) -> dict[str, Any] | None:
         verdict = json.loads(read_bytes(path, "verdict"))
         for one in verdict["claims"]:
             _ = [one[name] for name in ("text", "paper", "ours", "seeds", "holds")]
-        _ = verdict["command"]
+        _ = [verdict[name] for name in ("title", "wanted", "missing", "command")]
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} is no verdict of this project") from error
     return dict(verdict)

@@ -59,7 +59,10 @@ def test_what_was_validated_now_and_then_is_taken_where_it_was_measured():
 
 
 def test_how_fast_the_goal_is_crossed_makes_no_difference():
-    own, other = made(validated(21.1, 21.2, 21.3)), made(validated(21.4, 21.4, 21.4))
+    own, other = (
+        made(outcome("distance_m", np.array(metres)))
+        for metres in ([21.1, 21.2, 21.3], [21.4, 21.4, 21.4])
+    )
     assert efficiency(own, other).ratio.value == 1.0
     assert own.ends.tolist() == [21.0]
 

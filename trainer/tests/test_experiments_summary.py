@@ -9,7 +9,8 @@ import pytest
 from edge_runtime.errors import UserError
 from trainer.experiments import unit_table
 from trainer.experiments.gathered import Gathered
-from trainer.experiments.summary import CLAIMS, claim_lines, has_place, write_table
+from trainer.experiments.statistics import Holds
+from trainer.experiments.summary import CLAIMS, claim_lines, count_lines, has_place, write_table
 from trainer.experiments.units import Unit
 from trainer.experiments.verdict import claim, markdown, verdict_of, write_verdict
 from trainer.tests.experiments import store_in
@@ -44,10 +45,25 @@ def test_a_table_stands_between_its_comments_and_can_be_refreshed(tmp_path):
     assert text.startswith(f"# Results\n\n{CLAIMS.begin}\n\n| what |")
     assert text.endswith(f"\n\n{CLAIMS.end}\n\nThe rest.\n")
     assert "an earlier table" not in text
-    command = "`python -m trainer experiment fig7 --seeds 3`"
     link = "[fig7](experiments/fig7/verdict.md)"
-    assert f"| {link} | first | 7 | 8 | 3 | no | {command} |\n|  | second | 7 | 8" in text
+    assert f"| {link} | first | 7 | 8 | 3 | no |\n|  | second | 7 | 8" in text
     assert "| fig8 | not run yet |" in text
+
+
+def test_the_table_of_experiments_counts_their_claims_and_names_their_commands(tmp_path):
+    answers: tuple[Holds, ...] = ("yes", "no", "no", "undecided")
+    claims = [claim("text", "7", "8", answer, 3, "by hand") for answer in answers]
+    units = [Unit("left_turn", "phil_td3", "normal", seed) for seed in (1, 2)]
+    made = Gathered(units, {units[0]: outcome(units[0])}, 3)
+    directory = tmp_path / "experiments" / "fig7"
+    directory.mkdir(parents=True)
+    write_verdict(verdict_of("fig7", "curves", claims, made, "fig7.png"), directory)
+    assert count_lines(tmp_path, ["fig7", "fig8"])[2:] == [
+        "| [fig7](experiments/fig7/verdict.md) | curves | 1 of 2 | 1 | 2 | 1 "
+        "| `python -m trainer experiment fig7 --seeds 3` |",
+        "| fig8 | not run yet | – | – | – | – | `python -m trainer experiment fig8` |",
+        "| all |  |  | 1 | 2 | 1 | `python -m trainer experiment all` |",
+    ]
 
 
 def test_a_table_needs_its_place_and_whole_verdicts(tmp_path):

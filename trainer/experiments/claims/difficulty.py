@@ -12,7 +12,7 @@ from trainer.experiments.claims.lines import HI, IA, PER, PHIL
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES, TOUGH
-from trainer.experiments.progress import DISTANCES, TITLES
+from trainer.experiments.progress import TITLES, WITH_A_ZERO
 from trainer.experiments.statistics import Estimate, Holds, above, judge_all, mean_estimate
 from trainer.experiments.verdict import Claim, claim
 
@@ -23,11 +23,11 @@ def judge_fig8(gathered: Gathered) -> list[Claim]:
     """Who keeps their place, and who loses how much. Of rewards, which may be negative, a ratio
     says nothing.
     """
-    distances = tuple(product(SCENARIO_TITLES, DISTANCES))
+    places = tuple(product(SCENARIO_TITLES, WITH_A_ZERO))
     return [
         *(_ranking_claim(gathered, *place) for place in product(SCENARIO_TITLES, TITLES)),
-        *(_cloners_claim(gathered, *place) for place in distances),
-        *(_others_claim(gathered, *place) for place in distances),
+        *(_cloners_claim(gathered, *place) for place in places),
+        *(_others_claim(gathered, *place) for place in places),
     ]
 
 

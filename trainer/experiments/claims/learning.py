@@ -22,7 +22,7 @@ from trainer.experiments.claims.lines import (
 )
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES
-from trainer.experiments.progress import ALONE, DISTANCES, TITLES
+from trainer.experiments.progress import ALONE, TITLES, WITH_A_ZERO
 from trainer.experiments.verdict import Claim
 
 SPEEDS = {
@@ -72,7 +72,7 @@ def _congestion(gathered: Gathered) -> list[Claim]:
             for line in (PHIL, IA)
         ),
     ]  # fmt: skip
-    for metric in DISTANCES:
+    for metric in WITH_A_ZERO:
         place = (gathered, "congestion", metric)
         claims += [
             final_claim(*place, PHIL, [IA, HI, PER], "PHIL-TD3 learns the best asymptotic policy"),

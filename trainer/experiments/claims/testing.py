@@ -4,34 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from trainer.experiments.claims.bars import first_bar, human_bar, path_bar, success_bar
 from trainer.experiments.claims.baselines import competitive_claim, degraded_claim
-from trainer.experiments.claims.compare import BY_VALUE
 from trainer.experiments.claims.lines import HI, HUMAN, IA, PER, PHIL
 from trainer.experiments.claims.scenes import (
     DISTANCE,
     SUCCESS,
-    path_by_seed,
     scene_claim,
     shown_of,
     spread_claim,
-    success,
-    tested_all,
 )
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.figures.spread import BOXES
 from trainer.experiments.gathered import Gathered
-from trainer.experiments.plan import (
-    FULL_PATH_M,
-    HUMAN_MODEL,
-    SCENARIO_TITLES,
-    SCENES,
-    Scene,
-)
-from trainer.experiments.statistics import mean_estimate
-from trainer.experiments.verdict import Claim, claim
+from trainer.experiments.plan import HUMAN_MODEL, SCENARIO_TITLES, SCENES, Scene
+from trainer.experiments.verdict import Claim
 
-SUCCESS_BARS = {"L": 1.0, "L-N": 0.98, "L-V": 0.96, "C": 0.98, "C-N": 0.96, "C-V": 0.92}
-"""What this project asks of PHIL-TD3 in each scene."""
 FURTHEST = {"C-V": "furthest; but in table II IA-TD3 78.39 m, PHIL-TD3 77.29 m"}
 """Where the paper's text and its tables disagree about who survives furthest."""
 STEADIEST = {"C-V": "lowest variance; but in table II IA-TD3 ±7.66 m, PHIL-TD3 ±11.55 m"}
@@ -64,8 +52,9 @@ def judge_fig9(gathered: Gathered) -> list[Claim]:
     for scene in SCENES:
         place = (gathered, scene)
         claims += [
-            _success_bar(*place),
-            _human_bar(*place),
+            success_bar(*place),
+            *(first_bar(*place, quantity, others) for quantity in (SUCCESS, DISTANCE)),
+            *(human_bar(*place, quantity) for quantity in (SUCCESS, DISTANCE)),
             scene_claim(*place, SUCCESS, PHIL, others, "PHIL-TD3 has the highest success rate",
                         "highest"),
             scene_claim(*place, DISTANCE, PHIL, others, "PHIL-TD3 survives furthest",
@@ -76,41 +65,6 @@ def judge_fig9(gathered: Gathered) -> list[Claim]:
         ]  # fmt: skip
     claims += [degraded_claim(gathered, scenario, others) for scenario in SCENARIO_TITLES]
     return claims
-
-
-def _success_bar(gathered: Gathered, scene: Scene) -> Claim:
-    """Mean success of all seeds, each of which is shown."""
-    outcomes = gathered.tested(scene, PHIL.algorithm)
-    bar = SUCCESS_BARS[scene.label]
-    everything = success(outcomes, scene.condition)
-    return claim(
-        f"{scene.title}: bar of this project, success of PHIL-TD3 at least {bar:.0%}",
-        "highest of all",
-        f"{shown_of(gathered, scene, PHIL, SUCCESS)}, all drives {everything.text()}",
-        "yes" if everything.value >= bar else "no",
-        len(outcomes),
-        f"{BY_VALUE}; Wilson's interval shown",
-        everything,
-        tested_all(gathered, scene, [PHIL]),
-    )
-
-
-def _human_bar(gathered: Gathered, scene: Scene) -> Claim:
-    """Whether the mean success of all seeds is above the human model's."""
-    own, human = (
-        success(gathered.tested(scene, line.algorithm), scene.condition) for line in (PHIL, HUMAN)
-    )
-    shown = [f"{line.label} {shown_of(gathered, scene, line, SUCCESS)}" for line in (PHIL, HUMAN)]
-    return claim(
-        f"{scene.title}: bar of this project, PHIL-TD3 succeeds more often than the human model",
-        "–",
-        ", ".join(shown),
-        "yes" if own.value > human.value else "no",
-        len(gathered.tested(scene, PHIL.algorithm)),
-        BY_VALUE,
-        None,
-        tested_all(gathered, scene, [PHIL, HUMAN]),
-    )
 
 
 def judge_fig10(gathered: Gathered) -> list[Claim]:
@@ -156,29 +110,15 @@ def judge_table(gathered: Gathered, scenario: str) -> list[Claim]:
         ours = [f"{line.label} {shown_of(gathered, scene, line, DISTANCE)}" for line in lines]
         claims.append(replace(one, ours=", ".join(ours)))
         if scenario == "left_turn":
-            claims.append(_distance_bar(gathered, scene, PHIL, PATH_SHARE, "PHIL-TD3"))
+            claims.append(_path_bar(gathered, scene, PHIL, PATH_SHARE, "PHIL-TD3"))
     nominal = next(scene for scene in SCENES if scene.scenario == scenario)
-    claims.append(_distance_bar(gathered, nominal, HUMAN, HUMAN_SHARE, "the human model"))
+    claims.append(_path_bar(gathered, nominal, HUMAN, HUMAN_SHARE, "the human model"))
     return claims
 
 
-def _distance_bar(gathered: Gathered, scene: Scene, line: Line, share: float, who: str) -> Claim:
-    means_m = list(path_by_seed(gathered, scene, line).values())
-    found = mean_estimate(means_m)
-    least_m = share * FULL_PATH_M[scene.scenario]
+def _path_bar(gathered: Gathered, scene: Scene, line: Line, share: float, who: str) -> Claim:
     mean_m = PAPER_TABLES[scene.scenario][line.algorithm][_place(scene)][0]
-    each = f" ({' '.join(f'{mean_m:.2f}' for mean_m in means_m)})" if len(means_m) > 1 else ""
-    return claim(
-        f"{scene.title}: bar of this project, {who} survives {share:.0%} of the full path "
-        f"({least_m:.2f} m)",
-        f"{mean_m:.2f} m",
-        f"{found.text()} m{each}",
-        "yes" if found.value >= least_m else "no",
-        len(means_m),
-        f"{BY_VALUE}, nothing beyond the goal counted",
-        found,
-        tested_all(gathered, scene, [line]),
-    )
+    return path_bar(gathered, scene, line, share, who, f"{mean_m:.2f} m")
 
 
 def _place(scene: Scene) -> int:

@@ -18,7 +18,7 @@ from trainer.experiments.figures.style import (
 )
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import FULL_PATH_M, NORMAL, PRINTED_REWARD, SCENARIO_TITLES
-from trainer.experiments.progress import TITLES, progress
+from trainer.experiments.progress import ALONE, TITLES, progress
 from trainer.experiments.statistics import WINDOW
 
 STYLES = ("-", "--", ":", "-.")
@@ -91,8 +91,9 @@ def _draw_panel(
             found.episodes, mean - deviation, mean + deviation, color=shade, alpha=0.18, lw=0
         )
     if metric != "episode_return":
-        panel.axhline(FULL_PATH_M[scenario], color="0.6", lw=0.8, ls=":")
-        panel.set_ylim(0.0, 1.05 * FULL_PATH_M[scenario])
+        best = 1.0 if metric == ALONE else FULL_PATH_M[scenario]
+        panel.axhline(best, color="0.6", lw=0.8, ls=":")
+        panel.set_ylim(0.0, 1.05 * best)
     if not panel.has_data():
         note_missing(panel)
     panel.grid(alpha=0.3)
