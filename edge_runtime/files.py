@@ -28,7 +28,7 @@ def read_bytes(path: PathLike, what: str) -> bytes:
         raise UserError(f"{what} {path!r} is not a file name: {error}") from None
 
 
-def write_atomic(path: PathLike, data: bytes) -> None:
+def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """Write `data` so that a reader or a crash sees the old file or the new one, nothing between.
 
     A symbolic link stays, and the file behind it is written. Raises UserError when the directory

@@ -17,7 +17,7 @@ def save_torch(path: Path, state: Any) -> None:
     """Write ``state`` so that a kill at any moment leaves the old file or the new one."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
-    write_atomic(path, buffer.getvalue())
+    write_atomic(path, buffer.getbuffer())
 
 
 def load_torch(path: Path) -> Any:

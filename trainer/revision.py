@@ -3,19 +3,37 @@
 from __future__ import annotations
 
 import subprocess
+from functools import cache
 from pathlib import Path
 
+HERE = Path(__file__).parent
 
+
+@cache
 def source_revision() -> str:
-    """The repository's commit, ``-dirty`` where files differ from it, or ``unknown``."""
+    """The repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
+
+    As it was when first asked for: what is committed later is not what this process runs. Results
+    that a run has just written make no other source.
+    """
+    return revision_of(HERE)
+
+
+def revision_of(directory: Path) -> str:
+    """The revision of the repository that a directory belongs to, as it is now."""
+    commit = _git(directory, "rev-parse", "HEAD")
+    if commit is None:
+        return "unknown"
+    dirty = _git(directory, "diff", "--quiet", "HEAD", "--", ":/", ":(top,exclude)results") is None
+    return f"{commit}-dirty" if dirty else commit
+
+
+def _git(directory: Path, *arguments: str) -> str | None:
+    """What git says; None where it fails."""
     try:
-        described = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
+        done = subprocess.run(
+            ["git", *arguments], cwd=directory, capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return described.stdout.strip()
+        return None
+    return done.stdout.strip()

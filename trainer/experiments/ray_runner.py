@@ -76,6 +76,9 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Tally:
                     say(f"left to {task.store.holder(task.unit)}: {task.unit}")
                     tally.add(BUSY)
                     continue
+                if task.store.done(task.unit):  # elsewhere, since it was asked for
+                    tally.add(FINISHED)
+                    continue
                 waiting[_submit(ray, task)] = task
             while waiting:
                 (ready, *_), _ = ray.wait(list(waiting))
@@ -161,8 +164,8 @@ def _receive(ray: Any, task: Task, reference: Any) -> str:
         return keep(task.store, task.unit, ray.get(reference))
     except ray.exceptions.RayError as error:
         cause = getattr(error, "cause", None) or error
-        last = str(cause).strip().splitlines()[-1]
-        say(f"failed: {task.unit}: {type(cause).__name__}: {last}")
+        last = str(cause).strip().splitlines()[-1:]  # a MemoryError says nothing
+        say(": ".join(("failed", str(task.unit), type(cause).__name__, *last)))
         return FAILED
 
 

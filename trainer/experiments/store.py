@@ -88,7 +88,8 @@ class Store:
         if self.done(unit):
             return DONE
         run_dir = self.run_dir(unit)
-        if not run_dir.is_dir():
+        # On Ray the working directory is elsewhere, and only the lock is here.
+        if not (run_dir.is_dir() or self.lock_file(unit).is_file()):
             return MISSING
         with self.lock(unit) as free:
             if not free:

@@ -7,7 +7,6 @@ accelerator, never waits for a number.
 from __future__ import annotations
 
 import copy
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -129,7 +128,6 @@ class TD3Learner:
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers, noise and counters: all that a resumed run needs."""
         return {
-            "config": asdict(self.config),
             "actor": self.actor.state_dict(),
             "critics": self.critics.state_dict(),
             "target_actor": self.target_actor.state_dict(),

@@ -54,6 +54,11 @@ class TrafficVehicle(IDMVehicle):
         acceleration = float(min(max(acceleration, -self.ACC_MAX), self.ACC_MAX))
         Vehicle.act(self, {"steering": 0.0, "acceleration": acceleration})
 
+    def step(self, dt: float) -> None:
+        """Advance by ``dt`` seconds. Who has braked to a stop stands: nobody reverses."""
+        self.action["acceleration"] = max(self.action["acceleration"], -self.speed / dt)
+        super().step(dt)
+
     def on_state_update(self) -> None:
         """Keep the lane: nothing to look up."""
 

@@ -168,6 +168,19 @@ def test_the_brake_stops_the_car_and_no_one_behind_runs_into_it():
         assert info["speed_mps"] > 2.0
 
 
+@pytest.mark.parametrize("condition", ["nominal", "variant"])
+def test_nobody_behind_a_car_that_stays_standing_drives_backwards(condition):
+    env = make_environment("congestion", condition)
+    for seed in range(4):
+        env.reset(seed=seed)
+        env.press_brake(True)
+        for _ in range(120):
+            *_, terminated, truncated, _ = env.step(env.brake_action)
+            assert min(car.speed for car in env.traffic) > -1e-9
+            if terminated or truncated:
+                break
+
+
 def test_the_brake_action_is_the_last_steering():
     env = CongestionEnv(CENTRED)
     env.reset(seed=0)

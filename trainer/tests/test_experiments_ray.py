@@ -2,9 +2,11 @@
 
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
+from trainer.experiments import ray_runner
 from trainer.experiments.ray_runner import compute_parcel, keep, pack, run_on_ray
 from trainer.experiments.runner import FAILED
 from trainer.experiments.store import DONE
@@ -42,6 +44,25 @@ def test_a_parcel_that_stops_goes_on_elsewhere_from_its_checkpoint(tmp_path):
     assert "checkpoint.pt" in pack(Task(UNIT, store)).working
     assert keep(store, UNIT, compute_parcel(pack(Task(UNIT, store)))) == FINISHED
     same_results(store, in_this_process(store_in(tmp_path / "theirs"), [UNIT]), [UNIT])
+
+
+def test_a_failure_without_a_word_is_one_units_failure(tmp_path, capsys):
+    class TaskError(Exception):
+        cause = MemoryError()
+
+    def get(_reference):
+        raise TaskError
+
+    ray = SimpleNamespace(get=get, exceptions=SimpleNamespace(RayError=TaskError))
+    assert ray_runner._receive(ray, Task(UNIT, store_in(tmp_path)), None) == FAILED
+    assert f"failed: {UNIT}: MemoryError\n" in capsys.readouterr().err
+
+
+def test_what_was_finished_elsewhere_is_not_sent(tmp_path, monkeypatch):
+    ray = SimpleNamespace(is_initialized=lambda: True)  # and nothing to send with
+    monkeypatch.setattr(ray_runner, "_import_ray", lambda: ray)
+    store = in_this_process(store_in(tmp_path), [UNIT])
+    assert run_on_ray([Task(UNIT, store)], "local").count(FINISHED) == 1
 
 
 @pytest.fixture(scope="module")

@@ -32,6 +32,9 @@ def contents(directory):
 def test_a_unit_goes_from_missing_over_begun_to_done(tmp_path):
     store = store_in(tmp_path)
     assert store.state(UNIT) == MISSING
+    with store.lock(UNIT):
+        assert store.state(UNIT) == RUNNING  # elsewhere: without a working directory here
+    assert store.state(UNIT) == MISSING
     store.run_dir(UNIT).mkdir(parents=True)
     assert store.state(UNIT) == MISSING
     (store.run_dir(UNIT) / "metrics.csv").write_text("episode\n0\n")

@@ -27,7 +27,9 @@ def test_what_was_done_is_stored_and_only_taking_over_is_penalised(
 ):
     config = replace(CONFIG, algorithm=algorithm, penalise_stuck=penalise_stuck)
     run = scripted_run(tmp_path, config, length=5, human_steps=(2, 3), reason=reason)
-    run.train()
+    returns: list[float] = []
+    run.train(lambda metrics: returns.append(metrics.episode_return))
+    assert returns == [15.0]  # what the road paid, whatever the penalty
     assert run.stored == [
         (POLICY, 1.0, False, False),
         (HUMAN, 2.0 + penalty, False, True),

@@ -26,7 +26,7 @@ def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:
         next_frames=pictures[:, 1:],
         terminals=(random.random(size) < 0.2).astype(np.float32),
         human=np.arange(size) < humans,
-        probabilities=np.full(size, 1 / size),
+        probabilities=random.uniform(0.5, 1.5, size) / size,
     )
 
 

@@ -58,7 +58,9 @@ def trained(tmp_path_factory) -> TrainingRun:
 
 def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
     directory = trained.run_dir
-    assert RunConfig.from_dict(json.loads((directory / "config.json").read_text())) == TINY
+    config = json.loads((directory / "config.json").read_text())
+    assert config.pop("source_revision")
+    assert config == json.loads(json.dumps(TINY.as_dict()))
     rows = read_metrics(directory)
     assert [int(row["episode"]) for row in rows] == [0, 1, 2, 3]
     assert list(rows[0]) == NAMES
@@ -72,17 +74,6 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
 def test_the_human_is_in_the_replay_buffer_and_in_the_metrics(trained):
     human_steps = sum(int(row["human_steps"]) for row in read_metrics(trained.run_dir))
     assert human_steps == replay(trained).human_count > 0
-
-
-def test_returns_leave_the_shaping_out(trained):
-    rewards = sum(float(row["episode_return"]) for row in read_metrics(trained.run_dir))
-    stored = replay(trained)._rewards[: trained.learning.added].sum()
-    interventions = sum(int(row["interventions"]) for row in read_metrics(trained.run_dir))
-    assert interventions > 0
-    assert stored <= rewards + 1e-3
-    assert (rewards - stored) % 10 == pytest.approx(0, abs=1e-2) or (
-        rewards - stored
-    ) % 10 == pytest.approx(10, abs=1e-2)
 
 
 def test_the_same_seed_gives_the_same_weights(trained, tmp_path):

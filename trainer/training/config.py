@@ -90,10 +90,3 @@ class RunConfig:
         """A config of before the network, or before the switch of the reward, with their fields."""
         later = {"latency": RunConfig.latency, "printed_reward": RunConfig.printed_reward}
         return {**later, **values}
-
-    @staticmethod
-    def from_dict(values: dict[str, Any]) -> RunConfig:
-        """The inverse of ``as_dict``."""
-        values = RunConfig.completed(values)
-        known = {name: values[name] for name in RunConfig.__dataclass_fields__}
-        return RunConfig(**{**known, "learner": LearnerConfig(**values["learner"])})
