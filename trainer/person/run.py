@@ -131,6 +131,9 @@ class PersonRun(TrainingRun):
         except KeyboardInterrupt:
             print("validation left out", file=sys.stderr)
 
+    def _due(self) -> bool:
+        return True  # Whenever it is done: a person's run has no other end than a sitting's.
+
     def _more_state(self) -> dict[str, Any]:
         return {"recorded": list(self.sitting.recorder.position)}
 

@@ -6,12 +6,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from edge_runtime.cli import INTERRUPTED
+from edge_runtime.episode_report import COLLISION
 from edge_runtime.errors import UserError
 from trainer import seeds
 from trainer.commands.train import _quit as ask_to_quit
@@ -20,6 +22,7 @@ from trainer.files import load_torch, save_torch
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import ReplayBuffer
 from trainer.plots import moving_average, write_learning_curve
+from trainer.training import validation
 from trainer.training.config import RunConfig
 from trainer.training.learning import ProcessorLearning
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
@@ -201,6 +204,27 @@ def test_a_deadline_ends_the_run_with_a_checkpoint(tmp_path):
     assert run.episode == 1
     assert load_torch(directory / CHECKPOINT_FILE)["episode"] == 1
     assert (directory / BEST_FILE).exists()
+
+
+def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path, monkeypatch):
+    rewards = {1: 0.9, 2: 0.4, 3: 0.9, 4: 0.3}  # due after two and four
+    episodes = iter([2, 4, 1, 2, 3, 4])
+
+    def drive(*_, **__) -> list[SimpleNamespace]:
+        return [SimpleNamespace(outcome=COLLISION, reward=rewards[next(episodes)], distance_m=1.0)]
+
+    monkeypatch.setattr(validation, "drive_episodes", drive)
+    train(TINY, tmp_path / "whole")
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    for part in range(4):
+        TrainingRun(TINY, parts, resume=part > 0).train(deadline_s=time.monotonic() - 1)
+        kept = load_torch(parts / BEST_FILE)["episode"]
+        assert kept == (1, 2, 3, 2)[part]
+    whole, resumed = (load_torch(tmp_path / name / BEST_FILE) for name in ("whole", "parts"))
+    assert whole["episode"] == resumed["episode"]
+    for name, weights in whole["actor"].items():
+        assert torch.equal(weights, resumed["actor"][name])
 
 
 def test_a_foreign_checkpoint_is_refused(tmp_path):

@@ -120,7 +120,7 @@ class TrainingRun:
                 "kept_actor": self.config.kept_actor,
                 "exploration": self.exploration.bit_generator.state,
                 "guidance": self.guidance.bit_generator.state,
-                "best_validation": self.validation.best,
+                **self.validation.state_dict(),
             },
         )
 
@@ -140,7 +140,7 @@ class TrainingRun:
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
         self.guidance.bit_generator.state = state["guidance"]
-        self.validation.best = tuple(state["best_validation"])
+        self.validation.load_state_dict(state)
 
     def _must_stop(self, deadline_s: float) -> bool:
         """Whether the episode just driven is the last of this call."""
@@ -251,6 +251,10 @@ class TrainingRun:
 
     def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
         """Judge the policy where that is due, and keep it if it is the best one."""
-        every = self.config.evaluate_every
-        if every and (at_end or self.episode % every == 0):
-            self.validation.judge(metrics, self.episode)
+        if self.config.evaluate_every and (at_end or self._due()):
+            self.validation.judge(metrics, self.episode, self._due())
+
+    def _due(self) -> bool:
+        """Whether a run that is never stopped validates now, too."""
+        every, episodes = self.config.evaluate_every, self.config.episodes
+        return self.episode % every == 0 or self.episode == episodes

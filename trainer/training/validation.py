@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,25 +36,41 @@ class Validation:
         self.learning, self.network = learning, network
         self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
         self.best = (-1.0, -1.0)
-        """Success and return of the actor that is kept."""
+        """Success and return of the best actor of those validated when it was due."""
+        self._best_actor: dict[str, Any] | None = None
+        """As in its file; None before the first one."""
         self._seeds = [
             seeds.episode_seed(config.seed, seeds.VALIDATION, run)
             for run in range(config.evaluation_runs)
         ]
 
-    def judge(self, metrics: EpisodeMetrics, episode: int) -> None:
-        """Add to ``metrics`` how the policy drives after ``episode`` episodes."""
+    def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
+        """Add to ``metrics`` how the policy drives after ``episode`` episodes.
+
+        One that was not ``due``, since the run stops early, may be kept as the best so far, but a
+        resumed run forgets it: which actor a run ends with must not depend on when it was stopped.
+        """
         driver = LearningDriver(self.learning, self.config.averaged_actor)
         results = drive_episodes(self.env, driver, self._seeds, latency=self.network)
         success = float(np.mean([result.outcome == GOAL for result in results]))
         reward = float(np.mean([result.reward for result in results]))
         metrics.validation_success, metrics.validation_reward = success, reward
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
-        if (success, reward) >= self.best:
-            self.best = (success, reward)
-            self._keep(episode)
-
-    def _keep(self, episode: int) -> None:
+        if (success, reward) < self.best:
+            return
         actor = getattr(self.learning.learner, self.config.kept_actor)
         state = {**self.config.label(episode), "actor": actor.state_dict()}
         save_torch(self.run_dir / BEST_FILE, state)
+        if due:
+            self.best, self._best_actor = (success, reward), copy.deepcopy(state)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint holds of it."""
+        return {"best_validation": self.best, "best_actor": self._best_actor}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave, and keep that actor again."""
+        self.best = tuple(state["best_validation"])
+        self._best_actor = state.get("best_actor")  # not in older checkpoints
+        if self._best_actor is not None:
+            save_torch(self.run_dir / BEST_FILE, self._best_actor)
