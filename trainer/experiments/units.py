@@ -29,19 +29,27 @@ from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.learner.config import LearnerConfig
-from trainer.scenarios import SCENARIOS
+from trainer.scenarios import SCENARIOS, idm
+from trainer.scenarios.ego import EgoVehicle, PathTracker
+from trainer.scenarios.traffic import TrafficVehicle
 from trainer.training.config import RunConfig
 
 ID_LENGTH = 12
 NOT_DECIDING = ("device", "threads", "checkpoint_every")
 """Fields of a run that change where and how fast it is computed. A unit always learns on one
 thread; a GPU sums in another order, as another processor does, and is written beside the result."""
+CODE = 1
+"""Raise it with a change that no number below shows and that makes another result of a unit."""
+MOTION = (EgoVehicle, PathTracker, TrafficVehicle, idm)
+"""How cars move, beside the numbers of a scenario's config."""
 NEUTRAL: dict[str, Any] = {
     "poor_guidance_share": 0.0,
     "latency": "none",
     "printed_reward": False,
     "left_turn_tests": "b1b2df6847a6",
     "congestion_tests": "082f423f4a49",
+    "motion": "d975daa0e3e2",
+    "code": 1,
 }
 """Fields that came after the first results, with the value that means what was before them: left
 out of the id while they hold it, so that no result is lost. Add a row with each new field."""
@@ -117,11 +125,11 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
 
 
 def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
-    """Everything that decides a unit's result, as plain values: what its id is made from.
+    """What decides a unit's result, as plain values: what its id is made from.
 
     The human model counts by the contents of its file, when it takes over by the numbers of guide,
     trigger and the expert behind it, and neither where no human guides; the scenario by every
-    number of its config, and the tests by theirs.
+    number of its config, how cars move and the tests by theirs, and the code by ``CODE`` alone.
     """
     human = _fingerprint(human_file(unit.scenario, humans)) if unit.needs_human else "nobody"
     values: dict[str, Any] = {
@@ -130,6 +138,8 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
         "test_runs": plan.test_runs,
         "scenario": _numbers_of(unit.scenario),
         f"{unit.scenario}_tests": _tests_of(unit.scenario),
+        "motion": digest({kind.__name__: _constants_of(kind) for kind in MOTION}),
+        "code": CODE,
     }
     if unit.trained:
         run = run_config(unit, plan, humans).as_dict()
@@ -178,7 +188,7 @@ def _tests_of(scenario: str) -> str:
 
 
 def _constants_of(kind: Any) -> dict[str, Any]:
-    """What a class gives names in capitals: numbers, and plans of them."""
+    """What a class or module gives names in capitals: numbers, and plans of them."""
     named = {name: value for name, value in vars(kind).items() if name.isupper()}
     return {name: vars(v) if is_dataclass(v) else v for name, v in named.items()}
 

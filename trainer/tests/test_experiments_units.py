@@ -15,6 +15,9 @@ from trainer.human.expert import LeftTurnExpert
 from trainer.human.guide import HumanGuide
 from trainer.human.trigger import LeftTurnTrigger
 from trainer.learner.algorithms import ALGORITHMS
+from trainer.scenarios import idm
+from trainer.scenarios.ego import EgoVehicle
+from trainer.scenarios.traffic import TrafficVehicle
 from trainer.tests.experiments import GUIDED, TINY, UNIT, store_in, write_human
 
 
@@ -107,6 +110,19 @@ def test_when_the_human_takes_over_counts_only_where_one_guides(humans, monkeypa
         seen.add(unit_id(GUIDED, TINY, humans))
     assert len(seen) == 4
     assert unit_id(UNIT, TINY, humans) == alone
+
+
+def test_another_way_of_moving_or_another_code_gives_another_id(humans, monkeypatch):
+    seen = {unit_id(UNIT, TINY, humans)}
+    for place, name, value in (
+        (EgoVehicle, "MAX_STEERING_RAD", 0.7),
+        (TrafficVehicle, "TIME_WANTED", 0.9),
+        (idm, "EXPONENT", 2.0),
+        (units, "CODE", units.CODE + 1),
+    ):
+        monkeypatch.setattr(place, name, value)
+        seen.add(unit_id(UNIT, TINY, humans))
+    assert len(seen) == 5
 
 
 def test_without_tdqa_phil_td3_is_ia_td3():
