@@ -33,17 +33,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_scenario(parser)
     parser.add_argument(
-        "--human", choices=list(HUMANS), default="keyboard", help="what your hands are on"
+        "--human",
+        "--device",
+        dest="human",
+        choices=list(HUMANS),
+        default="keyboard",
+        help="what your hands are on",
     )
     parser.add_argument(
         "--policy",
         metavar="POLICY",
         help="who drives until you take over: see `trainer evaluate` (default: you drive alone)",
     )
-    goal = parser.add_mutually_exclusive_group(required=True)
+    goal = parser.add_mutually_exclusive_group()
     goal.add_argument(
         "--out",
         metavar="REC_DIR",
+        default="runs/drives",
         help="directory of the recordings; sittings add up there",
     )
     goal.add_argument(

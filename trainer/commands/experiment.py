@@ -16,7 +16,7 @@ from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.experiments import timing
 from trainer.experiments.catalogue import NAMES, TIME, units_of
 from trainer.experiments.plan import PLAN, QUICK
-from trainer.experiments.ray_runner import run_on_ray
+from trainer.experiments.ray_runner import import_ray, run_on_ray
 from trainer.experiments.report import (
     directory_of,
     draw_experiment,
@@ -48,6 +48,8 @@ EXAMPLE = examples(
 )
 ALL, STATUS, SUMMARY = "all", "status", "summary"
 DEFAULT_SEEDS = 3
+MOST_SEEDS = 1000
+"""Far beyond what anybody can compute; and each is a row of every table's work."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{SUMMARY}: write the tables of RESULTS/README.md again",
     )
     parser.add_argument(
-        "--seeds", type=positive, default=DEFAULT_SEEDS, help="seeds of each training run"
+        "--seeds", type=_seeds, default=DEFAULT_SEEDS, help="seeds of each training run"
     )
     parser.add_argument(
         "--jobs",
@@ -115,6 +117,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compute, draw and judge; returns the exit status."""
+    _check_names(arguments)
+    _check_places(arguments)
     store, names = _store(arguments), _names(arguments.names)
     _check_scenario(arguments, names)
     if STATUS in arguments.names:
@@ -148,6 +152,27 @@ def _write_tables(store: Store, seeds: int, wanted: bool) -> None:
             raise UserError(f"{readme} has no line {place.begin!r} for the table")
 
 
+def _seeds(text: str) -> int:
+    """An argparse type."""
+    value = positive(text)
+    if value > MOST_SEEDS:
+        raise argparse.ArgumentTypeError(f"{text} is more than {MOST_SEEDS}")
+    return value
+
+
+def _check_names(arguments: argparse.Namespace) -> None:
+    if {STATUS, SUMMARY} <= set(arguments.names):
+        raise UserError(f"{STATUS} and {SUMMARY} are two commands")
+
+
+def _check_places(arguments: argparse.Namespace) -> None:
+    """A typing error must not empty the tables of what is there."""
+    if arguments.humans and not Path(arguments.humans).is_dir():
+        raise UserError(f"--humans {arguments.humans}: there is no such directory")
+    if arguments.draw_only and not Path(arguments.results).is_dir():
+        raise UserError(f"--results {arguments.results}: there is no such directory to draw from")
+
+
 def _check_scenario(arguments: argparse.Namespace, names: list[str]) -> None:
     scenario = arguments.scenario
     if scenario is None:
@@ -178,6 +203,8 @@ def _names(given: list[str]) -> list[str]:
 def _compute(arguments: argparse.Namespace, store: Store, units: list[Unit]) -> Tally:
     if arguments.device == "cuda" and not arguments.ray and not torch.cuda.is_available():
         raise UserError("no CUDA device is available; use --device cpu")
+    if arguments.ray:
+        import_ray()  # said before anything else is
     # The clock that other processes, perhaps on other machines, have, too.
     stop_at_s = deadline_s(arguments, time.time)
     left = [unit for unit in warn_of_obstacles(store, units) if not store.done(unit)]

@@ -62,7 +62,7 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Tally:
     Raises:
         UserError: Ray is not installed, or nothing answers at the address.
     """
-    ray = _import_ray()
+    ray = import_ray()
     own_cluster = not ray.is_initialized()
     if own_cluster:
         _connect(ray, address)
@@ -132,7 +132,8 @@ def keep(store: Store, unit: Unit, answer: Answer) -> str:
     return FINISHED
 
 
-def _import_ray() -> Any:
+def import_ray() -> Any:
+    """The library; UserError where it is not installed."""
     try:
         import ray
     except ImportError:

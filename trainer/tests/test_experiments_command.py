@@ -34,6 +34,10 @@ def places(tmp_path):
         ("table2", "--scenario", "left_turn"),
         ("time", "--scenario", "congestion"),
         ("summary",),
+        ("status", "summary"),
+        ("fig7", "--seeds", "99999999"),
+        ("fig7", "--humans", "nowhere"),
+        ("fig7", "--draw-only"),  # from no results at all
     ],
     ids=" ".join,
 )
@@ -121,4 +125,4 @@ def test_ray_that_is_not_installed_is_said_in_one_line(capsys, places, monkeypat
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     status, _, err = call(capsys, "experiment", "fig7", "--ray", "auto", *places)
     assert status == 2
-    assert err.strip().splitlines()[-1] == "error: --ray needs Ray: python -m pip install '.[ray]'"
+    assert err.strip() == "error: --ray needs Ray: python -m pip install '.[ray]'"

@@ -60,7 +60,7 @@ def test_a_failure_without_a_word_is_one_units_failure(tmp_path, capsys):
 
 def test_what_was_finished_elsewhere_is_not_sent(tmp_path, monkeypatch):
     ray = SimpleNamespace(is_initialized=lambda: True)  # and nothing to send with
-    monkeypatch.setattr(ray_runner, "_import_ray", lambda: ray)
+    monkeypatch.setattr(ray_runner, "import_ray", lambda: ray)
     store = in_this_process(store_in(tmp_path), [UNIT])
     assert run_on_ray([Task(UNIT, store)], "local").count(FINISHED) == 1
 

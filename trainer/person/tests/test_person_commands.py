@@ -38,7 +38,8 @@ WRONG = [
     (DRIVE, ("--policy", "{tmp}/nobody"), "is no policy"),
     (DRIVE, ("--scenario", "congestion", "--policy", SHIPPED), "and congestion asks for steering"),
     (("drive", "--out", "{tmp}/file"), (), "cannot create the directory"),
-    (("drive",), (), "one of the arguments --out --calibrate is required"),
+    (("drive", "--scenario", "congestion"), ("--device", "gamepad"), "none is plugged in"),
+    (DRIVE, ("--calibrate", "{tmp}/p.toml"), "not allowed with argument --out"),
     (("drive", "--calibrate", "{tmp}/p.toml"), (), "--calibrate asks a --human gamepad or wheel"),
     (("drive", "--calibrate", "{tmp}/p.toml"), ("--human", "wheel"), "no wheel is plugged in"),
     (("drive", "--calibrate", "{tmp}/no/p.toml"), ("--human", "wheel"), "cannot write"),
@@ -96,6 +97,17 @@ def test_whoever_quits_before_the_first_episode_has_lost_nothing(
     assert (status, errors.strip()) == (0, "nothing was driven, and nothing recorded")
     assert "0 episodes, 0 steps" in out
     assert call(capsys, *command, "--resume")[0] == 0
+
+
+def test_a_device_and_a_scenario_are_all_that_must_be_said(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    person = Person(Hands([LET_GO] * 3, then=QUIT), Eyes())
+    monkeypatch.setitem(HUMANS, "keyboard", lambda options: person)
+    command = ("drive", "--scenario", "left_turn", "--device", "keyboard", "--speed", "1000")
+    status, out, _ = call(capsys, *command)
+    assert status == 0
+    (recording,) = (tmp_path / "runs" / "drives").iterdir()
+    assert str(recording.relative_to(tmp_path)) in out
 
 
 def test_a_validation_that_is_left_out_costs_nothing_else(
