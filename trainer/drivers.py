@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
+from trainer.actions import ACTIONS
 from trainer.files import load_torch
 from trainer.human.congestion_expert import CongestionExpert
 from trainer.human.congestion_trigger import CongestionTrigger
@@ -127,8 +128,6 @@ def _check_scenario(trained_in: str, scenario: str, policy: str) -> None:
 
 def _check_action(driver: OnnxDriver, scenario: str, policy: str) -> None:
     """Refuse a file whose action means something else than the scenario's."""
-    from trainer.export import ACTIONS  # which needs this module
-
     names = [action.name for action in driver.policy.manifest.action]
     wanted = ACTIONS[scenario].name
     if names != [wanted]:

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, read_bytes, write_atomic
-from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
+from edge_runtime.manifest import MANIFEST_KEY, Manifest, Observation, encode_manifest
 from edge_runtime.onnx_file import read_onnx
 from edge_runtime.signature import SIGNATURE_SUFFIX
+from trainer.actions import ACTIONS
 from trainer.drivers import make_environment
 from trainer.learner.networks import Actor
 
@@ -29,24 +30,6 @@ OPSET, IR_VERSION = 17, 8
 """The oldest onnxruntime that a board may have reads these."""
 PARITY_OBSERVATIONS = 1000
 PARITY_TOLERANCE = 1e-5
-
-ACTIONS = {
-    "left_turn": Action(
-        name="pedal",
-        meaning="positive opens the throttle, negative brakes",
-        unit="aperture",
-        low=-1.0,
-        high=1.0,
-    ),
-    "congestion": Action(
-        name="steering",
-        meaning="positive turns right, negative left (eq. 29)",
-        unit="share of the front wheels' 0.15 rad",
-        low=-1.0,
-        high=1.0,
-    ),
-}
-"""Scenario -> what its action means to a vehicle."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from PIL import Image
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
+from trainer.actions import ACTIONS
 from trainer.animation import draw_moment, drive_moments, encode_gif
 from trainer.commands.options import (
     add_scenario,
@@ -25,8 +26,6 @@ EXAMPLE = examples(
     "python -m trainer picture expert --seed 8 --time 3.4 --out scene.png",
     "python -m trainer picture runs/phil_1 --human expert --time 15 --out take_over.gif",
 )
-ACTIONS = {"left_turn": "pedal", "congestion": "steering"}
-"""Scenario -> what its one action is."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,5 +89,5 @@ def _film(arguments: argparse.Namespace, env: Any, driver: Driver) -> bytes:
         human, _ = load_driver(arguments.human, env)
         guide = HumanGuide(human, TRIGGERS[env.scenario](EXPERTS[env.scenario](env)))
     moments = drive_moments(env, driver, guide, arguments.seed, arguments.time)
-    pictures = [draw_moment(moment, ACTIONS[env.scenario]) for moment in moments]
+    pictures = [draw_moment(moment, ACTIONS[env.scenario].name) for moment in moments]
     return encode_gif(pictures, env.config.control_period_s)

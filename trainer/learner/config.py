@@ -69,7 +69,7 @@ class LearnerConfig:
     intervention_penalty: float = -10.0
     """Reward of the first step of an intervention (eq. 17: r_pen = r_fail)."""
     warmup_steps: int = 256
-    """Environment steps before the first update."""
+    """Transitions stored before the first update."""
     saturation_weight: float = 0.0
     """Weight of the mean squared action before tanh in the actor's loss. Not in the paper: a remedy
     for policies that saturate, whose gradient vanishes."""

@@ -9,17 +9,13 @@ from typing import Any, Protocol
 
 import pygame
 
-from trainer.person.interface import LET_GO, WISHES, Reading, Wish
+from trainer.person.interface import KEY_HELP, LET_GO, WISHES, Reading, Wish
 from trainer.person.profile import Profile
 
 PERIOD_S = 0.1
 KEYS = {
     "left_turn": {pygame.K_UP: 1.0, pygame.K_w: 1.0, pygame.K_DOWN: -1.0, pygame.K_s: -1.0},
     "congestion": {pygame.K_LEFT: -1.0, pygame.K_a: -1.0, pygame.K_RIGHT: 1.0, pygame.K_d: 1.0},
-}
-KEY_HELP = {
-    "left_turn": "Up / W: throttle    Down / S: brake",
-    "congestion": "Left / A, Right / D: steer",
 }
 RATES_PER_S = {"left_turn": 5.0, "congestion": 2.5}
 """How quickly a key presses: a pedal is down in 0.2 s; a wheel is turned by a tap, not thrown."""

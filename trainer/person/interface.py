@@ -21,6 +21,12 @@ Control = Literal["policy", "human", "returning"]
 """Who decides the applied action; ``returning``: the person has let go and the action is on its way
 back to the policy's, which still counts as the person's."""
 
+KEY_HELP = {
+    "left_turn": "Up / W: throttle    Down / S: brake",
+    "congestion": "Left / A, Right / D: steer",
+}
+"""Scenario -> what its keys do, in a window and in the browser alike."""
+
 
 @dataclass(frozen=True)
 class Reading:

@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 
 from edge_runtime.errors import UserError
+from trainer.drivers import make_environment
 from trainer.experiments import units
-from trainer.experiments.plan import HUMAN_MODEL
+from trainer.experiments.plan import FULL_PATH_M, HUMAN_MODEL
 from trainer.experiments.units import Unit, deciding, digest, obstacle, run_config, unit_id
 from trainer.human.crossing import PedalPlan
 from trainer.human.expert import LeftTurnExpert
@@ -123,6 +124,11 @@ def test_another_way_of_moving_or_another_code_gives_another_id(humans, monkeypa
         monkeypatch.setattr(place, name, value)
         seen.add(unit_id(UNIT, TINY, humans))
     assert len(seen) == 5
+
+
+def test_the_full_path_is_the_way_to_the_scenarios_goal():
+    for scenario, full_m in FULL_PATH_M.items():
+        assert make_environment(scenario).config.goal_m == full_m
 
 
 def test_without_tdqa_phil_td3_is_ia_td3():

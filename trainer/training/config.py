@@ -60,8 +60,8 @@ class RunConfig:
     ``bridge simulate --latency``."""
     device: str = "cpu"
     threads: int = 0
-    """Processor threads of the learner; 0: as many as torch takes. Another number sums in another
-    order, and gives other weights."""
+    """Processor threads of the learner, set by whoever starts the run; 0: as many as torch takes.
+    Another number sums in another order, and gives other weights."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
 
     def __post_init__(self) -> None:

@@ -34,7 +34,7 @@ class EpisodeMetrics:
 
     episode: int
     total_steps: int
-    """Environment steps since the run began."""
+    """Transitions stored since the run began; behind a network not an episode's first steps."""
     steps: int
     episode_return: float
     """Sum of the rewards, without the shaping of eq. 17."""

@@ -17,7 +17,7 @@ from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from edge_runtime.errors import UserError
-from trainer.person.interface import Person, Reading, View
+from trainer.person.interface import KEY_HELP, Person, Reading, View
 from trainer.person.web.seat import Seat
 from trainer.person.web.server import CLOSING_S, Server
 
@@ -26,10 +26,6 @@ if TYPE_CHECKING:
 
 TOKEN_BYTES = 16
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-KEYS = {
-    "left_turn": "Up / W: throttle    Down / S: brake",
-    "congestion": "Left / A, Right / D: steer",
-}
 HELP = (
     "Space: take over without driving",
     "or slide on the pad, or use a gamepad or wheel",
@@ -63,7 +59,7 @@ class Cockpit:
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, scenario: str = "left_turn") -> None:
-        self.help = (f"hold to take over    {KEYS[scenario]}", *HELP)
+        self.help = (f"hold to take over    {KEY_HELP[scenario]}", *HELP)
         self.seat = Seat()
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
