@@ -28,6 +28,7 @@ from trainer.experiments.plan import (
     REMEDY,
     SCENARIO_TITLES,
     TOUGH,
+    WEAK_CLONING,
 )
 from trainer.experiments.units import Unit
 from trainer.experiments.verdict import Claim
@@ -162,7 +163,8 @@ EXPERIMENTS: dict[str, Experiment] = {
         "what the paper leaves open: losses, weights, learning rates, reward scale, actor judged",
         _lines(
             ("phil_td3",),
-            *(NORMAL, EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, PRINTED_REWARD, LAST_ACTOR),
+            *(NORMAL, EXACT_LOSSES, IMPORTANCE, WEAK_CLONING),
+            *(PRINTED_RATES, PRINTED_REWARD, LAST_ACTOR),
         ),
         ours.judge_switches,
         by_metric=False,

@@ -9,34 +9,58 @@ from typing import Any, NamedTuple
 HUMAN_MODEL = "human_model"
 """Stands in an algorithm's place where the human model itself is tested: nothing is trained."""
 
-SETTINGS = (
-    "normal", "tough", "poor", "remedy",
-    "exact_losses", "importance", "printed_rates", "printed_reward", "last_actor", "network",
-)  # fmt: skip
-(
-    NORMAL, TOUGH, POOR, REMEDY,
-    EXACT_LOSSES, IMPORTANCE, PRINTED_RATES, PRINTED_REWARD, LAST_ACTOR, NETWORK,
-) = SETTINGS  # fmt: skip
-"""Section VI's definition; one frame instead of two; one third of the demonstrations random; a
-price on the action before tanh, for algorithms whose policy saturates; losses as eq. 22 and 23 are
-printed; the importance weights that the paper calls optional; table A5's learning rates, which the
-authors' code has the other way round; weight 1 on the reward's term of speed or steering; the actor
-as it stands judged, not its average;
-training behind ``NETWORK_SPEC``."""
 
-POOR_SHARE = 1.0 / 3.0
-"""Demonstrations replaced by random actions in the poor setting (section VII-E)."""
-NETWORK_SPEC = "delay=100ms,jitter=20ms,loss=2%"
-"""Each way, as in ``trainer train --latency``."""
-LEARNER_OF: Mapping[str, Mapping[str, Any]] = {
-    TOUGH: {"frames": 1},
-    # Not in the paper; measured on one run of a prototype.
-    REMEDY: {"saturation_weight": 0.1},
-    EXACT_LOSSES: {"split_loss": True},
-    IMPORTANCE: {"importance_sampling": True},
-    PRINTED_RATES: {"actor_learning_rate": 5e-4, "critic_learning_rate": 2e-4},
+@dataclass(frozen=True)
+class Setting:
+    """How the runs of a setting differ from the normal ones."""
+
+    meaning: str
+    run: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of the run's config that it changes."""
+    learner: Mapping[str, Any] = field(default_factory=dict)
+    """Hyper-parameters that it changes."""
+
+
+NORMAL, TOUGH, POOR, REMEDY = "normal", "tough", "poor", "remedy"
+EXACT_LOSSES, IMPORTANCE, WEAK_CLONING = "exact_losses", "importance", "weak_cloning"
+PRINTED_RATES, PRINTED_REWARD, LAST_ACTOR = "printed_rates", "printed_reward", "last_actor"
+NETWORK = "network"
+SETTINGS: Mapping[str, Setting] = {
+    NORMAL: Setting("section VI's definition"),
+    TOUGH: Setting("one frame instead of two", learner={"frames": 1}),
+    POOR: Setting(
+        "one third of the demonstrations replaced by random actions (section VII-E)",
+        run={"poor_guidance_share": 1.0 / 3.0},
+    ),
+    # Not in the paper; the weight was measured on one run of a prototype.
+    REMEDY: Setting(
+        "a price on the action before tanh, for algorithms whose policy saturates",
+        learner={"saturation_weight": 0.1},
+    ),
+    EXACT_LOSSES: Setting("losses as eq. 22 and 23 are printed", learner={"split_loss": True}),
+    IMPORTANCE: Setting(
+        "the importance weights that the paper calls optional",
+        learner={"importance_sampling": True},
+    ),
+    WEAK_CLONING: Setting(
+        "a tenth of the weight on behaviour cloning, for which the paper gives no value",
+        learner={"cloning_weight": 1.0},
+    ),
+    PRINTED_RATES: Setting(
+        "table A5's learning rates, which the authors' code has the other way round",
+        learner={"actor_learning_rate": 5e-4, "critic_learning_rate": 2e-4},
+    ),
+    PRINTED_REWARD: Setting(
+        "weight 1 on the reward's term of speed or steering", run={"printed_reward": True}
+    ),
+    LAST_ACTOR: Setting(
+        "the actor as it stands judged, not its average", run={"averaged_actor": False}
+    ),
+    NETWORK: Setting(
+        "training behind a network, as with `trainer train --latency`",
+        run={"latency": "delay=100ms,jitter=20ms,loss=2%"},
+    ),
 }
-"""Setting -> the hyper-parameters that it changes."""
 
 
 class Scene(NamedTuple):

@@ -13,18 +13,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from trainer.drivers import EXPERTS, TRIGGERS, make_environment
 from trainer.evaluation import COMMAND_NOISE
-from trainer.experiments.plan import (
-    HUMAN_MODEL,
-    LAST_ACTOR,
-    LEARNER_OF,
-    NETWORK,
-    NETWORK_SPEC,
-    POOR,
-    POOR_SHARE,
-    PRINTED_REWARD,
-    SETTINGS,
-    Plan,
-)
+from trainer.experiments.plan import HUMAN_MODEL, SETTINGS, Plan
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
 from trainer.learner.algorithms import ALGORITHMS
@@ -104,7 +93,8 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
     reason = obstacle(unit, humans)
     if reason or not unit.trained:
         raise UserError(f"{unit}: {reason or 'nothing is trained for it'}")
-    learner = replace(LearnerConfig(), **plan.learner, **LEARNER_OF.get(unit.setting, {}))
+    setting = SETTINGS[unit.setting]
+    learner = replace(LearnerConfig(), **{**plan.learner, **setting.learner})
     return RunConfig(
         scenario=unit.scenario,
         algorithm=unit.algorithm,
@@ -116,11 +106,8 @@ def run_config(unit: Unit, plan: Plan, humans: Path, device: str = "cpu") -> Run
         checkpoint_every=plan.checkpoint_every,
         device=device,
         threads=1,
-        averaged_actor=unit.setting != LAST_ACTOR,
-        printed_reward=unit.setting == PRINTED_REWARD,
-        poor_guidance_share=POOR_SHARE if unit.setting == POOR else 0.0,
-        latency=NETWORK_SPEC if unit.setting == NETWORK else "none",
         learner=learner,
+        **setting.run,
     )
 
 

@@ -24,6 +24,7 @@ FACTORS = {
     "remedy": 1.0,
     "exact_losses": 0.9,
     "importance": 0.9,
+    "weak_cloning": 0.9,
     "printed_rates": 0.9,
     "printed_reward": 0.5,
     "last_actor": 0.95,

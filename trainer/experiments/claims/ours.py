@@ -17,12 +17,14 @@ from trainer.experiments.plan import (
     PRINTED_REWARD,
     REMEDY,
     SCENARIO_TITLES,
+    WEAK_CLONING,
 )
 from trainer.experiments.progress import ALONE, TITLES
 from trainer.experiments.verdict import Claim
 
 HI_REMEDY, PER_REMEDY = Line("hi_td3", REMEDY), Line("per_td3", REMEDY)
 EXACT, WEIGHED = Line("phil_td3", EXACT_LOSSES), Line("phil_td3", IMPORTANCE)
+WEAK = Line("phil_td3", WEAK_CLONING)
 PRINTED, LAST = Line("phil_td3", PRINTED_RATES), Line("phil_td3", LAST_ACTOR)
 LITERAL = Line("phil_td3", PRINTED_REWARD)
 BEHIND_NETWORK = Line("phil_td3", NETWORK)
@@ -47,6 +49,7 @@ def judge_switches(gathered: Gathered) -> list[Claim]:
     texts = {
         EXACT: "one mean over the batch ends above eq. 22 and 23 as printed",
         WEIGHED: "no importance weights end above eq. 15",
+        WEAK: "cloning with weight 10 ends above weight 1",
         PRINTED: "the faster critic ends above table A5's learning rates",
         LITERAL: "the reward's weight ends above eq. 31 and 32 as printed",
         LAST: "the averaged actor ends above the last one",
