@@ -10,7 +10,7 @@ from trainer.experiments.figures.style import LABELS, write_figure
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.tests.synthetic import gathered
 
-CURVES = {"fig7": 4, "fig11": 3, "fig12": 3, "fig13": 3, "ablation": 4, "remedy": 5, "switches": 6,
+CURVES = {"fig7": 4, "fig11": 3, "fig12": 3, "fig13": 3, "ablation": 4, "remedy": 5, "switches": 7,
           "network": 2}  # fmt: skip
 """Experiment -> curves in each panel."""
 PANELS = {"fig8": 6, "fig9": 3, "fig10": 2, "fig14": 3, "fig15": 6, "table1": 1, "table2": 1}
@@ -60,8 +60,9 @@ def test_other_figures_have_their_panels(name, tmp_path):
 
 
 def test_each_box_says_of_how_many_drives_it_is():
-    boxes = sum(len(panel.patches) for panel in draw("fig10").axes)
-    assert texts(draw("fig10")).count("n=") == boxes > 0
+    figure = draw("fig10")
+    boxes = sum(len(panel.patches) for panel in figure.axes)
+    assert sum(line.isdigit() for line in texts(figure).splitlines()) == boxes > 0
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

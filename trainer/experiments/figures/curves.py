@@ -23,6 +23,8 @@ from trainer.experiments.statistics import WINDOW
 
 STYLES = ("-", "--", ":", "-.")
 """Of an algorithm's settings, the normal one first."""
+WIDEST, WIDTH_STEP, THINNEST = 3.0, 0.6, 1.2
+"""Of the lines, in points."""
 
 
 class Line(NamedTuple):
@@ -65,8 +67,9 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
     for panel in panels[-1] if by_metric else panels[:, -1]:
         panel.legend(fontsize=8, **legend)
     figure.supxlabel(
-        f"training episode; in training the human may take over, and lines are means of {WINDOW}; "
-        "without help: where validated; nothing beyond the goal counted; band: standard deviation",
+        f"training episode. In training: the human may take over; mean of {WINDOW} episodes, none "
+        "counted beyond the goal.\nWithout help: the policy alone, where it was validated. "
+        "Band: standard deviation over the seeds.",
         fontsize=9,
     )
     return figure
@@ -75,7 +78,7 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
 def _draw_panel(
     panel: Any, gathered: Gathered, lines: Sequence[Line], scenario: str, metric: str
 ) -> None:
-    for line in lines:
+    for place, line in enumerate(lines):
         if metric == "episode_return" and line.setting == PRINTED_REWARD:
             continue  # Its rewards are on another scale.
         outcomes = gathered.of(scenario, line.algorithm, line.setting)
@@ -86,7 +89,9 @@ def _draw_panel(
             panel.plot([], [], style, color=shade, alpha=0.4, label=named)
             continue
         mean, deviation = found.curves.mean(axis=0), found.curves.std(axis=0)
-        panel.plot(found.episodes, mean, style, color=shade, label=named)
+        # The first ones wider: where all arrive, each is seen below those drawn over it.
+        width = max(WIDEST - WIDTH_STEP * place, THINNEST)
+        panel.plot(found.episodes, mean, style, color=shade, lw=width, label=named)
         panel.fill_between(
             found.episodes, mean - deviation, mean + deviation, color=shade, alpha=0.18, lw=0
         )

@@ -28,7 +28,7 @@ LABELS = {
     HUMAN_MODEL: "human model",
 }
 _COLOURS = {"phil_td3": "C3", "ia_td3": "C0", "hi_td3": "C2", "per_td3": "C7", HUMAN_MODEL: "C1"}
-_OTHERS = ("C0", "C2", "C4", "C5", "C8")
+_OTHERS = ("C0", "C2", "C4", "C5", "C8", "C9")
 
 
 def label(algorithm: str) -> str:
