@@ -17,6 +17,8 @@ NAMES = {
 HEAD = ("network, each way", "through", "p50", "p90", "p99", "max", "unanswered", "safe stops",
         "success", "failed starts")  # fmt: skip
 
+MOST_UNANSWERED_PERCENT = 50.0
+
 
 def write_report(result: dict[str, Any], folder: Path) -> None:
     """Write table.md and quantiles.png into an existing folder."""
@@ -53,6 +55,15 @@ def _has_times(row: dict[str, Any]) -> bool:
     return row.get("round_trip_ms", {}).get("p50") is not None
 
 
+def _annotate(axes: Any, place: float, high_ms: float, unanswered_percent: float) -> None:
+    """Quick answers are worth little where few states have one: then in red."""
+    dead = unanswered_percent > MOST_UNANSWERED_PERCENT
+    axes.annotate(
+        f"{unanswered_percent:.0f}%", (place, high_ms), textcoords="offset points", xytext=(0, 6),
+        ha="center", fontsize=7, color="red" if dead else "0.3", weight="bold" if dead else None,
+    )  # fmt: skip
+
+
 def draw(result: dict[str, Any], path: Path) -> None:
     """Median to p99 of every cell, grouped by network."""
     import matplotlib
@@ -73,9 +84,13 @@ def draw(result: dict[str, Any], path: Path) -> None:
         axes.vlines(places, p50, p99, colors=line.get_color(), linewidth=2)
         axes.plot(places, p90, "_", color=line.get_color(), markersize=9)
         axes.plot(places, p99, "^", color=line.get_color(), markersize=5)
+        for place, high, row in zip(places, p99, rows, strict=True):
+            _annotate(axes, place, high, row["unanswered_percent"])
     axes.axhline(200, color="grey", linestyle=":", linewidth=1)
-    axes.annotate("2 T: safe stop", (0, 200), textcoords="offset points", xytext=(0, 3))
+    axes.annotate("2 T = 200 ms: safe stop", (0, 200), textcoords="offset points", xytext=(0, 3))
     axes.set_yscale("log")
+    axes.margins(y=0.12)
+    axes.set_title("round trips of what was answered; above: states without an answer", fontsize=9)
     axes.set_ylabel("state sent to command received, ms\n(circle p50, dash p90, triangle p99)")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")

@@ -10,12 +10,12 @@ from edge_runtime.files import read_bytes
 from hil_tests.campaign.figures import write_figures
 from hil_tests.commands import run_command
 
-RUNS = Path("results/left_turn/learner_after")
+RUNS = Path("results/units/left_turn/phil_td3/normal")
 LATENCY = Path("results/latency/left_turn/shipped.json")
 
 
 def learning_curve(out: Path, _work: Path) -> None:
-    """Five seeds of PHIL-TD3 in the left turn."""
+    """Three seeds of PHIL-TD3 in the left turn."""
     run_dirs = sorted(str(path) for path in RUNS.glob("seed_*"))
     run_command("trainer", "plot", *run_dirs, "--out", str(out))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,8 +77,13 @@ def count_lines(results: Path, names: Iterable[str]) -> list[str]:
             continue
         counts = Counter(one["holds"] for one in verdict["claims"])
         total += counts
-        runs = f"{verdict['wanted'] - len(verdict['missing'])} of {verdict['wanted']}"
-        cells = (_link(name), verdict["title"], runs, *_counted(counts), f"`{verdict['command']}`")
+        cells = (
+            _link(name),
+            verdict["title"],
+            _runs(verdict),
+            *_counted(counts),
+            f"`{verdict['command']}`",
+        )
         lines.append(row(cells))
     return [*lines, row(["all", "", "", *_counted(total), "`python -m trainer experiment all`"])]
 
@@ -103,6 +108,11 @@ def claim_lines(results: Path, names: Iterable[str]) -> list[str]:
 
 def _link(name: str) -> str:
     return f"[{name}](experiments/{name}/verdict.md)"
+
+
+def _runs(verdict: Mapping[str, Any]) -> str:
+    wanted = verdict["wanted"]
+    return f"{wanted - len(verdict['missing'])} of {wanted}" if wanted else "–"
 
 
 def _counted(counts: Counter[str]) -> list[str]:
