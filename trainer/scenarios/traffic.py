@@ -1,4 +1,9 @@
-"""Surrounding traffic: highway-env's IDM, in its lane, blind to the ego car."""
+"""Surrounding traffic: highway-env's IDM, in its lane, blind to the ego car unless it follows it.
+
+That IDM takes distances from centre to centre, which bounds its braking: a heavy vehicle close
+behind one that stops at once runs into it. ``idm.py``, on the ego car's pedals, takes gaps between
+bumpers.
+"""
 
 from __future__ import annotations
 
