@@ -48,7 +48,7 @@ class HelpFormatter(argparse.HelpFormatter):
         text = action.help or ""
         # By identity: 0 is a default worth showing, though it equals False.
         hidden = any(action.default is nothing for nothing in _WITHOUT_DEFAULT)
-        if hidden or "%(default)" in text:
+        if hidden or action.default == [] or "(default: " in text or "%(default)" in text:
             return text
         return f"{text} (default: %(default)s)".strip()
 
