@@ -7,6 +7,8 @@ from functools import cache
 from pathlib import Path
 
 HERE = Path(__file__).parent
+WRITTEN = ("results/units", "results/experiments", "results/README.md")
+"""What the experiments write themselves. Human models, which decide trainings, count as source."""
 
 
 @cache
@@ -24,7 +26,8 @@ def revision_of(directory: Path) -> str:
     commit = _git(directory, "rev-parse", "HEAD")
     if commit is None:
         return "unknown"
-    dirty = _git(directory, "diff", "--quiet", "HEAD", "--", ":/", ":(top,exclude)results") is None
+    source = (":/", *(f":(top,exclude){path}" for path in WRITTEN))
+    dirty = _git(directory, "diff", "--quiet", "HEAD", "--", *source) is None
     return f"{commit}-dirty" if dirty else commit
 
 

@@ -1,6 +1,7 @@
 """The latency campaign: what it says of its rows, and that it drives each of them once."""
 
 import json
+from itertools import chain, repeat
 from pathlib import Path
 
 import pytest
@@ -168,7 +169,7 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
 def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeypatch):
     policy = Path("results/policies/left_turn.onnx")
     task = Task(policy, "any", "left_turn", "nominal", "lockstep")
-    edges, limits_s = [], iter((0.1, 120.0))
+    edges, limits_s = [], chain((0.1,), repeat(120.0))
     start_edge, wait = workers._Worker._start_edge, workers.BackgroundCommand.wait
 
     def note_edge(worker):

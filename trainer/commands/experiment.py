@@ -36,7 +36,7 @@ from trainer.experiments.summary import (
     write_table,
 )
 from trainer.experiments.unit_table import unit_lines
-from trainer.experiments.units import Unit
+from trainer.experiments.units import Unit, human_file
 from trainer.experiments.work import BUSY, FINISHED, STOPPED, Task
 from trainer.parallel import cores
 from trainer.scenarios import SCENARIOS
@@ -118,8 +118,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Compute, draw and judge; returns the exit status."""
     _check_names(arguments)
-    _check_places(arguments)
     store, names = _store(arguments), _names(arguments.names)
+    _check_places(arguments, store)
     _check_scenario(arguments, names)
     if STATUS in arguments.names:
         print_status(store, names, arguments.seeds)
@@ -165,12 +165,13 @@ def _check_names(arguments: argparse.Namespace) -> None:
         raise UserError(f"{STATUS} and {SUMMARY} are two commands")
 
 
-def _check_places(arguments: argparse.Namespace) -> None:
+def _check_places(arguments: argparse.Namespace, store: Store) -> None:
     """A typing error must not empty the tables of what is there."""
-    if arguments.humans and not Path(arguments.humans).is_dir():
-        raise UserError(f"--humans {arguments.humans}: there is no such directory")
-    if arguments.draw_only and not Path(arguments.results).is_dir():
-        raise UserError(f"--results {arguments.results}: there is no such directory to draw from")
+    some_human = any(human_file(scenario, store.humans).is_file() for scenario in SCENARIOS)
+    if arguments.humans and not some_human:
+        raise UserError(f"--humans {arguments.humans} holds a human model for no scenario")
+    if arguments.draw_only and not store.results.is_dir():
+        raise UserError(f"there are no results to draw from: no directory {store.results}")
 
 
 def _check_scenario(arguments: argparse.Namespace, names: list[str]) -> None:

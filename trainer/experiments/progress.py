@@ -21,10 +21,15 @@ is guided looks good from the first one on."""
 ALONE = "validation_success"
 """The policy alone, now and then. Its success: a mean of distances, cut at the goal, would hide a
 few failures behind what the other drives cover beyond it."""
-WITH_A_ZERO = ("distance_m", ALONE)
-"""Metrics that are never negative, so that a share of one says something."""
 TITLES = {**METRICS, ALONE: "success without help"}
 """What ours show."""
+DISTANCE_ALONE = "validation_distance_m"
+"""For shares and for levels that both of two are to reach: who learns nothing has no success, of
+which a share says nothing, and drives some metres."""
+DISTANCES = ("distance_m", DISTANCE_ALONE)
+VALIDATED = (ALONE, DISTANCE_ALONE)
+NAMED = {**TITLES, DISTANCE_ALONE: "surviving distance without help, m"}
+"""Whatever a claim may be about."""
 
 
 class Progress(NamedTuple):
@@ -49,7 +54,7 @@ def progress(outcomes: Sequence[Outcome], metric: str) -> Progress | None:
     measured = [_measured(outcome, metric) for outcome in outcomes]
     shared = reduce(np.intersect1d, [episodes for episodes, _ in measured])
     curves = np.stack([values[np.isin(episodes, shared)] for episodes, values in measured])
-    if metric == ALONE:
+    if metric in VALIDATED:
         return Progress(shared, curves, np.ones(len(shared), dtype=bool), ends)
     return Progress(shared, smoothed(curves), shared >= min(WINDOW, len(shared)), ends)
 
@@ -62,9 +67,9 @@ def final(outcome: Outcome, metric: str) -> float:
 
 def _measured(outcome: Outcome, metric: str) -> tuple[Episodes, Numbers]:
     """What was measured; no distance beyond the goal, or two who always arrive would be told apart
-    by how fast they cross its line.
+    by how fast they cross its line. A validation's distance is a mean, and cut as one.
     """
     episodes, values = outcome.measured(metric)
-    if metric == "distance_m":
+    if metric in DISTANCES:
         values = within_path(outcome.unit.scenario, values)
     return episodes, values

@@ -120,7 +120,7 @@ def _train(task: Task, run_dir: Path, on_episode: OnEpisode) -> bool:
     """Train to the last episode; whether it was reached.
 
     Time is looked at only where a checkpoint was just written, and not through the deadline of
-    ``train``: that one validates once more when it stops, and the best actor would depend on when.
+    ``train``: that one validates once more when it stops, a row that no unbroken run has.
     """
     config = run_config(task.unit, task.store.plan, task.store.humans, task.device)
     if _trained(run_dir, config.episodes):

@@ -180,6 +180,14 @@ def test_the_first_is_ahead_of_each_other_by_its_mean_and_the_order_has_interval
     assert first_bar(level, SCENES[0], DISTANCE, [Line("per_td3")]).holds == "undecided"
 
 
+def test_a_tie_of_different_seeds_is_a_tie():
+    def reached(*counts: int) -> list[list[float]]:
+        return [[21.0] * count + [5.0] * (50 - count) for count in counts]
+
+    made = of_drives(phil_td3=reached(40, 42, 40), ia_td3=reached(40, 40, 42))
+    assert first_bar(made, SCENES[0], SUCCESS, [IA]).holds == "no"
+
+
 def test_the_steadiest_is_so_in_each_seed():
     made = of_drives(phil_td3=[[15.0, 15.1], [17.0, 17.2], [19.0, 19.1]], ia_td3=[[10.0, 20.0]] * 3)
     one = spread_claim(made, SCENES[0], PHIL, [IA], "steadiest", "lowest variance")

@@ -13,7 +13,7 @@ from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.outcome import Outcome
 from trainer.experiments.plan import FULL_PATH_M
-from trainer.experiments.progress import TITLES
+from trainer.experiments.progress import NAMED
 from trainer.experiments.units import Unit
 from trainer.tests.synthetic import gathered
 
@@ -136,7 +136,7 @@ def ranked(**ends) -> Gathered:
         )
         for seed, end in enumerate(values, 1):
             unit = Unit("left_turn", algorithm, setting, seed)
-            metrics = {metric: np.full(100, end) for metric in TITLES}
+            metrics = {metric: np.full(100, end) for metric in NAMED}
             found[unit] = Outcome(unit, metrics, {})
     return Gathered(found, found, SEEDS)
 

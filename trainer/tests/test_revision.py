@@ -13,19 +13,23 @@ def git(directory, *arguments: str) -> str:
 
 
 def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
-    code, results = tmp_path / "trainer" / "code.py", tmp_path / "results" / "table.md"
-    for path in (code, results):
-        path.parent.mkdir()
+    code, human = tmp_path / "trainer" / "code.py", tmp_path / "results" / "humans" / "human.pt"
+    table, unit = tmp_path / "results" / "README.md", tmp_path / "results" / "units" / "a.json"
+    for path in (code, human, table, unit):
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("as committed")
     git(tmp_path, "init", "-q")
     git(tmp_path, "add", "-A")
     git(tmp_path, "commit", "-qm", "all")
     commit = git(tmp_path, "rev-parse", "HEAD")
-    results.write_text("a run has written")
-    (results.parent / "more.md").write_text("new")
+    table.write_text("a run has written")
+    unit.write_text("another one")
+    (unit.parent / "b.json").write_text("new")
     assert revision_of(code.parent) == commit
-    code.write_text("changed")
-    assert revision_of(code.parent) == f"{commit}-dirty"
+    for path in (human, code):
+        path.write_text("changed")
+        assert revision_of(code.parent) == f"{commit}-dirty"
+        path.write_text("as committed")
 
 
 def test_outside_of_a_repository_it_is_unknown(tmp_path):

@@ -13,7 +13,7 @@ from edge_runtime.latency.model import LatencySpec
 from trainer import seeds
 from trainer.drivers import BEST_FILE, make_environment
 from trainer.evaluation import drive_episodes
-from trainer.files import save_torch
+from trainer.files import load_torch, save_torch
 from trainer.training.config import RunConfig
 from trainer.training.learning import Learning, LearningDriver
 from trainer.training.metrics import EpisodeMetrics
@@ -71,6 +71,10 @@ class Validation:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave, and keep that actor again."""
         self.best = tuple(state["best_validation"])
-        self._best_actor = state.get("best_actor")  # not in older checkpoints
+        path = self.run_dir / BEST_FILE
+        if "best_actor" not in state:  # an older checkpoint: what was kept then is the best known
+            self._best_actor = load_torch(path) if path.is_file() else None
+            return
+        self._best_actor = state["best_actor"]
         if self._best_actor is not None:
-            save_torch(self.run_dir / BEST_FILE, self._best_actor)
+            save_torch(path, self._best_actor)

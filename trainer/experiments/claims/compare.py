@@ -10,7 +10,7 @@ from trainer.experiments.efficiency import efficiency
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES
-from trainer.experiments.progress import ALONE, TITLES, final, progress
+from trainer.experiments.progress import NAMED, VALIDATED, final, progress
 from trainer.experiments.statistics import (
     Estimate,
     above,
@@ -60,7 +60,7 @@ def final_claim(
     shown = [f"{line.label} {mean_estimate(list(end.values())).text()}"
              for line, end in {ours: own, **ends}.items()]  # fmt: skip
     return claim(
-        f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}",
+        f"{SCENARIO_TITLES[scenario]}, {NAMED[metric]}: {text}",
         papers(paper, metric),
         ", ".join(shown),
         judged.holds,
@@ -85,7 +85,7 @@ def level_claim(
     found = difference(own, other)
     reach = SAME_LEVEL * abs(mean_estimate(list(own.values())).value)
     return claim(
-        f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}",
+        f"{SCENARIO_TITLES[scenario]}, {NAMED[metric]}: {text}",
         papers(paper, metric),
         f"difference {found.text()}, one level is ±{reach:.2f}" if found.size else "",
         within(found, reach),
@@ -98,7 +98,7 @@ def level_claim(
 
 def papers(paper: str, metric: str) -> str:
     """The paper's number or word: where ours is of the policy alone, the paper's is not."""
-    return f"{paper}, in training" if metric == ALONE and paper != "–" else paper
+    return f"{paper}, in training" if metric in VALIDATED and paper != "–" else paper
 
 
 def speed_claim(
@@ -122,7 +122,7 @@ def speed_claim(
         progress(gathered.of(scenario, line.algorithm, line.setting), metric)
         for line in (ours, other)
     )
-    text = f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}"
+    text = f"{SCENARIO_TITLES[scenario]}, {NAMED[metric]}: {text}"
     paper = papers(paper, metric)
     if own is None or theirs is None:
         return claim(text, paper, "", "undecided", 0, BY_BOOTSTRAP, None, False)

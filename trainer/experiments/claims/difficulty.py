@@ -12,7 +12,7 @@ from trainer.experiments.claims.lines import HI, IA, PER, PHIL
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES, TOUGH
-from trainer.experiments.progress import TITLES, WITH_A_ZERO
+from trainer.experiments.progress import DISTANCES, NAMED, TITLES
 from trainer.experiments.statistics import Estimate, Holds, above, judge_all, mean_estimate
 from trainer.experiments.verdict import Claim, claim
 
@@ -23,7 +23,7 @@ def judge_fig8(gathered: Gathered) -> list[Claim]:
     """Who keeps their place, and who loses how much. Of rewards, which may be negative, a ratio
     says nothing.
     """
-    places = tuple(product(SCENARIO_TITLES, WITH_A_ZERO))
+    places = tuple(product(SCENARIO_TITLES, DISTANCES))
     return [
         *(_ranking_claim(gathered, *place) for place in product(SCENARIO_TITLES, TITLES)),
         *(_cloners_claim(gathered, *place) for place in places),
@@ -62,7 +62,7 @@ def _kept_claim(
     judged = judge_all(differences)
     shown = [f"{line.label} {mean_estimate(list(kept[line].values())).text()}" for line in kept]
     return claim(
-        f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: {text}",
+        f"{SCENARIO_TITLES[scenario]}, {NAMED[metric]}: {text}",
         papers(paper, metric),
         f"tough over normal: {', '.join(shown)}",
         judged.holds,
@@ -101,7 +101,7 @@ def _ranking_claim(gathered: Gathered, scenario: str, metric: str) -> Claim:
     everything = complete(gathered, scenario, [*settings[0], *settings[1]])
     seeds = min(len(end) for own in ends for end in own.values())
     text = (
-        f"{SCENARIO_TITLES[scenario]}, {TITLES[metric]}: "
+        f"{SCENARIO_TITLES[scenario]}, {NAMED[metric]}: "
         "the tough setting does not change the ranking"
     )
     paper = papers("same order", metric)

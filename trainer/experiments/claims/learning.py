@@ -22,7 +22,7 @@ from trainer.experiments.claims.lines import (
 )
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES
-from trainer.experiments.progress import ALONE, TITLES, WITH_A_ZERO
+from trainer.experiments.progress import ALONE, DISTANCE_ALONE, TITLES
 from trainer.experiments.verdict import Claim
 
 SPEEDS = {
@@ -72,14 +72,15 @@ def _congestion(gathered: Gathered) -> list[Claim]:
             for line in (PHIL, IA)
         ),
     ]  # fmt: skip
-    for metric in WITH_A_ZERO:
+    for metric, driven in (("distance_m", "distance_m"), (ALONE, DISTANCE_ALONE)):
         place = (gathered, "congestion", metric)
         claims += [
             final_claim(*place, PHIL, [IA, HI, PER], "PHIL-TD3 learns the best asymptotic policy"),
             final_claim(*place, IA, [PER], "IA-TD3, guided by the human, ends above vanilla TD3",
                         "above"),
             level_claim(*place, IA, HI, "IA-TD3 and HI-TD3 end on one level", "comparable"),
-            speed_claim(*place, IA, HI, "IA-TD3 learns faster than HI-TD3, to their common level",
+            speed_claim(gathered, "congestion", driven, IA, HI,
+                        "IA-TD3 learns faster than HI-TD3, to their common level",
                         "sooner", common=True),
         ]  # fmt: skip
     return claims

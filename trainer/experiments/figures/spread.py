@@ -50,7 +50,7 @@ def draw_boxes(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
         _box_panel(panel, gathered, algorithms, scenes, BOXES[scenario])
     figure.supxlabel(
         "below a box: its drives, of all seeds; stars: paired t-test against PHIL-TD3; "
-        "a crash at once is quick and smooth",
+        "b counts drives that crash, too",
         fontsize=8,
     )
     return figure
