@@ -56,13 +56,16 @@ class Validation:
         reward = float(np.mean([result.reward for result in results]))
         metrics.validation_success, metrics.validation_reward = success, reward
         metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
-        if (success, reward) < self.best:
-            return
+        if (success, reward) >= self.best:
+            state = self._keep(episode)
+            if due:
+                self.best, self._best_actor = (success, reward), copy.deepcopy(state)
+
+    def _keep(self, episode: int) -> dict[str, Any]:
         actor = getattr(self.learning.learner, self.config.kept_actor)
         state = {**self.config.label(episode), "actor": actor.state_dict()}
         save_torch(self.run_dir / BEST_FILE, state)
-        if due:
-            self.best, self._best_actor = (success, reward), copy.deepcopy(state)
+        return state
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint holds of it."""
