@@ -2,32 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from argparse import ArgumentParser, ArgumentTypeError
+from argparse import ArgumentParser
 from typing import Any
 
+from edge_runtime.option_types import seconds
 from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
-
-
-def positive_int(text: str) -> int:
-    """Read an integer of at least 1."""
-    return _int_from(text, 1)
-
-
-def non_negative_int(text: str) -> int:
-    """Read an integer of at least 0."""
-    return _int_from(text, 0)
-
-
-def non_negative(text: str) -> float:
-    """Read a finite number of at least 0."""
-    return _from_zero(text, "a number")
-
-
-def non_negative_seconds(text: str) -> float:
-    """Read a finite number of seconds, at least 0."""
-    return _from_zero(text, "a number of seconds")
 
 
 def add_connect(parser: ArgumentParser) -> None:
@@ -50,14 +30,14 @@ def add_span(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--wait-s",
         metavar="SECONDS",
-        type=non_negative_seconds,
+        type=seconds,
         default=10.0,
         help="how long to wait for a simulator, in seconds",
     )
     parser.add_argument(
         "--duration-s",
         metavar="SECONDS",
-        type=non_negative_seconds,
+        type=seconds,
         help="stop after this many seconds (otherwise when no simulator is left)",
     )
 
@@ -67,7 +47,7 @@ def add_wait_edge(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--wait-edge-s",
         metavar="SECONDS",
-        type=non_negative_seconds,
+        type=seconds,
         default=30.0,
         help="how long to wait for an edge runtime, in seconds",
     )
@@ -102,23 +82,3 @@ def check_where(arguments: Any) -> tuple[str | None, str | None]:
     if arguments.connect is not None:
         return None, check_endpoint(arguments.connect)
     return check_endpoint(arguments.listen or DEFAULT_ENDPOINT), None
-
-
-def _from_zero(text: str, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value >= 0):
-        raise ArgumentTypeError(f"{text!r} is not {what}, at least 0")
-    return value
-
-
-def _int_from(text: str, least: int) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = least - 1
-    if value < least:
-        raise ArgumentTypeError(f"{text!r} is not a whole number, at least {least}")
-    return value

@@ -8,12 +8,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bridge.arguments import add_connect, add_span, add_tls, non_negative_seconds
+from bridge.arguments import add_connect, add_span, add_tls
 from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
 from bridge.recording.flushed_file import check_new
 from bridge.recording.writer import RecordingWriter
 from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.option_types import seconds
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
@@ -44,7 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--linger-s",
         metavar="SECONDS",
-        type=non_negative_seconds,
+        type=seconds,
         default=2.0,
         help="how long to go on without any simulator: it may come back, in seconds",
     )

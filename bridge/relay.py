@@ -10,12 +10,13 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from bridge.arguments import add_vehicle_id, non_negative_int
+from bridge.arguments import add_vehicle_id
 from bridge.relay_ends import Relay, open_relay
 from bridge.signals import sigterm_as_interrupt, wait_to_be_told
 from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
+from edge_runtime.option_types import not_negative
 from edge_runtime.tls import is_tls
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
@@ -43,7 +44,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     network = "injected network: " + GRAMMAR.replace("%", "%%")
     parser.add_argument("--latency", metavar="SPEC", default="none", help=network)
     parser.add_argument(
-        "--seed", metavar="N", type=non_negative_int, default=0, help="of delays and losses"
+        "--seed", metavar="N", type=not_negative, default=0, help="of delays and losses"
     )
     add_vehicle_id(parser, "the vehicle to relay")
     parser.add_argument(

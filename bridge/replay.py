@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bridge.arguments import add_tls, add_wait_edge, non_negative
+from bridge.arguments import add_tls, add_wait_edge
 from bridge.port import open_port
 from bridge.progress import count_bar
 from bridge.replaying.comparison import compare
@@ -15,6 +15,7 @@ from bridge.replaying.live import replay_live
 from bridge.replaying.recorded import RecordedDrive, key_of
 from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import not_negative_number
 from edge_runtime.policy import load_policy
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
@@ -64,7 +65,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--tolerance",
         metavar="X",
-        type=non_negative,
+        type=not_negative_number,
         default=DEFAULT_TOLERANCE,
         help="how far two actions may be apart, of a range of -1 to 1",
     )

@@ -6,7 +6,6 @@ zenoh-bridge-ros2dds. So ROS 2 hears what we show it, and can say nothing on our
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import functools
 import time
@@ -20,6 +19,7 @@ from bridge.to_ros2.policies import Policies
 from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.operator_commands import ask
+from edge_runtime.option_types import number
 from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT, check_ros2_endpoint, open_ros2_session
 from edge_runtime.ros2.names import check_ros_name, namespace_of
 from edge_runtime.ros2.node import Ros2Node, open_node
@@ -70,7 +70,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--max-rate-hz",
         metavar="HZ",
-        type=_rate,
+        type=number("a rate above 0 and up to 1000 Hz", lambda rate_hz: 0.0 < rate_hz <= 1000.0),
         default=MAX_RATE_HZ,
         help="most messages a second on each topic; more are left out",
     )
@@ -142,13 +142,3 @@ def _summary(report: dict[str, Any]) -> str:
             counts = ", ".join(f"{name} {count}" for name, count in report[what].items())
             text += f"; {what}: {counts}"
     return text
-
-
-def _rate(text: str) -> float:
-    try:
-        rate_hz = float(text)
-    except ValueError:
-        rate_hz = 0.0
-    if not 0.0 < rate_hz <= 1000.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a rate above 0 and up to 1000 Hz")
-    return rate_hz

@@ -10,15 +10,7 @@ from typing import Any
 import gymnasium
 
 from bridge.actions import policy_action
-from bridge.arguments import (
-    add_tls,
-    add_vehicle_id,
-    add_wait_edge,
-    add_where,
-    check_where,
-    non_negative_int,
-    positive_int,
-)
+from bridge.arguments import add_tls, add_vehicle_id, add_wait_edge, add_where, check_where
 from bridge.clock import Clock
 from bridge.clocks import CLOCKS, REALTIME, running_clock
 from bridge.command_check import CommandCheck
@@ -34,6 +26,7 @@ from bridge.vehicle_loop import VehicleInLoop
 from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
+from edge_runtime.option_types import not_negative, positive
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.topics import check_vehicle_id
 
@@ -81,7 +74,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="the scene as trained in, or its variant with more vehicles and other types of them",
     )
     parser.add_argument(
-        "--episodes", metavar="N", type=positive_int, default=1, help="episodes to drive"
+        "--episodes", metavar="N", type=positive, default=1, help="episodes to drive"
     )
     parser.add_argument(
         "--clock",
@@ -109,7 +102,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--seed",
         metavar="N",
-        type=non_negative_int,
+        type=not_negative,
         default=0,
         help="episode i is reset with seed + i",
     )

@@ -15,11 +15,11 @@ from rich.console import Console
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
+from edge_runtime.option_types import not_negative, positive, positive_number
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand, run_command
 from hil_tests.drives_table import drives_table
 from hil_tests.operator import Operator
-from trainer.commands.options import not_negative, positive, positive_float
 
 MARKER = ".phil-demo"
 """Says that a directory is a demo's, so that the demo may replace what is in it."""
@@ -59,13 +59,13 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--human-minutes",
-        type=positive_float,
+        type=positive_number,
         default=HUMAN_MINUTES,
         help="limit of the human model's training",
     )
     parser.add_argument(
         "--minutes",
-        type=positive_float,
+        type=positive_number,
         default=TRAINING_MINUTES,
         help="limit of the PHIL-TD3 training",
     )

@@ -6,7 +6,7 @@ import argparse
 import shlex
 import sys
 
-from trainer.commands.options import positive
+from edge_runtime.option_types import positive
 
 
 def several(text: str) -> int:
@@ -15,17 +15,6 @@ def several(text: str) -> int:
     if count < 2:
         raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
     return count
-
-
-def share(text: str) -> float:
-    """Read a share above 0, at most 1."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value <= 1.0:
-        raise argparse.ArgumentTypeError(f"{text} is not a share above 0 and at most 1")
-    return value
 
 
 def this_command() -> str:

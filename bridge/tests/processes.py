@@ -52,10 +52,12 @@ class BridgeProcess:
             self.process.communicate()
 
 
-def start_edge(endpoint: str, policy: Path, *options: str) -> EdgeProcess:
+def start_edge(
+    endpoint: str, policy: Path, *options: str, stderr: Any = subprocess.PIPE
+) -> EdgeProcess:
     """Start ``python -m edge_runtime run`` with an unsigned test policy and wait until ready."""
     fixed = ("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
-    return EdgeProcess(*fixed, *options)
+    return EdgeProcess(*fixed, *options, stderr=stderr)
 
 
 def refuse(arguments: list[str]) -> int:
@@ -71,6 +73,22 @@ def wait_until_driving(edge: EdgeProcess) -> None:
     log = edge.process.stderr
     assert log is not None
     wait_until(lambda: "now=drive" in log.readline(), "the first drive")
+
+
+def wait_until_driving_steadily(log: Path, steady_s: float = 0.4) -> None:
+    """Wait until the edge runtime, whose stderr is ``log``, has driven that long without a stop.
+
+    On a busy machine it may stop for a reason of its own, at any time.
+    """
+
+    def steady() -> bool:
+        before = log.read_text()
+        if not before.rpartition("now=")[2].startswith("drive"):
+            return False
+        time.sleep(steady_s)
+        return log.read_text() == before
+
+    wait_until(steady, "a steady drive")
 
 
 def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:

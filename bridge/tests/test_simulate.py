@@ -22,6 +22,7 @@ from bridge.tests.processes import (
     start_edge,
     start_simulate,
     wait_until_driving,
+    wait_until_driving_steadily,
 )
 from edge_runtime.transport import free_endpoint, open_session
 
@@ -92,11 +93,11 @@ def test_no_state_reaches_the_edge_so_the_simulator_brakes(tmp_path, clock):
 @pytest.mark.parametrize("clock", ["lockstep", "realtime"])
 def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path, clock):
     policy, endpoint = make_policy(tmp_path, "constant", 0.1), free_endpoint()
-    out = tmp_path / "killed.json"
+    out, log = tmp_path / "killed.json", tmp_path / "edge.log"
     with start_simulate(endpoint, out, SLOW_TOY, "--clock", clock) as run:
-        with start_edge(endpoint, policy) as edge:
-            wait_until_driving(edge)
-            time.sleep(0.4)
+        with log.open("w") as errors, start_edge(endpoint, policy, stderr=errors) as edge:
+            # One that had stopped by itself would not be missed.
+            wait_until_driving_steadily(log)
             edge.process.send_signal(signal.SIGKILL)
             edge.process.wait()
         # Another board with another policy takes over in the same episode.

@@ -22,6 +22,7 @@ from deploy.installer.archive import MANIFEST
 from deploy.installer.manifest import parse_manifest
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import not_negative, positive
 
 SLACK = 1.1
 """Some tries come after the end: a whole run must survive a power cut, too."""
@@ -173,8 +174,8 @@ def _parse(argv: list[str]) -> argparse.Namespace:
         description=__doc__,
         epilog=examples("python -m deploy.campaigns.kills --tries 20 --out runs/kills.json"),
     )
-    parser.add_argument("--tries", metavar="N", type=int, default=200, help="kills")
-    parser.add_argument("--seed", metavar="N", type=int, default=1, help="of the moments")
+    parser.add_argument("--tries", metavar="N", type=positive, default=200, help="kills")
+    parser.add_argument("--seed", metavar="N", type=not_negative, default=1, help="of the moments")
     parser.add_argument("--out", metavar="FILE.json", help="write the report here")
     parser.add_argument(
         "--bundles",

@@ -20,6 +20,7 @@ from deploy.campaigns.rig import Board, Kit, kit_of, make_kit
 from deploy.installer.archive import BLOCK
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
 from edge_runtime.files import check_writable, write_json
+from edge_runtime.option_types import not_negative, positive
 
 REFUSED = 2
 
@@ -98,8 +99,8 @@ def _parse(argv: list[str]) -> argparse.Namespace:
         description=__doc__,
         epilog=examples("python -m deploy.campaigns.tamper --tries 100 --out runs/tamper.json"),
     )
-    parser.add_argument("--tries", metavar="N", type=int, default=1000, help="changed bundles")
-    parser.add_argument("--seed", metavar="N", type=int, default=1, help="of the places")
+    parser.add_argument("--tries", metavar="N", type=positive, default=1000, help="changed bundles")
+    parser.add_argument("--seed", metavar="N", type=not_negative, default=1, help="of the places")
     parser.add_argument("--out", metavar="FILE.json", help="write the report here")
     parser.add_argument(
         "--bundle",

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from deploy.campaigns.rig import Board, kit_of
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
+from edge_runtime.option_types import positive
 
 
 def main(argv: list[str]) -> int:
@@ -76,7 +77,7 @@ def _parse(argv: list[str]) -> argparse.Namespace:
         ),
     )
     parser.add_argument("bundle", metavar="BUNDLE.tar", help="of `deploy bundle`, for this machine")
-    parser.add_argument("--tries", metavar="N", type=int, default=3, help="installations")
+    parser.add_argument("--tries", metavar="N", type=positive, default=3, help="installations")
     parser.add_argument("--out", metavar="FILE.json", help="write the report here")
     parser.add_argument("--trust", metavar="KEY.pub", default="keys/policy.pub")
     parser.add_argument("--python", metavar="PYTHON", default="python3.8", help="installs it")

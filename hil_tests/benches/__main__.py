@@ -13,6 +13,7 @@ import numpy as np
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import positive
 from edge_runtime.transport import free_endpoint, open_session
 from hil_tests.benches.contenders import Floor, Ours, answer, rouse, start_floor, start_ours
 from hil_tests.benches.footprint import first_command_s, idle_load, memory_mb
@@ -21,7 +22,6 @@ from hil_tests.benches.lockstep import lockstep
 from hil_tests.benches.table import show
 from hil_tests.faults.campaign import POLICY, PUBLIC_KEY
 from trainer.benches.machine import processor_model
-from trainer.commands.options import positive
 from trainer.revision import source_revision
 
 STARTS = 5

@@ -24,6 +24,7 @@ import numpy as np
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import not_negative, positive
 from edge_runtime.wire import SAFE_STOP
 from hil_tests.benches.can_floor import CAN_ID
 from hil_tests.faults.can_ears import CanEars
@@ -33,7 +34,6 @@ from hil_tests.faults.processes import Process
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.slow_policy import write_steady
 from trainer.benches.machine import processor_model
-from trainer.commands.options import not_negative, positive
 from trainer.revision import source_revision
 
 P99_BAR_MS = 25.0

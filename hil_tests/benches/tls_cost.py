@@ -22,6 +22,7 @@ from deploy.certs_command import add_arguments, certs
 from edge_runtime import wire
 from edge_runtime.access import rules_for_listener
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
+from edge_runtime.option_types import positive
 from edge_runtime.signature import SIGNATURE_SUFFIX
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint, open_session
@@ -150,12 +151,10 @@ def main(argv: list[str]) -> int:
         "--policy", default="results/policies/left_turn.onnx", help="the policy that answers"
     )
     parser.add_argument(
-        "--blocks", type=int, default=12, help=f"blocks of {BLOCK} round trips on each link"
+        "--blocks", type=positive, default=12, help=f"blocks of {BLOCK} round trips on each link"
     )
     parser.add_argument("--out", metavar="R.json", help="write the result to this file")
     arguments = parser.parse_args(argv)
-    if arguments.blocks < 1:
-        raise UserError(f"--blocks {arguments.blocks} is too few: at least 1")
     result = measure(Path(arguments.policy), arguments.blocks)
     for name, row in result["round_trip_us"].items():
         print(name, *(f"{label} {value:.0f} us" for label, value in row.items()))

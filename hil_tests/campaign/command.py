@@ -12,12 +12,13 @@ from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, read_bytes, write_atomic
 from edge_runtime.latency.model import parse_spec
+from edge_runtime.option_types import not_negative, positive, share
 from hil_tests.campaign.axes import AXES, Axis
 from hil_tests.campaign.figures import write_figures
 from hil_tests.campaign.latency import run_latency
 from hil_tests.campaign.render import render_latency
-from hil_tests.options import several, share, this_command
-from trainer.commands.options import add_scenario, not_negative, positive
+from hil_tests.options import several, this_command
+from trainer.commands.options import add_scenario
 from trainer.parallel import cores
 from trainer.progress import ProgressBar
 

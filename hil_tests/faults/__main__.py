@@ -7,8 +7,8 @@ from pathlib import Path
 
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import positive
 from hil_tests.faults import render_faults, run_faults
-from trainer.commands.options import positive
 
 
 def main(argv: list[str]) -> int:

@@ -15,12 +15,12 @@ from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import positive
 from hil_tests.fleet.drive import measure
 from hil_tests.fleet.rules import certificates_ms, measure_rules
 from hil_tests.fleet.scale import per_vehicle, project
 from hil_tests.fleet.usage import why_not_counted
 from trainer.benches.machine import processor_model
-from trainer.commands.options import positive
 
 _SIZES = (1, 5, 10, 20)
 _RULES = (10, 100, 1_000)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import signal
 import sys
 import time
@@ -11,6 +10,7 @@ from typing import Any
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
+from edge_runtime.option_types import seconds
 from edge_runtime.vehicles.hunter import multicast
 from edge_runtime.vehicles.hunter.bus import BusName, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE, PROFILES
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--fault", action="append", type=_fault, metavar="NAME", help="from the start"
     )
     parser.add_argument(
-        "--after-s", action=_AfterFault, type=_seconds, metavar="S", help="that fault comes later"
+        "--after-s", action=_AfterFault, type=seconds, metavar="S", help="that fault comes later"
     )
 
 
@@ -94,13 +94,3 @@ def _fault(text: str) -> tuple[float, str]:
         return 0.0, check_fault(text)
     except UserError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value >= 0.0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no time in seconds from 0 on")
-    return value

@@ -18,11 +18,11 @@ from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
+from edge_runtime.option_types import not_negative, positive
 from hil_tests.commands import end_children
 from hil_tests.network.cells import KERNEL, TRANSPORTS, Cell, Drive, run_cell
 from hil_tests.network.namespaces import why_not
 from hil_tests.network.report import write_report
-from trainer.commands.options import not_negative, positive
 
 SPECS = {
     "perfect": "none",

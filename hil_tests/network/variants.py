@@ -18,13 +18,13 @@ from bridge.report import quantiles
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
+from edge_runtime.option_types import not_negative, positive
 from hil_tests.commands import BackgroundCommand
 from hil_tests.network.cells import JUMBO_MTU, PORT
 from hil_tests.network.echo import READY, zenoh_config
 from hil_tests.network.kernel import MTU, kernel_network
 from hil_tests.network.throwaway_tls import write_tls
 from hil_tests.network.tun_bridge import SIMULATOR_ADDRESS
-from trainer.commands.options import not_negative, positive
 
 RELIABLE, BEST_EFFORT = "reliable", "best_effort"
 

@@ -11,10 +11,11 @@ from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.option_types import not_negative, positive, share
 from edge_runtime.policy import load_policy
 from hil_tests.commands import end_children
 from hil_tests.mock_hunter.parameters import make_parameters, read_changes
-from hil_tests.options import several, share, this_command
+from hil_tests.options import several, this_command
 from hil_tests.vehicle.comparison import PART_EPISODES, run_comparison
 from hil_tests.vehicle.figures import write_figures
 from hil_tests.vehicle.kept import KeptPoints
@@ -22,7 +23,7 @@ from hil_tests.vehicle.lag_axes import LAGS, Lag
 from hil_tests.vehicle.render import lag_sentence, render_comparison, render_sweep, verdict
 from hil_tests.vehicle.rigs import VEHICLE, Drive
 from hil_tests.vehicle.sweep import MODEL, SweepTask, run_sweep
-from trainer.commands.options import add_scenario, not_negative, positive
+from trainer.commands.options import add_scenario
 from trainer.parallel import cores
 from trainer.progress import ProgressBar
 

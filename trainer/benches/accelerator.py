@@ -22,8 +22,8 @@ import torch
 
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import positive
 from trainer.benches.machine import about
-from trainer.commands.options import positive
 from trainer.learner.config import LearnerConfig
 from trainer.training.metrics import read_metrics
 

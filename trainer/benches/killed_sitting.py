@@ -23,9 +23,9 @@ import numpy as np
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import not_negative, positive, positive_number
 from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
-from trainer.commands.options import not_negative, positive, positive_float
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.files import load_torch
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
@@ -167,10 +167,10 @@ def main(argv: list[str]) -> int:
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--minutes", type=positive_float, default=30.0, help="simulated, in all")
-    parser.add_argument("--speed", type=positive_float, default=10.0, help="times real time")
+    parser.add_argument("--minutes", type=positive_number, default=30.0, help="simulated, in all")
+    parser.add_argument("--speed", type=positive_number, default=10.0, help="times real time")
     parser.add_argument("--batch-size", type=positive, default=8, help="of the learner")
-    parser.add_argument("--longest", type=positive_float, default=40.0, help="s until a kill")
+    parser.add_argument("--longest", type=positive_number, default=40.0, help="s until a kill")
     parser.add_argument("--seed", type=not_negative, default=0, help="of the moments")
     parser.add_argument("--out", metavar="F.json", help="the figures")
 

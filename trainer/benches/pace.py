@@ -22,9 +22,10 @@ import numpy as np
 from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
+from edge_runtime.option_types import not_negative, positive_number
 from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
-from trainer.commands.options import add_scenario, not_negative, positive_float
+from trainer.commands.options import add_scenario
 from trainer.person.pacing import LATE_S
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
 from trainer.training.metrics import read_metrics
@@ -115,7 +116,7 @@ def main(argv: list[str]) -> int:
         epilog="example: python -m trainer.benches.pace --seconds 120 --out pace.json",
     )
     add_scenario(parser)
-    parser.add_argument("--seconds", type=positive_float, default=120.0, help="of training")
+    parser.add_argument("--seconds", type=positive_number, default=120.0, help="of training")
     parser.add_argument("--threads", type=not_negative, default=0, help="the learner's; 0: all")
     parser.add_argument("--out", metavar="F.json", help="the figures")
     arguments = parser.parse_args(argv)

@@ -7,13 +7,8 @@ from pathlib import Path
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from trainer.commands.options import (
-    add_scenario,
-    add_threads,
-    not_negative,
-    positive,
-    set_threads,
-)
+from edge_runtime.option_types import not_negative, positive
+from trainer.commands.options import add_scenario, add_threads, set_threads
 from trainer.drivers import load_driver, make_environment
 from trainer.person.options import add_person, person_options
 from trainer.person.recording import Recorder

@@ -9,13 +9,8 @@ from edge_runtime.cli import examples, write_json_out
 from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
-from trainer.commands.options import (
-    add_latency,
-    add_scenario,
-    not_negative,
-    positive,
-    set_threads,
-)
+from edge_runtime.option_types import not_negative, positive
+from trainer.commands.options import add_latency, add_scenario, set_threads
 from trainer.drivers import load_driver, make_environment
 from trainer.evaluation import CONDITIONS, drive_episodes
 from trainer.parallel import WORTH_STARTING, choose_jobs, drive_episodes_in_parallel

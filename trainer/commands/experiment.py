@@ -11,7 +11,7 @@ import torch
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from trainer.commands.options import not_negative, positive
+from edge_runtime.option_types import not_negative, whole_number
 from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.experiments import timing
 from trainer.experiments.catalogue import NAMES, TIME, units_of
@@ -63,7 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{SUMMARY}: write the tables of RESULTS/README.md again",
     )
     parser.add_argument(
-        "--seeds", type=_seeds, default=DEFAULT_SEEDS, help="seeds of each training run"
+        "--seeds",
+        type=whole_number(1, MOST_SEEDS),
+        default=DEFAULT_SEEDS,
+        help="seeds of each training run",
     )
     parser.add_argument(
         "--jobs",
@@ -150,14 +153,6 @@ def _write_tables(store: Store, seeds: int, wanted: bool) -> None:
             print(f"{place.what}: {readme}")
         elif wanted:
             raise UserError(f"{readme} has no line {place.begin!r} for the table")
-
-
-def _seeds(text: str) -> int:
-    """An argparse type."""
-    value = positive(text)
-    if value > MOST_SEEDS:
-        raise argparse.ArgumentTypeError(f"{text} is more than {MOST_SEEDS}")
-    return value
 
 
 def _check_names(arguments: argparse.Namespace) -> None:

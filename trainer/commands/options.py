@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.latency.model import GRAMMAR
+from edge_runtime.option_types import whole_number
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import MOST_THREADS
 
@@ -26,7 +26,8 @@ def add_threads(parser: argparse.ArgumentParser) -> None:
     """``--threads``."""
     parser.add_argument(
         "--threads",
-        type=_threads,
+        # torch asks the system for as many at once, and dies where it has none.
+        type=whole_number(0, MOST_THREADS),
         default=0,
         metavar="N",
         help="processor threads of the learner; 0: all cores",
@@ -49,38 +50,6 @@ def set_threads(count: int) -> None:
         import torch  # takes two seconds, which whoever asks for help need not wait
 
         torch.set_num_threads(count)
-
-
-def _threads(text: str) -> int:
-    """An argparse type: torch asks the system for as many at once, and dies where it has none."""
-    value = not_negative(text)
-    if value > MOST_THREADS:
-        raise argparse.ArgumentTypeError(f"{text} is more than {MOST_THREADS}")
-    return value
-
-
-def positive(text: str) -> int:
-    """An argparse type: an integer above zero."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not above zero")
-    return value
-
-
-def not_negative(text: str) -> int:
-    """An argparse type: an integer of at least zero that fits into 63 bits, as seeds must."""
-    value = int(text)
-    if not 0 <= value < 2**63:
-        raise argparse.ArgumentTypeError(f"{text} is not a number from 0 to 2**63 - 1")
-    return value
-
-
-def positive_float(text: str) -> float:
-    """An argparse type: a finite number above zero."""
-    value = float(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is not a finite number above zero")
-    return value
 
 
 def check_picture(out: str, film: bool = False) -> None:

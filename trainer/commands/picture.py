@@ -11,14 +11,10 @@ from PIL import Image
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.option_types import not_negative, positive_number
 from trainer.actions import ACTIONS
 from trainer.animation import draw_moment, drive_moments, encode_gif
-from trainer.commands.options import (
-    add_scenario,
-    check_picture,
-    not_negative,
-    positive_float,
-)
+from trainer.commands.options import add_scenario, check_picture
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver, HumanGuide
 
@@ -35,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=not_negative, default=0, help="of the episode")
     parser.add_argument(
         "--time",
-        type=positive_float,
+        type=positive_number,
         default=3.0,
         metavar="S",
         help="simulated seconds from the start: the moment of a picture, the end of a film",

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
-from trainer.commands.options import positive_float
+from edge_runtime.option_types import positive_number
 
 Part = TypeVar("Part")
 
@@ -17,7 +17,7 @@ def add_time_limit(parser: argparse.ArgumentParser, what: str) -> None:
     """``--max-minutes``; ``what`` says what becomes of the work then."""
     parser.add_argument(
         "--max-minutes",
-        type=positive_float,
+        type=positive_number,
         default=None,
         metavar="MIN",
         help=f"{what} (default: no limit)",

@@ -18,14 +18,8 @@ from edge_runtime.cli import INTERRUPTED, examples
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.latency.model import parse_spec
-from trainer.commands.options import (
-    add_latency,
-    add_scenario,
-    add_threads,
-    not_negative,
-    positive,
-    set_threads,
-)
+from edge_runtime.option_types import not_negative, positive
+from trainer.commands.options import add_latency, add_scenario, add_threads, set_threads
 from trainer.commands.resuming import check_directory
 from trainer.commands.settings import DEFAULTS, settings, with_setting
 from trainer.commands.time_limit import add_time_limit, deadline_s

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from edge_runtime.errors import UserError
-from trainer.commands.options import positive_float
+from edge_runtime.option_types import positive_number, whole_number
 from trainer.person.registry import PersonOptions
 
 PERSON = "person"
@@ -26,11 +26,14 @@ def add_person(parser: argparse.ArgumentParser) -> None:
         "--host", default=DEFAULTS.host, help="where --human web listens: this machine only"
     )
     group.add_argument(
-        "--port", type=_port, default=DEFAULTS.port, help="of --human web; 0: any that is free"
+        "--port",
+        type=whole_number(0, 65535),
+        default=DEFAULTS.port,
+        help="of --human web; 0: any that is free",
     )
     group.add_argument(
         "--speed",
-        type=positive_float,
+        type=positive_number,
         default=1.0,
         metavar="X",
         help="simulated seconds in one of yours: 0.5 is slow motion",
@@ -60,10 +63,3 @@ def _refuse(arguments: argparse.Namespace, name: str, useful: bool) -> None:
     given = getattr(arguments, name) != {"speed": 1.0}.get(name, getattr(DEFAULTS, name, None))
     if given and not useful:
         raise UserError(f"--{name} means nothing with --human {arguments.human}")
-
-
-def _port(text: str) -> int:
-    """An argparse type: a TCP port."""
-    if not (text.isdecimal() and int(text) < 65536):
-        raise argparse.ArgumentTypeError(f"{text} is no port")
-    return int(text)

@@ -142,7 +142,7 @@ def test_orders_come_in_turn_and_bad_ones_are_told():
         (["--bus", "udp_multicast:10.1.2.3"], "is no IPv4 multicast group"),
         (["--fault", "meteor"], "no fault 'meteor'; choose from silent"),
         (["--after-s", "3"], "--after-s follows a --fault"),
-        (["--fault", "silent", "--after-s", "-1"], "no time in seconds"),
+        (["--fault", "silent", "--after-s", "-1"], "not a finite number of seconds"),
         (["--set", "wings=2"], "no parameter 'wings'"),
         (["--set", "track_m"], "use NAME=VALUE"),
         (["--model", "hunter-3"], "invalid choice"),
