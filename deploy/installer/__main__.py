@@ -36,7 +36,7 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         for value in sys.argv[1:] if args is None else args:
-            if not value or (value.startswith("--") and value.endswith("=")):
+            if not value or (value.startswith("--") and value.find("=") == len(value) - 1):
                 self.error("an empty value")
         return super().parse_known_args(args, namespace)
 

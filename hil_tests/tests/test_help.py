@@ -135,6 +135,10 @@ def test_the_installer_takes_no_empty_root(empty, capsys):
     assert "an empty value" in capsys.readouterr().err
 
 
+def test_the_installer_takes_a_root_that_ends_with_an_equals_sign():
+    assert installer._parser().parse_args(["uninstall", "--root=/a="]).root == "/a="
+
+
 def test_examples_and_paragraphs_keep_their_lines():
     parser = ArgumentParser(
         prog="x", description="One.\n\nTwo\nlines.", epilog=examples("a \\\n    b") + "\n\nAnd\nso."
