@@ -74,11 +74,18 @@ class Trips:
             if trip is not None:
                 trip.round_trip_ms = message.round_trip_ms
 
+    def begins_s(self) -> list[float]:
+        """When the first episode ended and the next ones began."""
+        first_s: dict[int, float] = {}
+        for (episode, _), trip in self.trips.items():
+            first_s.setdefault(episode, trip.time_s)
+        return sorted(first_s.values())[1:]
+
     def lost_s(self) -> list[float]:
-        """When a state was due that never came out of the network."""
+        """When a state was due that never came out of the network, since the first one that did."""
         times_s = [trip.time_s for trip in self.trips.values()]
         there = {round(time_s / CONTROL_PERIOD_S) for time_s in times_s}
-        return [n * CONTROL_PERIOD_S for n in range(max(there)) if n not in there]
+        return [n * CONTROL_PERIOD_S for n in range(min(there), max(there)) if n not in there]
 
 
 def loop(out: Path, work: Path) -> None:
@@ -91,6 +98,7 @@ def loop(out: Path, work: Path) -> None:
     trips = sorted(found.trips.values(), key=lambda trip: trip.time_s)
     _draw_speed(speed, trips, found.lost_s())
     _draw_latency(latency, trips)
+    _mark_begins((speed, latency), found.begins_s())
     figure.suptitle(f"bridge simulate --clock realtime --latency {LATENCY}", fontsize=11)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
@@ -106,6 +114,17 @@ def _messages(recording: Path) -> Iterator[Any]:
     for heard in read_heard(Recording(recording), VEHICLE):
         if heard.topic in decoders:
             yield decoders[heard.topic](heard.payload)
+
+
+def _mark_begins(panels: tuple[Any, ...], begins_s: list[float]) -> None:
+    for panel in panels:
+        for begin_s in begins_s:
+            panel.axvline(begin_s, color="black", linestyle="--", linewidth=1)
+    for begin_s in begins_s:
+        panels[0].annotate(
+            "next episode", (begin_s, 1.0), (4, -4), xycoords=("data", "axes fraction"),
+            textcoords="offset points", va="top", fontsize=9,
+        )  # fmt: skip
 
 
 def _draw_speed(panel: Any, trips: list[Trip], lost_s: list[float]) -> None:

@@ -46,6 +46,14 @@ def test_a_round_trip_is_drawn_in_its_parts_and_a_lost_state_as_lost():
     assert trips.lost_s() == pytest.approx([0.2])
 
 
+def test_a_new_episode_begins_behind_the_last_one():
+    trips = Trips()
+    for episode, step in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 1)):
+        trips.take(make_state(step, episode=episode))
+    *times_s, last_s = (trip.time_s for trip in trips.trips.values())
+    assert trips.begins_s() == [times_s[3], last_s]
+
+
 def test_only_the_first_answer_to_a_state_counts():
     trips = Trips()
     trips.take(make_state(0, sent_ns=0))

@@ -161,6 +161,11 @@ for (const button of document.querySelectorAll("[data-wish]")) {
 
 function item(text) {
   const element = document.createElement("li");
-  element.textContent = text;
+  // A line breaks between the keys, not between a key and what it does.
+  element.replaceChildren(...text.split("    ").map((part) => {
+    const span = document.createElement("span");
+    span.textContent = part;
+    return span;
+  }));
   return element;
 }
