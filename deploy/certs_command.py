@@ -30,6 +30,7 @@ from deploy.certs import (
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic
+from edge_runtime.option_types import whole_number
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
 from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 
@@ -77,7 +78,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f" (always: {', '.join(LOOPBACK_HOSTS)})",
     )
     parser.add_argument(
-        "--days", metavar="N", type=int, default=DEFAULT_DAYS, help="how long they are valid, days"
+        "--days",
+        metavar="N",
+        type=whole_number(1, CA_DAYS),
+        default=DEFAULT_DAYS,
+        help="how long they are valid, days",
     )
 
 
@@ -123,10 +128,6 @@ def _check(arguments: argparse.Namespace) -> Request:
     for host in arguments.host:
         if not _is_host(host):
             raise UserError(f"host {host!r} is not valid: write a name or an address, without port")
-    if arguments.days < 1:
-        raise UserError(f"--days {arguments.days} is too short: at least 1")
-    if arguments.days > CA_DAYS:
-        raise UserError(f"--days {arguments.days} is too long: at most {CA_DAYS}")
     hosts = [*LOOPBACK_HOSTS, *arguments.host]
     return Request(Path(arguments.out), list(dict.fromkeys(vehicle_ids)), hosts, arguments.days)
 

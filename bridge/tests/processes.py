@@ -15,8 +15,8 @@ import gymnasium
 import numpy as np
 
 from bridge.__main__ import main
-from edge_runtime.cli import run_cli
 from edge_runtime.policy import load_policy
+from edge_runtime.tests.commands import exit_status
 from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, wait_until
 from edge_runtime.tests.policies import write_policy
 
@@ -60,12 +60,9 @@ def start_edge(
     return EdgeProcess(*fixed, *options, stderr=stderr)
 
 
-def refuse(arguments: list[str]) -> int:
-    """Run ``python -m bridge`` in this process, for input that is refused; return the status."""
-    try:
-        return run_cli(main, arguments)
-    except SystemExit as end:
-        return int(str(end.code))
+def bridge_status(arguments: list[str]) -> int:
+    """Run ``python -m bridge`` in this process; return its exit status."""
+    return exit_status(main, arguments)
 
 
 def wait_until_driving(edge: EdgeProcess) -> None:

@@ -23,9 +23,9 @@ from bridge.recording.writer import RecordingWriter
 from bridge.tests.processes import (
     SLOW_TOY,
     BridgeProcess,
+    bridge_status,
     make_policy,
     read,
-    refuse,
     start_edge,
     start_simulate,
 )
@@ -108,7 +108,7 @@ def record_and_kill(folder: Path) -> tuple[Path, float]:
         start_edge(endpoint, make_policy(folder)),
     ):
         wait_until(lambda: recording.exists() and len(states_in(recording)) > 10, "a second")
-        assert refuse(["repair", str(recording)]) == 2  # Not while it grows.
+        assert bridge_status(["repair", str(recording)]) == 2  # Not while it grows.
         run.process.send_signal(signal.SIGKILL)
         killed_ns = time.time_ns()
         run.process.wait()
@@ -132,12 +132,12 @@ def test_a_kill_loses_at_most_the_last_second_and_repair_gives_the_index_back(tm
             count += 1
     assert count == len(states)
     assert "is being written" in capsys.readouterr().err
-    assert refuse(["repair", str(recording)]) == 0
+    assert bridge_status(["repair", str(recording)]) == 0
     with recording.open("rb") as stream:
         summary = make_reader(stream).get_summary()
         assert summary is not None
         assert len(states_in(recording)) == len(states)
-    assert refuse(["repair", str(recording)]) == 0
+    assert bridge_status(["repair", str(recording)]) == 0
     assert "is whole" in capsys.readouterr().out
 
 
@@ -243,7 +243,7 @@ def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
 def test_bad_input_is_one_line_and_status_2(options, part, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.mcap").write_bytes(b"mine")
-    assert refuse(options) == 2
+    assert bridge_status(options) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
     assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]

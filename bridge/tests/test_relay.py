@@ -12,9 +12,9 @@ from bridge.tests.commands import make_command
 from bridge.tests.processes import (
     SHORT_TOY,
     BridgeProcess,
+    bridge_status,
     make_policy,
     read,
-    refuse,
     simulate,
     start_edge,
 )
@@ -127,6 +127,6 @@ def test_two_unmodified_ends_drive_through_a_relay(tmp_path):
     ],
 )
 def test_bad_input_is_one_line_and_status_2(options, part, capsys):
-    assert refuse(["relay", *options]) == 2
+    assert bridge_status(["relay", *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 from bridge.recording.reader import Recording, Stored
 from bridge.tests.damage import LEFT_TURN, chunks, flip, flip_chunk, messages_of
-from bridge.tests.processes import make_policy, refuse
+from bridge.tests.processes import bridge_status, make_policy
 from bridge.tests.test_replay import Hand
 
 MESSAGES = 2865
@@ -86,7 +86,7 @@ def test_repair_says_what_it_leaves_out_and_keeps_the_file_as_it_was(copy, capsy
     damaged, kept = copy.read_bytes(), copy.with_name("drive.mcap.damaged")
     left = without_chunk(3)
     assert 2000 < len(left) < MESSAGES
-    assert refuse(["repair", str(copy)]) == 0
+    assert bridge_status(["repair", str(copy)]) == 0
     assert capsys.readouterr().out == (
         f"wrote {copy}: {len(left)} messages; left out: 1 damaged place of"
         f" {chunks(LEFT_TURN)[3].chunk_length} bytes; the file as it was: {kept}\n"
@@ -95,7 +95,7 @@ def test_repair_says_what_it_leaves_out_and_keeps_the_file_as_it_was(copy, capsy
     assert read(copy) == left
     with copy.open("rb") as stream:
         assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == len(left)
-    assert refuse(["repair", str(copy)]) == 0
+    assert bridge_status(["repair", str(copy)]) == 0
     assert "is whole" in capsys.readouterr().out
 
 
@@ -108,7 +108,7 @@ def test_a_replay_says_damaged_and_replays_the_rest(tmp_path, capsys):
     hand.close()
     flip_chunk(path, 1)
     trust = ["--policy", str(make_policy(tmp_path, "constant", 0.3)), "--allow-unsigned"]
-    refuse(["replay", str(path), *trust, "--out", str(out)])
+    bridge_status(["replay", str(path), *trust, "--out", str(out)])
     report = json.loads(out.read_text())
     assert (report["states"], report["cut_off"], report["damaged_places"]) == (40, False, 1)
     (line,) = capsys.readouterr().err.splitlines()
@@ -117,7 +117,7 @@ def test_a_replay_says_damaged_and_replays_the_rest(tmp_path, capsys):
 
 def test_a_broken_index_is_written_anew_and_no_message_is_lost(copy, capsys):
     flip(copy, copy.stat().st_size - 100)
-    assert refuse(["repair", str(copy)]) == 0
+    assert bridge_status(["repair", str(copy)]) == 0
     assert f"{MESSAGES} messages; left out: 1 damaged place" in capsys.readouterr().out
     with copy.open("rb") as stream:
         assert len(list(make_reader(stream).iter_messages())) == MESSAGES
@@ -134,7 +134,7 @@ def test_of_a_cut_file_with_a_broken_first_chunk_the_nameless_messages_are_count
     data = copy.read_bytes()
     copy.write_bytes(data[: chunks(copy)[20].chunk_start_offset])
     flip(copy, 300)
-    assert refuse(["repair", str(copy)]) == 0
+    assert bridge_status(["repair", str(copy)]) == 0
     out = capsys.readouterr().out
     assert "messages whose topic was in a damaged place" in out
     assert "the file as it was" in out
@@ -144,7 +144,7 @@ def test_a_damaged_file_is_not_kept_over_an_earlier_one(copy, capsys):
     flip_chunk(copy, 3)
     damaged, kept = copy.read_bytes(), copy.with_name("drive.mcap.damaged")
     kept.write_text("mine")
-    assert refuse(["repair", str(copy)]) == 2
+    assert bridge_status(["repair", str(copy)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "drive.mcap.damaged exists" in line
     assert (kept.read_text(), copy.read_bytes()) == ("mine", damaged)
@@ -153,7 +153,7 @@ def test_a_damaged_file_is_not_kept_over_an_earlier_one(copy, capsys):
 def test_a_repair_that_was_killed_can_be_done_again(copy):
     flip_chunk(copy, 3)
     copy.with_name("drive.mcap.damaged").hardlink_to(copy)
-    assert refuse(["repair", str(copy)]) == 0
+    assert bridge_status(["repair", str(copy)]) == 0
     assert read(copy) == without_chunk(3)
 
 
@@ -162,7 +162,7 @@ def test_through_a_link_the_file_is_repaired_and_kept_where_it_is(copy, tmp_path
     link = tmp_path / "elsewhere" / "link.mcap"
     link.parent.mkdir()
     link.symlink_to(copy)
-    assert refuse(["repair", str(link)]) == 0
+    assert bridge_status(["repair", str(link)]) == 0
     assert link.is_symlink()
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "drive.mcap", "drive.mcap.damaged", "elsewhere",
@@ -172,10 +172,10 @@ def test_through_a_link_the_file_is_repaired_and_kept_where_it_is(copy, tmp_path
 def test_out_writes_a_new_file_only(copy, tmp_path, capsys):
     flip_chunk(copy, 3)
     damaged, out = copy.read_bytes(), tmp_path / "ok.mcap"
-    assert refuse(["repair", str(copy), "--out", str(out)]) == 0
+    assert bridge_status(["repair", str(copy), "--out", str(out)]) == 0
     assert copy.read_bytes() == damaged
     whole = out.read_bytes()
-    assert refuse(["repair", str(copy), "--out", str(out)]) == 2
+    assert bridge_status(["repair", str(copy), "--out", str(out)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "exists; choose another name: no recording is lost" in line
     assert out.read_bytes() == whole
@@ -192,13 +192,13 @@ def test_what_is_being_written_is_not_repaired_and_a_kill_frees_it(tmp_path, cap
         writer.stdin.flush()
         assert writer.stdout.readline() == b"ready\n"
         for options in ([], ["--out", str(tmp_path / "other.mcap")]):
-            assert refuse(["repair", str(path), *options]) == 2
+            assert bridge_status(["repair", str(path), *options]) == 2
             (line,) = capsys.readouterr().err.splitlines()
             assert "is being written" in line
         assert path.read_bytes() == data
         writer.kill()
         writer.wait()
-    assert refuse(["repair", str(path)]) == 0
+    assert bridge_status(["repair", str(path)]) == 0
     assert "a torn end of" in capsys.readouterr().out
     assert [place.name for place in tmp_path.iterdir()] == ["growing.mcap"]
 
@@ -208,6 +208,6 @@ def test_a_pipe_is_no_recording_and_nobody_waits_for_it(tmp_path, capsys):
     os.mkfifo(pipe)
     out = str(tmp_path / "out")
     for command in (["repair", str(pipe), "--out", out], ["view", str(pipe), "--save", out]):
-        assert refuse(command) == 2
+        assert bridge_status(command) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert "no regular file" in line

@@ -10,7 +10,7 @@ import pytest
 from bridge.feed import Heard
 from bridge.recording.writer import RecordingWriter
 from bridge.tests.commands import make_command
-from bridge.tests.processes import BridgeProcess, make_policy, refuse, start_edge
+from bridge.tests.processes import BridgeProcess, bridge_status, make_policy, start_edge
 from bridge.tests.test_edge_counts import health
 from edge_runtime.tests.harness import BLACK, WHITE, make_state
 from edge_runtime.transport import free_endpoint
@@ -75,7 +75,7 @@ def replay(path, policy, *options):
     """Replay in process; the exit status and the report."""
     out = path.with_suffix(".json")
     trust = ["--policy", str(policy), "--allow-unsigned"]
-    status = refuse(["replay", str(path), *trust, "--out", str(out), *options])
+    status = bridge_status(["replay", str(path), *trust, "--out", str(out), *options])
     return status, json.loads(out.read_text()) if out.exists() else {}
 
 
@@ -256,7 +256,7 @@ def test_through_a_running_edge_runtime(hand, path, tmp_path):
 def test_bad_input_is_one_line_and_status_2(options, part, hand, path, capsys):
     hand.drive(0, 2)
     hand.close()
-    assert refuse(["replay", str(path), *options]) == 2
+    assert bridge_status(["replay", str(path), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
 
@@ -266,5 +266,5 @@ def test_what_is_no_recording_is_one_line_and_status_2(name, hand, tmp_path, cap
     (tmp_path / "junk.mcap").write_bytes(b"\x89MCAP1\r\n" + bytes(100))
     hand.close()
     shutil.move(tmp_path / "by_hand.mcap", tmp_path / "empty.mcap")
-    assert refuse(["replay", str(tmp_path / name), "--policy", "p.onnx"]) == 2
+    assert bridge_status(["replay", str(tmp_path / name), "--policy", "p.onnx"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -11,9 +11,9 @@ import pytest
 from bridge.tests.processes import (
     SLOW_TOY,
     BridgeProcess,
+    bridge_status,
     make_policy,
     read,
-    refuse,
     start_edge,
     start_simulate,
 )
@@ -141,7 +141,7 @@ def test_a_sigterm_ends_it_with_its_counts(tmp_path):
 def test_bad_input_is_one_line_and_status_2(options, part, capsys):
     if not any(option.startswith("--ros2") for option in options):
         options = [*options, "--ros2-listen", free_endpoint()]
-    assert refuse(["ros2", "--connect", free_endpoint(), *options]) == 2
+    assert bridge_status(["ros2", "--connect", free_endpoint(), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
 
@@ -149,7 +149,7 @@ def test_bad_input_is_one_line_and_status_2(options, part, capsys):
 def test_a_busy_ros_2_port_names_the_option_to_change(capsys):
     busy = free_endpoint()
     session = open_session(listen=busy, mode="router")
-    assert refuse(["ros2", "--connect", free_endpoint(), "--ros2-listen", busy]) == 2
+    assert bridge_status(["ros2", "--connect", free_endpoint(), "--ros2-listen", busy]) == 2
     session.close()
     (line,) = capsys.readouterr().err.splitlines()
     assert "is in use" in line

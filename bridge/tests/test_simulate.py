@@ -13,10 +13,10 @@ from bridge.tests.processes import (
     SHORT_TOY,
     SLOW_TOY,
     TOY,
+    bridge_status,
     drive_in_process,
     make_policy,
     read,
-    refuse,
     simulate,
     simulate_undisturbed,
     start_edge,
@@ -123,7 +123,8 @@ def test_two_simulators_cannot_share_a_port(tmp_path, capsys):
     endpoint, out = free_endpoint(), tmp_path / "never.json"
     first = open_session(listen=endpoint, mode="router")
     try:
-        assert refuse(["simulate", "--env", TOY, "--listen", endpoint, "--out", str(out)]) == 2
+        arguments = ["simulate", "--env", TOY, "--listen", endpoint, "--out", str(out)]
+        assert bridge_status(arguments) == 2
     finally:
         first.close()
     (line,) = capsys.readouterr().err.splitlines()
@@ -162,7 +163,7 @@ def test_nobody_comes_and_one_line_says_what_to_start(tmp_path):
     ],
 )
 def test_bad_input_is_one_line_and_status_2(options, part, capsys):
-    assert refuse(["simulate", *options]) == 2
+    assert bridge_status(["simulate", *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
 

@@ -15,9 +15,9 @@ from bridge.feedback_hold import NO_FEEDBACK
 from bridge.tests.commands import make_command, make_feedback
 from bridge.tests.processes import (
     SHORT_TOY,
+    bridge_status,
     make_policy,
     read,
-    refuse,
     start_edge,
     start_simulate,
 )
@@ -130,7 +130,7 @@ def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
 
 
 def test_lock_step_cannot_have_a_vehicle(capsys):
-    assert refuse(["simulate", "--env", SHORT_TOY, "--loop", "vehicle"]) == 2
+    assert bridge_status(["simulate", "--env", SHORT_TOY, "--loop", "vehicle"]) == 2
     assert "--loop vehicle needs --clock realtime" in capsys.readouterr().err
 
 

@@ -20,8 +20,8 @@ from bridge.tests.damage import LEFT_TURN, flip_chunk
 from bridge.tests.processes import (
     SLOW_TOY,
     BridgeProcess,
+    bridge_status,
     make_policy,
-    refuse,
     start_edge,
     start_simulate,
 )
@@ -103,7 +103,7 @@ def test_bad_input_is_one_line_and_status_2(options, part, capsys, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert refuse(["view", "--connect", free_endpoint(), *options]) == 2
+    assert bridge_status(["view", "--connect", free_endpoint(), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
 
@@ -112,7 +112,7 @@ def test_a_simulator_of_another_vehicle_is_one_line_and_no_file(tmp_path, capsys
     endpoint, recording = free_endpoint(), tmp_path / "other.rrd"
     with open_port(endpoint, "other"):
         options = ["--connect", endpoint, "--save", str(recording), "--wait-s", "0.2"]
-        assert refuse(["view", *options]) == 2
+        assert bridge_status(["view", *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--vehicle-id" in line
     assert list(tmp_path.iterdir()) == []
@@ -167,7 +167,7 @@ def test_a_damaged_recording_is_shown_without_what_is_broken(tmp_path, capsys):
     ],
 )
 def test_a_recording_that_cannot_be_shown_is_one_line_and_no_file(options, part, capsys, tmp_path):
-    assert refuse(["view", *options, "--save", str(tmp_path / "a.rrd")]) == 2
+    assert bridge_status(["view", *options, "--save", str(tmp_path / "a.rrd")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
     assert list(tmp_path.iterdir()) == []

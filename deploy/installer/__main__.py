@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
 import signal
 import sys
-from typing import Any, NoReturn
+from typing import Any, Callable, NoReturn
 
 from deploy.installer import ed25519
 from deploy.installer.errors import UnhealthyError, UserError
@@ -91,12 +92,12 @@ def _parser() -> argparse.ArgumentParser:
                 help="who runs it (default: systemd where it runs this computer, else none)",
             )
         if name in ("install", "rollback"):
-            for option, default, text in (
-                ("--health-limit", LIMITS.within_s, "healthy within this time, or back"),
-                ("--settle", LIMITS.settle_s, "and for so long after that"),
+            for option, kind, default, text in (
+                ("--health-limit", _seconds(True), LIMITS.within_s, "healthy by then, or back"),
+                ("--settle", _seconds(False), LIMITS.settle_s, "and for so long after that"),
             ):
                 text = f"{text}, s (default: {default:g})"
-                command.add_argument(option, metavar="S", type=float, default=default, help=text)
+                command.add_argument(option, metavar="S", type=kind, default=default, help=text)
         if name == "install":
             command.add_argument("bundle", metavar="BUNDLE.tar")
             command.add_argument(
@@ -105,6 +106,22 @@ def _parser() -> argparse.ArgumentParser:
         if name == "status":
             command.add_argument("--json", action="store_true", help="print JSON")
     return parser
+
+
+def _seconds(above_0: bool) -> Callable[[str], float]:
+    """A type: a finite number of seconds, above 0 or at least 0."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or value < 0 or (above_0 and not value):
+            limit = "above 0" if above_0 else "at least 0"
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, {limit}")
+        return value
+
+    return read
 
 
 def _example(name: str) -> str:
@@ -128,8 +145,6 @@ def _dispatch(arguments: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     os.register_at_fork(after_in_child=_just_end)
     limits = Limits(arguments.health_limit, arguments.settle)
-    if not (limits.within_s > 0 and limits.settle_s >= 0):
-        raise UserError("--health-limit must be above 0, and --settle 0 or more")
     way = Way(service, limits)
     if arguments.command == "install":
         version = install(arguments.bundle, arguments.trust, layout, way)

@@ -14,16 +14,16 @@ from deploy.bundle import make_bundle
 from deploy.campaigns.light import HERE
 from deploy.pyz import build_installer
 from deploy.wheelhouse import build_edge_wheel
-from edge_runtime.cli import run_cli
 from edge_runtime.config import load_config
 from edge_runtime.errors import UserError
+from edge_runtime.tests.commands import exit_status
 
 
 @pytest.fixture(scope="module")
 def party(tmp_path_factory):
     """A vehicle's TLS folder, and another vehicle's."""
     folder = tmp_path_factory.mktemp("tls") / "certs"
-    assert run_cli(main, ["certs", "--out", str(folder), "--vehicle-id", "hunter01",
+    assert exit_status(main, ["certs", "--out", str(folder), "--vehicle-id", "hunter01",
                           "--vehicle-id", "other"]) == 0  # fmt: skip
     (folder / "edge-hunter01" / "ca.key.pem").write_text("never to leave the workstation")
     return folder
@@ -143,17 +143,10 @@ def test_a_mistake_is_one_line_before_anything_is_downloaded(
         monkeypatch.setattr(bundle_command, "gather", lambda *_: pytest.fail("downloads"))
     inputs = workshop.inputs()
     good = ["--policy", inputs.policy, "--public-key", inputs.public_key, "--key", inputs.key]
-    status = run_one(["bundle", *map(str, good), *arguments])
+    status = exit_status(main, ["bundle", *map(str, good), *arguments])
     said = capsys.readouterr().err.strip().splitlines()
     assert (status, len(said)) == (2, 1)
     assert list(tmp_path.iterdir()) == []
-
-
-def run_one(argv: list[str]) -> int:
-    try:
-        return run_cli(main, argv)
-    except SystemExit as error:
-        return int(error.code or 0)
 
 
 def test_an_out_that_is_a_file_is_said(workshop, tmp_path):

@@ -11,15 +11,15 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from deploy.__main__ import main
 from deploy.certs import issue, read_authority
-from edge_runtime.cli import run_cli
 from edge_runtime.errors import UserError
+from edge_runtime.tests.commands import exit_status
 from edge_runtime.tls import load_tls, tls_for
 
 PARTIES = {"router", "viewer", "edge-hunter01", "simulator-hunter01", "operator-hunter01"}
 
 
 def make(folder, *options):
-    return run_cli(main, ["certs", "--out", str(folder), *options])
+    return exit_status(main, ["certs", "--out", str(folder), *options])
 
 
 def contents(folder):
@@ -89,10 +89,11 @@ def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
         (["--vehicle-id", "hunter01"], "nothing is overwritten"),
         (["--vehicle-id", "a/b"], "a/b"),
         (["--vehicle-id", "new", "--host", "tcp/host:1"], "tcp/host:1"),
-        (["--vehicle-id", "new", "--days", "0"], "--days 0"),
+        (["--vehicle-id", "new", "--days", "0"], "--days: '0'"),
+        (["--vehicle-id", "new", "--days", "soon"], "'soon' is not a whole number from 1 to 3650"),
         (["--vehicle-id", "new", "--host", "a..b"], "a..b"),
         (["--vehicle-id", "new", "--days", "3650"], "authority's own"),
-        (["--vehicle-id", "new", "--days", "99999999999"], "at most 3650"),
+        (["--vehicle-id", "new", "--days", "99999999999"], "from 1 to 3650"),
         (["--vehicle-id", "x" * 55], "shorter --vehicle-id"),
     ],
 )

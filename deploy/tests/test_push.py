@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from deploy.__main__ import main
-from edge_runtime.cli import run_cli
+from edge_runtime.tests.commands import exit_status
 
 SSH = """\
 #!{python}
@@ -57,7 +57,7 @@ def far(tmp_path, monkeypatch):
 
 def push(board, workshop, *arguments: object) -> int:
     options = ["--trust", workshop.public_key, "--root", board.root, "--no-sudo"]
-    return run_cli(main, ["push", *map(str, [*arguments, *options])])
+    return exit_status(main, ["push", *map(str, [*arguments, *options])])
 
 
 def test_a_push_installs_and_leaves_nothing_behind(far, board, workshop, capfd):
@@ -126,13 +126,7 @@ def test_a_board_of_another_kind_is_not_touched(far, board, workshop, capfd, tmp
 @pytest.mark.parametrize("host", ["-oProxyCommand=touch x", "a b", "", "a;b", "$(id)", "user@"])
 def test_a_host_that_would_be_an_option_or_a_command_is_refused(far, board, workshop, host, capsys):
     made = workshop.make(0.1)
-    try:
-        status = push(board, workshop, "--", host, made.path) if host[:1] == "-" else push(
-            board, workshop, host, made.path
-        )  # fmt: skip
-    except SystemExit as error:
-        status = int(error.code or 0)
-    assert status == 2
+    assert push(board, workshop, *(["--"] if host[:1] == "-" else []), host, made.path) == 2
     assert not (far / "log").read_text()
 
 

@@ -161,8 +161,7 @@ def test_a_systemd_that_does_not_run_is_said_before_anything_is_made(board: Boar
     "arguments",
     [
         [], ["install"], ["fly"], ["status", "--service", "cron"], ["install", "missing.tar"],
-        ["install", "x", "--health-limit", "soon"], ["rollback", "--health-limit", "0"],
-        ["supervise", "--root", "/nowhere/at/all"], ["install", "x", "--settle", "-1"],
+        ["supervise", "--root", "/nowhere/at/all"],
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_line(board: Board, arguments):
@@ -170,4 +169,21 @@ def test_a_mistake_is_one_line(board: Board, arguments):
     line = board.command(command, *rest) if arguments else board.command("status")[:3]
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert (done.returncode, len(done.stderr.strip().splitlines())) == (2, 1), done.stderr
+    assert not board.root.exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--health-limit", "soon"), ("--health-limit", "0"), ("--health-limit", "inf"),
+        ("--settle", "-1"), ("--settle", "nan"), ("--settle", "inf"),
+    ],
+)  # fmt: skip
+def test_what_is_no_number_of_seconds_is_refused(board: Board, option, value):
+    """Above all one that would wait for ever."""
+    line = board.command("rollback", option, value)
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2, done.stderr
+    assert f"argument {option}: {value!r} is not a number of seconds" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
     assert not board.root.exists()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from edge_runtime.cli import run_cli
 from edge_runtime.errors import UserError
+from edge_runtime.tests.commands import exit_status
 from hil_tests.__main__ import main
 from hil_tests.commands import BackgroundCommand
 from hil_tests.demo import Demo
@@ -66,11 +66,7 @@ def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(tmp_pa
 )
 def test_bad_input_gets_one_line_and_touches_nothing(arguments, capsys, tmp_path):
     (tmp_path / "file").write_text("mine")
-    try:
-        status = run_cli(main, [a.format(tmp=tmp_path) for a in arguments])
-    except SystemExit as end:
-        status = int(end.code or 0)
-    assert status == 2
+    assert exit_status(main, [a.format(tmp=tmp_path) for a in arguments]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 

@@ -4,17 +4,14 @@ import json
 
 import pytest
 
-from edge_runtime.cli import run_cli
+from edge_runtime.tests.commands import exit_status
 from trainer.__main__ import main
 from trainer.files import save_torch
 
 
 def call(capsys, *arguments: str) -> tuple[int, str, str]:
     """Run ``python -m trainer`` in this process: exit status, stdout, stderr."""
-    try:
-        status = run_cli(main, list(arguments))
-    except SystemExit as end:
-        status = int(end.code or 0)
+    status = exit_status(main, list(arguments))
     captured = capsys.readouterr()
     return status, captured.out, captured.err
 
