@@ -18,6 +18,7 @@ from edge_runtime.option_types import seconds
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
+from edge_runtime.words import counted
 
 POLL_S = 0.1
 FLUSH_S = 0.5
@@ -79,8 +80,9 @@ def record(arguments: Any) -> int:
         finally:
             writer.close()
     if feed.dropped:
-        print(f"{feed.dropped} messages came faster than they could be written", file=sys.stderr)
-    print(f"wrote {path}: {writer.messages} messages")
+        dropped = counted(feed.dropped, "message")
+        print(f"{dropped} came faster than they could be written", file=sys.stderr)
+    print(f"wrote {path}: {counted(writer.messages, 'message')}")
     return 0
 
 

@@ -17,6 +17,7 @@ from bridge.recording.writer import CHUNK_BYTES, METADATA
 from edge_runtime.cli import ArgumentParser, UserError, examples
 from edge_runtime.file_lock import try_to_hold
 from edge_runtime.files import behind_link, check_writable, write_atomic
+from edge_runtime.words import counted
 
 KEPT = ".damaged"
 """Ends the name under which a damaged recording is kept beside the repaired one."""
@@ -55,11 +56,11 @@ def repair(arguments: Any) -> int:
         if not messages:
             raise UserError(f"{source} holds no whole message; there is nothing to repair")
         if not recording.trouble() and arguments.out is None:
-            print(f"{source} is whole: {messages} messages; nothing done")
+            print(f"{source} is whole: {counted(messages, 'message')}; nothing done")
             return 0
         kept = _write(data, recording, arguments.out)
     left_out = recording.missing() and f"; left out: {recording.missing()}"
-    print(f"wrote {arguments.out or source}: {messages} messages{left_out}{kept}")
+    print(f"wrote {arguments.out or source}: {counted(messages, 'message')}{left_out}{kept}")
     return 0
 
 

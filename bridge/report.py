@@ -11,6 +11,7 @@ import numpy as np
 
 from bridge.safe_stops import SafeStopEvent
 from edge_runtime.episode_report import EpisodeResult, summarise
+from edge_runtime.words import counted
 
 QUANTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 
@@ -82,9 +83,11 @@ def summary_line(report: Mapping[str, Any]) -> str:
     rejected = sum(report["rejected"].values())
     vehicle = "" if report["vehicle"] is None else f"; {_vehicle_words(report['vehicle'])}"
     return (
-        f"{report['episodes']} episodes: {report['success_rate']:.0%} goal, "
-        f"{report['collision_rate']:.0%} collision; {times}; {report['safe_stops']} safe stops, "
-        f"{report['deadline_misses']} deadline misses, {rejected} rejected messages{vehicle}"
+        f"{counted(report['episodes'], 'episode')}: {report['success_rate']:.0%} goal, "
+        f"{report['collision_rate']:.0%} collision; {times}; "
+        f"{counted(report['safe_stops'], 'safe stop')}, "
+        f"{report['deadline_misses']} deadline misses, "
+        f"{counted(rejected, 'rejected message')}{vehicle}"
     )
 
 

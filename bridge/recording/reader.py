@@ -12,6 +12,7 @@ from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 
 from bridge.recording.records import Records
 from edge_runtime.errors import UserError
+from edge_runtime.words import counted
 
 
 class Stored(NamedTuple):
@@ -59,12 +60,13 @@ class Recording:
         """Say what could not be read; empty where all of the file could."""
         parts = []
         if self.damaged_places:
-            places = "place" if self.damaged_places == 1 else "places"
-            parts.append(f"{self.damaged_places} damaged {places} of {self.damaged_bytes} bytes")
+            places = counted(self.damaged_places, "damaged place")
+            parts.append(f"{places} of {counted(self.damaged_bytes, 'byte')}")
         if self.nameless_messages:
-            parts.append(f"{self.nameless_messages} messages whose topic was in a damaged place")
+            messages = counted(self.nameless_messages, "message")
+            parts.append(f"{messages} whose topic was in a damaged place")
         if self.torn_bytes:
-            parts.append(f"a torn end of {self.torn_bytes} bytes")
+            parts.append(f"a torn end of {counted(self.torn_bytes, 'byte')}")
         return ", ".join(parts)
 
     def trouble(self) -> str:

@@ -16,6 +16,7 @@ from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import positive
+from edge_runtime.words import counted
 from hil_tests.fleet.drive import measure
 from hil_tests.fleet.rules import certificates_ms, measure_rules
 from hil_tests.fleet.scale import per_vehicle, project
@@ -76,7 +77,7 @@ def _measure(arguments: argparse.Namespace, console: Console) -> dict[str, Any]:
     rows = []
     for count in sorted(set(arguments.vehicles)):
         rows.append(_undisturbed(count, arguments.seconds))
-        console.print(f"{count} vehicles: done, {rows[-1]['tries']} tries")
+        console.print(f"{counted(count, 'vehicle')}: done, {rows[-1]['tries']} tries")
     with tempfile.TemporaryDirectory() as folder:
         rules = measure_rules(sorted(set(arguments.rules)), Path(folder))
         making_ms = certificates_ms(_CERTIFIED, Path(folder) / "many")

@@ -27,7 +27,7 @@ def headless_viewer() -> Iterator[Any]:
     """A viewer, as a ``ViewerClient`` that asks it for pictures.
 
     Raises:
-        UserError: it does not start here.
+        UserError: it does not start here, or ends as soon as it is to draw.
     """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -40,6 +40,8 @@ def headless_viewer() -> Iterator[Any]:
     )
     try:
         yield _connect(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
+    except ConnectionError as error:
+        raise UserError(f"rerun's viewer ends as it draws ({error}): {NEEDS}") from None
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(viewer.pid, signal.SIGTERM)

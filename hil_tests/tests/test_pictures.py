@@ -13,7 +13,7 @@ from edge_runtime.cli import run_cli
 from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
 from hil_tests.__main__ import main
-from hil_tests.pictures import command
+from hil_tests.pictures import command, headless
 from hil_tests.pictures.curves import success_against_latency
 from hil_tests.pictures.loop import Trips
 from hil_tests.pictures.scenes import policy_sees
@@ -95,3 +95,9 @@ def test_bad_input_is_one_line(words, part, capsys):
     assert run_cli(main, ["pictures", *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
+
+
+def test_a_viewer_that_ends_as_it_draws_is_said(monkeypatch):
+    monkeypatch.setattr(headless, "_connect", lambda viewer, _url: viewer)
+    with pytest.raises(UserError, match="mesa-vulkan-drivers"), headless.headless_viewer():
+        raise ConnectionError("transport error")

@@ -8,6 +8,7 @@ from pathlib import Path
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.option_types import not_negative, positive
+from edge_runtime.words import counted
 from trainer.commands.options import add_scenario, add_threads, set_threads
 from trainer.drivers import load_driver, make_environment
 from trainer.person.options import add_person, person_options
@@ -84,8 +85,10 @@ def run(arguments: argparse.Namespace) -> int:
         person.close()
     ends = ", ".join(f"{count} {word}" for word, count in outcomes.items()) or "none"
     print(
-        f"episodes: {ends}; {recorder.index} steps, {sitting.human_steps} of them yours in "
-        f"{sitting.interventions} interventions; {sitting.pacer.late} control periods late"
+        f"episodes: {ends}; {counted(recorder.index, 'step')}, "
+        f"{sitting.human_steps} of them yours in "
+        f"{counted(sitting.interventions, 'intervention')}; "
+        f"{counted(sitting.pacer.late, 'control period')} late"
     )
     if recorder.index:
         print(recorder.path)

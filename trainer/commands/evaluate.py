@@ -10,6 +10,7 @@ from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
 from edge_runtime.option_types import not_negative, positive
+from edge_runtime.words import counted
 from trainer.commands.options import add_latency, add_scenario, set_threads
 from trainer.drivers import load_driver, make_environment
 from trainer.evaluation import CONDITIONS, drive_episodes
@@ -93,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
     write_json_out(arguments.out, {**report, "per_episode": detail})
     distance_m = report["surviving_distance_m"]
     print(
-        f"{arguments.runs} episodes: success {report['success_rate']:.0%}, surviving distance "
-        f"{distance_m['mean']:.2f} ± {distance_m['std']:.2f} m: {arguments.out}"
+        f"{counted(arguments.runs, 'episode')}: success {report['success_rate']:.0%}, "
+        f"surviving distance {distance_m['mean']:.2f} ± {distance_m['std']:.2f} m: {arguments.out}"
     )
     return 0

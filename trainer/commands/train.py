@@ -19,6 +19,7 @@ from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.latency.model import parse_spec
 from edge_runtime.option_types import not_negative, positive
+from edge_runtime.words import counted
 from trainer.commands.options import add_latency, add_scenario, add_threads, set_threads
 from trainer.commands.resuming import check_directory
 from trainer.commands.settings import DEFAULTS, settings, with_setting
@@ -109,7 +110,8 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
             training.train(_both(_Reporter(bar), watch), end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
-    print(f"{training.episode} episodes, {training.learning.added} steps: {run_dir}")
+    steps = counted(training.learning.added, "step")
+    print(f"{counted(training.episode, 'episode')}, {steps}: {run_dir}")
     if training.quitting and training.episode < config.episodes:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
         return INTERRUPTED

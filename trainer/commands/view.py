@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from edge_runtime.cli import examples
+from edge_runtime.words import counted
 from trainer.person.recording import find_recordings, read_steps
 
 EXAMPLE = examples(
@@ -48,8 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
     with show_sittings(paths, sink) as shown:
         road = f"; {shown.without_road} without their road" if shown.without_road else ""
         print(
-            f"{shown.episodes} episodes, {shown.steps} steps, {shown.human_steps} of them the "
-            f"person's{road}",
+            f"{counted(shown.episodes, 'episode')}, {counted(shown.steps, 'step')}, "
+            f"{shown.human_steps} of them the person's{road}",
             flush=True,
         )
         try:

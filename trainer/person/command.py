@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from edge_runtime.words import counted
 from trainer.files import make_directory
 from trainer.person.options import person_options
 from trainer.person.registry import HUMANS
@@ -43,7 +44,9 @@ def summary(training: PersonRun) -> str:
     if not sitting.recorder.index:
         return "nothing was driven, and nothing recorded"
     return (
-        f"{sitting.episodes} episodes, {sitting.interventions} interventions, "
-        f"{sitting.human_steps} steps yours; {sitting.pacer.late} control periods late, "
+        f"{counted(sitting.episodes, 'episode')}, "
+        f"{counted(sitting.interventions, 'intervention')}, "
+        f"{counted(sitting.human_steps, 'step')} yours; "
+        f"{counted(sitting.pacer.late, 'control period')} late, "
         f"checkpoints in {training.longest_save_s:.2f} s at most: {sitting.recorder.path}"
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
+from edge_runtime.words import counted
 from trainer.human.guide import Guide
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.person.guide import PersonGuide
@@ -86,8 +87,8 @@ class PersonRun(TrainingRun):
         metrics = super().advance()
         self.sitting.rest(metrics.outcome)
         self.sitting.progress = (
-            f"{self.learning.added} steps stored, {self.sitting.human_steps} yours in "
-            f"{self.sitting.interventions} interventions of this sitting; "
+            f"{counted(self.learning.added, 'step')} stored, {self.sitting.human_steps} yours in "
+            f"{counted(self.sitting.interventions, 'intervention')} of this sitting; "
             f"critic loss {metrics.critic_loss:.3f}, return {metrics.episode_return:.1f}"
         )
         return metrics

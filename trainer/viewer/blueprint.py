@@ -30,21 +30,22 @@ RECENT = (
     Plot("speed", "Speed, m/s, the last 20 s"),
 )
 LINES = {
+    # Blue is the policy's and green the human's, in every view.
     "return/episode": GREY,
     "return/mean_of_20": BLUE,
     "success/mean_of_20": BLUE,
     "success/validation": ORANGE,
-    "loss/critic": BLUE,
-    "loss/policy": GREEN,
-    "loss/cloning": ORANGE,
-    "priority/human": ORANGE,
+    "loss/critic": PURPLE,
+    "loss/policy": BLUE,
+    "loss/cloning": GREEN,
+    "priority/human": GREEN,
     "priority/policy": BLUE,
-    "human/share": ORANGE,
+    "human/share": GREEN,
     "action/policy": BLUE,
     "action/applied": ORANGE,
     "speed/ego": BLUE,
 }
-POINTS = {"advantage/of_the_human": PURPLE}
+POINTS = {"advantage/of_the_human": GREEN}
 
 ROAD = "Road from above (blue: the policy drives, green: the human)"
 

@@ -12,6 +12,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from edge_runtime.episode_report import GOAL
+from edge_runtime.words import counted
 from trainer.training.metrics import EpisodeMetrics
 from trainer.viewer.advantage import q_advantage
 from trainer.viewer.blueprint import LINES, POINTS, TIMELINE, make_blueprint
@@ -163,8 +164,9 @@ class TrainingLog:
 def _status(metrics: EpisodeMetrics) -> rr.TextDocument:
     lines = [
         f"# episode {metrics.episode}: {metrics.outcome}",
-        f"{metrics.total_steps} steps in all, {metrics.steps} in this episode",
-        f"{metrics.interventions} interventions, {metrics.human_steps} steps the human's",
+        f"{counted(metrics.total_steps, 'step')} in all, {metrics.steps} in this episode",
+        f"{counted(metrics.interventions, 'intervention')}, "
+        f"{counted(metrics.human_steps, 'step')} the human's",
         f"{metrics.distance_m:.1f} m, return {metrics.episode_return:.1f}",
     ]
     if not math.isnan(metrics.validation_success):

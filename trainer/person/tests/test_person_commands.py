@@ -124,7 +124,7 @@ def test_a_validation_that_is_left_out_costs_nothing_else(
     status, out, errors = call(capsys, *command)
     assert status == 0
     assert "validation left out" in errors
-    assert "1 episodes, 4 steps" in out
+    assert "1 episode, 4 steps" in out
     assert [row["outcome"] for row in read_metrics(run_dir)] == [STOPPED]
     assert (run_dir / "learning_curve.png").is_file()
 

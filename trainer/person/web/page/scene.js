@@ -10,7 +10,7 @@ const COLOURS = {
   traffic: "#eb8c28",
   glass: "rgba(10, 12, 15, 0.75)",
   policy: "#4d9bff",
-  human: "#ffc247",
+  human: "#3fd07c",
   returning: "#b98cff",
 };
 const GOAL_HALF_M = 2.0;
@@ -119,7 +119,7 @@ export class History {
     const y = (action) => height / 2 - action * (height / 2 - 3);
     this.steps.forEach(([, , control], i) => {
       if (control === "policy") return;
-      pen.fillStyle = control === "human" ? "rgba(255, 194, 71, 0.22)" : "rgba(185, 140, 255, 0.22)";
+      pen.fillStyle = control === "human" ? "rgba(63, 208, 124, 0.22)" : "rgba(185, 140, 255, 0.22)";
       const [from, to] = [Math.round(left + i * dx), Math.round(left + (i + 1) * dx)];
       pen.fillRect(from, 0, to - from, height);
     });
