@@ -14,6 +14,7 @@ from bridge.replaying.in_process import Answers, replay_in_process
 from bridge.replaying.live import replay_live
 from bridge.replaying.recorded import RecordedDrive, key_of
 from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
+from edge_runtime.config import load_config
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import not_negative_number
 from edge_runtime.policy import load_policy
@@ -58,6 +59,12 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--allow-unsigned",
         action="store_true",
         help="also take a policy whose origin cannot be verified",
+    )
+    parser.add_argument(
+        "--config",
+        metavar="FILE.toml",
+        help="with --policy: the settings of the edge runtime that was recorded, where a vehicle's"
+        " model or scale was not the default",
     )
     parser.add_argument(
         "--vehicle-id", metavar="ID", help="which vehicle, where the recording holds several"
@@ -110,7 +117,10 @@ def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:
         if arguments.tls is not None:
             raise UserError("--tls is for a link, of --listen or --connect; --policy has none")
         policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
-        return policy.policy_id, replay_in_process(drive, policy)
+        config = load_config(arguments.config, {"policy": arguments.policy})
+        return policy.policy_id, replay_in_process(drive, policy, config)
+    if arguments.config is not None:
+        raise UserError("--config is for --policy; an edge runtime that is asked has its own")
     endpoint = check_endpoint(arguments.listen or arguments.connect)
     wait_s, tls = arguments.wait_edge_s, tls_for(arguments.tls, endpoint)
     with open_port(arguments.listen, drive.vehicle_id, tls, arguments.connect, wait_s) as port:

@@ -18,7 +18,7 @@ from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
 from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
 from edge_runtime.vehicles.hunter.faults import PROFILES
 from edge_runtime.vehicles.hunter.specs import SPECS
-from edge_runtime.vehicles.registry import NONE, VEHICLE_NAMES
+from edge_runtime.vehicles.registry import NONE, VEHICLE_NAMES, VehicleSetup
 from edge_runtime.vehicles.ros2.settings import Ros2Settings, check_settings
 from edge_runtime.vehicles.settings import CarSettings, HunterSettings, SimilaritySettings
 
@@ -46,6 +46,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     hunter: HunterSettings = msgspec.field(default_factory=HunterSettings)
     similarity: SimilaritySettings = msgspec.field(default_factory=SimilaritySettings)
     ros2: Ros2Settings = msgspec.field(default_factory=Ros2Settings)
+
+    def vehicle_setup(self, scenario: str) -> VehicleSetup:
+        """What a driver is made from, for a policy of this scenario."""
+        return VehicleSetup(scenario, self.bus, self.hunter, self.similarity, self.ros2)
 
 
 _TABLES: Dict[str, Type[msgspec.Struct]] = {

@@ -22,7 +22,7 @@ from edge_runtime.sd_notify import Notifier
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.interface import Vehicle
-from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle
+from edge_runtime.vehicles.registry import make_vehicle
 from edge_runtime.vehicles.runner import VehicleRunner
 from edge_runtime.wire import key
 
@@ -57,7 +57,7 @@ def _run(config: Config) -> int:
     tls = _certificate(config)
     realtime.configure(config.realtime_priority, config.cpus, config.lock_memory)
     policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
-    vehicle = _vehicle(config, policy)
+    vehicle = make_vehicle(config.vehicle, config.vehicle_setup(policy.manifest.scenario))
     with _closed_on_error(vehicle):
         rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
     controller = Controller(rows, vehicle is not None, config.armed_at_start)
@@ -73,13 +73,6 @@ def _closed_on_error(vehicle: Optional[Vehicle]) -> Iterator[None]:
         if vehicle is not None:
             vehicle.close()
         raise
-
-
-def _vehicle(config: Config, policy: Policy) -> Optional[Vehicle]:
-    setup = VehicleSetup(
-        policy.manifest.scenario, config.bus, config.hunter, config.similarity, config.ros2
-    )
-    return make_vehicle(config.vehicle, setup)
 
 
 def _certificate(config: Config) -> Optional[TlsFiles]:

@@ -15,25 +15,28 @@ from bridge.replaying.recorded import (
     RecordedState,
     key_of,
 )
+from edge_runtime.config import Config
 from edge_runtime.controller import Controller, Order, Received
 from edge_runtime.inference import infer
 from edge_runtime.limiter import LimitRow, limit_rows
 from edge_runtime.policy import Policy
-from edge_runtime.vehicles.registry import make_vehicle
+from edge_runtime.safety import Event
+from edge_runtime.vehicles.registry import NONE, vehicle_limits
 
 Answers = dict[Key, list[Answer]]
 
 
-def replay_in_process(drive: RecordedDrive, policy: Policy) -> Answers:
+def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> Answers:
     """Return the answers to every state that was answered in the recording.
 
-    Whether a vehicle was attached, and its limits, are the recording's; so are the moments at
-    which an operator re-armed (before a state that was answered with ``drive``) and at which the
-    runtime was started anew. UserError where the vehicle lacks an action of the policy.
+    Which vehicle was attached is the recording's, and so is what befell it: when it failed, when
+    an operator re-armed (before a state that was answered with ``drive``), and when the runtime
+    was started anew. Its limits follow from ``config``. UserError where it lacks an action of the
+    policy or cannot follow its scenario.
     """
-    vehicle = make_vehicle(drive.vehicle)
-    rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
-    return _Replay(drive, policy, rows, needs_rearm=vehicle is not None).run()
+    limits = vehicle_limits(drive.vehicle, config.vehicle_setup(policy.manifest.scenario))
+    rows = limit_rows(policy.manifest.action, limits)
+    return _Replay(drive, policy, rows, needs_rearm=drive.vehicle != NONE).run()
 
 
 class _Replay:
@@ -73,8 +76,23 @@ class _Replay:
         self._controller.begin(Received(state, exchange.arrived_s, arrived_ns), exchange.begun_s)
         output = infer(self._policy, state.frames_array()).output
         self._pass_time(exchange.finished_s)
+        first, *later = exchange.answers
+        self._controller.vehicle_fault = self._new_fault([first])
         self._note(self._controller.finish(output, 1, exchange.finished_s))
+        self._controller.vehicle_fault = self._new_fault(later)
+        if self._controller.vehicle_fault:
+            self._note(self._controller.tick(exchange.finished_s))
+            self._controller.vehicle_fault = ""
         self._last_heard_s = exchange.last_s
+
+    def _new_fault(self, answers: Sequence[Answer]) -> str:
+        """The vehicle's fault where these answers are the first to tell of it; else empty.
+
+        How long the cause stood is not recorded, and need not be: the stop is latched.
+        """
+        fault = Event.VEHICLE.value
+        told = any(answer.reason == fault for answer in answers)
+        return fault if told and self._controller.safety.reason != fault else ""
 
     def _pass_time(self, until_s: float) -> None:
         """Be the watchdog up to a moment."""

@@ -15,6 +15,7 @@ from bridge.tests.commands import make_command
 from bridge.tests.processes import make_policy
 from bridge.tests.test_edge_counts import health
 from edge_runtime.cli import UserError
+from edge_runtime.config import Config
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import FRAMES_BYTES, MAX_PAYLOAD_BYTES, encode
@@ -85,7 +86,7 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     drive = RecordedDrive(tmp_path / "a.mcap", None)
     policy = load_policy(make_policy(tmp_path), allow_unsigned=True)
     assert ("here", 0, 1) in drive.exchanges
-    replay_in_process(drive, policy)
+    replay_in_process(drive, policy, Config())
 
 
 def test_an_empty_file_is_no_recording(tmp_path):

@@ -18,6 +18,7 @@ from edge_runtime.wire import FRAMES_BYTES, encode
 
 EPOCH_NS = 1_700_000_000 * 10**9
 ANSWER_S, INFERENCE_S = 0.002, 0.001
+FAULT = {"mode": "safe_stop", "reason": "vehicle_fault", "action": [-1.0]}
 SAFE_STOP = {"mode": "safe_stop", "reason": "no_fresh_state", "action": [-1.0]}
 
 
@@ -207,6 +208,30 @@ def test_an_attached_vehicle_and_its_operator_are_the_recordings(hand, path, tmp
     assert status == 0, report["first_differences"]
 
 
+def test_a_hunter_and_its_faults_are_the_recordings(hand, path, tmp_path):
+    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="hunter", needs_rearm=False))
+    hand.drive(0, 3)
+    hand.command(0.25, 2, answer_s=0.05, inference_ns=0, **FAULT)  # While nothing else happens.
+    for step in range(3, 10):
+        hand.state(step * 0.1, step)
+        hand.command(step * 0.1 + ANSWER_S, step, **FAULT)
+    hand.drive(10, 13)
+    for step in range(13, 20):  # Seen when a state was to be answered.
+        hand.state(step * 0.1, step)
+        hand.command(step * 0.1 + ANSWER_S, step, **FAULT)
+    hand.drive(20, 23)
+    hand.close()
+    policy = make_policy(tmp_path, "constant", 0.3)
+    status, report = replay(path, policy)
+    assert status == 0, report["first_differences"]
+    assert report["compared"] == 23
+    settings = tmp_path / "edge.toml"
+    settings.write_text("vehicle = 'hunter'\n[similarity]\nscale = 0.2\n")
+    assert replay(path, policy, "--config", str(settings))[0] == 0
+    settings.write_text("[similarity]\nscale = -1\n")
+    assert replay(path, policy, "--config", str(settings))[0] == 2
+
+
 def test_of_several_vehicles_one_is_named(hand, path, tmp_path, capsys):
     hand.drive(0, 3)
     hand.hear(1.0, "state", make_state(0), vehicle_id="w")
@@ -245,6 +270,7 @@ def test_through_a_running_edge_runtime(hand, path, tmp_path):
     [
         (["--policy", "none.onnx"], "does not exist"),
         (["--policy", "none.onnx", "--tls", "certs/viewer"], "--tls is for a link"),
+        (["--listen", free_endpoint(), "--config", "edge.toml"], "--config is for --policy"),
         ([], "--policy"),
         (["--policy", "a.onnx", "--connect", free_endpoint()], "not allowed"),
         (["--listen", "here"], "endpoint"),

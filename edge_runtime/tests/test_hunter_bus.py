@@ -18,7 +18,7 @@ from edge_runtime.vehicles.hunter.bus import BusName, Gate, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.specs import SPECS
 from edge_runtime.vehicles.hunter.states import State
 from edge_runtime.vehicles.hunter.vehicle import HunterVehicle
-from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle
+from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle, vehicle_limits
 from edge_runtime.vehicles.settings import CarSettings, SimilaritySettings
 from edge_runtime.vehicles.similarity import CARS, similarity_to
 
@@ -325,8 +325,10 @@ def test_the_registry_makes_it_for_a_known_scenario_only(channel):
     vehicle = make_vehicle("hunter", setup)
     assert isinstance(vehicle, HunterVehicle)
     vehicle.close()
-    with pytest.raises(UserError, match="parking"):
-        make_vehicle("hunter", setup._replace(scenario="parking"))
+    assert vehicle.limits == vehicle_limits("hunter", setup)
+    for make in (make_vehicle, vehicle_limits):
+        with pytest.raises(UserError, match="parking"):
+            make("hunter", setup._replace(scenario="parking"))
     car = CarSettings(
         throttle_mps2=1.0, brake_mps2=1.0, max_speed_mps=3.0, full_steering_rad=0.5,
         wheelbase_m=2.0,

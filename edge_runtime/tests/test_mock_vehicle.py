@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.errors import UserError
 from edge_runtime.vehicles.mock import MockParameters, MockState, MockVehicle, advance
-from edge_runtime.vehicles.registry import make_vehicle
+from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle, vehicle_limits
 
 
 def enabled(**parameters):
@@ -80,8 +80,11 @@ def test_it_stays_within_its_limits(commands):
 def test_the_registry():
     assert make_vehicle("none") is None
     assert isinstance(make_vehicle("mock"), MockVehicle)
-    with pytest.raises(UserError, match="choose from none, mock, hunter"):
-        make_vehicle("tank")
+    assert vehicle_limits("none", VehicleSetup()) == {}
+    assert vehicle_limits("mock", VehicleSetup()) == MockVehicle.limits
+    for make in (make_vehicle, vehicle_limits):
+        with pytest.raises(UserError, match="choose from none, mock, hunter"):
+            make("tank", VehicleSetup())
 
 
 def test_a_stop_is_latched_until_it_is_enabled_again():

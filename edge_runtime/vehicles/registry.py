@@ -8,8 +8,9 @@ import msgspec
 
 from edge_runtime.errors import UserError
 from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
+from edge_runtime.vehicles.hunter.set_point import limits_of
 from edge_runtime.vehicles.hunter.specs import SPECS
-from edge_runtime.vehicles.interface import Vehicle
+from edge_runtime.vehicles.interface import ActionLimit, Vehicle
 from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.vehicles.ros2.settings import Ros2Settings
 from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
@@ -65,9 +66,27 @@ def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Optional[Ve
     """
     if name == NONE:
         return None
+    _check_known(name)
+    return _MAKERS[name](setup or VehicleSetup())
+
+
+def vehicle_limits(name: str, setup: VehicleSetup) -> Dict[str, ActionLimit]:
+    """What the vehicle of that name lets each action be, without opening anything; "none": {}.
+
+    Raises UserError for any other name, and for a scenario that the vehicle cannot follow.
+    """
+    if name == NONE:
+        return {}
+    _check_known(name)
+    if name == MockVehicle.name:
+        return MockVehicle.limits
+    spec = SPECS[setup.ros2.model if name == "ros2" else setup.hunter.model]
+    return limits_of(spec, make_similarity(setup, name, spec.max_speed_mps))
+
+
+def _check_known(name: str) -> None:
     if name not in _MAKERS:
         raise UserError(f"vehicle {name!r} is not known; choose from {', '.join(VEHICLE_NAMES)}")
-    return _MAKERS[name](setup or VehicleSetup())
 
 
 def make_similarity(setup: VehicleSetup, name: str, max_speed_mps: float) -> Similarity:

@@ -13,6 +13,7 @@ from edge_runtime.tests.harness import wait_until
 from edge_runtime.transport import free_endpoint
 from edge_runtime.vehicles import stream
 from edge_runtime.vehicles.hunter.specs import SPECS
+from edge_runtime.vehicles.registry import VehicleSetup, vehicle_limits
 from edge_runtime.vehicles.ros2.settings import Ros2Settings
 from edge_runtime.vehicles.ros2.states import Event, State
 from edge_runtime.vehicles.ros2.tests.ros_hunter import RosHunter
@@ -70,6 +71,7 @@ def pair(request):
     endpoint = free_endpoint()
     if request.param == "we listen":
         vehicle = make_vehicle(listen=endpoint)
+        assert vehicle.limits == vehicle_limits("ros2", VehicleSetup("left_turn"))
         vehicle.enable(time.monotonic())
         hunter = RosHunter(connect=endpoint)
     else:
