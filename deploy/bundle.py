@@ -13,9 +13,7 @@ import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
-from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 import edge_runtime
 from deploy.installer import errors as installer_errors
@@ -28,6 +26,7 @@ from edge_runtime.config import Config, load_config
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.policy import Policy, load_policy
+from edge_runtime.private_keys import read_signing_key
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE, load_tls
 from edge_runtime.vehicles.registry import NONE
 
@@ -91,7 +90,11 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
 
     Raises UserError for what `make_bundle` would refuse.
     """
-    key = _read_private_key(inputs.key)
+    if not inputs.key.exists():
+        raise UserError(
+            f"private key {inputs.key} does not exist; `python -m deploy keys` makes one"
+        )
+    key = read_signing_key(inputs.key)
     if inputs.policy.is_file() and not Path(f"{inputs.policy}.sig").exists():
         # Here, because load_policy would name a flag that no bundle has.
         raise UserError(
@@ -171,19 +174,6 @@ def _tls(folder: Path, vehicle_id: str) -> dict[str, bytes]:
         f"{TLS}{name}": read_bytes(folder / name, "TLS file")
         for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE)
     }
-
-
-def _read_private_key(path: Path) -> Ed25519PrivateKey:
-    if not path.exists():
-        raise UserError(f"private key {path} does not exist; `python -m deploy keys` makes one")
-    pem = read_bytes(path, "private key")
-    try:
-        key = load_pem_private_key(pem, password=None)
-    except (ValueError, TypeError, UnsupportedAlgorithm):
-        raise UserError(f"{path} is not a private key in PEM without a password") from None
-    if not isinstance(key, Ed25519PrivateKey):
-        raise UserError(f"{path} is not an Ed25519 key; `python -m deploy keys` makes one")
-    return key
 
 
 def _write(path: Path, manifest: Manifest, key: Ed25519PrivateKey, contents: dict) -> None:

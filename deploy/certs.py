@@ -15,12 +15,12 @@ from typing import NamedTuple
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from edge_runtime.access import ROLES, common_name
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
+from edge_runtime.private_keys import read_private_key
 from edge_runtime.tls import CA_FILE
 
 CA_KEY_FILE = "ca.key.pem"
@@ -58,12 +58,12 @@ def make_authority(now: datetime.datetime, days: int = CA_DAYS) -> Authority:
 
 def read_authority(folder: Path) -> Authority:
     """The authority that `make_authority` made before. UserError where its files do not fit."""
-    pem, key_pem = (read_bytes(folder / n, "authority") for n in (CA_FILE, CA_KEY_FILE))
+    pem = read_bytes(folder / CA_FILE, "authority")
     try:
         certificate = x509.load_pem_x509_certificate(pem)
-        key = load_pem_private_key(key_pem, password=None)
-    except (ValueError, TypeError):
-        raise UserError(f"{folder} holds no authority in PEM") from None
+    except ValueError:
+        raise UserError(f"{folder / CA_FILE} is not a certificate in PEM") from None
+    key = read_private_key(folder / CA_KEY_FILE)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UserError(f"{folder / CA_KEY_FILE} is not a key of an elliptic curve")
     if key.public_key() != certificate.public_key():

@@ -13,6 +13,7 @@ from typing import Any, Dict, NamedTuple, Optional
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import PathLike, read_bytes
+from edge_runtime.private_keys import read_private_key
 
 CA_FILE, CERTIFICATE_FILE, KEY_FILE = "ca.pem", "cert.pem", "key.pem"
 TLS_PROTOCOLS = ("tls", "quic")
@@ -119,16 +120,9 @@ def _certificate(path: Path, x509: Any) -> Any:
 
 
 def _check_key(path: Path, certificate: Any) -> None:
-    from cryptography.exceptions import UnsupportedAlgorithm
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key
-
-    data = read_bytes(path, "private key")
+    key = read_private_key(path)
     if path.stat().st_mode & _OPEN_MODE:
         raise UserError(f"private key {path} is open to others; close it: chmod 600 {path}")
-    try:
-        key = load_pem_private_key(data, password=None)
-    except (ValueError, TypeError, UnsupportedAlgorithm):
-        raise UserError(f"{path} is not a private key in PEM without a password") from None
     if key.public_key() != certificate.public_key():
         raise UserError(f"private key {path} does not fit {CERTIFICATE_FILE} beside it")
 

@@ -13,14 +13,13 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable, read_bytes, write_atomic
+from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.manifest import MANIFEST_KEY, Manifest, Observation, encode_manifest
 from edge_runtime.onnx_file import read_onnx
+from edge_runtime.private_keys import read_signing_key
 from edge_runtime.signature import SIGNATURE_SUFFIX
 from trainer.actions import ACTIONS
 from trainer.drivers import make_environment
@@ -86,7 +85,7 @@ def write_policy(export: Export, path: Path, key_file: Path | None) -> None:
 
     The key is read first: a wrong one leaves no unsigned file behind.
     """
-    key = load_private_key(key_file) if key_file else None
+    key = read_signing_key(key_file) if key_file else None
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     check_writable(signature_path)
     if key is None:
@@ -95,21 +94,6 @@ def write_policy(export: Export, path: Path, key_file: Path | None) -> None:
     write_atomic(path, export.model)
     if key is not None:
         write_atomic(signature_path, key.sign(export.model))
-
-
-def load_private_key(path: Path) -> Ed25519PrivateKey:
-    """An Ed25519 private key from a PEM file (PKCS8, not encrypted).
-
-    Raises:
-        UserError: no such key.
-    """
-    try:
-        key = load_pem_private_key(read_bytes(path, "key"), password=None)
-    except (ValueError, TypeError) as error:
-        raise UserError(f"{path} is not a private key in PEM: {error}") from error
-    if not isinstance(key, Ed25519PrivateKey):
-        raise UserError(f"{path} is not an Ed25519 key; `python -m deploy keys` makes one")
-    return key
 
 
 def real_observations(scenario: str, count: int, seed: int = 0) -> NDArray[np.uint8]:

@@ -8,9 +8,10 @@ from pathlib import Path
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
+from edge_runtime.private_keys import read_signing_key
 from trainer.commands.options import existing_directory, read_json
 from trainer.drivers import load_actor
-from trainer.export import export_policy, load_private_key, write_policy
+from trainer.export import export_policy, write_policy
 from trainer.training.run import CONFIG_FILE
 
 EXAMPLE = examples(
@@ -33,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(f"--out {out}: a policy file's name ends in .onnx")
     check_writable(out)
     if key:
-        load_private_key(key)
+        read_signing_key(key)
     actor, label = load_actor(run_dir)
     training = read_json(run_dir / CONFIG_FILE, "run config")
     export = export_policy(actor, label, training)

@@ -7,11 +7,11 @@ from deploy.keys import write_key_pair
 from edge_runtime.errors import UserError
 from edge_runtime.onnx_file import read_onnx
 from edge_runtime.policy import load_policy
+from edge_runtime.private_keys import read_signing_key
 from trainer import export as export_module
 from trainer.export import (
     Export,
     export_policy,
-    load_private_key,
     parity,
     real_observations,
     write_policy,
@@ -114,4 +114,4 @@ def test_a_wrong_key_leaves_no_file(exported, tmp_path):
     assert not (tmp_path / "policy.onnx").exists()
     _, public = write_key_pair(tmp_path / "keys")
     with pytest.raises(UserError):
-        load_private_key(public)
+        read_signing_key(public)
