@@ -23,7 +23,8 @@ SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"
 """Scenario word on the command line and in the report -> gymnasium id."""
 _REGISTERED_BY = {"phil": "trainer.scenarios"}
 """Namespace of a gymnasium id -> the module that registers it."""
-NOMINAL, VARIANT = CONDITIONS = ("nominal", "variant")
+NOMINAL = "nominal"
+CONDITIONS = (NOMINAL, "variant")
 """Scenes that can be served: the one that was trained in, and one with other traffic."""
 
 PLUGIN_GROUP, ROOT = "gymnasium.envs", "__root__"

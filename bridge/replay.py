@@ -97,7 +97,7 @@ def replay(arguments: Any) -> int:
         "cut_off": drive.recording.cut_off,
         "damaged_places": drive.recording.damaged_places,
         "damaged_bytes": drive.recording.damaged_bytes,
-        "dropped": int(drive.recording.metadata.get("dropped", 0)),
+        "dropped": _dropped(drive),
         **compare(drive.exchanges, replayed, states, arguments.tolerance),
     }
     if report["compared"] == 0:
@@ -110,6 +110,12 @@ def replay(arguments: Any) -> int:
         )
     _say(report)
     return DIFFERENT if report["different"] else 0
+
+
+def _dropped(drive: RecordedDrive) -> int:
+    """Messages that the recorder had to drop; of another program's recording nothing is known."""
+    dropped = drive.recording.metadata.get("dropped", "")
+    return int(dropped) if dropped.isdecimal() else 0
 
 
 def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:

@@ -118,8 +118,9 @@ def run_command(
 def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:
     """Run `main(argv)` and return its exit status; `argv` defaults to the command line.
 
-    UserError becomes one line on stderr and status 2, ^C status 130, and a reader that closed
-    the pipe (`| head`) status 141 as the shell would show it. Use: `sys.exit(run_cli(main))`.
+    UserError becomes one line on stderr and status 2, and so does a file that the system does not
+    let us use; ^C status 130, and a reader that closed the pipe (`| head`) status 141 as the shell
+    would show it. Use: `sys.exit(run_cli(main))`.
     """
     try:
         return main(sys.argv[1:] if argv is None else argv)
@@ -133,6 +134,11 @@ def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) 
         # Python flushes stdout once more at exit; give it somewhere to go.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except OSError as error:
+        if error.filename is None:
+            raise  # nothing that a person named
+        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
+        return BAD_INPUT
 
 
 def write_json_out(path: Optional[files.PathLike], value: Any) -> None:

@@ -115,12 +115,13 @@ class Demo:
         marker = self.directory / MARKER
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            foreign = any(self.directory.iterdir()) and not marker.exists()
+            if any(self.directory.iterdir()) and not marker.exists():
+                raise UserError(
+                    f"--out {self.directory} holds something else; name an empty directory"
+                )
+            marker.touch()
         except OSError as error:
             raise UserError(f"--out {self.directory}: {error.strerror}") from None
-        if foreign:
-            raise UserError(f"--out {self.directory} holds something else; name an empty directory")
-        marker.touch()
 
     def offer_kept(self) -> bool:
         """Whether a trained policy is there and the person (if one is asked) wants it."""
@@ -132,7 +133,11 @@ class Demo:
         if not sys.stdin.isatty():
             print("Using it; --fresh trains anew.")
             return True
-        return input("Use it? [Y/n] ").strip().lower() in ("", "y", "yes")
+        try:
+            answer = input("Use it? [Y/n] ")
+        except EOFError:  # ^D: nothing said, and nothing thrown away for it
+            answer = ""
+        return answer.strip().lower() in ("", "y", "yes")
 
     def train(self, arguments: argparse.Namespace) -> None:
         """Human model, PHIL-TD3 with its guidance, export with signature."""

@@ -157,6 +157,6 @@ def _read_actor(path: Path) -> tuple[Actor, dict[str, Any]]:
         actor = Actor(len(weights["head.output.bias"]), frames)
         actor.load_state_dict(weights)
         label = {key: state[key] for key in ("scenario", "algorithm", "seed", "episode")}
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         raise UserError(f"{path} is not a checkpoint of this project") from error
     return actor, label

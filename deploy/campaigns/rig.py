@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,8 @@ from deploy.keys import write_key_pair
 from deploy.pyz import NAME, build_installer
 from deploy.targets import ROOT
 from deploy.wheelhouse import build_edge_wheel
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes
 from edge_runtime.transport import free_endpoint
 
 _POLICY = ROOT / "results/policies/left_turn.onnx"
@@ -51,7 +54,14 @@ def make_kit(folder: Path) -> Kit:
 
 
 def kit_of(bundles: list[Path], trust: Path, python: str, folder: Path) -> Kit:
-    """Bundles that are there already, with this checkout's installer."""
+    """Bundles that are there already, with this checkout's installer.
+
+    Raises UserError for a file or a Python that is not there.
+    """
+    for path in (*bundles, trust):
+        read_bytes(path, "file")
+    if shutil.which(python) is None:
+        raise UserError(f"there is no {python} here; name another with --python")
     installer = folder / NAME
     installer.write_bytes(build_installer())
     return Kit(bundles, trust, python, installer)

@@ -17,12 +17,15 @@ from pathlib import Path
 
 from deploy.campaigns.rig import Board, kit_of
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
+from edge_runtime.files import check_writable
 from edge_runtime.option_types import positive
 
 
 def main(argv: list[str]) -> int:
     """Install, measure, uninstall; the report."""
     arguments = _parse(argv)
+    if arguments.out:
+        check_writable(arguments.out)
     bundle = Path(arguments.bundle)
     with tempfile.TemporaryDirectory() as place:
         kit = kit_of([bundle], Path(arguments.trust), arguments.python, Path(place))

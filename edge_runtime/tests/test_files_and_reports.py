@@ -99,6 +99,21 @@ def test_run_cli_turns_errors_into_one_line(capsys):
     assert run_cli(lambda argv: len(argv), ["a"]) == 1
 
 
+def test_run_cli_names_the_file_that_the_system_refuses(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    path = tmp_path / "file" / "below"
+    assert run_cli(lambda argv: len(os.listdir(path)), []) == 2
+    assert capsys.readouterr().err == f"error: {path}: Not a directory\n"
+
+
+def test_run_cli_hides_no_error_that_is_about_no_file():
+    def broken(argv):
+        raise OSError("about a socket")
+
+    with pytest.raises(OSError, match="about a socket"):
+        run_cli(broken, [])
+
+
 def test_a_parser_error_is_one_line_and_help_shows_defaults(capsys):
     parser = ArgumentParser(prog="tool")
     parser.add_argument("--runs", type=int, default=50, help="how many")

@@ -14,6 +14,7 @@ from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import positive
+from edge_runtime.policy import load_policy
 from edge_runtime.transport import free_endpoint, open_session
 from hil_tests.benches.contenders import Floor, Ours, answer, rouse, start_floor, start_ours
 from hil_tests.benches.footprint import first_command_s, idle_load, memory_mb
@@ -47,6 +48,7 @@ def main(argv: list[str]) -> int:
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_writable(arguments.out)
+    load_policy(arguments.policy, arguments.public_key)
     machine = {"processor": processor_model(), "cores": os.cpu_count(), "load_before": _load()}
     report = {"machine": machine, "source_revision": source_revision(), **_measure(arguments)}
     machine["load_after"] = _load()

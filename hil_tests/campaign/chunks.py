@@ -1,23 +1,19 @@
 """The unit of work: some episodes of one specification through a real edge runtime, kept on disk.
 
-A chunk's file is named by a hash of all that decides it, so a campaign that was killed, or is asked
-for another row, computes only what is missing.
+A campaign that was killed, or is asked for another row, computes only what is missing.
 """
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from edge_runtime.episode_report import GOAL
-from edge_runtime.files import read_bytes, write_json
-from trainer.drivers import make_environment
-from trainer.experiments.units import digest
+from hil_tests.kept import KeptResults
 
 CHUNK_EPISODES = 50
 FORMAT = 1
@@ -83,47 +79,23 @@ def join_reports(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-class ChunkStore:
-    """Reports of ``bridge simulate``, one file for each chunk."""
+def kept_chunks(directory: Path, task: Task) -> KeptResults:
+    """Where the chunks of a task are kept."""
+    deciding = {"format": FORMAT, "policy": task.policy_id, "clock": task.clock}
+    return KeptResults(directory, task.scenario, task.condition, deciding)
 
-    def __init__(self, directory: Path, task: Task) -> None:
-        self.directory = directory
-        config = make_environment(task.scenario, task.condition).config
-        self._deciding = {
-            "format": FORMAT,
-            "policy": task.policy_id,
-            "scenario": task.scenario,
-            "condition": task.condition,
-            "clock": task.clock,
-            "environment": asdict(config),
-        }
 
-    def path(self, chunk: Chunk) -> Path:
-        """Where a chunk's report is or will be."""
-        return self.directory / f"{digest({**self._deciding, **asdict(chunk)})}.json"
-
-    def load(self, chunk: Chunk) -> dict[str, Any] | None:
-        """The kept report; None where there is none."""
-        path = self.path(chunk)
-        if not path.is_file():
-            return None
-        report: dict[str, Any] = json.loads(read_bytes(path, "kept row"))
-        return report
-
-    def save(self, chunk: Chunk, report: dict[str, Any], wall_s: float) -> dict[str, Any]:
-        """Keep what the campaign needs of a report of ``bridge simulate``."""
-        episodes = [
-            {name: row[name] for name in ("seed", "outcome", "distance_m", "time_s", "steps")}
-            for row in report["per_episode"]
-        ]
-        names = ("latency_ms", "deadline_misses", "tick_overruns", "rejected", "safe_stops")
-        kept = {
-            "spec": chunk.spec,
-            "command": report["command"],
-            "wall_s": round(wall_s, 3),
-            **{name: report[name] for name in names},
-            "episodes": episodes,
-        }
-        self.directory.mkdir(parents=True, exist_ok=True)
-        write_json(self.path(chunk), kept)
-        return kept
+def worth_keeping(chunk: Chunk, report: dict[str, Any], wall_s: float) -> dict[str, Any]:
+    """What the campaign needs of a report of ``bridge simulate``."""
+    episodes = [
+        {name: row[name] for name in ("seed", "outcome", "distance_m", "time_s", "steps")}
+        for row in report["per_episode"]
+    ]
+    names = ("latency_ms", "deadline_misses", "tick_overruns", "rejected", "safe_stops")
+    return {
+        "spec": chunk.spec,
+        "command": report["command"],
+        "wall_s": round(wall_s, 3),
+        **{name: report[name] for name in names},
+        "episodes": episodes,
+    }

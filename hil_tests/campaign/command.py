@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, examples, write_json_out
+from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable, read_bytes, write_atomic
+from edge_runtime.files import read_bytes
 from edge_runtime.latency.model import parse_spec
 from edge_runtime.option_types import not_negative, positive, share
 from hil_tests.campaign.axes import AXES, Axis
@@ -18,6 +18,7 @@ from hil_tests.campaign.figures import write_figures
 from hil_tests.campaign.latency import run_latency
 from hil_tests.campaign.render import render_latency
 from hil_tests.options import several, this_command
+from hil_tests.reports import check_report, write_report
 from trainer.commands.options import add_scenario
 from trainer.parallel import cores
 from trainer.progress import ProgressBar
@@ -103,7 +104,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where a fault was not met as it should be."""
     out = Path(arguments.out)
-    check_writable(out)
+    check_report(out)
     arguments.jobs = arguments.jobs or cores()
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
     for spec in arguments.check_realtime:
@@ -123,8 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
         report["faults"], table = _run_faults(arguments, faults)
         passed = report["faults"]["passed"]
         text += ["## Faults", "", table]
-    write_json_out(out, report)
-    write_atomic(out.with_suffix(".md"), ("\n".join(text).rstrip() + "\n").encode())
+    write_report(out, report, text)
     _conclude(out, report)
     return 0 if passed else 1
 
@@ -175,8 +175,9 @@ def _other(text: str) -> tuple[str, dict[str, Any]]:
         raise UserError(f"--against {text}: write NAME=R.json")
     try:
         latency: dict[str, Any] = json.loads(read_bytes(path, "report"))["latency"]
+        latency["rows"], latency["budget"]["sentence"]
     except (ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is no report of a latency campaign") from None
+        raise UserError(f"{path} is no report of a latency campaign with its budget") from None
     return name, latency
 
 

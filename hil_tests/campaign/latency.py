@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,14 @@ from edge_runtime.latency.model import parse_spec
 from edge_runtime.policy import load_policy
 from hil_tests.campaign.axes import Axis
 from hil_tests.campaign.budget import budget
-from hil_tests.campaign.chunks import CHUNK_EPISODES, Chunk, ChunkStore, Task, chunks_of
+from hil_tests.campaign.chunks import (
+    CHUNK_EPISODES,
+    Chunk,
+    Task,
+    chunks_of,
+    kept_chunks,
+    worth_keeping,
+)
 from hil_tests.campaign.rows import make_row
 from hil_tests.campaign.workers import drive_chunks
 from trainer.progress import ProgressBar
@@ -60,16 +68,17 @@ def drive_rows(
     task: Task, specs: Sequence[str], seed: int, runs: int, jobs: int, keep: Path
 ) -> dict[str, dict[str, Any]]:
     """The rows of the specifications, from kept chunks where there are any."""
-    store = ChunkStore(keep, task)
+    store = kept_chunks(keep, task)
     size = REALTIME_CHUNK if task.clock == "realtime" else CHUNK_EPISODES
     chunks = {spec: chunks_of(spec, seed, runs, size) for spec in specs}
     asked = [chunk for spec in specs for chunk in chunks[spec]]
-    kept = {chunk: store.load(chunk) for chunk in asked}
+    kept = {chunk: store.load(asdict(chunk)) for chunk in asked}
     missing = [chunk for chunk in asked if kept[chunk] is None]
     with ProgressBar(f"latency, {task.clock}", len(asked), len(asked) - len(missing)) as bar:
 
         def on_chunk(chunk: Chunk, report: dict[str, Any], wall_s: float) -> None:
-            kept[chunk] = store.save(chunk, report, wall_s)
+            kept[chunk] = result = worth_keeping(chunk, report, wall_s)
+            store.save(asdict(chunk), result)
             bar.advance({"success": f"{report['success_rate']:.2f}", "of": chunk.spec})
 
         if missing:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import signal
 import sys
 import time
@@ -67,6 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
         server = Server(hunter, bus, _tell, arguments.fault or ())
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: server.stop())
+        if isinstance(sys.stdin, io.TextIOWrapper):
+            # A byte that is no text is a wrong order, not the end of all orders.
+            sys.stdin.reconfigure(errors="replace")
         orders = Orders(sys.stdin, lambda line: print(line, file=sys.stderr, flush=True))
         _tell(f"ready bus={arguments.bus} model={arguments.model}")
         server.run(orders.newest)

@@ -11,8 +11,10 @@ from pathlib import Path
 from edge_runtime.cli import ArgumentParser, examples, run_cli
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic, write_json
+from edge_runtime.option_types import positive
 from hil_tests.mutation.report import judge, read_accepted, render
 from hil_tests.mutation.session import TARGETS, run_targets
+from trainer.files import make_directory
 
 
 def main(argv: list[str]) -> int:
@@ -28,14 +30,14 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         "--only", metavar="MODULE", action="append", help=f"of {', '.join(TARGETS)} (default: all)"
     )
-    parser.add_argument("--jobs", type=int, default=2, help="modules at a time")
+    parser.add_argument("--jobs", type=positive, default=2, help="modules at a time")
     arguments = parser.parse_args(argv)
     names = arguments.only or list(TARGETS)
     for name in names:
         if name not in TARGETS:
             raise UserError(f"module {name!r} is not known; choose from {', '.join(TARGETS)}")
     out = Path(arguments.out)
-    out.mkdir(parents=True, exist_ok=True)
+    make_directory(out)
     mutants = run_targets(names, arguments.jobs)
     report = judge(mutants, read_accepted())
     write_json(out / "report.json", report)

@@ -19,6 +19,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
 from edge_runtime.option_types import not_negative, positive
+from edge_runtime.policy import load_policy
 from hil_tests.commands import end_children
 from hil_tests.network.cells import KERNEL, TRANSPORTS, Cell, Drive, run_cell
 from hil_tests.network.namespaces import why_not
@@ -87,15 +88,7 @@ def _run(arguments: argparse.Namespace) -> int:
         "episodes": arguments.episodes,
         "seed": arguments.seed,
         "jobs": arguments.jobs,
-        "rows": [
-            {
-                "row": cell.row,
-                "latency_spec": str(cell.spec),
-                "transport": cell.transport,
-                **numbers,
-            }
-            for cell, numbers in found
-        ],
+        "rows": [{**_names(cell), **numbers} for cell, numbers in found],
     }
     write_json_out(arguments.out, result)
     if arguments.report is not None:
@@ -103,11 +96,16 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _names(cell: Cell) -> dict[str, str]:
+    return {"row": cell.row, "latency_spec": str(cell.spec), "transport": cell.transport}
+
+
 def _check(arguments: argparse.Namespace) -> None:
     if set(arguments.transports) & set(KERNEL) and (reason := why_not()):
         raise UserError(f"no kernel network on this machine: {reason}")
     if arguments.out is not None:
         check_writable(arguments.out)
+    load_policy(arguments.policy, arguments.public_key)
     if arguments.report is not None and not Path(arguments.report).is_dir():
         raise UserError(f"--report {arguments.report} is not a directory")
 
@@ -150,10 +148,6 @@ def _attempt(drive: Drive, cell: Cell, ending: threading.Event) -> dict[str, Any
         except UserError as error:
             failures.append(str(error))
     return {"failed_starts": failures}
-
-
-def _names(cell: Cell) -> dict[str, str]:
-    return {"row": cell.row, "latency_spec": str(cell.spec), "transport": cell.transport}
 
 
 def show(cell: Cell, found: dict[str, Any]) -> str:

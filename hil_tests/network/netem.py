@@ -17,11 +17,7 @@ _PROBE = ("tc", "qdisc", "add", "dev", "lo", "root", "netem", "delay", "1ms")
 
 def has_netem(namespace: str) -> bool:
     """Whether the kernel takes a netem qdisc."""
-    command = (
-        *inside(namespace),
-        *["tc", "qdisc", "add", "dev", "lo", "root", "netem", "delay", "1ms"],
-    )
-    if subprocess.run(command, check=False, capture_output=True).returncode:
+    if subprocess.run((*inside(namespace), *_PROBE), check=False, capture_output=True).returncode:
         return False
     undo = (*inside(namespace), "tc", "qdisc", "delete", "dev", "lo", "root")
     subprocess.run(undo, check=True, capture_output=True)
@@ -43,7 +39,7 @@ def netem_arguments(spec: DirectionSpec) -> list[str]:
     }
     if any(missing.values()):
         names = ", ".join(name for name, there in missing.items() if there)
-        raise UserError(f"netem has no {names}; leave it out or use --network tun")
+        raise UserError(f"netem has no {names}; leave it out")
     words = ["delay", f"{spec.delay_ms:g}ms", f"{spec.jitter_ms:g}ms"]
     if spec.jitter_ms:
         words += ["distribution", spec.tail]

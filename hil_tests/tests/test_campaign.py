@@ -121,6 +121,7 @@ def test_intervals_that_do_not_meet_do_not_agree():
         (["--rows", "delay,edge_kiled"], "no fault 'edge_kiled'"),
         (["--rows", "delay", "--only", "faults"], "no fault"),
         (["--against", "r.json"], "write NAME=R.json"),
+        (["--against", "a=results/latency/left_turn/realtime.json"], "with its budget"),
         (["--policy", "nowhere.onnx", "--only", "latency"], "nowhere.onnx"),
     ],
 )

@@ -179,6 +179,8 @@ def test_the_sweep_as_a_command(tmp_path):
     assert (tmp_path / sweep["figures"]["table"]).stat().st_size > 5000
     (kept,) = (tmp_path / "r_rows").iterdir()
     row = json.loads(kept.read_text())
+    kept.write_text("{")
+    assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 2
     kept.write_text(json.dumps({**row, "outcomes": {"kept": 2}}))
     assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 0
     again = json.loads(out.read_text())["sweep"]

@@ -8,21 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, examples, write_json_out
+from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.option_types import not_negative, positive, share
 from edge_runtime.policy import load_policy
 from hil_tests.commands import end_children
 from hil_tests.mock_hunter.parameters import make_parameters, read_changes
 from hil_tests.options import several, this_command
+from hil_tests.reports import check_report, write_report
 from hil_tests.vehicle.comparison import PART_EPISODES, run_comparison
 from hil_tests.vehicle.figures import write_figures
-from hil_tests.vehicle.kept import KeptPoints
 from hil_tests.vehicle.lag_axes import LAGS, Lag
 from hil_tests.vehicle.render import lag_sentence, render_comparison, render_sweep, verdict
 from hil_tests.vehicle.rigs import VEHICLE, Drive
-from hil_tests.vehicle.sweep import MODEL, SweepTask, run_sweep
+from hil_tests.vehicle.sweep import MODEL, SweepTask, kept_points, run_sweep
 from trainer.commands.options import add_scenario
 from trainer.parallel import cores
 from trainer.progress import ProgressBar
@@ -91,7 +90,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where the vehicle in the loop is below the target."""
     out = Path(arguments.out)
-    check_writable(out)
+    check_report(out)
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
     # The edge runtime checks signatures where it matters; here the loop is measured.
     policy_id = load_policy(str(policy), allow_unsigned=True).policy_id
@@ -113,8 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
             figures = write_figures(out, report["sweep"])
             report["sweep"]["figures"] = figures
             text += ["", "## Lag, in virtual time", "", render_sweep(report["sweep"], figures)]
-    write_json_out(out, report)
-    write_atomic(out.with_suffix(".md"), ("\n".join(text).rstrip() + "\n").encode())
+    write_report(out, report, text)
     return _conclude(out, report)
 
 
@@ -150,7 +148,7 @@ def _sweep(
         changes,
     )  # fmt: skip
     out = Path(arguments.out)
-    kept = KeptPoints(out.with_name(f"{out.stem}_rows"), task._asdict(), policy_id)
+    kept = kept_points(out.with_name(f"{out.stem}_rows"), task, policy_id)
     with ProgressBar("lags", len(lags)) as bar:
 
         def on_point(row: dict[str, Any]) -> None:

@@ -17,8 +17,8 @@ from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from hil_tests.campaign.axes import Axis
 from hil_tests.campaign.budget import budget
+from hil_tests.kept import KeptResults
 from hil_tests.mock_hunter.parameters import make_parameters
-from hil_tests.vehicle.kept import KeptPoints
 from hil_tests.vehicle.lag_axes import LAG_AXES, Lag
 from hil_tests.vehicle.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
@@ -26,6 +26,8 @@ from trainer.experiments.statistics import Estimate, mean_estimate, success_esti
 from trainer.parallel import die_with_parent, interrupts_blocked
 
 MODEL = "hunter-2.0"
+FORMAT = 1
+"""Raise it where the same point begins to mean another drive: kept points become void."""
 
 
 class SweepTask(NamedTuple):
@@ -39,12 +41,19 @@ class SweepTask(NamedTuple):
     changes: Mapping[str, float]
 
 
+def kept_points(directory: Path, task: SweepTask, policy_id: str) -> KeptResults:
+    """Where the points of a task are kept, whatever its policy's file is called."""
+    deciding = {name: value for name, value in task._asdict().items() if name != "policy"}
+    deciding |= {"format": FORMAT, "policy_id": policy_id}
+    return KeptResults(directory, task.scenario, task.condition, deciding)
+
+
 def run_sweep(
     task: SweepTask,
     lags: Sequence[Lag],
     target: float,
     jobs: int,
-    kept: KeptPoints,
+    kept: KeptResults,
     on_point: Callable[[dict[str, Any]], None] = lambda row: None,
 ) -> dict[str, Any]:
     """Drive every point that is not kept, ``jobs`` at a time; the report's part ``sweep``.
@@ -52,12 +61,12 @@ def run_sweep(
     Raises:
         UserError: the policy does not load, or a worker died.
     """
-    found = {lag: row for lag in lags if (row := kept.load(lag)) is not None}
+    found = {lag: row for lag in lags if (row := kept.load({"lag": lag.spec})) is not None}
     for row in found.values():
         on_point(row)
     for row in _drive_points(task, [lag for lag in lags if lag not in found], jobs):
         lag = Lag(row["dead_ms"], row["constant_ms"])
-        kept.save(lag, row)
+        kept.save({"lag": lag.spec}, row)
         found[lag] = row
         on_point(row)
     rows = {lag.spec: found[lag] for lag in lags}

@@ -35,7 +35,7 @@ def add_threads(parser: argparse.ArgumentParser) -> None:
 
 
 def add_latency(parser: argparse.ArgumentParser, what: str) -> None:
-    """``--latency``, read as a ``LatencySpec``."""
+    """``--latency``, as it is typed: a run's config keeps the text."""
     parser.add_argument(
         "--latency",
         metavar="SPEC",

@@ -45,7 +45,9 @@ class Questions:
         self._joystick, self._pump, self._say = joystick, pump, say
 
     def at_rest(self) -> list[float]:
-        """Where all axes are when nobody touches them."""
+        """Where all axes are when nobody touches them. UserError: it has none."""
+        if not self._joystick.get_numaxes():
+            raise UserError(f"{self._joystick.get_name()} has no axes to calibrate")
         self._say("Press every pedal and turn the wheel once, then let go of everything.")
         time.sleep(FIRST_S)
         self._until(lambda: self._still() or None)

@@ -113,7 +113,8 @@ class LeftTurnEnv(DrivingEnv):
         half = 0.5 * c.lane_width_m
         # Right-hand traffic: the ego car comes up the right lane of the side road, crosses the
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
-        self.path = LeftTurnPath((half, c.straight_m + c.lane_width_m), c.straight_m, 3 * half)
+        start = (half, c.straight_m + c.lane_width_m)
+        self.path = LeftTurnPath(start, c.straight_m, c.turn_radius_m)
         self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel)
         self.road_areas = road_areas(c.lane_width_m)
         self._background = self.rasteriser.background(self.road_areas)

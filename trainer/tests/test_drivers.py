@@ -2,7 +2,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from edge_runtime.errors import UserError
 from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver, make_environment
 from trainer.files import save_torch
 from trainer.learner.networks import Actor
@@ -20,6 +22,21 @@ def test_an_actor_is_loaded_with_the_frames_that_it_was_trained_on(tmp_path, fra
     driver, policy_id = load_driver(str(tmp_path), make_environment("congestion"))
     assert policy_id.startswith("run:")
     assert driver.act(np.zeros((2, 45, 80), np.uint8)).shape == (1,)
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        [1, 2],
+        torch.ones(3),
+        {"actor": {"picture.trunk.conv1.weight": torch.ones(3), "head.output.bias": torch.ones(1)}},
+    ],
+    ids=["a list", "a tensor", "wrong shapes"],
+)
+def test_what_is_no_actor_is_one_line(tmp_path, state):
+    save_torch(tmp_path / BEST_FILE, state)
+    with pytest.raises(UserError, match="is not a checkpoint of this project"):
+        load_actor(tmp_path)
 
 
 def test_a_policy_file_answers_within_the_domain_as_the_edge_sends_it(monkeypatch):

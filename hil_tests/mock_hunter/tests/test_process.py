@@ -97,7 +97,8 @@ def test_a_bus_that_takes_nothing_is_said_once():
     assert sum("not sent: no buffer space" in line for line in said) == 1
 
 
-def test_as_a_process_it_obeys_switches_and_ends_on_a_signal():
+def test_as_a_process_it_obeys_switches_and_ends_on_a_signal(monkeypatch):
+    monkeypatch.setenv("PYTHONIOENCODING", "utf-8:strict")  # as in a desktop's locale
     name = free_bus()
     chassis = ChassisProcess(name, "--fault", "estop", "--after-s", "0.3")
     bus = open_bus(parse_bus(name))
@@ -105,6 +106,8 @@ def test_as_a_process_it_obeys_switches_and_ends_on_a_signal():
         assert status_after(bus, lambda data: data[0] == 1)  # the fault of the command line
         chassis.switch("estop", False)
         assert status_after(bus, lambda data: data[0] == 0)
+        chassis.process.tell("\udcff")  # no UTF-8
+        chassis.process.wait_for_line("is no order")
         chassis.process.tell("estop maybe")
         chassis.process.wait_for_line("'estop maybe' is no order")
         chassis.switch("remote", True)
