@@ -52,7 +52,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
 
 
-def record(arguments: Any) -> int:
+def run(arguments: Any) -> int:
     """Run the command until the simulators go, the time is over, or somebody interrupts."""
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     vehicle_id = arguments.vehicle_id

@@ -52,7 +52,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
 
 
-def relay(arguments: Any) -> int:
+def run(arguments: Any) -> int:
     """Run the command until it is told to end; UserError for anything the caller can put right."""
     spec = _check(arguments)
     began_s = time.monotonic()

@@ -43,7 +43,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
 
 
-def repair(arguments: Any) -> int:
+def run(arguments: Any) -> int:
     """Rewrite what can be read; the file is replaced only once the new one is whole."""
     source = Path(arguments.recording)
     if arguments.out is None:

@@ -80,7 +80,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
 
 
-def replay(arguments: Any) -> int:
+def run(arguments: Any) -> int:
     """Run the command: 0 where every command is the same, 1 where one differs."""
     if arguments.out is not None:
         check_writable(arguments.out)

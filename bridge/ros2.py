@@ -78,7 +78,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="write the counts to this file at the end")
 
 
-def ros2(arguments: Any) -> int:
+def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
     check_vehicle_id(arguments.vehicle_id)
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))

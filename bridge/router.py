@@ -47,7 +47,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
 
 
-def router(arguments: Any) -> int:
+def run(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
     if arguments.config is not None:
         if arguments.listen or arguments.tls or arguments.vehicle_id:

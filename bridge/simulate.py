@@ -110,7 +110,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
 
 
-def simulate(arguments: Any) -> int:
+def run(arguments: Any) -> int:
     """Run the command; UserError for anything the caller can put right."""
     settings = _check(arguments)
     environment = make_environment(settings.env, settings.condition)

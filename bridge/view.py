@@ -5,15 +5,14 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from bridge.arguments import add_connect, add_span, add_tls
 from bridge.feed import Feed, Heard, open_feed
+from bridge.messages import MESSAGES
 from bridge.recording.reader import Recording
-from bridge.scene import decode_scene
 from bridge.signals import sigterm_as_interrupt, wait_to_be_told
 from bridge.viewer.blueprint import APPLICATION, make_blueprint
 from bridge.viewer.recorded import read_heard
@@ -23,18 +22,11 @@ from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import check_endpoint
+from viewing.options import add_sink, chosen_sink
 from viewing.pace import PICTURE_INTERVAL_S
-from viewing.sinks import SERVE, SPAWN, Sink, check_sink, open_sink
+from viewing.sinks import SERVE, Sink, check_sink, open_sink
 
 POLL_S = 0.1
-
-DECODERS: dict[str, Callable[[bytes], Any]] = {
-    "state": wire.decode_state,
-    "command": wire.decode_command,
-    "feedback": wire.decode_feedback,
-    "health": wire.decode_health,
-    "scene": decode_scene,
-}
 
 EXAMPLE = examples(
     "python -m bridge view --serve",
@@ -51,12 +43,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="F.mcap",
         help="show what bridge record has written, instead of listening",
     )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--spawn", action="store_true", help="open a rerun window (the default)")
-    where.add_argument(
-        "--serve", action="store_true", help="serve a web page on this machine's loopback only"
-    )
-    where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
+    add_sink(parser)
     add_connect(parser)
     add_tls(parser)
     parser.add_argument(
@@ -67,11 +54,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_span(parser)
 
 
-def view(arguments: Any) -> int:
+def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
     if arguments.vehicle_id is not None:
         wire.check_vehicle_id(arguments.vehicle_id)
-    sink = _sink(arguments)
+    sink = chosen_sink(arguments)
     if arguments.recording is not None:
         check_sink(sink)
         _show_recording(arguments, sink)
@@ -84,12 +71,6 @@ def view(arguments: Any) -> int:
     if sink.path:
         print(f"wrote {sink.path}")
     return 0
-
-
-def _sink(arguments: Any) -> Sink:
-    if arguments.save is not None:
-        return Sink("save", arguments.save)
-    return Sink(SERVE if arguments.serve else SPAWN)
 
 
 def _show_recording(arguments: Any, sink: Sink) -> None:
@@ -141,10 +122,10 @@ def _show(feed: Feed, log: WireLog, duration_s: float | None) -> None:
 
 
 def _write(log: WireLog, heard: Heard) -> None:
-    decode = DECODERS.get(heard.topic)
-    if decode is None:
+    row = MESSAGES.get(heard.topic)
+    if row is None:
         return  # A token: it shows as silence.
-    message = decode(heard.payload)
+    message = row.decode(heard.payload)
     if message is None or isinstance(message, wire.Rejection):
         log.write_unreadable(heard.topic, message.detail if message else "not a scene")
     else:

@@ -18,9 +18,9 @@ from typing import Any
 from mcap.writer import CompressionType, Writer
 
 from bridge.feed import TOKEN_TOPICS, Heard
+from bridge.messages import MESSAGES
 from bridge.recording import protobuf
 from bridge.recording.flushed_file import FlushedFile
-from bridge.scene import Scene, decode_scene
 from edge_runtime import __version__, wire
 
 CHUNK_BYTES = 1 << 20
@@ -28,14 +28,6 @@ WIRE_ENCODING = "msgpack"
 METADATA = "phil"
 INFO, WARNING = 2, 3
 """Levels of foxglove.Log."""
-
-READERS: dict[str, tuple[type, Callable[[bytes], Any]]] = {
-    "state": (wire.State, wire.decode_state),
-    "command": (wire.Command, wire.decode_command),
-    "feedback": (wire.Feedback, wire.decode_feedback),
-    "health": (wire.Health, wire.decode_health),
-    "scene": (Scene, decode_scene),
-}
 
 
 class RecordingWriter:
@@ -91,7 +83,7 @@ class RecordingWriter:
         self._file.close()
 
     def _view(self, vehicle_id: str, heard: Heard) -> None:
-        kind, read = READERS[heard.topic]
+        kind, read = MESSAGES[heard.topic]
         message = read(heard.payload)
         if message is None or isinstance(message, wire.Rejection):
             why = message.detail if message else "not a scene"

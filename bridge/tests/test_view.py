@@ -97,6 +97,7 @@ def test_a_killed_simulator_ends_the_view(tmp_path):
         (["--save", "/no/such/folder/a.rrd"], "does not exist"),
         (["--vehicle-id", "a/b"], "vehicle id"),
         (["--save", "a.rrd", "--serve"], "not allowed with"),
+        (["--save", "a.mcap"], "called F.rrd"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(options, part, capsys, monkeypatch, tmp_path):

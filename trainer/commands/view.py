@@ -9,6 +9,7 @@ from pathlib import Path
 from edge_runtime.cli import examples
 from edge_runtime.words import counted
 from trainer.person.recording import find_recordings, read_steps
+from viewing.options import add_sink, chosen_sink
 
 EXAMPLE = examples(
     "python -m trainer view runs/drives --serve",
@@ -26,23 +27,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         help="sitting-NNNN.mcap, a directory of such, or a run that a person guided",
     )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--spawn", action="store_true", help="open a rerun window (the default)")
-    where.add_argument(
-        "--serve", action="store_true", help="serve a web page on this machine's loopback only"
-    )
-    where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
+    add_sink(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw all of it; a page is served until somebody interrupts. Returns the exit status."""
     from trainer.viewer.command import show_sittings
-    from viewing.sinks import SERVE, SPAWN, Sink, check_sink
+    from viewing.sinks import SERVE, check_sink
 
     paths = find_recordings([Path(place) for place in arguments.recordings])
-    sink = Sink(SERVE if arguments.serve else SPAWN)
-    if arguments.save is not None:
-        sink = Sink("save", arguments.save)
+    sink = chosen_sink(arguments)
     check_sink(sink)
     for path in paths:  # Before a window opens, or a file takes another's place.
         next(read_steps(path), None)

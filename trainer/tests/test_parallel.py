@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from edge_runtime.errors import UserError
 from trainer.__main__ import main
@@ -24,14 +23,6 @@ def policy(tmp_path):
     model = HumanModel(HumanModelConfig(frames=2), seed=1)
     model.save(tmp_path, {"scenario": "left_turn"})
     return str(tmp_path)
-
-
-@pytest.fixture
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("one_thread")
