@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli, run_command
+from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS = {
     "simulate": (
@@ -34,7 +34,7 @@ EXAMPLE = examples(
 def main(argv: list[str]) -> int:
     """Run one of the commands and return its exit status."""
     parser = ArgumentParser(prog="python -m bridge", description=__doc__, epilog=EXAMPLE)
-    return run_command(parser, COMMANDS, argv)
+    return dispatch(parser, COMMANDS, argv)
 
 
 if __name__ == "__main__":

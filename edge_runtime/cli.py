@@ -21,9 +21,9 @@ __all__ = [
     "ArgumentParser",
     "HelpFormatter",
     "UserError",
+    "dispatch",
     "examples",
     "run_cli",
-    "run_command",
     "write_json_out",
 ]
 
@@ -93,9 +93,7 @@ def examples(*commands: str) -> str:
     return "\n".join(["examples:", *("  " + text.replace("\n", "\n  ") for text in commands)])
 
 
-def run_command(
-    parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv: List[str]
-) -> int:
+def dispatch(parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv: List[str]) -> int:
     """Parse and run one of many commands; its exit status.
 
     `commands` has for each name a module and one line on what it does. Such a module has EXAMPLE,

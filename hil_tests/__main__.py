@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli, run_command
+from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": (
@@ -44,7 +44,7 @@ def main(argv: list[str]) -> int:
         description="Proves the loop.",
         epilog=examples("python -m hil_tests doctor", "python -m hil_tests demo"),
     )
-    return run_command(parser, COMMANDS, argv)
+    return dispatch(parser, COMMANDS, argv)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli, run_command
+from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("trainer.commands.train", "train a policy with human guidance"),
@@ -30,7 +30,7 @@ def main(argv: list[str]) -> int:
             "python -m trainer evaluate runs/phil_1 --runs 50",
         ),
     )
-    return run_command(parser, COMMANDS, argv)
+    return dispatch(parser, COMMANDS, argv)
 
 
 if __name__ == "__main__":

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from typing import Deque, Dict, List, NamedTuple, Optional, Tuple
+from typing import Dict, List, NamedTuple, Optional
 
 from edge_runtime.vehicles.hunter import frames
 from edge_runtime.vehicles.hunter.faults import LINK_LOST, motor_faults, status_faults
 from edge_runtime.vehicles.hunter.frames import MotionStatus, MotorSlow, SystemStatus
 from edge_runtime.vehicles.hunter.specs import HunterSpec
 from edge_runtime.vehicles.hunter.states import Event
+from edge_runtime.vehicles.speeds import IMPOSSIBLE, Speeds
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 MOTION_SILENCE_S = 2 * CONTROL_PERIOD_S  # ten frames of 0x221
 STATUS_SILENCE_S = 3 * CONTROL_PERIOD_S  # three frames of 0x211
-STANDS_MPS = 0.02
-_IMPOSSIBLE = 1.3  # times what the model can do
 
 REMOTE_WORDS = "the remote control drives"
 ESTOP_WORDS = "the emergency stop is pressed"
@@ -38,7 +36,7 @@ class Reports:
         self.status_s = self.motion_s = -math.inf
         self._spec, self._profile = spec, profile
         self._motor_faults: Dict[int, List[str]] = {}
-        self._speeds: Deque[Tuple[float, float]] = deque()
+        self._speeds = Speeds()
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
         """Note a frame; one that is not in the table, or of a wrong length, is none."""
@@ -50,21 +48,19 @@ class Reports:
             self.status, self.status_s = message, now_s
         elif isinstance(message, MotionStatus):
             self.motion, self.motion_s = message, now_s
-            self._speeds.append((now_s, message.speed_mps))
-            while self._speeds[0][0] < now_s - CONTROL_PERIOD_S - 0.01:
-                self._speeds.popleft()
+            self._speeds.note(message.speed_mps, now_s)
         elif isinstance(message, MotorSlow):
             self._motor_faults[can_id] = motor_faults(can_id, message)
 
     @property
     def speed_mps(self) -> float:
         """The newest speed, 0 before the first."""
-        return self.motion.speed_mps if self.motion else 0.0
+        return self._speeds.newest_mps
 
     @property
     def stands(self) -> bool:
         """Whether it stood when it was last heard."""
-        return abs(self.speed_mps) < STANDS_MPS
+        return self._speeds.stands
 
     def is_known_to_stand(self, now_s: float) -> bool:
         """Whether it says now that it stands."""
@@ -83,10 +79,7 @@ class Reports:
 
     def acceleration_mps2(self) -> float:
         """Over the last control period; 0 while there is too little to tell."""
-        if len(self._speeds) < 2:
-            return 0.0
-        (since_s, before_mps), (now_s, speed_mps) = self._speeds[0], self._speeds[-1]
-        return (speed_mps - before_mps) / (now_s - since_s) if now_s > since_s else 0.0
+        return self._speeds.acceleration_mps2()
 
     def errors(self) -> List[str]:
         """The errors that the chassis names, in words, without those of its operation."""
@@ -138,9 +131,9 @@ class Reports:
         if self.motion is None:
             return None
         speed_mps, inner_rad = self.motion
-        if abs(speed_mps) > _IMPOSSIBLE * self._spec.max_speed_mps:
+        if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
             return Finding(Event.LYING, f"the chassis reports {speed_mps:.1f} m/s")
-        if abs(inner_rad) > _IMPOSSIBLE * self._spec.max_inner_steering_rad:
+        if abs(inner_rad) > IMPOSSIBLE * self._spec.max_inner_steering_rad:
             return Finding(
                 Event.LYING, f"the chassis reports a steering angle of {inner_rad:.2f} rad"
             )
