@@ -216,16 +216,18 @@ def _drive(
             "edge_changes": port.edge_counts.changes,
             **rejections(port.edge_counts.rejected, check.rejected + unbelieved),
         },
-        settings={
-            "scenario": scenario_of(settings.env),
-            "condition": settings.condition,
-            "policy_ids": check.policy_ids,
-            "seed": settings.seed,
-            "clock": settings.clock,
-            "loop": settings.loop,
-            "standing": settings.standing,
-            "latency_spec": str(settings.latency),
-            "wall_s": wall_s,
-        },
+        settings={**_as_asked(settings), "policy_ids": check.policy_ids, "wall_s": wall_s},
         vehicle=vehicle.report() if vehicle else None,
     )
+
+
+def _as_asked(settings: SimulateSettings) -> dict[str, Any]:
+    return {
+        "scenario": scenario_of(settings.env),
+        "condition": settings.condition,
+        "seed": settings.seed,
+        "clock": settings.clock,
+        "loop": settings.loop,
+        "standing": settings.standing,
+        "latency_spec": str(settings.latency),
+    }
