@@ -206,8 +206,7 @@ def test_what_is_being_written_is_not_repaired_and_a_kill_frees_it(tmp_path, cap
 def test_a_pipe_is_no_recording_and_nobody_waits_for_it(tmp_path, capsys):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    out = str(tmp_path / "out")
-    for command in (["repair", str(pipe), "--out", out], ["view", str(pipe), "--save", out]):
-        assert bridge_status(command) == 2
+    for command, option, out in (("repair", "--out", "out.mcap"), ("view", "--save", "out.rrd")):
+        assert bridge_status([command, str(pipe), option, str(tmp_path / out)]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert "no regular file" in line
