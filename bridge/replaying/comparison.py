@@ -20,14 +20,16 @@ def compare(
 
     ``states`` are the keys of all recorded states; those that nobody answered are counted, not
     compared. Two answers are equal where mode and reason are, and no action is further apart
-    than ``tolerance``.
+    than ``tolerance``. A stop that goes on is repeated every T: whether that falls just before
+    the next state or just after it, where it counts as an answer to that, is no difference.
     """
     answered = [key for key in states if key in recorded]
     kinds: dict[str, dict[str, int]] = {}
     differences: list[dict[str, Any]] = []
     largest = 0.0
-    for key in answered:
-        ours, theirs = recorded[key].answers, replayed.get(key, [])
+    each_ours = _without_repetitions([recorded[key].answers for key in answered])
+    each_theirs = _without_repetitions([replayed.get(key, []) for key in answered])
+    for key, ours, theirs in zip(answered, each_ours, each_theirs, strict=True):
         same_shape, distance = _distance(ours, theirs)
         largest = max(largest, distance)
         row = kinds.setdefault(_kind(ours[-1]), {"compared": 0, "different": 0})
@@ -46,6 +48,17 @@ def compare(
         "by_recorded": kinds,
         "first_differences": differences[:SHOWN_DIFFERENCES],
     }
+
+
+def _without_repetitions(each: Sequence[Sequence[Answer]]) -> list[Sequence[Answer]]:
+    """The answers to each state, without a first one that only repeats the stop before it."""
+    kept: list[Sequence[Answer]] = []
+    standing: Answer | None = None
+    for answers in each:
+        repeats = len(answers) > 1 and answers[0] == standing and standing.mode == "safe_stop"
+        kept.append(answers[1:] if repeats else answers)
+        standing = answers[-1] if answers else None
+    return kept
 
 
 def _distance(ours: Sequence[Answer], theirs: Sequence[Answer]) -> tuple[bool, float]:

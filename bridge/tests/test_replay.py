@@ -232,6 +232,21 @@ def test_a_hunter_and_its_faults_are_the_recordings(hand, path, tmp_path):
     assert replay(path, policy, "--config", str(settings))[0] == 2
 
 
+def test_a_repeated_stop_just_before_or_after_the_next_state_is_no_difference(hand, path, tmp_path):
+    hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="mock", needs_rearm=False))
+    hand.drive(0, 3)
+    for step in range(3, 10):
+        hand.state(step * 0.1, step)
+        hand.command(step * 0.1 + ANSWER_S, step, **FAULT)
+    # The policy is a little slower this time: the repetition is due before its answer.
+    hand.state(1.0, 10)
+    hand.command(1.0 + 2 * ANSWER_S, 10, answer_s=2 * ANSWER_S, inference_ns=3 * 10**6)
+    hand.close()
+    status, report = replay(path, make_policy(tmp_path, "constant", 0.3))
+    assert status == 0, report["first_differences"]
+    assert report["compared"] == 11
+
+
 def test_of_several_vehicles_one_is_named(hand, path, tmp_path, capsys):
     hand.drive(0, 3)
     hand.hear(1.0, "state", make_state(0), vehicle_id="w")
