@@ -142,8 +142,7 @@ def _dispatch(arguments: argparse.Namespace) -> int:
         return 0
     # A link that breaks must not end it between two releases; whoever ends it makes it go back.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    os.register_at_fork(after_in_child=_just_end)
+    _interrupt_on(signal.SIGTERM, signal.SIGINT)
     limits = Limits(arguments.health_limit, arguments.settle)
     way = Way(service, limits)
     if arguments.command == "install":
@@ -154,10 +153,20 @@ def _dispatch(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _just_end() -> None:
-    """A process that compiles has nothing to go back to, nor to say, when it is told to end."""
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, signal.SIG_DFL)
+def _interrupt_on(*numbers: int) -> None:
+    """Let these signals be a KeyboardInterrupt here, and the end of the processes that compile.
+
+    Those have nothing to go back to, nor to say, from the moment of their fork on.
+    """
+    installer = os.getpid()
+
+    def handle(number: int, _frame: object) -> None:
+        if os.getpid() != installer:
+            os._exit(128 + number)
+        raise KeyboardInterrupt
+
+    for number in numbers:
+        signal.signal(number, handle)
 
 
 def _status(layout: Layout, service: Any, as_json: bool) -> int:
