@@ -90,10 +90,6 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
 
     Raises UserError for what `make_bundle` would refuse.
     """
-    if not inputs.key.exists():
-        raise UserError(
-            f"private key {inputs.key} does not exist; `python -m deploy keys` makes one"
-        )
     key = read_signing_key(inputs.key)
     if inputs.policy.is_file() and not Path(f"{inputs.policy}.sig").exists():
         # Here, because load_policy would name a flag that no bundle has.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 from edge_runtime.errors import UserError
@@ -28,6 +29,8 @@ def read_signing_key(path: PathLike) -> Ed25519PrivateKey:
     """The Ed25519 key that signs policies and bundles. Raises UserError for anything else."""
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+    if not os.path.exists(path):
+        raise UserError(f"private key {path} does not exist; `python -m deploy keys` makes one")
     key = read_private_key(path)
     if not isinstance(key, Ed25519PrivateKey):
         raise UserError(f"{path} is not an Ed25519 key; `python -m deploy keys` makes one")

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bridge.replaying.recorded import Answer, Exchange, Key
+from edge_runtime.messages import SAFE_STOP
 
 SHOWN_DIFFERENCES = 10
 
@@ -55,7 +56,7 @@ def _without_repetitions(each: Sequence[Sequence[Answer]]) -> list[Sequence[Answ
     kept: list[Sequence[Answer]] = []
     standing: Answer | None = None
     for answers in each:
-        repeats = len(answers) > 1 and answers[0] == standing and standing.mode == "safe_stop"
+        repeats = len(answers) > 1 and answers[0] == standing and standing.mode == SAFE_STOP
         kept.append(answers[1:] if repeats else answers)
         standing = answers[-1] if answers else None
     return kept

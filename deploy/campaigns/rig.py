@@ -21,7 +21,6 @@ from deploy.pyz import NAME, build_installer
 from deploy.targets import ROOT
 from deploy.wheelhouse import build_edge_wheel
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
 from edge_runtime.transport import free_endpoint
 
 _POLICY = ROOT / "results/policies/left_turn.onnx"
@@ -59,7 +58,8 @@ def kit_of(bundles: list[Path], trust: Path, python: str, folder: Path) -> Kit:
     Raises UserError for a file or a Python that is not there.
     """
     for path in (*bundles, trust):
-        read_bytes(path, "file")
+        if not path.is_file():
+            raise UserError(f"file {path} does not exist")
     if shutil.which(python) is None:
         raise UserError(f"there is no {python} here; name another with --python")
     installer = folder / NAME

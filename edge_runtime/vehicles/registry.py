@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Callable, Dict, NamedTuple, Optional
+from typing import Callable, Dict, NamedTuple, Optional, Tuple
 
 import msgspec
 
 from edge_runtime.errors import UserError
 from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
 from edge_runtime.vehicles.hunter.set_point import limits_of
-from edge_runtime.vehicles.hunter.specs import SPECS
+from edge_runtime.vehicles.hunter.specs import SPECS, HunterSpec
 from edge_runtime.vehicles.interface import ActionLimit, Vehicle
 from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.vehicles.ros2.settings import Ros2Settings
@@ -33,20 +33,25 @@ def _mock(setup: VehicleSetup) -> Vehicle:
     return MockVehicle()
 
 
+def _robot(name: str, setup: VehicleSetup) -> Tuple[HunterSpec, Similarity]:
+    """The chassis behind a driver, and how it stands to the policy's car. Raises UserError."""
+    model = setup.ros2.model if name == "ros2" else setup.hunter.model
+    spec = SPECS[model]
+    return spec, make_similarity(setup, name, spec.max_speed_mps)
+
+
 def _hunter(setup: VehicleSetup) -> Vehicle:
     # Imported here: its thread and its bus are for those who have one.
     from edge_runtime.vehicles.hunter.vehicle import HunterVehicle
 
-    spec = SPECS[setup.hunter.model]
-    similarity = make_similarity(setup, "hunter", spec.max_speed_mps)
+    spec, similarity = _robot("hunter", setup)
     return HunterVehicle(parse_bus(setup.bus), spec, setup.hunter.profile, similarity)
 
 
 def _ros2(setup: VehicleSetup) -> Vehicle:
     from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle  # As above; and it needs pycdr2.
 
-    spec = SPECS[setup.ros2.model]
-    similarity = make_similarity(setup, "ros2", spec.max_speed_mps)
+    spec, similarity = _robot("ros2", setup)
     return Ros2Vehicle(setup.ros2, spec, similarity)
 
 
@@ -80,8 +85,7 @@ def vehicle_limits(name: str, setup: VehicleSetup) -> Dict[str, ActionLimit]:
     _check_known(name)
     if name == MockVehicle.name:
         return MockVehicle.limits
-    spec = SPECS[setup.ros2.model if name == "ros2" else setup.hunter.model]
-    return limits_of(spec, make_similarity(setup, name, spec.max_speed_mps))
+    return limits_of(*_robot(name, setup))
 
 
 def _check_known(name: str) -> None:
