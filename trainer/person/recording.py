@@ -19,7 +19,7 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
@@ -34,7 +34,6 @@ WIRE = ("phil/", "view/")
 """How the topics of the wire's recordings begin, and those of their copies for viewers."""
 DIRECTORY = "sittings"
 """Where a training run keeps its recordings."""
-MAGIC = b"\x89MCAP0\r\n"
 FRAME_SHAPE = (45, 80)
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 TORN = (
@@ -185,7 +184,7 @@ def read_steps(path: Path) -> Iterator[Step]:
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
     with stream:
-        if stream.read(len(MAGIC)) != MAGIC:
+        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise UserError(f"{path} is no recording of a sitting")
         stream.seek(0)
         try:
