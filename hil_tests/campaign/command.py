@@ -175,7 +175,10 @@ def _other(text: str) -> tuple[str, dict[str, Any]]:
         raise UserError(f"--against {text}: write NAME=R.json")
     try:
         latency: dict[str, Any] = json.loads(read_bytes(path, "report"))["latency"]
-        latency["rows"], latency["budget"]["sentence"]
+        policy = Path(latency["policy"]).stem
+        budget = latency["budget"]
+        budget["sentence"] = name + budget["sentence"].removeprefix(policy)
+        latency["rows"]
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is no report of a latency campaign with its budget") from None
     return name, latency

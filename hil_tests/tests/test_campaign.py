@@ -133,6 +133,12 @@ def test_a_mistake_is_one_line(options, said, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_another_campaigns_sentence_has_the_name_that_it_is_shown_by():
+    name, latency_part = command._other("without_1=results/latency/left_turn/shipped.json")
+    assert latency_part["policy"].endswith("left_turn.onnx")
+    assert latency_part["budget"]["sentence"].startswith(f"{name} holds at least 98%")
+
+
 def test_one_episode_has_no_interval_that_a_report_could_hold(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["campaign", "--out", str(tmp_path / "r.json"), "--runs", "1"])
