@@ -1,4 +1,4 @@
-"""Who can drive: the expert, a human model, a run's actor, an exported policy."""
+"""Who can drive: the expert, a human model, a run's actor, an exported policy, one action."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ from trainer.human.trigger import LeftTurnTrigger
 from trainer.learner.networks import Actor
 from trainer.scenarios import SCENARIOS
 
+CONSTANT = "constant:"
+"""Before an action that is kept throughout: what any policy should be better than."""
 CHECKPOINT_FILE = "checkpoint.pt"
 BEST_FILE = "best_actor.pt"
 
@@ -53,6 +55,20 @@ class NetworkDriver:
         """pi(s), float32 [action size]."""
         frames = torch.from_numpy(observation)[None].to(self.device)
         return self.actor(frames)[0].cpu().numpy()
+
+
+class ConstantDriver:
+    """One action throughout, whatever it sees."""
+
+    def __init__(self, action: float) -> None:
+        self.action = np.array([action], np.float32)
+
+    def reset(self) -> None:
+        """It has no memory."""
+
+    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The action, float32 [1]."""
+        return self.action
 
 
 class OnnxDriver:
@@ -102,6 +118,8 @@ def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
     """
     if policy == "expert":
         return EXPERTS[env.scenario](env), "expert"
+    if policy.startswith(CONSTANT):
+        return ConstantDriver(_constant_action(policy)), policy
     path = Path(policy)
     if path.suffix == ".onnx":
         driver = OnnxDriver(path)
@@ -114,11 +132,22 @@ def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
     if not path.is_dir():
         raise UserError(
             f"{policy} is no policy: expected an .onnx file, a training run, "
-            "a human model's directory, or the word expert"
+            "a human model's directory, the word expert, or constant:ACTION"
         )
     actor, state = load_actor(path)
     _check_scenario(state["scenario"], env.scenario, policy)
     return NetworkDriver(actor), f"run:{path.name}:{state['episode']}"
+
+
+def _constant_action(policy: str) -> float:
+    """The action behind the word, from -1 to 1."""
+    try:
+        action = float(policy.removeprefix(CONSTANT))
+    except ValueError:
+        action = float("nan")
+    if not -1.0 <= action <= 1.0:
+        raise UserError(f"{policy}: expected an action from -1 to 1, as in {CONSTANT}0.5")
+    return action
 
 
 def _check_scenario(trained_in: str, scenario: str, policy: str) -> None:

@@ -19,6 +19,7 @@ from trainer.progress import ProgressBar
 
 EXAMPLE = examples(
     "python -m trainer evaluate expert --runs 20",
+    "python -m trainer evaluate constant:0 --scenario congestion",
     "python -m trainer evaluate runs/phil_1 --runs 50 --out result.json",
     "python -m trainer evaluate runs/phil_1 --condition variant --latency 50ms+-10ms,loss=1%",
 )
@@ -26,7 +27,11 @@ EXAMPLE = examples(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("policy", help="an .onnx file, a RUN_DIR, a HUMAN_DIR or the word expert")
+    parser.add_argument(
+        "policy",
+        help="an .onnx file, a RUN_DIR, a HUMAN_DIR, the word expert, or constant:ACTION for one "
+        "action from -1 to 1 throughout",
+    )
     add_scenario(parser)
     parser.add_argument(
         "--condition",
