@@ -26,8 +26,8 @@ class Efficiency(NamedTuple):
 
 class Reached(NamedTuple):
     """When a level was reached: after the episode ``before``, where it was not yet, and not later
-    than after ``at``, where it was measured. Who is there at the first validation may have been
-    there all the time (0); who never is, may be after the last one (infinite).
+    than after ``at``, where it was measured. Who is there at the first value that counts may have
+    been there all the time (0); who never is, may be after the last one (infinite).
     """
 
     before: float
@@ -64,10 +64,11 @@ def efficiency(ours: Progress, baseline: Progress, common: bool = False) -> Effi
 
 def episodes_to_reach(learner: Progress, curve: Numbers, level: float) -> Reached:
     """Episodes until a curve of the learner first reaches a level."""
-    first = np.flatnonzero(learner.whole & (curve >= level - 1e-9))
-    place = int(first[0]) if len(first) else len(curve)
-    before = float(learner.episodes[place - 1]) if place else 0.0
-    return Reached(before, float(learner.episodes[place]) if len(first) else float("inf"))
+    episodes, values = learner.episodes[learner.whole], curve[learner.whole]
+    first = np.flatnonzero(values >= level - 1e-9)
+    place = int(first[0]) if len(first) else len(values)
+    before = float(episodes[place - 1]) if place else 0.0
+    return Reached(before, float(episodes[place]) if len(first) else float("inf"))
 
 
 def _needed(ours: Progress, baseline: Progress, common: bool) -> tuple[Reached, Reached]:
