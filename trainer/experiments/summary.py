@@ -10,13 +10,16 @@ from typing import Any, NamedTuple
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes, write_atomic
+from trainer.experiments.catalogue import OURS
 from trainer.experiments.statistics import Holds
-from trainer.experiments.verdict import VERDICT_FILE
+from trainer.experiments.verdict import BAR, VERDICT_FILE
 
 CLAIMS_HEADER = ("what", "claim", "paper", "ours", "seeds", "holds")
 ANSWERS: tuple[Holds, ...] = ("yes", "no", "undecided")
 COUNTS_HEADER = ("experiment", "about", "runs", *ANSWERS, "command")
 NOT_RUN = "not run yet"
+PAPERS, BARS, OWN = "what the paper says", "bars of this project", "experiments of our own"
+"""Whose a claim is."""
 
 
 class Place(NamedTuple):
@@ -60,7 +63,8 @@ def write_table(readme: Path, place: Place, lines: Iterable[str]) -> None:
 
 
 def count_lines(results: Path, names: Iterable[str]) -> list[str]:
-    """The table of experiments: how many of each one's claims hold, and the command that says so.
+    """The table of experiments: how many of each one's claims hold, and the command that says so;
+    below, how many of the paper's, of this project's bars and of its own experiments'.
 
     Args:
         results: directory with ``experiments/<name>/verdict.json``.
@@ -69,14 +73,16 @@ def count_lines(results: Path, names: Iterable[str]) -> list[str]:
     Raises:
         UserError: a verdict cannot be read.
     """
-    lines, total = [row(COUNTS_HEADER), row(["---"] * len(COUNTS_HEADER))], Counter[str]()
+    lines = [row(COUNTS_HEADER), row(["---"] * len(COUNTS_HEADER))]
+    totals = {kind: Counter[str]() for kind in (PAPERS, BARS, OWN)}
     for name, verdict in _verdicts(results, names):
         if verdict is None:
             dashes = "–" * (1 + len(ANSWERS))
             lines.append(row([name, NOT_RUN, *dashes, f"`python -m trainer experiment {name}`"]))
             continue
         counts = Counter(one["holds"] for one in verdict["claims"])
-        total += counts
+        for one in verdict["claims"]:
+            totals[_whose(name, one["text"])][one["holds"]] += 1
         cells = (
             _link(name),
             verdict["title"],
@@ -85,7 +91,15 @@ def count_lines(results: Path, names: Iterable[str]) -> list[str]:
             f"`{verdict['command']}`",
         )
         lines.append(row(cells))
-    return [*lines, row(["all", "", "", *_counted(total), "`python -m trainer experiment all`"])]
+    everything = sum(totals.values(), Counter[str]())
+    lines.append(row(["all", "", "", *_counted(everything), "`python -m trainer experiment all`"]))
+    return [*lines, *(row(["", kind, "", *_counted(totals[kind]), ""]) for kind in totals)]
+
+
+def _whose(name: str, text: str) -> str:
+    if BAR in text:
+        return BARS
+    return OWN if name in OURS else PAPERS
 
 
 def claim_lines(results: Path, names: Iterable[str]) -> list[str]:

@@ -26,7 +26,7 @@ from trainer.experiments.figures.style import colour, label, new_figure, note_mi
 from trainer.experiments.plan import NORMAL, Plan
 from trainer.experiments.statistics import CONFIDENCE, RESAMPLES, Estimate, Holds
 from trainer.experiments.units import Unit, obstacle, run_config, unit_id
-from trainer.experiments.verdict import Claim, claim
+from trainer.experiments.verdict import BAR, Claim, claim
 from trainer.files import make_directory
 from trainer.progress import ProgressBar
 from trainer.training.run import TrainingRun
@@ -179,7 +179,7 @@ def draw(turns: Turns | None) -> Figure:
 
 def judge(turns: Turns | None) -> list[Claim]:
     """Whether the priorities cost next to nothing."""
-    text = f"PHIL-TD3 takes at most {RATIO} times as long as IA-TD3 (bar of this project)"
+    text = f"PHIL-TD3 takes at most {RATIO} times as long as IA-TD3 ({BAR})"
     paper = f"similar, {PAPER_S['phil_td3'] / PAPER_S['ia_td3']:.3f}"
     rule = "95 % bootstrap interval over the rounds, on one side of the bar"
     if turns is None:

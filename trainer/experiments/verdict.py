@@ -13,6 +13,8 @@ from trainer.experiments.gathered import Gathered
 from trainer.experiments.statistics import Estimate, Holds
 
 VERDICT_FILE, READABLE_FILE = "verdict.json", "verdict.md"
+BAR = "bar of this project"
+"""In the text of each claim that is this project's aim, not the paper's word."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from trainer.experiments.gathered import Gathered
 from trainer.experiments.statistics import Holds
 from trainer.experiments.summary import CLAIMS, claim_lines, count_lines, has_place, write_table
 from trainer.experiments.units import Unit
-from trainer.experiments.verdict import claim, markdown, verdict_of, write_verdict
+from trainer.experiments.verdict import BAR, claim, markdown, verdict_of, write_verdict
 from trainer.tests.experiments import store_in
 from trainer.tests.synthetic import outcome
 
@@ -53,16 +53,23 @@ def test_a_table_stands_between_its_comments_and_can_be_refreshed(tmp_path):
 def test_the_table_of_experiments_counts_their_claims_and_names_their_commands(tmp_path):
     answers: tuple[Holds, ...] = ("yes", "no", "no", "undecided")
     claims = [claim("text", "7", "8", answer, 3, "by hand") for answer in answers]
+    claims.append(claim(f"scene: {BAR}, first", "7", "8", "no", 3, "by hand"))
     units = [Unit("left_turn", "phil_td3", "normal", seed) for seed in (1, 2)]
     made = Gathered(units, {units[0]: outcome(units[0])}, 3)
-    directory = tmp_path / "experiments" / "fig7"
-    directory.mkdir(parents=True)
-    write_verdict(verdict_of("fig7", "curves", claims, made, "fig7.png"), directory)
-    assert count_lines(tmp_path, ["fig7", "fig8"])[2:] == [
-        "| [fig7](experiments/fig7/verdict.md) | curves | 1 of 2 | 1 | 2 | 1 "
+    for name in ("fig7", "remedy"):
+        directory = tmp_path / "experiments" / name
+        directory.mkdir(parents=True)
+        write_verdict(verdict_of(name, "curves", claims, made, f"{name}.png"), directory)
+    assert count_lines(tmp_path, ["fig7", "fig8", "remedy"])[2:] == [
+        "| [fig7](experiments/fig7/verdict.md) | curves | 1 of 2 | 1 | 3 | 1 "
         "| `python -m trainer experiment fig7 --seeds 3` |",
         "| fig8 | not run yet | – | – | – | – | `python -m trainer experiment fig8` |",
-        "| all |  |  | 1 | 2 | 1 | `python -m trainer experiment all` |",
+        "| [remedy](experiments/remedy/verdict.md) | curves | 1 of 2 | 1 | 3 | 1 "
+        "| `python -m trainer experiment remedy --seeds 3` |",
+        "| all |  |  | 2 | 6 | 2 | `python -m trainer experiment all` |",
+        "|  | what the paper says |  | 1 | 2 | 1 |  |",
+        "|  | bars of this project |  | 0 | 2 | 0 |  |",
+        "|  | experiments of our own |  | 1 | 2 | 1 |  |",
     ]
 
 

@@ -19,9 +19,8 @@ from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import FULL_PATH_M, Scene
 from trainer.experiments.statistics import Estimate, mean_estimate
-from trainer.experiments.verdict import Claim, claim
+from trainer.experiments.verdict import BAR, Claim, claim
 
-BAR = "bar of this project"
 ROUNDING = 1e-9
 """Of a mean of means, which a tie must survive."""
 SUCCESS_BARS = {"L": 1.0, "L-N": 0.98, "L-V": 0.96, "C": 0.98, "C-N": 0.96, "C-V": 0.92}

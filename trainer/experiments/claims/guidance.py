@@ -21,7 +21,7 @@ from trainer.experiments.statistics import (
     mean_estimate,
     within,
 )
-from trainer.experiments.verdict import Claim, claim
+from trainer.experiments.verdict import BAR, Claim, claim
 
 POOR_LOSS = 0.02
 """Share of its surviving distance that poor guidance may cost PHIL-TD3 (this project's bar); also
@@ -36,7 +36,7 @@ def judge_fig14(gathered: Gathered) -> list[Claim]:
     return [
         _cost_claim(
             gathered, PHIL, changes[PHIL],
-            f"poor guidance costs PHIL-TD3 at most {POOR_LOSS:.0%} (bar of this project)",
+            f"poor guidance costs PHIL-TD3 at most {POOR_LOSS:.0%} ({BAR})",
             lambda found: "yes" if found.value >= -POOR_LOSS else "no", BY_VALUE,
         ),
         _each_scene_claim(gathered),
