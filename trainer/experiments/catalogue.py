@@ -11,6 +11,7 @@ from itertools import product
 from matplotlib.figure import Figure
 
 from trainer.experiments.claims import difficulty, guidance, learning, ours, testing
+from trainer.experiments.claims.lines import TDQA
 from trainer.experiments.figures.bars import draw_difficulty, draw_guidance, draw_tests
 from trainer.experiments.figures.curves import Line, draw_curves
 from trainer.experiments.figures.spread import draw_boxes, draw_distributions, draw_table
@@ -112,12 +113,12 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "fig11": _curves(
         "priority schemes",
-        _lines(("phil_td3", "phil_td_only", "phil_q_advantage_only")),
+        (TDQA, *_lines(("phil_td_only", "phil_q_advantage_only"))),
         learning.judge_fig11,
     ),
     "fig12": _curves(
         "weights of the Q-advantage",
-        _lines(("phil_td3", "phil_advantage_0.1", "phil_advantage_100")),
+        (TDQA, *_lines(("phil_advantage_0.1", "phil_advantage_100"))),
         learning.judge_fig12,
     ),
     "fig13": _curves(

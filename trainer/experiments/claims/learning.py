@@ -19,6 +19,7 @@ from trainer.experiments.claims.lines import (
     RD2_PHIL,
     SMALL,
     TD,
+    TDQA,
 )
 from trainer.experiments.gathered import Gathered
 from trainer.experiments.plan import SCENARIO_TITLES
@@ -106,7 +107,7 @@ def judge_fig11(gathered: Gathered) -> list[Claim]:
             speed_claim(*place, TD, Q_ADVANTAGE, "TD learns faster than Q-advantage", "faster",
                         common=True),
             final_claim(*place, Q_ADVANTAGE, [TD], "Q-advantage ends above TD", "above"),
-            final_claim(*place, PHIL, [TD, Q_ADVANTAGE], "TDQA, which has both, ends highest"),
+            final_claim(*place, TDQA, [TD, Q_ADVANTAGE], "TDQA, which has both, ends highest"),
         ]  # fmt: skip
     return claims
 
@@ -117,10 +118,10 @@ def judge_fig12(gathered: Gathered) -> list[Claim]:
     for scenario, metric in EVERYWHERE:
         place = (gathered, scenario, metric)
         claims += [
-            speed_claim(*place, SMALL, PHIL, "w = 0.1 converges faster than w = 1", "faster",
+            speed_claim(*place, SMALL, TDQA, "w = 0.1 converges faster than w = 1", "faster",
                         common=True),
-            final_claim(*place, PHIL, [SMALL], "w = 0.1 ends below w = 1", "below"),
-            level_claim(*place, PHIL, LARGE, "w = 100 ends on the level of w = 1",
+            final_claim(*place, TDQA, [SMALL], "w = 0.1 ends below w = 1", "below"),
+            level_claim(*place, TDQA, LARGE, "w = 100 ends on the level of w = 1",
                         "same level"),
         ]  # fmt: skip
     return claims

@@ -6,6 +6,8 @@ from trainer.experiments.figures.curves import Line
 from trainer.experiments.plan import HUMAN_MODEL
 
 PHIL, IA, HI, PER = map(Line, ("phil_td3", "ia_td3", "hi_td3", "per_td3"))
+TDQA = Line("phil_td3", name="PHIL-TD3 (TDQA, w = 1)")
+"""PHIL-TD3 beside other priorities and other weights."""
 HUMAN = Line(HUMAN_MODEL)
 TD, Q_ADVANTAGE = Line("phil_td_only"), Line("phil_q_advantage_only")
 SMALL, LARGE = Line("phil_advantage_0.1"), Line("phil_advantage_100")

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from trainer.experiments.figures.style import colour, letter, new_figure, note_missing, short
+from trainer.experiments.figures.style import (
+    SCENE_KEY,
+    colour,
+    letter,
+    new_figure,
+    note_missing,
+    short,
+)
 from trainer.experiments.gathered import Gathered, pairs, pooled
 from trainer.experiments.outcome import within_path
 from trainer.experiments.plan import (
@@ -54,7 +61,8 @@ def _difficulty_panel(
                 color=colour(algorithm), alpha=1.0 if setting == NORMAL else 0.45,
                 hatch=None if setting == NORMAL else "//",
             )  # fmt: skip
-        if len(means) == 2 and min(means.values()) > 0.0:  # of losses a ratio says nothing
+        # Of rewards, which may be negative, a ratio says nothing.
+        if len(means) == 2 and metric != "episode_return" and means[NORMAL] > 0.0:
             top = max(means.values())
             text = f"{means[TOUGH] / means[NORMAL]:.2f}"
             panel.annotate(
@@ -62,6 +70,8 @@ def _difficulty_panel(
             )
         names.append(f"{short(algorithm)}\n{counts[0]} + {counts[1]} seeds")
     _finish(panel, names, bool(panel.patches))
+    if metric != "episode_return":
+        panel.set_ylim(bottom=0.0)
     panel.set_xlabel("left: normal; right, hatched: tough (one frame); number: ratio", fontsize=8)
 
 
@@ -74,6 +84,7 @@ def draw_tests(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
         letter(panel, number, f"surviving distance, m, {SCENARIO_TITLES[scenario]}")
         scenes = [scene for scene in SCENES if scene.scenario == scenario]
         _distance_bars(panel, gathered, algorithms, scenes)
+    figure.supxlabel(SCENE_KEY, fontsize=8)
     return figure
 
 
@@ -87,7 +98,9 @@ def _heat_map(panel: Any, gathered: Gathered, algorithms: Sequence[str]) -> None
                 shares[row, column] = np.mean(np.concatenate(reached))
             share = shares[row, column]
             missing = np.isnan(share)
-            text = "–" if missing else f"{100 * share:.0f}%\n{len(outcomes)} s."
+            fewer = len(outcomes) < gathered.seeds
+            seeds = f"\n{len(outcomes)} of {gathered.seeds} seeds" if fewer else ""
+            text = "–" if missing else f"{100 * share:.0f}%{seeds}"
             dark = not missing and share > 0.6
             panel.text(column, row, text, ha="center", va="center", fontsize=9,
                        color="white" if dark else "black")  # fmt: skip
@@ -95,7 +108,7 @@ def _heat_map(panel: Any, gathered: Gathered, algorithms: Sequence[str]) -> None
     panel.set_facecolor("0.92")
     panel.set_xticks(range(len(algorithms)), [short(name) for name in algorithms], fontsize=8)
     panel.set_yticks(range(len(SCENES)), [scene.label for scene in SCENES])
-    letter(panel, 0, "success rate (s.: seeds)")
+    letter(panel, 0, f"success rate, {gathered.seeds} seeds")
 
 
 def _distance_bars(
@@ -179,6 +192,7 @@ def draw_guidance(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
     figure.supylabel(
         "share of the two mean surviving distances\n(nothing beyond the goal counted)", fontsize=9
     )
+    figure.supxlabel(SCENE_KEY, fontsize=8)
     return figure
 
 

@@ -38,7 +38,7 @@ class Line(NamedTuple):
     @property
     def label(self) -> str:
         """As in the legend."""
-        setting = "" if self.setting == NORMAL else f", {self.setting}"
+        setting = "" if self.setting == NORMAL else f", {self.setting.replace('_', ' ')}"
         return (self.name or label(self.algorithm)) + setting
 
 
@@ -67,8 +67,8 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
     for panel in panels[-1] if by_metric else panels[:, -1]:
         panel.legend(fontsize=8, **legend)
     figure.supxlabel(
-        f"training episode. In training: the human may take over; mean of {WINDOW} episodes, none "
-        "counted beyond the goal.\nWithout help: the policy alone, where it was validated. "
+        f"x: training episode. In training: the human may take over; mean of {WINDOW} episodes, "
+        "none counted beyond the goal.\nWithout help: the policy alone, where it was validated. "
         "Band: standard deviation over the seeds.",
         fontsize=9,
     )

@@ -9,7 +9,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from trainer.experiments.figures.style import colour, letter, new_figure, note_missing, short
+from trainer.experiments.figures.style import (
+    SCENE_KEY,
+    colour,
+    letter,
+    new_figure,
+    note_missing,
+    short,
+)
 from trainer.experiments.gathered import Gathered, pairs, pooled
 from trainer.experiments.plan import NORMAL, POOR, SCENES, Scene
 from trainer.experiments.statistics import paired_t, stars
@@ -49,8 +56,11 @@ def draw_boxes(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
         scenes = [scene for scene in SCENES if scene.scenario == scenario]
         _box_panel(panel, gathered, algorithms, scenes, BOXES[scenario])
     figure.supxlabel(
+        f"{SCENE_KEY}\n"
         "below a box: its drives, of all seeds; stars: paired t-test against PHIL-TD3; "
-        "b counts drives that crash, too",
+        "b counts drives that crash, too\n"
+        "who arrives only where nobody has to be waited for looks quick (a), and who hardly "
+        "steers, smooth (b)",
         fontsize=8,
     )
     return figure
@@ -108,14 +118,20 @@ def draw_distributions(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
     """How often each mean acceleration occurs, scene by scene (fig. 15): poor guidance as a solid
     line, good guidance as a dotted one.
     """
-    figure = new_figure(12.0, 6.6)
-    for number, (panel, scene) in enumerate(zip(figure.subplots(2, 3).flat, SCENES, strict=True)):
+    figure = new_figure(13.5, 6.8)
+    panels = figure.subplots(2, 3)
+    for number, (panel, scene) in enumerate(zip(panels.flat, SCENES, strict=True)):
         letter(panel, number, scene.title)
         quantity = SMOOTHNESS[scene.scenario]
         _distribution_panel(panel, gathered, algorithms, scene, quantity)
         panel.set_xlabel(quantity.title, fontsize=8)
         panel.set_ylabel("share of episodes", fontsize=8)
         panel.grid(alpha=0.3)
+    for panel in panels[:, -1]:  # one a scenario, whose scenes are tested together
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend(fontsize=8, title="guidance (seeds)", title_fontsize=8, loc="center left",
+                         bbox_to_anchor=(1.02, 0.5))  # fmt: skip
+    figure.supxlabel("drives that crash are counted, too", fontsize=8)
     return figure
 
 
@@ -144,7 +160,6 @@ def _distribution_panel(
             ls="-" if setting == POOR else ":", lw=1.6 if setting == POOR else 1.0,
             label=f"{short(algorithm)}, {'poor' if setting == POOR else 'good'} ({seeds})",
         )  # fmt: skip
-    panel.legend(fontsize=6, title="guidance (seeds)", title_fontsize=6)
 
 
 Published = Mapping[str, tuple[tuple[float, float], ...]]

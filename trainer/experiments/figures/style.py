@@ -27,8 +27,9 @@ LABELS = {
     "phil_without_shaping": "without shaping",
     HUMAN_MODEL: "human model",
 }
+SCENE_KEY = "L: left turn; C: congestion; -N: with command noise; -V: variant scene"
 _COLOURS = {"phil_td3": "C3", "ia_td3": "C0", "hi_td3": "C2", "per_td3": "C7", HUMAN_MODEL: "C1"}
-_OTHERS = ("C0", "C2", "C4", "C5", "C8", "C9")
+_OTHERS = ("C4", "C5", "C6", "C8", "C9", "black")
 
 
 def label(algorithm: str) -> str:
