@@ -23,6 +23,8 @@ OWN = (
 )
 """The run's own that may be set; those of the learner may all be."""
 
+EXPECTED = {bool: "true or false", int: "a whole number", float: "a number"}
+
 
 def settings() -> dict[str, Any]:
     """Every setting that ``--set`` may change, with its default."""
@@ -36,7 +38,9 @@ def with_setting(config: RunConfig, assignment: str) -> RunConfig:
     Raises:
         UserError: no such setting, or no such value of it.
     """
-    name, _, text = assignment.partition("=")
+    name, given, text = assignment.partition("=")
+    if not given:
+        raise UserError(f"--set {assignment}: expected NAME=VALUE")
     known = settings()
     if name not in known:
         raise UserError(f"--set {assignment}: no setting {name!r}; there is {', '.join(known)}")
@@ -44,7 +48,7 @@ def with_setting(config: RunConfig, assignment: str) -> RunConfig:
     try:
         value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
     except (ValueError, KeyError):
-        raise UserError(f"--set {assignment}: {text!r} is no {kind.__name__}") from None
+        raise UserError(f"--set {assignment}: expected {EXPECTED[kind]}, got {text!r}") from None
     if name in LEARNERS:
         return replace(config, learner=replace(config.learner, **{name: value}))
     return replace(config, **{name: value})

@@ -4,9 +4,12 @@ import json
 
 import pytest
 
+from edge_runtime.errors import UserError
 from edge_runtime.tests.commands import exit_status
 from trainer.__main__ import main
+from trainer.commands.settings import with_setting
 from trainer.files import save_torch
+from trainer.training.config import RunConfig
 
 
 def call(capsys, *arguments: str) -> tuple[int, str, str]:
@@ -171,3 +174,17 @@ def test_a_foreign_torch_file_is_said_in_one_line(name, capsys, tmp_path):
     save_torch(tmp_path / name, {"something": 1})
     status, _, err = call(capsys, "evaluate", str(tmp_path), "--runs", "1")
     assert (status, len(err.strip().splitlines())) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "expected"),
+    [
+        ("printed_reward", "expected NAME=VALUE"),
+        ("printed_reward=maybe", "expected true or false, got 'maybe'"),
+        ("batch_size=1.5", "expected a whole number, got '1.5'"),
+        ("gamma=", "expected a number, got ''"),
+    ],
+)
+def test_a_wrong_setting_is_told_what_would_be_right(assignment, expected):
+    with pytest.raises(UserError, match=f"^--set {assignment}: {expected}$"):
+        with_setting(RunConfig(), assignment)
