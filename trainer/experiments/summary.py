@@ -12,9 +12,9 @@ from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes, write_atomic
 from trainer.experiments.catalogue import OURS
 from trainer.experiments.statistics import Holds
-from trainer.experiments.verdict import BAR, VERDICT_FILE
+from trainer.experiments.verdict import BAR, VERDICT_FILE, decisive_text
 
-CLAIMS_HEADER = ("what", "claim", "paper", "ours", "seeds", "holds")
+CLAIMS_HEADER = ("what", "claim", "paper", "ours", "what decides", "seeds", "holds")
 ANSWERS: tuple[Holds, ...] = ("yes", "no", "undecided")
 COUNTS_HEADER = ("experiment", "about", "runs", *ANSWERS, "command")
 NOT_RUN = "not run yet"
@@ -110,12 +110,13 @@ def claim_lines(results: Path, names: Iterable[str]) -> list[str]:
     lines = [row(CLAIMS_HEADER), row(["---"] * len(CLAIMS_HEADER))]
     for name, verdict in _verdicts(results, names):
         if verdict is None:
-            lines.append(row([name, NOT_RUN, "", "", "0", "undecided"]))
+            lines.append(row([name, NOT_RUN, "", "", "", "0", "undecided"]))
             continue
         link = _link(name)
         for one in verdict["claims"]:
-            cells = (one["text"], one["paper"], one["ours"], str(one["seeds"]), one["holds"])
-            lines.append(row([link, *cells]))
+            decided = decisive_text(one)
+            cells = (one["text"], one["paper"], one["ours"], decided, str(one["seeds"]))
+            lines.append(row([link, *cells, one["holds"]]))
             link = ""
     return lines
 
@@ -144,7 +145,7 @@ def _read(path: Path) -> dict[str, Any] | None:
     try:
         verdict = json.loads(read_bytes(path, "verdict"))
         for one in verdict["claims"]:
-            _ = [one[name] for name in ("text", "paper", "ours", "seeds", "holds")]
+            _ = decisive_text(one), [one[name] for name in ("text", "paper", "ours", "holds")]
         _ = [verdict[name] for name in ("title", "wanted", "missing", "command")]
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} is no verdict of this project") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from trainer.experiments.gathered import Gathered
 from trainer.experiments.statistics import Estimate, Holds
 
 VERDICT_FILE, READABLE_FILE = "verdict.json", "verdict.md"
+COLUMNS = ("claim", "paper", "ours", "what decides", "seeds", "holds", "decided by")
 BAR = "bar of this project"
 """In the text of each claim that is this project's aim, not the paper's word."""
 
@@ -32,8 +33,12 @@ class Claim:
     """Training seeds behind our number; the fewest, where several algorithms are compared."""
     rule: str
     """How it was decided."""
+    decisive: float | None = None
+    """The number that decides: a difference, a ratio or a value, as the rule says."""
     interval: tuple[float | None, float | None] | None = None
-    """95 % interval of the number that decides; None for an end that is infinite."""
+    """Its 95 % interval; None for an end that is infinite."""
+    rival: str = ""
+    """Whom it is about, where several are compared."""
 
 
 def claim(
@@ -45,15 +50,17 @@ def claim(
     rule: str,
     decisive: Estimate | None = None,
     complete: bool = True,
+    rival: str = "",
 ) -> Claim:
     """A claim; undecided wherever units are missing, whatever the numbers say so far."""
-    interval = None
-    if decisive is not None:
+    value, interval = None, None
+    if decisive is not None and decisive.size:
+        value = decisive.value if math.isfinite(decisive.value) else None
         ends = [end if math.isfinite(end) else None for end in (decisive.low, decisive.high)]
         interval = (ends[0], ends[1]) if any(end is not None for end in ends) else None
     if not complete:
         holds, rule = "undecided", f"{rule}; units are missing"
-    return Claim(text, paper, ours or "not measured", holds, seeds, rule, interval)
+    return Claim(text, paper, ours or "not measured", holds, seeds, rule, value, interval, rival)
 
 
 @dataclass(frozen=True)
@@ -104,13 +111,25 @@ def markdown(verdict: Verdict) -> str:
     if verdict.wanted:
         lines += [f"{done} of {verdict.wanted} training runs and tests, {verdict.seeds} seeds.", ""]
     lines += [f"`{verdict.command}`", ""]
-    lines += ["| claim | paper | ours | seeds | holds | decided by |", "|---|---|---|---|---|---|"]
+    lines += [f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"]
     for one in verdict.claims:
-        cells = (one.text, one.paper, one.ours, str(one.seeds), one.holds, one.rule)
+        decided = decisive_text(asdict(one))
+        cells = (one.text, one.paper, one.ours, decided, str(one.seeds), one.holds, one.rule)
         lines.append(f"| {' | '.join(map(_cell, cells))} |")
     if verdict.missing:
         lines += ["", "Missing:", "", *(f"- {unit}" for unit in verdict.missing)]
     return "\n".join(lines) + "\n"
+
+
+def decisive_text(claim: Mapping[str, Any]) -> str:
+    """The number that decides a claim, as kept in JSON, with its interval; a dash for none."""
+    value = claim["decisive"]
+    if value is None:
+        return "–"
+    low, high = claim["interval"] or (None, None)
+    ends = (-math.inf if low is None else low, math.inf if high is None else high)
+    number = Estimate(value, *ends, claim["seeds"]).text(3)
+    return f"{number} ({claim['rival']})" if claim["rival"] else number
 
 
 def _cell(text: str) -> str:

@@ -117,9 +117,9 @@ def test_who_never_arrives_is_left_out_by_name_and_who_crashes_early_is_not_smoo
     one = scene_claim(*place, [IA, Line("hi_td3")], "smoother", "–", -1.0, arrived=True)
     assert one.interval == (-1.0, -1.0)  # 1 against 2 where both arrive
     assert one.holds == "undecided"  # about HI-TD3 nothing is known
-    assert one.ours.endswith(
-        "in which both arrived, by seed: IA-TD3 1 1 1, HI-TD3 0 0 0; "
-        "left out: HI-TD3, no common arrival"
+    assert one.ours == (
+        "PHIL-TD3 1.00 against IA-TD3 2.00 (1 1 1 drives), "
+        "PHIL-TD3 against HI-TD3: no common arrival"
     )
     assert scene_claim(*place, [IA], "smoother", "–", -1.0, arrived=True).holds == "yes"
     rough = scene_claim(*place, [IA, Line("hi_td3")], "rougher", "–", 1.0, arrived=True)
@@ -211,7 +211,7 @@ def test_seeds_are_those_that_have_a_common_arrival():
     )
     one = scene_claim(made, SCENES[0], DISTANCE, PHIL, [IA], "further", "–", arrived=True)
     assert one.seeds == 2
-    assert "drives in which both arrived, by seed: IA-TD3 1 1 0" in one.ours
+    assert one.ours == "PHIL-TD3 21.00 against IA-TD3 21.00 (1 1 0 drives)"
 
 
 @pytest.mark.parametrize(("hi", "holds"), [(48, "yes"), (50, "no"), (20, "yes")])

@@ -9,7 +9,7 @@ import pytest
 from edge_runtime.errors import UserError
 from trainer.experiments import unit_table
 from trainer.experiments.gathered import Gathered
-from trainer.experiments.statistics import Holds
+from trainer.experiments.statistics import Estimate, Holds
 from trainer.experiments.summary import CLAIMS, claim_lines, count_lines, has_place, write_table
 from trainer.experiments.units import Unit
 from trainer.experiments.verdict import BAR, claim, markdown, verdict_of, write_verdict
@@ -20,13 +20,14 @@ from trainer.tests.synthetic import outcome
 def test_a_verdict_is_written_for_programs_and_for_people(tmp_path):
     there, missing = (Unit("left_turn", name, "normal", 1) for name in ("phil_td3", "hi_td3"))
     made = Gathered([there, missing], {there: outcome(there)}, 3)
-    one = claim("a | b", "7", "8", "yes", 1, "by hand")
+    difference = Estimate(8.0, 7.5, float("inf"), 3)
+    one = claim("a | b", "7", "8", "yes", 1, "by hand", difference, rival="HI-TD3")
     write_verdict(verdict_of("fig7", "learning curves", [one], made, "fig7.png"), tmp_path)
     verdict = json.loads((tmp_path / "verdict.json").read_text())
     assert verdict["claims"][0]["holds"] == "yes"
     assert verdict["missing"] == ["left_turn hi_td3 normal seed 1"]
     page = (tmp_path / "verdict.md").read_text()
-    assert "| a \\| b | 7 | 8 | 1 | yes | by hand |" in page
+    assert "| a \\| b | 7 | 8 | 8.000 [7.500, ∞] (HI-TD3) | 1 | yes | by hand |" in page
     assert "1 of 2 training runs and tests, 3 seeds." in page
     assert page.endswith("- left_turn hi_td3 normal seed 1\n")
     assert markdown(verdict_of("t", "t", [one], Gathered([], {}, 1), "t.png")).count("Missing") == 0
@@ -46,7 +47,7 @@ def test_a_table_stands_between_its_comments_and_can_be_refreshed(tmp_path):
     assert text.endswith(f"\n\n{CLAIMS.end}\n\nThe rest.\n")
     assert "an earlier table" not in text
     link = "[fig7](experiments/fig7/verdict.md)"
-    assert f"| {link} | first | 7 | 8 | 3 | no |\n|  | second | 7 | 8" in text
+    assert f"| {link} | first | 7 | 8 | – | 3 | no |\n|  | second | 7 | 8" in text
     assert "| fig8 | not run yet |" in text
 
 

@@ -1,6 +1,6 @@
 """Claims against made-up results whose answer is known."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from trainer.experiments.outcome import Outcome
 from trainer.experiments.plan import FULL_PATH_M
 from trainer.experiments.progress import NAMED
 from trainer.experiments.units import Unit
+from trainer.experiments.verdict import decisive_text
 from trainer.tests.synthetic import gathered
 
 PHIL, IA = Line("phil_td3"), Line("ia_td3")
@@ -60,6 +61,7 @@ def test_the_interval_is_of_the_one_who_decides():
     one = final_claim(made, "left_turn", "distance_m", PHIL, [IA, Line("hi_td3")], "highest")
     assert one.holds == "no"
     assert one.interval == pytest.approx((-2.0, -2.0))  # IA-TD3's begins lower
+    assert decisive_text(asdict(one)) == "-2.000 [-2.000, -2.000] (HI-TD3)"
     mirrored = final_claim(
         made, "left_turn", "distance_m", Line("hi_td3"), [PHIL], "lowest", sign=-1.0
     )

@@ -39,7 +39,7 @@ def success_bar(gathered: Gathered, scene: Scene) -> Claim:
         f"{shown_of(gathered, scene, PHIL, SUCCESS)}, all drives {everything.text()}",
         "yes" if everything.value >= least else "no",
         len(outcomes),
-        f"{BY_VALUE}; Wilson's interval shown",
+        f"{BY_VALUE}; Wilson's interval, as if all drives were independent, shown",
         everything,
         tested_all(gathered, scene, [PHIL]),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from trainer.experiments.claims.compare import BY_SEED, difference
+from trainer.experiments.claims.compare import BY_SEED, difference, rival
 from trainer.experiments.claims.scenes import (
     SUCCESS,
     shown_of,
@@ -27,10 +27,10 @@ def competitive_claim(
     """Whether one line's success is about that of each of the others, or above it."""
     lines = [line, *others]
     own = success_by_seed(gathered, scene, line)
-    ahead = [difference(own, success_by_seed(gathered, scene, other)) for other in others]
-    judged = judge_all(ahead, least=-COMPETITIVE)
+    ahead = {other: difference(own, success_by_seed(gathered, scene, other)) for other in others}
+    judged = judge_all(list(ahead.values()), least=-COMPETITIVE)
     shown = [f"{one.label} {shown_of(gathered, scene, one, SUCCESS)}" for one in lines]
-    points = [each.times(100.0).text(1) for each in ahead]
+    points = [each.times(100.0).text(1) for each in ahead.values()]
     return claim(
         f"{scene.title}: {line.label} is competitive with "
         f"{' and '.join(other.label for other in others)} in success",
@@ -41,6 +41,7 @@ def competitive_claim(
         f"less than {100 * COMPETITIVE:.0f} percentage points behind each; {BY_SEED}",
         judged.decisive.times(100.0) if judged.decisive else None,
         tested_all(gathered, scene, lines),
+        rival(judged, ahead),
     )
 
 
@@ -50,10 +51,12 @@ def degraded_claim(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> 
         next(s for s in SCENES if (s.scenario, s.condition) == (scenario, condition))
         for condition in ("nominal", "variant")
     )
-    shares = [[success_by_seed(gathered, s, line) for s in (nominal, variant)] for line in lines]
-    points = [difference(before, after).times(100.0) for before, after in shares]
-    judged = judge_all(points)
-    shown = [f"{line.label} {lost.text(1)}" for line, lost in zip(lines, points, strict=True)]
+    points = {}
+    for line in lines:
+        before, after = (success_by_seed(gathered, scene, line) for scene in (nominal, variant))
+        points[line] = difference(before, after).times(100.0)
+    judged = judge_all(list(points.values()))
+    shown = [f"{line.label} {lost.text(1)}" for line, lost in points.items()]
     return claim(
         f"{SCENARIO_TITLES[scenario]}: the variant scene degrades the baselines' success",
         "significantly",
@@ -63,4 +66,5 @@ def degraded_claim(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> 
         BY_SEED,
         judged.decisive,
         all(tested_all(gathered, scene, lines) for scene in (nominal, variant)),
+        rival(judged, points),
     )

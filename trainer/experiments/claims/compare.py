@@ -13,6 +13,7 @@ from trainer.experiments.plan import SCENARIO_TITLES
 from trainer.experiments.progress import NAMED, VALIDATED, final, progress
 from trainer.experiments.statistics import (
     Estimate,
+    Judged,
     above,
     judge_all,
     mean_estimate,
@@ -38,6 +39,13 @@ def difference(first: Mapping[int, float], second: Mapping[int, float]) -> Estim
     return mean_estimate([first[seed] - second[seed] for seed in first if seed in second])
 
 
+def rival(judged: Judged, differences: Mapping[Line, Estimate]) -> str:
+    """Whose difference decides, where there is more than one."""
+    if len(differences) < 2:
+        return ""
+    return next((line.label for line, d in differences.items() if d == judged.decisive), "")
+
+
 def complete(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> bool:
     """Whether all units of these lines are there."""
     return all(gathered.complete(scenario, [one.algorithm], one.setting) for one in lines)
@@ -56,7 +64,8 @@ def final_claim(
     """Whether one line ends above (sign 1) or below (-1) each of the others."""
     own = finals(gathered, scenario, ours, metric)
     ends = {line: finals(gathered, scenario, line, metric) for line in others}
-    judged = judge_all([difference(own, end) for end in ends.values()], sign)
+    differences = {line: difference(own, end) for line, end in ends.items()}
+    judged = judge_all(list(differences.values()), sign)
     shown = [f"{line.label} {mean_estimate(list(end.values())).text()}"
              for line, end in {ours: own, **ends}.items()]  # fmt: skip
     return claim(
@@ -68,6 +77,7 @@ def final_claim(
         f"final averages; {BY_SEED}",
         judged.decisive,
         complete(gathered, scenario, [ours, *others]),
+        rival(judged, differences),
     )
 
 

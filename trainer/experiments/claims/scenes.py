@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trainer.experiments.claims.compare import BY_SEED, complete, difference
+from trainer.experiments.claims.compare import BY_SEED, complete, difference, rival
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered, comparable, pairs, pooled
 from trainer.experiments.outcome import Drives, Outcome, within_path
@@ -50,29 +50,38 @@ def scene_claim(
 ) -> Claim:
     """Whether one line's mean over test episodes is above (sign 1) or below (-1) all others'.
 
-    With ``arrived`` only pairs of drives count in which both reached the goal. Who never arrives
-    where we do is left out, and named; that we are ahead of all others cannot be said then. What
-    is shown is over all drives, or all that arrived.
+    With ``arrived`` only pairs of drives count in which both reached the goal, and are shown; who
+    never arrives where we do is left out: that we are ahead of all others cannot be said then.
     """
     found = {line: _by_seed(gathered, scene, ours, line, quantity, arrived) for line in others}
-    differences = {line: mean_estimate([d.mean() for d in found[line] if len(d)]) for line in found}
-    left_out = [line for line in others if found[line] and not differences[line].size]
-    judged = judge_all([differences[line] for line in others if line not in left_out], sign)
+    differences = {
+        line: mean_estimate([(own - theirs).mean() for own, theirs in found[line] if len(own)])
+        for line in found
+    }
+    known = {line: each for line, each in differences.items() if each.size or not found[line]}
+    judged = judge_all(list(known.values()), sign)
     # Of who is left out nothing is known, which leaves a yes open.
-    holds = all_of([judged.holds, *(above(differences[line]) for line in left_out)])
+    left_out = [above(each) for line, each in differences.items() if line not in known]
     lines = [ours, *others]
-    shown = [f"{line.label} {shown_of(gathered, scene, line, quantity, arrived)}" for line in lines]
-    ours_text = ", ".join(shown)
-    if arrived and any(found.values()):
-        counts = [f"{line.label} {' '.join(str(len(d)) for d in found[line])}" for line in others]
-        ours_text += f"; drives in which both arrived, by seed: {', '.join(counts)}"
-    if left_out:
-        ours_text += f"; left out: {', '.join(line.label for line in left_out)}, no common arrival"
+    if arrived:
+        shown = [f"{ours.label} {_where_both_arrived(line, found[line])}" for line in others]
+    else:
+        shown = [f"{line.label} {shown_of(gathered, scene, line, quantity)}" for line in lines]
     return claim(
-        f"{scene.title}: {text}", paper, ours_text,
-        holds, judged.size, _rule(quantity, arrived), judged.decisive,
-        tested_all(gathered, scene, lines),
+        f"{scene.title}: {text}", paper, ", ".join(shown),
+        all_of([judged.holds, *left_out]), judged.size, _rule(quantity, arrived), judged.decisive,
+        tested_all(gathered, scene, lines), rival(judged, known),
     )  # fmt: skip
+
+
+def _where_both_arrived(line: Line, found: Sequence[tuple[Numbers, Numbers]]) -> str:
+    """The means of both over the drives that both finished, and how many of each seed these are."""
+    some = [(own.mean(), theirs.mean()) for own, theirs in found if len(own)]
+    if not some:
+        return f"against {line.label}: {'no common arrival' if found else '–'}"
+    own, theirs = np.mean(some, axis=0)
+    counts = " ".join(str(len(own)) for own, _ in found)
+    return f"{own:.2f} against {line.label} {theirs:.2f} ({counts} drives)"
 
 
 def spread_claim(
@@ -87,7 +96,8 @@ def spread_claim(
         }
         for line in lines
     }
-    judged = judge_all([difference(spreads[ours], spreads[line]) for line in others], sign=-1.0)
+    differences = {line: difference(spreads[ours], spreads[line]) for line in others}
+    judged = judge_all(list(differences.values()), sign=-1.0)
     shown = [
         f"{line.label} {mean_estimate(list(of_line.values())).text()} m"
         for line, of_line in spreads.items()
@@ -98,19 +108,18 @@ def spread_claim(
         f"standard deviation over each seed's drives; {BY_SEED}; nothing beyond the goal counted",
         judged.decisive,
         tested_all(gathered, scene, lines),
+        rival(judged, differences),
     )  # fmt: skip
 
 
-def shown_of(
-    gathered: Gathered, scene: Scene, line: Line, quantity: str, arrived: bool = False
-) -> str:
+def shown_of(gathered: Gathered, scene: Scene, line: Line, quantity: str) -> str:
     """Mean and standard deviation over the test episodes, as the paper's tables have them."""
     outcomes = gathered.tested(scene, line.algorithm, line.setting)
     if quantity == SUCCESS:
         each = [success([outcome], scene.condition).value for outcome in outcomes]
         shares = " ".join(f"{100 * share:.0f}" for share in each)
         return f"{100 * np.mean(each):.1f} % ({shares})" if each else "–"
-    values = pooled(outcomes, scene.condition, quantity, arrived)
+    values = pooled(outcomes, scene.condition, quantity)
     return f"{values.mean():.2f}±{values.std():.2f}" if len(values) else "–"
 
 
@@ -134,18 +143,18 @@ def tested_all(gathered: Gathered, scene: Scene, lines: Sequence[Line]) -> bool:
 
 def _by_seed(
     gathered: Gathered, scene: Scene, first: Line, second: Line, quantity: str, arrived: bool
-) -> list[Numbers]:
-    """First minus second in each pair of drives: an array for each training seed that both have."""
+) -> list[tuple[Numbers, Numbers]]:
+    """First and second in each pair of drives: two arrays for each training seed that both have."""
     own, theirs = (gathered.tested(scene, line.algorithm, line.setting) for line in (first, second))
-    differences = []
+    paired = []
     for one in own:
         if not any(comparable(one, other) for other in theirs):
             continue
         ours, rivals = pairs([one], theirs, scene.condition, _column(quantity), arrived)
         if quantity == DISTANCE:
             ours, rivals = (within_path(scene.scenario, each) for each in (ours, rivals))
-        differences.append(ours - rivals)
-    return differences
+        paired.append((ours, rivals))
+    return paired
 
 
 def _column(quantity: str) -> str:

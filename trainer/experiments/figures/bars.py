@@ -28,17 +28,17 @@ from trainer.experiments.plan import (
     TOUGH,
     Scene,
 )
-from trainer.experiments.progress import TITLES, final
+from trainer.experiments.progress import DISTANCES, NAMED, final
 from trainer.experiments.statistics import paired_t, stars
 
 
 def draw_difficulty(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
-    """Final averages in the normal and the tough setting, with the ratio of the two."""
-    figure = new_figure(15.0, 6.6)
-    panels = figure.subplots(len(SCENARIO_TITLES), len(TITLES))
-    for number, (scenario, metric) in enumerate(product(SCENARIO_TITLES, TITLES)):
+    """Final averages in the normal and the tough setting; of distances, the ratio of the two."""
+    figure = new_figure(18.0, 6.6)
+    panels = figure.subplots(len(SCENARIO_TITLES), len(NAMED))
+    for number, (scenario, metric) in enumerate(product(SCENARIO_TITLES, NAMED)):
         panel = panels.flat[number]
-        letter(panel, number, f"{TITLES[metric]}, {SCENARIO_TITLES[scenario]}")
+        letter(panel, number, f"{NAMED[metric]}, {SCENARIO_TITLES[scenario]}")
         _difficulty_panel(panel, gathered, algorithms, scenario, metric)
     return figure
 
@@ -48,7 +48,7 @@ def _difficulty_panel(
 ) -> None:
     names = []
     for place, algorithm in enumerate(algorithms):
-        means, counts = {}, []
+        means, tops, counts = {}, [], []
         for side, setting in ((-0.2, NORMAL), (0.2, TOUGH)):
             outcomes = gathered.of(scenario, algorithm, setting)
             counts.append(len(outcomes))
@@ -56,23 +56,25 @@ def _difficulty_panel(
                 continue
             finals = [final(outcome, metric) for outcome in outcomes]
             means[setting] = float(np.mean(finals))
+            tops.append(means[setting] + float(np.std(finals)))
             panel.bar(
                 place + side, means[setting], 0.38, yerr=np.std(finals), capsize=3,
                 color=colour(algorithm), alpha=1.0 if setting == NORMAL else 0.45,
                 hatch=None if setting == NORMAL else "//",
             )  # fmt: skip
-        # Of rewards, which may be negative, a ratio says nothing.
-        if len(means) == 2 and metric != "episode_return" and means[NORMAL] > 0.0:
-            top = max(means.values())
+        # Of rewards, which may be negative, and of no success, a ratio says nothing.
+        if len(means) == 2 and metric in DISTANCES and means[NORMAL] > 0.0:
             text = f"{means[TOUGH] / means[NORMAL]:.2f}"
             panel.annotate(
-                text, (place, top), (0, 12), textcoords="offset points", ha="center", fontsize=9
-            )
+                text, (place, max(tops)), (0, 5), textcoords="offset points", ha="center",
+                fontsize=9,
+            )  # fmt: skip
         names.append(f"{short(algorithm)}\n{counts[0]} + {counts[1]} seeds")
     _finish(panel, names, bool(panel.patches))
     if metric != "episode_return":
         panel.set_ylim(bottom=0.0)
-    panel.set_xlabel("left: normal; right, hatched: tough (one frame); number: ratio", fontsize=8)
+    ratio = "; number: ratio" if metric in DISTANCES else ""
+    panel.set_xlabel(f"left: normal; right, hatched: tough (one frame){ratio}", fontsize=8)
 
 
 def draw_tests(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
@@ -84,7 +86,12 @@ def draw_tests(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
         letter(panel, number, f"surviving distance, m, {SCENARIO_TITLES[scenario]}")
         scenes = [scene for scene in SCENES if scene.scenario == scenario]
         _distance_bars(panel, gathered, algorithms, scenes)
-    figure.supxlabel(SCENE_KEY, fontsize=8)
+    figure.supxlabel(
+        f"{SCENE_KEY}\n"
+        "error bar: standard deviation; dotted: the goal, beyond which a car may drive one step\n"
+        "stars: paired t-test against PHIL-TD3 over all drives of all seeds, cut at the goal",
+        fontsize=8,
+    )
     return figure
 
 
@@ -143,11 +150,6 @@ def _distance_bars(
             once.values(), once.keys(), fontsize=7, ncols=len(once), loc="upper center",
             bbox_to_anchor=(0.5, -0.12),
         )  # fmt: skip
-    panel.set_xlabel(
-        "error bar: standard deviation; stars: paired t-test against PHIL-TD3\n"
-        "over all drives of all seeds, nothing beyond the goal counted",
-        fontsize=8,
-    )
 
 
 def draw_guidance(gathered: Gathered, algorithms: Sequence[str]) -> Figure:

@@ -52,14 +52,18 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
     """
     if by_metric:
         places = [[(scenario, metric) for scenario in SCENARIO_TITLES] for metric in TITLES]
-        figure = new_figure(10.0, 9.6)
+        heights = [0.6 if metric == "distance_m" else 1.0 for metric in TITLES]
+        figure = new_figure(10.0, 8.6)
         legend = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12), "ncols": 2}
     else:
         places = [[(scenario, metric) for metric in TITLES] for scenario in SCENARIO_TITLES]
+        heights = [1.0] * len(SCENARIO_TITLES)
         figure = new_figure(16.0, 6.6)
         legend = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)}
     # Panels of one scenario share their episodes; the other one's are more or fewer.
-    panels: Any = figure.subplots(len(places), len(places[0]), sharex="col" if by_metric else "row")
+    panels: Any = figure.subplots(
+        len(places), len(places[0]), sharex="col" if by_metric else "row", height_ratios=heights
+    )
     for number, (scenario, metric) in enumerate(chain.from_iterable(places)):
         panel = panels.flat[number]
         letter(panel, number, f"{TITLES[metric]}, {SCENARIO_TITLES[scenario]}")
@@ -67,8 +71,9 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
     for panel in panels[-1] if by_metric else panels[:, -1]:
         panel.legend(fontsize=8, **legend)
     figure.supxlabel(
-        f"x: training episode. In training: the human may take over; mean of {WINDOW} episodes, "
-        "none counted beyond the goal.\nWithout help: the policy alone, where it was validated. "
+        f"x: training episode. In training: the human may take over; mean of the last {WINDOW} "
+        "episodes, none counted beyond the goal.\n"
+        "Without help: the policy alone, where it was validated. "
         "Band: standard deviation over the seeds.",
         fontsize=9,
     )
@@ -88,12 +93,14 @@ def _draw_panel(
         if found is None:
             panel.plot([], [], style, color=shade, alpha=0.4, label=named)
             continue
-        mean, deviation = found.curves.mean(axis=0), found.curves.std(axis=0)
+        # A mean of fewer episodes than the caption says would be another curve.
+        episodes, curves = found.episodes[found.whole], found.curves[:, found.whole]
+        mean, deviation = curves.mean(axis=0), curves.std(axis=0)
         # The first ones wider: where all arrive, each is seen below those drawn over it.
         width = max(WIDEST - WIDTH_STEP * place, THINNEST)
-        panel.plot(found.episodes, mean, style, color=shade, lw=width, label=named)
+        panel.plot(episodes, mean, style, color=shade, lw=width, label=named)
         panel.fill_between(
-            found.episodes, mean - deviation, mean + deviation, color=shade, alpha=0.18, lw=0
+            episodes, mean - deviation, mean + deviation, color=shade, alpha=0.18, lw=0
         )
     if metric != "episode_return":
         best = 1.0 if metric == ALONE else FULL_PATH_M[scenario]

@@ -59,8 +59,8 @@ def draw_boxes(gathered: Gathered, algorithms: Sequence[str]) -> Figure:
         f"{SCENE_KEY}\n"
         "below a box: its drives, of all seeds; stars: paired t-test against PHIL-TD3; "
         "b counts drives that crash, too\n"
-        "who arrives only where nobody has to be waited for looks quick (a), and who hardly "
-        "steers, smooth (b)",
+        "a: boxes of all drives that arrive, stars of those in which both do; "
+        "b: who hardly steers looks smooth",
         fontsize=8,
     )
     return figure
