@@ -145,7 +145,10 @@ def _read(path: Path) -> dict[str, Any] | None:
     try:
         verdict = json.loads(read_bytes(path, "verdict"))
         for one in verdict["claims"]:
-            _ = decisive_text(one), [one[name] for name in ("text", "paper", "ours", "holds")]
+            _ = (
+                decisive_text(one),
+                [one[key] for key in ("text", "paper", "ours", "seeds", "holds")],
+            )
         _ = [verdict[name] for name in ("title", "wanted", "missing", "command")]
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} is no verdict of this project") from error

@@ -38,7 +38,7 @@ class Claim:
     interval: tuple[float | None, float | None] | None = None
     """Its 95 % interval; None for an end that is infinite."""
     rival: str = ""
-    """Whom it is about, where several are compared."""
+    """Whom or which pair it is about, where several are compared."""
 
 
 def claim(

@@ -116,6 +116,7 @@ def test_who_never_arrives_is_left_out_by_name_and_who_crashes_early_is_not_smoo
     place = (made, SCENES[0], "shaking", PHIL)
     one = scene_claim(*place, [IA, Line("hi_td3")], "smoother", "–", -1.0, arrived=True)
     assert one.interval == (-1.0, -1.0)  # 1 against 2 where both arrive
+    assert one.rival == "IA-TD3"  # named, though the only one left
     assert one.holds == "undecided"  # about HI-TD3 nothing is known
     assert one.ours == (
         "PHIL-TD3 1.00 against IA-TD3 2.00 (1 1 1 drives), "

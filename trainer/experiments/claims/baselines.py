@@ -27,7 +27,9 @@ def competitive_claim(
     """Whether one line's success is about that of each of the others, or above it."""
     lines = [line, *others]
     own = success_by_seed(gathered, scene, line)
-    ahead = {other: difference(own, success_by_seed(gathered, scene, other)) for other in others}
+    ahead = {
+        other.label: difference(own, success_by_seed(gathered, scene, other)) for other in others
+    }
     judged = judge_all(list(ahead.values()), least=-COMPETITIVE)
     shown = [f"{one.label} {shown_of(gathered, scene, one, SUCCESS)}" for one in lines]
     points = [each.times(100.0).text(1) for each in ahead.values()]
@@ -54,9 +56,9 @@ def degraded_claim(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> 
     points = {}
     for line in lines:
         before, after = (success_by_seed(gathered, scene, line) for scene in (nominal, variant))
-        points[line] = difference(before, after).times(100.0)
+        points[line.label] = difference(before, after).times(100.0)
     judged = judge_all(list(points.values()))
-    shown = [f"{line.label} {lost.text(1)}" for line, lost in points.items()]
+    shown = [f"{name} {lost.text(1)}" for name, lost in points.items()]
     return claim(
         f"{SCENARIO_TITLES[scenario]}: the variant scene degrades the baselines' success",
         "significantly",

@@ -39,11 +39,11 @@ def difference(first: Mapping[int, float], second: Mapping[int, float]) -> Estim
     return mean_estimate([first[seed] - second[seed] for seed in first if seed in second])
 
 
-def rival(judged: Judged, differences: Mapping[Line, Estimate]) -> str:
-    """Whose difference decides, where there is more than one."""
+def rival(judged: Judged, differences: Mapping[str, Estimate]) -> str:
+    """The name of the difference that decides, where there is more than one."""
     if len(differences) < 2:
         return ""
-    return next((line.label for line, d in differences.items() if d == judged.decisive), "")
+    return next((name for name, each in differences.items() if each == judged.decisive), "")
 
 
 def complete(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> bool:
@@ -64,7 +64,7 @@ def final_claim(
     """Whether one line ends above (sign 1) or below (-1) each of the others."""
     own = finals(gathered, scenario, ours, metric)
     ends = {line: finals(gathered, scenario, line, metric) for line in others}
-    differences = {line: difference(own, end) for line, end in ends.items()}
+    differences = {line.label: difference(own, end) for line, end in ends.items()}
     judged = judge_all(list(differences.values()), sign)
     shown = [f"{line.label} {mean_estimate(list(end.values())).text()}"
              for line, end in {ours: own, **ends}.items()]  # fmt: skip

@@ -7,7 +7,7 @@ from itertools import pairwise, permutations, product
 
 import numpy as np
 
-from trainer.experiments.claims.compare import BY_SEED, complete, difference, finals, papers
+from trainer.experiments.claims.compare import BY_SEED, complete, difference, finals, papers, rival
 from trainer.experiments.claims.lines import HI, IA, PER, PHIL
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
@@ -34,9 +34,12 @@ def judge_fig8(gathered: Gathered) -> list[Claim]:
 def _cloners_claim(gathered: Gathered, scenario: str, metric: str) -> Claim:
     """Whether each who clones keeps a larger share than each who does not."""
     kept = {line: kept_shares(gathered, scenario, line, metric) for line in LINES}
-    pairs = product((PHIL, IA), (HI, PER))
+    differences = {
+        f"{one.label} over {two.label}": difference(kept[one], kept[two])
+        for one, two in product((PHIL, IA), (HI, PER))
+    }
     return _kept_claim(
-        gathered, scenario, metric, kept, [difference(kept[one], kept[two]) for one, two in pairs],
+        gathered, scenario, metric, kept, differences,
         "PHIL-TD3 and IA-TD3 are less affected by the tough setting than HI-TD3 and vanilla TD3",
         "less",
     )  # fmt: skip
@@ -45,7 +48,10 @@ def _cloners_claim(gathered: Gathered, scenario: str, metric: str) -> Claim:
 def _others_claim(gathered: Gathered, scenario: str, metric: str) -> Claim:
     """Whether each who does not clone loses anything."""
     kept = {line: kept_shares(gathered, scenario, line, metric) for line in (HI, PER)}
-    lost = [mean_estimate([1.0 - share for share in shares.values()]) for shares in kept.values()]
+    lost = {
+        line.label: mean_estimate([1.0 - share for share in shares.values()])
+        for line, shares in kept.items()
+    }
     text = "HI-TD3 and vanilla TD3 are degraded by the tough setting"
     return _kept_claim(gathered, scenario, metric, kept, lost, text, "significantly")
 
@@ -55,11 +61,11 @@ def _kept_claim(
     scenario: str,
     metric: str,
     kept: Mapping[Line, Mapping[int, float]],
-    differences: Sequence[Estimate],
+    differences: Mapping[str, Estimate],
     text: str,
     paper: str,
 ) -> Claim:
-    judged = judge_all(differences)
+    judged = judge_all(list(differences.values()))
     shown = [f"{line.label} {mean_estimate(list(kept[line].values())).text()}" for line in kept]
     return claim(
         f"{SCENARIO_TITLES[scenario]}, {NAMED[metric]}: {text}",
@@ -70,6 +76,7 @@ def _kept_claim(
         f"ratios of the means, each with its seeds' deviations; {BY_SEED}",
         judged.decisive,
         all(complete(gathered, scenario, [line, _tough(line)]) for line in kept),
+        rival(judged, differences),
     )
 
 

@@ -55,13 +55,13 @@ def scene_claim(
     """
     found = {line: _by_seed(gathered, scene, ours, line, quantity, arrived) for line in others}
     differences = {
-        line: mean_estimate([(own - theirs).mean() for own, theirs in found[line] if len(own)])
-        for line in found
+        line.label: mean_estimate([(own - theirs).mean() for own, theirs in drives if len(own)])
+        for line, drives in found.items()
     }
-    known = {line: each for line, each in differences.items() if each.size or not found[line]}
-    judged = judge_all(list(known.values()), sign)
+    left_out = [one.label for one in others if found[one] and not differences[one.label].size]
+    judged = judge_all([differences[name] for name in differences if name not in left_out], sign)
     # Of who is left out nothing is known, which leaves a yes open.
-    left_out = [above(each) for line, each in differences.items() if line not in known]
+    holds = all_of([judged.holds, *(above(differences[name]) for name in left_out)])
     lines = [ours, *others]
     if arrived:
         shown = [f"{ours.label} {_where_both_arrived(line, found[line])}" for line in others]
@@ -69,8 +69,8 @@ def scene_claim(
         shown = [f"{line.label} {shown_of(gathered, scene, line, quantity)}" for line in lines]
     return claim(
         f"{scene.title}: {text}", paper, ", ".join(shown),
-        all_of([judged.holds, *left_out]), judged.size, _rule(quantity, arrived), judged.decisive,
-        tested_all(gathered, scene, lines), rival(judged, known),
+        holds, judged.size, _rule(quantity, arrived), judged.decisive,
+        tested_all(gathered, scene, lines), rival(judged, differences),
     )  # fmt: skip
 
 
@@ -96,7 +96,7 @@ def spread_claim(
         }
         for line in lines
     }
-    differences = {line: difference(spreads[ours], spreads[line]) for line in others}
+    differences = {line.label: difference(spreads[ours], spreads[line]) for line in others}
     judged = judge_all(list(differences.values()), sign=-1.0)
     shown = [
         f"{line.label} {mean_estimate(list(of_line.values())).text()} m"

@@ -74,10 +74,15 @@ def draw_curves(gathered: Gathered, lines: Sequence[Line], by_metric: bool = Fal
         f"x: training episode. In training: the human may take over; mean of the last {WINDOW} "
         "episodes, none counted beyond the goal.\n"
         "Without help: the policy alone, where it was validated. "
-        "Band: standard deviation over the seeds.",
+        f"Band: standard deviation over the seeds.{_left_out(lines)}",
         fontsize=9,
     )
     return figure
+
+
+def _left_out(lines: Sequence[Line]) -> str:
+    unlike = any(line.setting == PRINTED_REWARD for line in lines)
+    return " The printed reward, on another scale, is not drawn." if unlike else ""
 
 
 def _draw_panel(
@@ -85,7 +90,7 @@ def _draw_panel(
 ) -> None:
     for place, line in enumerate(lines):
         if metric == "episode_return" and line.setting == PRINTED_REWARD:
-            continue  # Its rewards are on another scale.
+            continue
         outcomes = gathered.of(scenario, line.algorithm, line.setting)
         named = f"{line.label} ({len(outcomes)} of {gathered.seeds} seeds)"
         shade, style = _look(line, lines)
