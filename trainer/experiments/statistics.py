@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -98,21 +98,27 @@ class Judged(NamedTuple):
     decisive: Estimate | None
     """The one that says no; of those that leave it open the lowest; the lowest end of those that
     say yes."""
+    rival: str
+    """Its name; empty where none decides."""
 
 
-def judge_all(differences: Sequence[Estimate], sign: float = 1.0, least: float = 0.0) -> Judged:
+def judge_all(differences: Mapping[str, Estimate], sign: float = 1.0, least: float = 0.0) -> Judged:
     """Judge whether all differences, or with sign -1 their opposites, are above ``least``."""
-    signed = [difference.times(sign) for difference in differences]
-    holds = all_of([above(each, least) for each in signed])
+    signed = {name: each.times(sign) for name, each in differences.items()}
+    holds = all_of([above(each, least) for each in signed.values()])
     if holds == "no":
-        decisive = min(signed, key=lambda each: each.high)
-        return Judged(holds, decisive.size, decisive.times(sign))
-    size = min((each.size for each in signed), default=0)
-    candidates = [each for each in signed if each.size and above(each, least) == holds]
+        rival = min(signed, key=lambda name: signed[name].high)
+        return Judged(holds, signed[rival].size, differences[rival], rival)
+    size = min((each.size for each in signed.values()), default=0)
+    candidates = {
+        name: each.low if holds == "yes" else each.value
+        for name, each in signed.items()
+        if each.size and above(each, least) == holds
+    }
     if not candidates:
-        return Judged(holds, size, None)
-    decisive = min(candidates, key=lambda each: each.low if holds == "yes" else each.value)
-    return Judged(holds, size, decisive.times(sign))
+        return Judged(holds, size, None, "")
+    rival = min(candidates, key=candidates.__getitem__)
+    return Judged(holds, size, differences[rival], rival)
 
 
 def paired_t(first: Numbers, second: Numbers) -> float:

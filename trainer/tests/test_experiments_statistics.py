@@ -87,20 +87,22 @@ WIDE, OPEN, BEHIND = (
 
 
 @pytest.mark.parametrize(
-    ("differences", "holds", "size", "decisive"),
+    ("differences", "holds", "size", "decisive", "rival"),
     [
-        ([AHEAD, Estimate(9.0, 0.1, 18.0, 2)], "yes", 2, Estimate(9.0, 0.1, 18.0, 2)),
-        ([AHEAD, WIDE, OPEN], "undecided", 3, OPEN),
+        ([AHEAD, Estimate(9.0, 0.1, 18.0, 2)], "yes", 2, Estimate(9.0, 0.1, 18.0, 2), "b"),
+        ([AHEAD, WIDE, OPEN], "undecided", 3, OPEN, "c"),
         # Who says no decides, whatever is known of the others.
-        ([AHEAD, OPEN, BEHIND, Estimate(5.0, -math.inf, math.inf, 1)], "no", 2, BEHIND),
-        ([AHEAD, mean_estimate([])], "undecided", 0, None),
-        ([], "undecided", 0, None),
+        ([AHEAD, OPEN, BEHIND, Estimate(5.0, -math.inf, math.inf, 1)], "no", 2, BEHIND, "c"),
+        ([AHEAD, mean_estimate([])], "undecided", 0, None, ""),
+        ([], "undecided", 0, None, ""),
     ],
 )
-def test_who_decides_a_comparison_with_all(differences, holds, size, decisive):
-    assert judge_all(differences) == (holds, size, decisive)
-    mirrored = judge_all([each.times(-1.0) for each in differences], sign=-1.0)
-    assert mirrored == (holds, size, decisive.times(-1.0) if decisive else None)
+def test_who_decides_a_comparison_with_all(differences, holds, size, decisive, rival):
+    named = dict(zip("abcd", differences, strict=False))
+    assert judge_all(named) == (holds, size, decisive, rival)
+    opposites = {name: each.times(-1.0) for name, each in named.items()}
+    mirrored = judge_all(opposites, sign=-1.0)
+    assert mirrored == (holds, size, decisive.times(-1.0) if decisive else None, rival)
 
 
 def test_an_interval_may_be_open_at_one_end():

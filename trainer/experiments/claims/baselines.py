@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from trainer.experiments.claims.compare import BY_SEED, difference, rival
+from trainer.experiments.claims.compare import BY_SEED, difference
 from trainer.experiments.claims.scenes import (
     SUCCESS,
     shown_of,
@@ -30,7 +30,7 @@ def competitive_claim(
     ahead = {
         other.label: difference(own, success_by_seed(gathered, scene, other)) for other in others
     }
-    judged = judge_all(list(ahead.values()), least=-COMPETITIVE)
+    judged = judge_all(ahead, least=-COMPETITIVE)
     shown = [f"{one.label} {shown_of(gathered, scene, one, SUCCESS)}" for one in lines]
     points = [each.times(100.0).text(1) for each in ahead.values()]
     return claim(
@@ -43,7 +43,7 @@ def competitive_claim(
         f"less than {100 * COMPETITIVE:.0f} percentage points behind each; {BY_SEED}",
         judged.decisive.times(100.0) if judged.decisive else None,
         tested_all(gathered, scene, lines),
-        rival(judged, ahead),
+        judged.rival,
     )
 
 
@@ -57,7 +57,7 @@ def degraded_claim(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> 
     for line in lines:
         before, after = (success_by_seed(gathered, scene, line) for scene in (nominal, variant))
         points[line.label] = difference(before, after).times(100.0)
-    judged = judge_all(list(points.values()))
+    judged = judge_all(points)
     shown = [f"{name} {lost.text(1)}" for name, lost in points.items()]
     return claim(
         f"{SCENARIO_TITLES[scenario]}: the variant scene degrades the baselines' success",
@@ -68,5 +68,5 @@ def degraded_claim(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> 
         BY_SEED,
         judged.decisive,
         all(tested_all(gathered, scene, lines) for scene in (nominal, variant)),
-        rival(judged, points),
+        judged.rival,
     )

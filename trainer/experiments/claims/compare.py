@@ -13,7 +13,6 @@ from trainer.experiments.plan import SCENARIO_TITLES
 from trainer.experiments.progress import NAMED, VALIDATED, final, progress
 from trainer.experiments.statistics import (
     Estimate,
-    Judged,
     above,
     judge_all,
     mean_estimate,
@@ -39,13 +38,6 @@ def difference(first: Mapping[int, float], second: Mapping[int, float]) -> Estim
     return mean_estimate([first[seed] - second[seed] for seed in first if seed in second])
 
 
-def rival(judged: Judged, differences: Mapping[str, Estimate]) -> str:
-    """The name of the difference that decides, where there is more than one."""
-    if len(differences) < 2:
-        return ""
-    return next((name for name, each in differences.items() if each == judged.decisive), "")
-
-
 def complete(gathered: Gathered, scenario: str, lines: Sequence[Line]) -> bool:
     """Whether all units of these lines are there."""
     return all(gathered.complete(scenario, [one.algorithm], one.setting) for one in lines)
@@ -64,8 +56,7 @@ def final_claim(
     """Whether one line ends above (sign 1) or below (-1) each of the others."""
     own = finals(gathered, scenario, ours, metric)
     ends = {line: finals(gathered, scenario, line, metric) for line in others}
-    differences = {line.label: difference(own, end) for line, end in ends.items()}
-    judged = judge_all(list(differences.values()), sign)
+    judged = judge_all({line.label: difference(own, end) for line, end in ends.items()}, sign)
     shown = [f"{line.label} {mean_estimate(list(end.values())).text()}"
              for line, end in {ours: own, **ends}.items()]  # fmt: skip
     return claim(
@@ -77,7 +68,7 @@ def final_claim(
         f"final averages; {BY_SEED}",
         judged.decisive,
         complete(gathered, scenario, [ours, *others]),
-        rival(judged, differences),
+        judged.rival if len(others) > 1 else "",
     )
 
 

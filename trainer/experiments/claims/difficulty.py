@@ -7,7 +7,7 @@ from itertools import pairwise, permutations, product
 
 import numpy as np
 
-from trainer.experiments.claims.compare import BY_SEED, complete, difference, finals, papers, rival
+from trainer.experiments.claims.compare import BY_SEED, complete, difference, finals, papers
 from trainer.experiments.claims.lines import HI, IA, PER, PHIL
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered
@@ -65,7 +65,7 @@ def _kept_claim(
     text: str,
     paper: str,
 ) -> Claim:
-    judged = judge_all(list(differences.values()))
+    judged = judge_all(differences)
     shown = [f"{line.label} {mean_estimate(list(kept[line].values())).text()}" for line in kept]
     return claim(
         f"{SCENARIO_TITLES[scenario]}, {NAMED[metric]}: {text}",
@@ -76,7 +76,7 @@ def _kept_claim(
         f"ratios of the means, each with its seeds' deviations; {BY_SEED}",
         judged.decisive,
         all(complete(gathered, scenario, [line, _tough(line)]) for line in kept),
-        rival(judged, differences),
+        judged.rival,
     )
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trainer.experiments.claims.compare import BY_SEED, complete, difference, rival
+from trainer.experiments.claims.compare import BY_SEED, complete, difference
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered, comparable, pairs, pooled
 from trainer.experiments.outcome import Drives, Outcome, within_path
@@ -59,7 +59,8 @@ def scene_claim(
         for line, drives in found.items()
     }
     left_out = [one.label for one in others if found[one] and not differences[one.label].size]
-    judged = judge_all([differences[name] for name in differences if name not in left_out], sign)
+    known = {name: each for name, each in differences.items() if name not in left_out}
+    judged = judge_all(known, sign)
     # Of who is left out nothing is known, which leaves a yes open.
     holds = all_of([judged.holds, *(above(differences[name]) for name in left_out)])
     lines = [ours, *others]
@@ -70,7 +71,7 @@ def scene_claim(
     return claim(
         f"{scene.title}: {text}", paper, ", ".join(shown),
         holds, judged.size, _rule(quantity, arrived), judged.decisive,
-        tested_all(gathered, scene, lines), rival(judged, differences),
+        tested_all(gathered, scene, lines), judged.rival if len(others) > 1 else "",
     )  # fmt: skip
 
 
@@ -96,8 +97,9 @@ def spread_claim(
         }
         for line in lines
     }
-    differences = {line.label: difference(spreads[ours], spreads[line]) for line in others}
-    judged = judge_all(list(differences.values()), sign=-1.0)
+    judged = judge_all(
+        {line.label: difference(spreads[ours], spreads[line]) for line in others}, sign=-1.0
+    )
     shown = [
         f"{line.label} {mean_estimate(list(of_line.values())).text()} m"
         for line, of_line in spreads.items()
@@ -108,7 +110,7 @@ def spread_claim(
         f"standard deviation over each seed's drives; {BY_SEED}; nothing beyond the goal counted",
         judged.decisive,
         tested_all(gathered, scene, lines),
-        rival(judged, differences),
+        judged.rival,
     )  # fmt: skip
 
 
