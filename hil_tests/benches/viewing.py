@@ -60,7 +60,7 @@ class Called:
 
 def measure_training(episodes: int, scenario: str) -> dict[str, Any]:
     """Time a step with the view and without, in turn, and what the loop spends in it itself."""
-    config = RunConfig(scenario=scenario, episodes=10**6, evaluate_every=0)
+    config = RunConfig(scenario=scenario, episodes=10**6, evaluate_every_steps=0)
     with tempfile.TemporaryDirectory(prefix="phil-view-") as work, contextlib.ExitStack() as stack:
         folder = Path(work)
         runs = [TrainingRun(config, folder) for _ in range(2)]

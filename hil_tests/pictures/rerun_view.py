@@ -15,7 +15,7 @@ LOADED_S, DRAWN_S = 20.0, 5.0
 """Until some 10 MB are in the viewer, and until it has drawn them, in software."""
 LOOP_TIME_S = 8.0
 TRAINING = ("--episodes", "40", "--seed", "1", "--set", "batch_size=32",
-            "--set", "evaluate_every=10", "--set", "evaluation_runs=10")  # fmt: skip
+            "--set", "evaluate_every_steps=10", "--set", "evaluation_runs=10")  # fmt: skip
 
 
 def rerun_loop(out: Path, work: Path) -> None:

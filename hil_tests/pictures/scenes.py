@@ -51,7 +51,7 @@ def policy_sees(out: Path, _work: Path) -> None:
 def take_over(out: Path, work: Path) -> None:
     """A policy that has learned nothing yet drives, and the scripted expert takes over."""
     run_dir = work / "untrained"
-    nothing = ("--episodes", "1", "--set", "evaluate_every=0", "--set", "warmup_steps=100000")
+    nothing = ("--episodes", "1", "--set", "evaluate_every_steps=0", "--set", "warmup_steps=100000")
     run_command("trainer", "train", *nothing, "--out", str(run_dir))
     words = ("--human", "expert", "--seed", FILM_SEED, "--time", "15")
     run_command("trainer", "picture", str(run_dir), *words, "--out", str(out))

@@ -41,7 +41,7 @@ NOTE_KEYS = """
 globalThis.keyMs = [];
 addEventListener("keydown", (event) => keyMs.push(performance.timeOrigin + event.timeStamp), true);
 """
-QUIET = ("--set", "evaluate_every=0")
+QUIET = ("--set", "evaluate_every_steps=0")
 """Nothing is to be waited for at the end."""
 
 

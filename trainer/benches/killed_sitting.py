@@ -67,7 +67,7 @@ class KilledRun:
         resume = ["--resume"] if (self.run_dir / CHECKPOINT_FILE).is_file() else []
         command = [sys.executable, "-m", "trainer.benches.scripted_person", str(self.seen)]
         command += ["train", "--human", "scripted", "--speed", f"{self.speed}", *resume]
-        command += ["--set", f"batch_size={self.batch_size}", "--set", "evaluate_every=0"]
+        command += ["--set", f"batch_size={self.batch_size}", "--set", "evaluate_every_steps=0"]
         command += ["--episodes", str(episodes), "--out", str(self.run_dir), "--threads", "1"]
         return subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 

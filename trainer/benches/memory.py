@@ -50,7 +50,7 @@ def measure_memory(effort: Effort) -> dict[str, Any]:
 
 def _train(effort: Effort) -> tuple[int, int]:
     learner = LearnerConfig(batch_size=effort.batch_size, warmup_steps=effort.batch_size)
-    config = RunConfig(episodes=effort.memory_episodes, evaluate_every=0, learner=learner)
+    config = RunConfig(episodes=effort.memory_episodes, evaluate_every_steps=0, learner=learner)
     with tempfile.TemporaryDirectory() as directory:
         run = TrainingRun(config, Path(directory))
         run.train()

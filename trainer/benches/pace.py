@@ -89,7 +89,7 @@ def measure(directory: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     common += ["--threads", str(arguments.threads)]
     run_dir, alone = directory / "run", directory / "alone"
     drive(directory, ["drive", "--out", str(alone), "--policy", "expert", *common], 15.0)
-    settings = ["--set", "evaluate_every=0", "--episodes", "100000"]
+    settings = ["--set", "evaluate_every_steps=0", "--episodes", "100000"]
     errors = drive(
         directory, ["train", "--out", str(run_dir), *settings, *common], arguments.seconds
     )

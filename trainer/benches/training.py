@@ -16,7 +16,7 @@ from trainer.benches.updates import Updates
 from trainer.learner.config import LearnerConfig
 from trainer.learner.td3 import TD3Learner
 from trainer.training.config import RunConfig
-from trainer.training.learning import ProcessorLearning
+from trainer.training.learning import LearningThread
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 
@@ -56,7 +56,7 @@ class _Watch:
     def __init__(self, run: TrainingRun, effort: Effort, tick: Tick) -> None:
         config = run.config.learner
         alone = TD3Learner(config, run.algorithm, run.config.seed)
-        assert isinstance(run.learning, ProcessorLearning)
+        assert isinstance(run.learning, LearningThread)
         self.learning = run.learning
         self.updates = Updates(alone, run.learning.replay, config.batch_size)
         self.warmup_steps = config.warmup_steps
@@ -86,7 +86,7 @@ def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
     """PHIL-TD3 in the left turn, without validation and checkpoints."""
     config = RunConfig(
         episodes=ENDLESS,
-        evaluate_every=0,
+        evaluate_every_steps=0,
         checkpoint_every=ENDLESS + 1,
         learner=LearnerConfig(batch_size=effort.batch_size, warmup_steps=effort.batch_size),
     )

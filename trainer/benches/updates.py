@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from trainer.learner.minibatch import Losses
 from trainer.learner.replay import Batch, ReplayBuffer
+from trainer.learner.td3 import Losses
 
 
 class Learner(Protocol):

@@ -16,6 +16,8 @@ from trainer.training.run import CONFIG_FILE
 
 OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
 """What an option of its own decides."""
+EXTENT = ("episodes", "steps")
+"""How long a run is: it may go on for longer."""
 
 
 def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
@@ -31,20 +33,20 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
 
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
-    saved = _flat(RunConfig.completed(read_json(path, "run config")))
+    saved = _flat(read_json(path, "run config"))
     wanted = _flat(config.as_dict())
-    episodes = saved.get("episodes")
-    if not isinstance(episodes, int):
-        raise UserError(f"run config {path} does not say how many episodes")
+    if not all(isinstance(saved.get(name), int) for name in EXTENT):
+        raise UserError(f"run config {path} does not say how many episodes and steps")
     changed = [
         f"{_given(name, saved)} (now {_value(name, wanted)})"
         for name in wanted
-        if name != "episodes" and (name not in saved or saved[name] != wanted[name])
+        if name not in EXTENT and (name not in saved or saved[name] != wanted[name])
     ]
     if changed:
         raise UserError(f"{run_dir} was trained with {', '.join(changed)}: repeat what it had")
-    if config.episodes < episodes:
-        raise UserError(f"{run_dir} is a run of {episodes} episodes, not fewer")
+    for name in EXTENT:
+        if 0 < wanted[name] < saved[name]:
+            raise UserError(f"{run_dir} is a run of {saved[name]} {name}, not fewer")
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:

@@ -14,10 +14,12 @@ LEARNERS = tuple(field.name for field in fields(LearnerConfig))
 OWN = (
     "averaged_actor",
     "guided_share",
+    "guided_until_step",
     "penalise_stuck",
     "printed_reward",
     "poor_guidance_share",
-    "evaluate_every",
+    "poor_guidance",
+    "evaluate_every_steps",
     "evaluation_runs",
     "checkpoint_every",
 )

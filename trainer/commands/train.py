@@ -8,6 +8,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,13 @@ from trainer.person.registry import HUMANS
 from trainer.plots import write_learning_curve
 from trainer.progress import ProgressBar
 from trainer.signals import quit_on_signals
-from trainer.training.config import RunConfig
+from trainer.training.config import PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 
 EXAMPLE = examples(
-    "python -m trainer train --scenario left_turn --episodes 120 --out runs/phil_1",
-    "python -m trainer train --episodes 240 --out runs/phil_1 --resume",
+    "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
+    "python -m trainer train --steps 8000 --out runs/phil_1 --resume",
     "python -m trainer train --human keyboard --rerun mine.rrd --out runs/mine",
     "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
     "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
@@ -56,6 +57,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=not_negative, default=DEFAULTS.seed, help="of everything")
     parser.add_argument(
         "--episodes", type=positive, default=DEFAULTS.episodes, help="episodes to train in all"
+    )
+    parser.add_argument(
+        "--steps",
+        type=not_negative,
+        default=DEFAULTS.steps,
+        metavar="N",
+        help="environment steps to train in all, if the episodes last so long; 0: no limit",
+    )
+    parser.add_argument(
+        "--preset",
+        choices=list(PRESETS),
+        default="ours",
+        help="settings to start from: this project's, or the paper's as they are printed",
     )
     parser.add_argument(
         "--human",
@@ -102,20 +116,28 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
     with _training(arguments, config, run_dir) as training:
         end_s = deadline_s(arguments)
         with (
-            ProgressBar("training", config.episodes, training.episode) as bar,
+            ProgressBar("training", *_extent(training)) as bar,
             _watched(training, sink) as watch,
             # The last: behind the first signal is what a viewer makes of them.
             quit_on_signals(partial(_quit, training)),
         ):
-            training.train(_both(_Reporter(bar), watch), end_s)
+            training.train(_both(_Reporter(bar, bool(config.steps)), watch), end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
-    steps = counted(training.learning.added, "step")
+    steps = counted(training.steps, "step")
     print(f"{counted(training.episode, 'episode')}, {steps}: {run_dir}")
-    if training.quitting and training.episode < config.episodes:
+    if training.quitting and not training.over:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def _extent(training: TrainingRun) -> tuple[int, int]:
+    """What the progress bar counts to, and from: steps where they are limited, else episodes."""
+    config = training.config
+    if config.steps:
+        return config.steps, training.steps
+    return config.episodes, training.episode
 
 
 def _check_human(human: str) -> None:
@@ -181,10 +203,15 @@ def _both(
 
 
 class _Reporter:
-    """Feeds the progress bar from the episodes' metrics: means over the last twenty."""
+    """Feeds the progress bar from the episodes' metrics: means over the last twenty.
 
-    def __init__(self, bar: ProgressBar) -> None:
-        self.bar = bar
+    Args:
+        bar: the progress bar.
+        by_steps: whether it counts environment steps.
+    """
+
+    def __init__(self, bar: ProgressBar, by_steps: bool = False) -> None:
+        self.bar, self.by_steps = bar, by_steps
         self.recent: deque[EpisodeMetrics] = deque(maxlen=20)
         self.validation = "-"
 
@@ -199,16 +226,19 @@ class _Reporter:
                 "distance": f"{sum(m.distance_m for m in self.recent) / count:.1f} m",
                 "success": f"{sum(m.outcome == GOAL for m in self.recent) / count:.2f}",
                 "validation": self.validation,
-            }
+            },
+            metrics.steps if self.by_steps else 1,
         )
 
 
 def _config(arguments: argparse.Namespace) -> RunConfig:
-    config = RunConfig(
+    config = replace(
+        PRESETS[arguments.preset],
         scenario=arguments.scenario,
         algorithm=arguments.algorithm,
         seed=arguments.seed,
         episodes=arguments.episodes,
+        steps=arguments.steps,
         human=PERSON if arguments.human in HUMANS else arguments.human,
         latency=str(parse_spec(arguments.latency)),
         device=arguments.device,

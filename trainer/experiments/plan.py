@@ -92,7 +92,7 @@ class Plan:
 
     episodes: Mapping[str, int]
     """Scenario -> episodes of a run."""
-    evaluate_every: int = 10
+    evaluate_every_steps: int = 10
     """Episodes between two validations; the best validated actor is the one that is tested."""
     evaluation_runs: int = 100
     """Episodes of a validation."""
@@ -111,7 +111,7 @@ class Plan:
 PLAN = Plan(episodes={"left_turn": 200, "congestion": 100})
 QUICK = Plan(
     episodes={"left_turn": 3, "congestion": 3},
-    evaluate_every=2,
+    evaluate_every_steps=2,
     evaluation_runs=1,
     test_runs=3,
     checkpoint_every=1,

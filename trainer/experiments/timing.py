@@ -53,7 +53,7 @@ def measure(plan: Plan, humans: Path, device: str) -> dict[str, Any]:
             config = run_config(_unit(algorithm), plan, humans, device)
             run_dir = Path(directory) / algorithm
             make_directory(run_dir)
-            runs[algorithm] = TrainingRun(replace(config, evaluate_every=0), run_dir)
+            runs[algorithm] = TrainingRun(replace(config, evaluate_every_steps=0), run_dir)
             closing.callback(runs[algorithm].learning.close)
         turns = take_turns(runs, plan)
     torch.set_num_threads(before)

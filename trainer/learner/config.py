@@ -25,8 +25,12 @@ class LearnerConfig:
     """Factor on both rates, once an episode (table A5)."""
     gamma: float = 0.95
     """Discount factor of one control period (table A5)."""
-    tau: float = 1e-3
-    """Share of the online weights that each soft update moves into the targets (table A5)."""
+    return_steps: int = 8
+    """Rewards that a target sums up before it bootstraps (n of n-step returns; Hessel et al.,
+    2018); the paper has 1. Goal and failure are 30 to 70 steps away, and one-step targets hardly
+    carry them back."""
+    tau: float = 5e-3
+    """Share of the online weights that each soft update moves into the targets (table A5: 1e-3)."""
     policy_delay: int = 1
     """Critic updates for each actor update (table A5: d)."""
     target_noise: float = 0.2
@@ -67,23 +71,34 @@ class LearnerConfig:
     on single runs, in which a small weight let the policy forget the human before the critic knew
     better."""
     intervention_penalty: float = -10.0
-    """Reward of the first step of an intervention (eq. 17: r_pen = r_fail)."""
+    """What an intervention costs (eq. 17: r_pen = r_fail)."""
+    penalty_on: str = "overruled"
+    """What it is charged to: ``overruled``, the policy's action that made the human take over,
+    whose value it becomes; or ``human``, the reward of the human's own first action, as printed,
+    which teaches the critic that rescuing is as bad as crashing."""
     warmup_steps: int = 256
     """Transitions stored before the first update."""
-    saturation_weight: float = 0.0
-    """Weight of the mean squared action before tanh in the actor's loss. Not in the paper: a remedy
-    for policies that saturate, whose gradient vanishes."""
+    saturation_weight: float = 0.03
+    """Price on saturation: weight of the mean squared action before tanh in the actor's loss. Not
+    in the paper. Without it the policy saturates before the critic knows anything, and its
+    gradient vanishes."""
     precision: str = "bfloat16"
     """Of the products in convolutions and first connected layers while learning: float32, or
     bfloat16 where the processor multiplies that faster. Acting is always float32."""
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
-        if self.precision not in PRECISIONS:
-            raise UserError(f"precision must be one of {', '.join(PRECISIONS)}: {self.precision}")
+        for name, words in WORDS.items():
+            if getattr(self, name) not in words:
+                raise UserError(f"{name} must be one of {', '.join(words)}: {getattr(self, name)}")
 
 
-PRECISIONS = ("float32", "bfloat16")
+OVERRULED_ACTION, HUMANS_ACTION = "overruled", "human"
+WORDS = {
+    "precision": ("float32", "bfloat16"),
+    "penalty_on": (OVERRULED_ACTION, HUMANS_ACTION),
+}
+"""What each word may be."""
 RANGES = {
     "frames": (1, 2),
     "batch_size": FROM_ONE,
@@ -91,6 +106,7 @@ RANGES = {
     "critic_learning_rate": FROM_ZERO,
     "learning_rate_decay": SHARE,
     "gamma": SHARE,
+    "return_steps": FROM_ONE,
     "tau": SHARE,
     "policy_delay": FROM_ONE,
     "target_noise": FROM_ZERO,
@@ -110,3 +126,15 @@ RANGES = {
     "saturation_weight": FROM_ZERO,
 }
 """What each number may be."""
+
+PRINTED_LEARNER = LearnerConfig(
+    actor_learning_rate=5e-4,
+    critic_learning_rate=2e-4,
+    return_steps=1,
+    tau=1e-3,
+    split_loss=True,
+    penalty_on=HUMANS_ACTION,
+    saturation_weight=0.0,
+)
+"""Tables A5 and A6 and the equations as they are printed. The weight on cloning, for which the
+paper has no value, is ours."""

@@ -36,9 +36,15 @@ def smoothed_target_action(action: Tensor, noise: Tensor, bound: float) -> Tenso
 
 
 def td_target(
-    rewards: Tensor, terminals: Tensor, next_values: tuple[Tensor, Tensor], gamma: float
+    rewards: Tensor,
+    terminals: Tensor,
+    next_values: tuple[Tensor, Tensor],
+    gamma: float | Tensor,
 ) -> Tensor:
-    """The target of eq. 22: r + gamma min(Q'_1, Q'_2), and r alone at a terminal state."""
+    """The target of eq. 22: r + gamma min(Q'_1, Q'_2), and r alone at a terminal state.
+
+    Over m steps ``rewards`` is the discounted sum of m of them, and ``gamma`` its own m-th power.
+    """
     return rewards + gamma * (1.0 - terminals) * torch.minimum(*next_values)
 
 
@@ -96,6 +102,15 @@ def critic_loss(
     """
     losses = weights * (targets - values).square()
     return split_mean(losses, human) if split else losses.mean()
+
+
+def overruled_loss(values: Tensor, penalised: Tensor, penalty: float, weights: Tensor) -> Tensor:
+    """Eq. 17 where it hits the action that the human overruled: its value is the penalty.
+
+    Not in the paper, which lowers the reward of the human's own first action. ``values`` [n] are
+    those of the overruled actions; only ``penalised`` rows count, in one mean over the batch.
+    """
+    return (weights * penalised * (penalty - values).square()).mean()
 
 
 def policy_loss(values: Tensor, human: Tensor, split: bool) -> Tensor:

@@ -1,8 +1,4 @@
-"""The books of a replay buffer: where pictures and transitions go, and which are forgotten.
-
-Both are kept in rings, on the processor or on an accelerator; these few numbers are always on the
-processor, so that storing never has to ask an accelerator for anything.
-"""
+"""The books of a replay buffer: where pictures and transitions go, and which are forgotten."""
 
 from __future__ import annotations
 
@@ -14,9 +10,6 @@ from numpy.typing import NDArray
 
 FRAMES_PER_TRANSITION = 1.05
 """Stored pictures for each transition: one, and one more at the start of each episode."""
-LOST_AT_ONCE = 2
-"""Most transitions that one new picture can make forgotten: an episode's first two begin with the
-same picture, any later one with a picture of its own."""
 
 
 AddPicture = Callable[[NDArray[np.uint8]], int]
@@ -75,7 +68,7 @@ class Ledger:
 
         Returns:
             The number, and the slots of transitions that are forgotten because this picture
-            takes the place of theirs: at most ``LOST_AT_ONCE``.
+            takes the place of theirs.
         """
         number = self.frames_added
         self.frames_added += 1
@@ -92,6 +85,13 @@ class Ledger:
         self.oldest = max(self.oldest, self.added - self.capacity)
         self._current = (newer, newest)
         return slot
+
+    def follows(self, slots: NDArray[np.int64], following: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether each transition begins with the picture that another ended with, [n].
+
+        Pictures have running numbers, so no other episode's transition does, nor a forgotten one.
+        """
+        return self.frame_ids[slots, 2] == self.frame_ids[following, 1]
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on."""

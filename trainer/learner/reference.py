@@ -16,10 +16,10 @@ from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
 from trainer.learner import equations
 from trainer.learner.algorithms import Algorithm
-from trainer.learner.config import LearnerConfig
-from trainer.learner.minibatch import Losses
+from trainer.learner.config import OVERRULED_ACTION, LearnerConfig
 from trainer.learner.networks import Actor, Critic, CriticPair, Picture
 from trainer.learner.replay import Batch
+from trainer.learner.td3 import Losses
 
 
 def picture_features(picture: Picture, frames: Tensor) -> Tensor:
@@ -76,8 +76,9 @@ class ReferenceLearner:
         targets = self._targets(batch)
         values = value(self.critics.first, frames, actions)
         critic_loss = self._critic_loss(batch, frames, actions, human, targets, beta)
+        errors = self._errors(batch, frames, targets - values)
         policy, cloning = self._actor_losses(frames, actions, human)
-        priorities = self._priorities(targets - values, frames, actions, human)
+        priorities = self._priorities(errors, frames, actions, human)
 
         self.critic_optimiser.zero_grad()
         critic_loss.backward()
@@ -107,7 +108,8 @@ class ReferenceLearner:
             value(critic, next_frames, next_actions) for critic in self.target_critics.pair
         )
         rewards, terminals = torch.from_numpy(batch.rewards), torch.from_numpy(batch.terminals)
-        return equations.td_target(rewards, terminals, (first, second), c.gamma)
+        discount = c.gamma ** torch.as_tensor(batch.spans)
+        return equations.td_target(rewards, terminals, (first, second), discount)
 
     def _critic_loss(
         self,
@@ -128,7 +130,32 @@ class ReferenceLearner:
             )
             for critic in self.critics.pair
         )
-        return first + second
+        if not self._charges_overruled(batch):
+            return first + second
+        third, fourth = (
+            equations.overruled_loss(
+                value(critic, frames, torch.from_numpy(batch.overruled)),
+                torch.from_numpy(batch.penalised),
+                self.config.intervention_penalty,
+                weights,
+            )
+            for critic in self.critics.pair
+        )
+        return first + second + third + fourth
+
+    @torch.no_grad()
+    def _errors(self, batch: Batch, frames: Tensor, errors: Tensor) -> Tensor:
+        """What priorities go by: of a penalised action's error and the TD error the larger one."""
+        if not self._charges_overruled(batch):
+            return errors
+        overruled = value(self.critics.first, frames, torch.from_numpy(batch.overruled))
+        missed = self.config.intervention_penalty - overruled
+        worse = torch.from_numpy(batch.penalised) & (missed.abs() > errors.abs())
+        return torch.where(worse, missed, errors)
+
+    def _charges_overruled(self, batch: Batch) -> bool:
+        wanted = self.config.penalty_on == OVERRULED_ACTION and self.algorithm.penalty
+        return wanted and batch.penalised is not None
 
     def _actor_losses(
         self, frames: Tensor, actions: Tensor, human: Tensor

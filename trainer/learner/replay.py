@@ -16,6 +16,10 @@ from trainer.learner.ledger import Ledger
 from trainer.learner.sum_tree import Indices, SumTree
 
 FRAME_SHAPE = (45, 80)
+COLUMNS = (
+    "actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities"
+)  # fmt: skip
+"""What is kept of a transition beside its pictures."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +32,21 @@ class Batch:
     actions: NDArray[np.float32]
     """a, the action that was carried out, [n, action size]."""
     rewards: NDArray[np.float32]
-    """r after shaping, [n]."""
+    """r after shaping: the discounted sum over ``spans`` steps, [n]."""
     next_frames: NDArray[np.uint8]
-    """s', [n, 2, 45, 80]."""
+    """s' after those steps, [n, 2, 45, 80]."""
     terminals: NDArray[np.float32]
     """1 where s' ends the episode for good; a timeout is not terminal, [n]."""
     human: NDArray[np.bool_]
-    """Delta: whether the human acted, [n]."""
+    """Delta of the first step: whether the human acted, [n]."""
     probabilities: NDArray[np.float64]
     """p(i), the probability with which each was drawn (eq. 20), [n]."""
+    spans: NDArray[np.int64] | int = 1
+    """Steps from s to s', [n]; or as many in all rows."""
+    overruled: NDArray[np.float32] | None = None
+    """What the policy would have done where the human acted, else the action, [n, action size]."""
+    penalised: NDArray[np.bool_] | None = None
+    """Whether the overruled action is penalised (eq. 17), [n]; None: in no row."""
 
 
 class ReplayBuffer:
@@ -48,19 +58,29 @@ class ReplayBuffer:
         alpha: priority scaling factor (eq. 20).
         separate: draw from the human's transitions and from the policy's apart, from each as
             often as its share of all (section VII-A: RD2).
+        steps: rewards that a drawn transition sums up, at most (n of n-step returns).
+        gamma: their discount factor.
     """
 
     def __init__(
-        self, capacity: int, action_size: int = 1, alpha: float = 0.6, separate: bool = False
+        self,
+        capacity: int,
+        action_size: int = 1,
+        alpha: float = 0.6,
+        separate: bool = False,
+        steps: int = 1,
+        gamma: float = 1.0,
     ) -> None:
-        self.capacity = capacity
-        self.alpha = alpha
+        self.capacity, self.alpha = capacity, alpha
+        self.steps, self.gamma = steps, gamma
         self._ledger = Ledger(capacity)
         self._pictures = np.empty((self._ledger.frame_slots, *FRAME_SHAPE), np.uint8)
         self._actions = np.zeros((capacity, action_size), np.float32)
         self._rewards = np.zeros(capacity, np.float32)
         self._terminals = np.zeros(capacity, np.float32)
         self._human = np.zeros(capacity, np.bool_)
+        self._overruled = np.zeros((capacity, action_size), np.float32)
+        self._penalised = np.zeros(capacity, np.bool_)
         self._priorities = np.zeros(capacity)
         self._trees = [SumTree(capacity) for _ in range(2 if separate else 1)]
 
@@ -94,8 +114,20 @@ class ReplayBuffer:
         next_frames: NDArray[np.uint8],
         terminal: bool,
         human: bool,
+        overruled: NDArray[np.float32] | None = None,
+        penalised: bool = False,
     ) -> None:
-        """Store a transition with the highest priority that any other has (algorithm 1)."""
+        """Store a transition with the highest priority that any other has (algorithm 1).
+
+        Args:
+            action: what was carried out.
+            reward: after shaping.
+            next_frames: what it led to, [2, 45, 80].
+            terminal: whether that ends the episode for good.
+            human: whether the human acted.
+            overruled: the policy's action in its place, if so.
+            penalised: whether that action is penalised.
+        """
         self._ledger.check_started()
         priority = self._highest_priority()
         slot = self._ledger.add_transition(self._add_picture(next_frames[1]))
@@ -103,6 +135,8 @@ class ReplayBuffer:
         self._rewards[slot] = reward
         self._terminals[slot] = terminal
         self._human[slot] = human
+        self._overruled[slot] = action if overruled is None else overruled
+        self._penalised[slot] = penalised
         self.update_priorities(np.array([slot]), np.array([priority]))
 
     def sample(self, count: int, random: np.random.Generator) -> Batch:
@@ -137,11 +171,7 @@ class ReplayBuffer:
         return {
             **self._ledger.state_dict(),
             "pictures": self._pictures[:pictures],
-            "actions": self._actions[:used],
-            "rewards": self._rewards[:used],
-            "terminals": self._terminals[:used],
-            "human": self._human[:used],
-            "priorities": self._priorities[:used],
+            **{name: getattr(self, f"_{name}")[:used] for name in COLUMNS},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -149,7 +179,7 @@ class ReplayBuffer:
         self._ledger.load_state_dict(state)
         used, pictures = self._ledger.used, self._ledger.used_frames
         self._pictures[:pictures] = state["pictures"]
-        for name in ("actions", "rewards", "terminals", "human", "priorities"):
+        for name in COLUMNS:
             getattr(self, f"_{name}")[:used] = state[name]
         # What was here before must not be drawn any more.
         self._trees = [SumTree(self.capacity) for _ in self._trees]
@@ -158,18 +188,42 @@ class ReplayBuffer:
             self._set_weights(alive, self._priorities[alive] ** self.alpha)
 
     def _gather(self, indices: Indices) -> Batch:
-        slots = self._ledger.frame_ids[indices] % self._ledger.frame_slots
-        pictures = self._pictures[slots]
+        rewards, lasts, spans = self._sums(indices)
         return Batch(
             indices=indices,
-            frames=pictures[:, :2],
+            frames=self._pictures[self._places(indices, 0)],
             actions=self._actions[indices],
-            rewards=self._rewards[indices],
-            next_frames=pictures[:, 1:],
-            terminals=self._terminals[indices],
+            rewards=rewards,
+            next_frames=self._pictures[self._places(lasts, 1)],
+            terminals=self._terminals[lasts],
             human=self._human[indices],
             probabilities=self._probabilities(indices),
+            spans=spans,
+            overruled=self._overruled[indices],
+            penalised=self._penalised[indices],
         )
+
+    def _places(self, indices: Indices, first: int) -> Indices:
+        """Where the two pictures from ``first`` on of each transition lie, [n, 2]."""
+        return self._ledger.frame_ids[indices, first : first + 2] % self._ledger.frame_slots
+
+    def _sums(self, indices: Indices) -> tuple[NDArray[np.float32], Indices, Indices]:
+        """n-step returns without their bootstrap: sums, last transitions, lengths, each [n].
+
+        A sum ends early where the episode does, for good or by a timeout, and at the newest step.
+        """
+        sums, lasts = self._rewards[indices], indices
+        spans = np.ones(len(indices), np.int64)
+        going = np.ones(len(indices), np.bool_)
+        for step in range(1, self.steps):
+            following = (lasts + 1) % self.capacity
+            going &= (self._terminals[lasts] == 0.0) & self._ledger.follows(lasts, following)
+            if not going.any():
+                break
+            lasts = np.where(going, following, lasts)
+            sums = sums + going * (np.float32(self.gamma**step) * self._rewards[following])
+            spans += going
+        return sums.astype(np.float32), lasts, spans
 
     def _probabilities(self, indices: Indices) -> NDArray[np.float64]:
         if len(self._trees) == 1:

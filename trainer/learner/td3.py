@@ -1,13 +1,12 @@
 """The learner: twin delayed DDPG with human guidance (algorithm 1), one update at a time.
 
-``reference.py`` is the same written plainly; this one computes nothing twice and, on an
-accelerator, never waits for a number.
+``reference.py`` is the same written plainly; this one computes nothing twice.
 """
 
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,12 +15,20 @@ from torch import Tensor
 
 from trainer.learner import equations
 from trainer.learner.algorithms import Algorithm
-from trainer.learner.config import LearnerConfig
-from trainer.learner.minibatch import Losses, Minibatch, Outcome
+from trainer.learner.config import OVERRULED_ACTION, LearnerConfig
 from trainer.learner.networks import Actor, CriticPair
-from trainer.learner.optimiser import load_adam, make_adam
 from trainer.learner.precision import multiplies_bfloat16
 from trainer.learner.replay import Batch
+
+
+class Losses(NamedTuple):
+    """What one update reports; ``priorities`` are the batch's new ones (eq. 21)."""
+
+    critic: float
+    policy: float
+    cloning: float
+    mean_value: float
+    priorities: NDArray[np.float64]
 
 
 class TD3Learner:
@@ -47,16 +54,23 @@ class TD3Learner:
         device: str = "cpu",
     ) -> None:
         self.config, self.algorithm, self.device = config, algorithm, torch.device(device)
+        if self.device.type == "cuda":
+            _calculate_exactly()
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames).to(self.device)
             self.critics = CriticPair(action_size, config.frames).to(self.device)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.actor_optimiser = make_adam(self.actor, config.actor_learning_rate, self.device)
-        self.critic_optimiser = make_adam(self.critics, config.critic_learning_rate, self.device)
+        self.actor_optimiser = torch.optim.Adam(
+            self.actor.parameters(), config.actor_learning_rate, fused=True
+        )
+        self.critic_optimiser = torch.optim.Adam(
+            self.critics.parameters(), config.critic_learning_rate, fused=True
+        )
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
+        self._charges_overruled = algorithm.penalty and config.penalty_on == OVERRULED_ACTION
 
     @torch.no_grad()
     def act(self, frames: NDArray[np.uint8], averaged: bool = False) -> NDArray[np.float32]:
@@ -67,44 +81,20 @@ class TD3Learner:
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
         """One step of algorithm 1 on a drawn minibatch; ``beta`` is eq. 15's exponent."""
-        columns = (getattr(batch, name) for name in Minibatch._fields)
-        minibatch = Minibatch(*(torch.from_numpy(column).to(self.device) for column in columns))
-        outcome = self.step(minibatch, torch.tensor(beta, device=self.device))
-        critic, policy, cloning, value = outcome.losses.tolist()
-        priorities = outcome.priorities.double().cpu().numpy()
-        return Losses(critic, policy, cloning, value, priorities)
-
-    def step(self, batch: Minibatch, beta: Tensor) -> Outcome:
-        """The same for a batch that is on the device already, and nothing read back."""
-        return self.change(batch, beta, with_policy=self.count_update())
-
-    def count_update(self) -> bool:
-        """Count an update that begins; whether it is the policy's turn, too (table A5: d)."""
+        c = self.config
         self.updates += 1
-        return self.updates % self.config.policy_delay == 0
-
-    def change(self, batch: Minibatch, beta: Tensor, with_policy: bool) -> Outcome:
-        """One step on all weights, or on the critics' alone: what a CUDA graph captures."""
-        c, human, actions = self.config, batch.human, batch.actions
+        with_policy = self.updates % c.policy_delay == 0
+        frames, actions = self._tensor(batch.frames), self._tensor(batch.actions)
+        human = self._tensor(batch.human)
         targets = self._targets(batch)
         with self._precision():
-            pictures = [critic.embed(batch.frames) for critic in self.critics.pair]
-            own_picture = self.actor.embed(batch.frames)
-        values = [
-            critic.value(picture, actions)
-            for critic, picture in zip(self.critics.pair, pictures, strict=True)
-        ]
-        weights = equations.importance_weights(
-            batch.probabilities.float(), beta, c.normalise_importance
-        )
-        first, second = (
-            equations.critic_loss(value, targets, human, weights, c.split_loss) for value in values
-        )
-        critic_loss = first + second
+            pictures = [critic.embed(frames) for critic in self.critics.pair]
+            own_picture = self.actor.embed(frames)
+        critic_loss, errors, value = self._critic_loss(batch, pictures, actions, targets, beta)
         score = self.actor.score(own_picture)
         own_actions = torch.tanh(score)
         policy, cloning = self._actor_losses(pictures[0].detach(), own_actions, actions, human)
-        priorities = self._priorities(targets - values[0].detach(), batch, own_actions.detach())
+        priorities = self._priorities(errors, frames, actions, human, own_actions.detach())
 
         _differentiate(critic_loss, self.critics)
         if with_policy:
@@ -116,8 +106,13 @@ class TD3Learner:
         self.critic_optimiser.step()
         if with_policy:
             self._update_targets()
-        found = (critic_loss, policy, cloning, values[0].mean())
-        return Outcome(torch.stack([loss.detach() for loss in found]), priorities)
+        return Losses(
+            critic_loss.item(),
+            policy.item(),
+            cloning.item(),
+            value.item(),
+            priorities.double().cpu().numpy(),
+        )
 
     def decay_learning_rates(self) -> None:
         """Once an episode (table A5)."""
@@ -142,8 +137,9 @@ class TD3Learner:
         """Take up what ``state_dict`` gave."""
         for name in ("actor", "critics", "target_actor", "target_critics"):
             getattr(self, name).load_state_dict(state[name])
-        load_adam(self.actor_optimiser, state["actor_optimiser"])
-        load_adam(self.critic_optimiser, state["critic_optimiser"])
+        # Optimisers keep the very tensors that they are given.
+        self.actor_optimiser.load_state_dict(copy.deepcopy(state["actor_optimiser"]))
+        self.critic_optimiser.load_state_dict(copy.deepcopy(state["critic_optimiser"]))
         self.noise.set_state(state["noise"])
         self.updates = state["updates"]
 
@@ -152,12 +148,15 @@ class TD3Learner:
         reduced = self.config.precision == "bfloat16" and multiplies_bfloat16(kind)
         return torch.autocast(kind, torch.bfloat16, enabled=reduced)
 
+    def _tensor(self, column: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(column).to(self.device)
+
     @torch.no_grad()
-    def _targets(self, batch: Minibatch) -> Tensor:
-        c = self.config
+    def _targets(self, batch: Batch) -> Tensor:
+        c, next_frames = self.config, self._tensor(batch.next_frames)
         with self._precision():
-            own_picture = self.target_actor.embed(batch.next_frames)
-            pictures = [critic.embed(batch.next_frames) for critic in self.target_critics.pair]
+            own_picture = self.target_actor.embed(next_frames)
+            pictures = [critic.embed(next_frames) for critic in self.target_critics.pair]
         next_actions = torch.tanh(self.target_actor.score(own_picture))
         noise = c.target_noise * torch.randn(
             next_actions.shape, generator=self.noise, device=self.device
@@ -167,7 +166,43 @@ class TD3Learner:
             critic.value(picture, next_actions)
             for critic, picture in zip(self.target_critics.pair, pictures, strict=True)
         )
-        return equations.td_target(batch.rewards, batch.terminals, (first, second), c.gamma)
+        rewards, terminals = self._tensor(batch.rewards), self._tensor(batch.terminals)
+        discount = c.gamma ** torch.as_tensor(batch.spans, device=self.device)
+        return equations.td_target(rewards, terminals, (first, second), discount)
+
+    def _critic_loss(
+        self, batch: Batch, pictures: list[Tensor], actions: Tensor, targets: Tensor, beta: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Both critics' loss, the errors [n] that priorities go by, and the mean value."""
+        c, human = self.config, self._tensor(batch.human)
+        weights = equations.importance_weights(
+            self._tensor(batch.probabilities).float(), beta, c.normalise_importance
+        )
+        values = self._values(pictures, actions)
+        first, second = (
+            equations.critic_loss(value, targets, human, weights, c.split_loss) for value in values
+        )
+        loss, errors, mean = first + second, targets - values[0].detach(), values[0].detach().mean()
+        if self._charges_overruled and batch.penalised is not None and batch.penalised.any():
+            assert batch.overruled is not None
+            penalised = self._tensor(batch.penalised)
+            values = self._values(pictures, self._tensor(batch.overruled))
+            first, second = (
+                equations.overruled_loss(value, penalised, c.intervention_penalty, weights)
+                for value in values
+            )
+            loss = loss + first + second
+            # A row is drawn again as often as the worse known of its two actions deserves.
+            missed = (c.intervention_penalty - values[0].detach()) * penalised
+            errors = torch.where(missed.abs() > errors.abs(), missed, errors)
+        return loss, errors, mean
+
+    def _values(self, pictures: list[Tensor], actions: Tensor) -> list[Tensor]:
+        """Q_1 and Q_2, each [n], from pictures that both critics have embedded."""
+        return [
+            critic.value(picture, actions)
+            for critic, picture in zip(self.critics.pair, pictures, strict=True)
+        ]
 
     def _actor_losses(
         self, picture: Tensor, own_actions: Tensor, actions: Tensor, human: Tensor
@@ -181,26 +216,25 @@ class TD3Learner:
         return policy, equations.behaviour_cloning_loss(own_actions, actions, human)
 
     @torch.no_grad()
-    def _priorities(self, td_errors: Tensor, batch: Minibatch, own_actions: Tensor) -> Tensor:
+    def _priorities(
+        self, errors: Tensor, frames: Tensor, actions: Tensor, human: Tensor, own_actions: Tensor
+    ) -> Tensor:
         """Eq. 21; the target critic looks only at the human's samples, the only ones that count."""
-        c, row, human = self.config, self.algorithm, batch.human
-        advantage = torch.zeros_like(td_errors)
-        # To pick samples is to wait for their number, which an accelerator must not.
-        looked_at = human.nonzero()[:, 0] if self.device.type == "cpu" else slice(None)
-        if row.advantage_weight and td_errors[looked_at].numel():
-            critic, frames = self.target_critics.first, batch.frames
-            if isinstance(looked_at, Tensor):
-                # Copies picture by picture; [looked_at] would go byte by byte, 25 times as slow.
-                frames = frames.index_select(0, looked_at)
+        c, row = self.config, self.algorithm
+        advantage = torch.zeros_like(errors)
+        looked_at = human.nonzero()[:, 0]
+        if row.advantage_weight and len(looked_at):
+            critic = self.target_critics.first
+            # Copies picture by picture; [looked_at] would go byte by byte, 25 times as slow.
             with self._precision():
-                picture = critic.embed(frames)
+                picture = critic.embed(frames.index_select(0, looked_at))
             advantage[looked_at] = equations.q_advantage(
-                critic.value(picture, batch.actions[looked_at]),
+                critic.value(picture, actions[looked_at]),
                 critic.value(picture, own_actions[looked_at]),
                 c.advantage_bound,
             )
         return equations.priority(
-            td_errors,
+            errors,
             advantage,
             human,
             c.priority_offset,
@@ -225,3 +259,10 @@ def _differentiate(loss: Tensor, module: torch.nn.Module) -> None:
     parameters = list(module.parameters())
     for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
         parameter.grad = gradient
+
+
+def _calculate_exactly() -> None:
+    """Float32 products in full, and the same every time: a resumed run must equal one unbroken."""
+    torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cuda.matmul.allow_tf32 = False
+    torch.backends.cudnn.deterministic = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,6 +17,8 @@ Position = tuple[int, int]
 """Sitting and index of a recorded step."""
 Shape = Callable[[float, Intervention | None], float]
 """The reward to store (eq. 17), from the environment's and what the person did."""
+Penalises = Callable[[Intervention | None], bool]
+"""Whether what the person did costs the policy the penalty."""
 
 
 class Store(Protocol):
@@ -25,10 +27,8 @@ class Store(Protocol):
     def start_episode(self, observation: Observation) -> None:
         """Take an episode's first observation."""
 
-    def add(
-        self, action: Action, reward: float, observation: Observation, terminal: bool, human: bool
-    ) -> None:
-        """Store a transition that led to ``observation``."""
+    def add(self, *transition: Any, **guidance: Any) -> None:
+        """Store a transition; arguments as ``ReplayBuffer.add``."""
 
 
 def steps_since(directory: Path, position: Position) -> Iterator[Step]:
@@ -38,7 +38,11 @@ def steps_since(directory: Path, position: Position) -> Iterator[Step]:
 
 
 def store_again(
-    store: Store, steps: Iterable[Step], shape: Shape, ticks_late: int = 0
+    store: Store,
+    steps: Iterable[Step],
+    shape: Shape,
+    penalises: Penalises,
+    ticks_late: int = 0,
 ) -> tuple[int, int]:
     """Put recorded steps into the replay buffer as the run had put them there.
 
@@ -46,6 +50,7 @@ def store_again(
         store: the learner, or its buffer.
         steps: in their order.
         shape: the run's reward shaping.
+        penalises: whether the run charges an intervention to the overruled action.
         ticks_late: how many ticks old the observation is that an action answers, behind a network
             (``training/wheel.py``).
 
@@ -60,8 +65,19 @@ def store_again(
                 store.start_episode(known.observation)
             action = np.array([step.action], np.float32)
             by_person = Intervention(action, "person", step.first) if step.human else None
-            reward = shape(step.reward, by_person)
-            store.add(action, reward, known.next_observation, step.terminated, step.human)
+            store.add(
+                action,
+                shape(step.reward, by_person),
+                known.next_observation,
+                step.terminated,
+                step.human,
+                overruled=_array(step.policy_action, action),
+                penalised=penalises(by_person),
+            )
             stored += 1
             human += step.human
     return stored, human
+
+
+def _array(value: float | None, otherwise: Action) -> Action:
+    return otherwise if value is None else np.array([value], np.float32)

@@ -22,7 +22,7 @@ from trainer.person.unhurried import UnhurriedLearning
 from trainer.person.watched import WatchedEnv
 from trainer.training.config import RunConfig
 from trainer.training.divergence import divergence_said
-from trainer.training.learning import Learning, ProcessorLearning
+from trainer.training.learning import Learning, LearningThread
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 from trainer.training.wheel import ticks_late
@@ -101,12 +101,8 @@ class PersonRun(TrainingRun):
             super().save()
         self.longest_save_s = max(self.longest_save_s, time.perf_counter() - began_s)
 
-    def _make_learning(self, action_size: int) -> Learning:
-        learning = super()._make_learning(action_size)
-        # On an accelerator the loop waits for milliseconds only.
-        if isinstance(learning, ProcessorLearning):
-            return UnhurriedLearning(learning)
-        return learning
+    def _around(self, learning: LearningThread) -> Learning:
+        return UnhurriedLearning(learning)
 
     def _make_guide(self) -> Guide | None:
         return None  # The sitting is opened when all else is known to work.
@@ -120,7 +116,7 @@ class PersonRun(TrainingRun):
             return
         self.save()
         self.sitting.close()
-        if self.config.evaluate_every:
+        if self.config.evaluate_every_steps:
             print(
                 f"validating on {self.config.evaluation_runs} episodes; all is saved, "
                 "^C leaves it out",
@@ -132,7 +128,7 @@ class PersonRun(TrainingRun):
         except KeyboardInterrupt:
             print("validation left out", file=sys.stderr)
 
-    def _due(self) -> bool:
+    def _due(self, last_steps: int) -> bool:
         return True  # Whenever it is done: a person's run has no other end than a sitting's.
 
     def _more_state(self) -> dict[str, Any]:
@@ -142,7 +138,9 @@ class PersonRun(TrainingRun):
         super()._restore(state)
         position = tuple(state["recorded"])
         steps = steps_since(self.run_dir / DIRECTORY, position)
-        self.recovered = store_again(self.learning, steps, self._shape, ticks_late(self.network))
+        self.recovered = store_again(
+            self.learning, steps, self._shape, self._penalises, ticks_late(self.network)
+        )
 
 
 def check_settings(config: RunConfig) -> None:

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 
 from trainer.learner.td3 import TD3Learner
-from trainer.training.learning import Action, EpisodeLearning, Observation, ProcessorLearning
+from trainer.training.learning import Action, EpisodeLearning, LearningThread, Observation
 
 NICENESS = 10
 """Of the updates' thread, and of those that torch starts from it: the person's loop goes first."""
@@ -37,7 +37,7 @@ class UnhurriedLearning:
         inner: where it learns.
     """
 
-    def __init__(self, inner: ProcessorLearning) -> None:
+    def __init__(self, inner: LearningThread) -> None:
         self._inner = inner
         self._kept_back: deque[Callable[[], None]] = deque()
         self._kept_back_steps = 0
@@ -74,15 +74,13 @@ class UnhurriedLearning:
         """Take an episode's first observation."""
         self._later(lambda: self._inner.start_episode(observation))
 
-    def add(
-        self, action: Action, reward: float, observation: Observation, terminal: bool, human: bool
-    ) -> None:
-        """Store a transition that led to ``observation``, now or when the update is done."""
+    def add(self, *transition: Any, **guidance: Any) -> None:
+        """Store a transition, now or when the update is done; arguments as ``Learning.add``."""
         self._kept_back_steps += 1
 
         def store() -> None:
             self._kept_back_steps -= 1
-            self._inner.add(action, reward, observation, terminal, human)
+            self._inner.add(*transition, **guidance)
 
         self._later(store)
 

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from trainer.human.guide import Intervention
 from trainer.human.trigger import Reason
 from trainer.learner.config import LearnerConfig
-from trainer.learner.minibatch import Losses
+from trainer.learner.td3 import Losses
 from trainer.training.config import RunConfig
 from trainer.training.run import TrainingRun
 
@@ -24,7 +24,7 @@ LEARNER = LearnerConfig(
     exploration_final=0.0,
     intervention_penalty=-7.0,
 )
-CONFIG = RunConfig(episodes=1, evaluate_every=0, checkpoint_every=1000, learner=LEARNER)
+CONFIG = RunConfig(episodes=1, evaluate_every_steps=0, checkpoint_every=1000, learner=LEARNER)
 
 
 class ScriptedEnv:
@@ -104,13 +104,15 @@ def scripted_run(
     run.env = ScriptedEnv(length, outcome)
     run.guide = ScriptedGuide(run, human_steps, reason)
     run.stored, run.betas, run.learned, run.written = [], [], [], []
+    run.guidance_stored = []
     replay, learner = run.learning.replay, run.learning.learner
     add, write = replay.add, replay.update_priorities
 
-    def spy_add(action, reward, next_frames, terminal, human):
+    def spy_add(action, reward, next_frames, terminal, human, **guidance):
         assert next_frames[1, 0, 0] == run.env.steps
         run.stored.append((float(action[0]), reward, terminal, human))
-        add(action, reward, next_frames, terminal, human)
+        run.guidance_stored.append((float(guidance["overruled"][0]), guidance["penalised"]))
+        add(action, reward, next_frames, terminal, human, **guidance)
 
     def spy_write(indices, priorities):
         # The buffer itself writes one at a time.

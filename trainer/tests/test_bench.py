@@ -20,11 +20,11 @@ from trainer.benches.training import Episode
 from trainer.benches.turns import compare, median, take_turns
 from trainer.benches.updates import Updates
 from trainer.commands import bench
-from trainer.learner.minibatch import Losses
 from trainer.learner.replay import ReplayBuffer
+from trainer.learner.td3 import Losses
 from trainer.scenarios import SCENARIOS
 from trainer.tests.test_commands import call
-from trainer.training.learning import ProcessorLearning
+from trainer.training.learning import LearningThread
 
 TINY = replace(
     QUICK,
@@ -156,7 +156,7 @@ def test_the_learner_alone_works_in_the_thread_of_the_updates(monkeypatch):
 
         monkeypatch.setattr(owner, name, spied)
 
-    spy(ProcessorLearning, "_update", threads[0])
+    spy(LearningThread, "_update", threads[0])
     spy(Updates, "run", threads[1])
     training.measure_training(TINY, lambda done: None)
     assert len(threads[0]) == 1

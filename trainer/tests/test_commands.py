@@ -144,7 +144,7 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path):
     other = ("train", "--out", run, "--human", human, "--episodes", "4", "--seed", "8", "--resume")
     status, _, err = call(capsys, *other)
     assert status == 2
-    assert "--seed 0 (now 8), --set evaluation_runs=1 (now 20), --set batch_size=4 (now 128)" in err
+    assert "--seed 0 (now 8), --set evaluation_runs=1 (now 30), --set batch_size=4 (now 128)" in err
     status, _, err = call(capsys, *steps[0])
     assert status == 2
     assert "holds a human model" in err

@@ -8,7 +8,7 @@ import torch
 
 from edge_runtime.errors import UserError
 from trainer.drivers import CHECKPOINT_FILE
-from trainer.learner.minibatch import Losses
+from trainer.learner.td3 import Losses
 from trainer.tests.scripted import BATCH, CONFIG, scripted_run
 from trainer.tests.test_commands import call
 

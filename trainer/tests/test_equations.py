@@ -52,6 +52,17 @@ def test_equation_22_target_takes_the_smaller_value_and_stops_at_terminals():
     assert target.tolist() == [1.0 + 0.5 * 2.0, 1.0]
 
 
+def test_a_target_over_several_steps_bootstraps_by_its_own_power_of_gamma():
+    target = eq.td_target(t(1.0, 1.0), t(0.0, 0.0), (t(4.0, 4.0), t(9.0, 9.0)), t(0.5, 0.25))
+    assert target.tolist() == [3.0, 2.0]
+
+
+def test_equation_17_on_the_overruled_action():
+    penalised = torch.tensor([True, False, True, False])
+    loss = eq.overruled_loss(t(-9.0, 5.0, -10.0, 5.0), penalised, -10.0, t(2.0, 1.0, 1.0, 1.0))
+    assert loss.item() == 2.0 * 1.0 / 4
+
+
 def test_equation_21b_q_advantage():
     advantage = eq.q_advantage(t(1.0, 0.0), t(0.0, 2.0), exponent_bound=4.0)
     assert advantage.tolist() == pytest.approx([math.e, math.exp(-2.0)])

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from trainer.learner.algorithms import PHIL
-from trainer.learner.minibatch import Losses
-from trainer.tests.accelerating import SMALL, fill, observation
+from trainer.learner.td3 import Losses
+from trainer.tests.filled import SMALL, fill, observation
 from trainer.tests.scripted import CONFIG, ScriptedEnv, scripted_run
 from trainer.training import run as run_module
-from trainer.training.learning import ProcessorLearning
+from trainer.training.learning import LearningThread
 
 PRIORITIES = np.full(SMALL.batch_size, 2.0)
 
@@ -21,7 +21,7 @@ PRIORITIES = np.full(SMALL.batch_size, 2.0)
 @pytest.fixture
 def learning():
     """One that is filled, and whose learner is yet to be scripted."""
-    made: Any = ProcessorLearning(SMALL, PHIL, 1, 1)
+    made: Any = LearningThread(SMALL, PHIL, 1, 1)
     fill(made)
     yield made
     made.close()
@@ -89,7 +89,9 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
 
 
 def test_validation_acts_in_the_learners_thread(tmp_path):
-    run = scripted_run(tmp_path, replace(CONFIG, evaluate_every=1, evaluation_runs=2), length=3)
+    run = scripted_run(
+        tmp_path, replace(CONFIG, evaluate_every_steps=1, evaluation_runs=2), length=3
+    )
     run.validation.env = ScriptedEnv(3, "goal")
     act, threads = run.learning.learner.act, []
 
@@ -171,10 +173,10 @@ def test_each_second_of_a_control_period_is_counted_where_it_is_spent(tmp_path, 
     now_s = 0.0
 
     def taking(seconds, function):
-        def slow(*arguments):
+        def slow(*arguments, **named):
             nonlocal now_s
             now_s += seconds
-            return function(*arguments)
+            return function(*arguments, **named)
 
         return slow
 

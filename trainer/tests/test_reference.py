@@ -52,6 +52,8 @@ def test_every_algorithm(name):
         {"cloning_weight": 0.0},
         {"gamma": 0.5, "tau": 0.1},
         {"target_noise": 0.0},
+        {"penalty_on": "human"},
+        {"intervention_penalty": -3.0},
     ],
     ids=lambda change: "-".join(change),
 )

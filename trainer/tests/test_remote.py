@@ -9,10 +9,7 @@ from edge_runtime.latency.model import LatencySpec, parse_spec
 from trainer.drivers import make_environment
 from trainer.evaluation import drive_episode
 from trainer.remote.vehicle_end import RemoteDriver, VehicleEnd
-from trainer.training.wheel import DirectWheel, Ends, RemoteWheel, make_wheel, ticks_late
-
-TERMINATED, TRUNCATED = Ends(True, False), Ends(False, True)
-GOES_ON = Ends(False, False)
+from trainer.training.wheel import DirectWheel, RemoteWheel, make_wheel, ticks_late
 
 
 class Brightness:
@@ -67,7 +64,7 @@ def answer(observation):
     return np.array([number(observation) / 100.0], np.float32)
 
 
-def drive_wheel(spec, ticks, seed=0, ends=GOES_ON, human=()):
+def drive_wheel(spec, ticks, seed=0, terminated=False, human=()):
     """Drive a wheel over numbered observations; the reward of tick n is n."""
     kept: Any = Kept()
     wheel = RemoteWheel(kept, Car(), parse_spec(spec))
@@ -75,7 +72,7 @@ def drive_wheel(spec, ticks, seed=0, ends=GOES_ON, human=()):
     actions = []
     for tick in range(ticks):
         actions.append(float(wheel.act(frames(tick), answer)[0]))
-        end = ends if tick == ticks - 1 else GOES_ON
+        end = terminated and tick == ticks - 1
         action = np.array([0.9 if tick in human else actions[-1]], np.float32)
         wheel.store(action, float(tick), frames(tick + 1), end, tick in human)
     return kept.rows, actions
@@ -100,7 +97,7 @@ def test_a_delayed_driver_is_another_and_the_same_each_time():
 
 
 def test_a_reward_stands_beside_the_action_that_earned_it():
-    rows, actions = drive_wheel("100ms", 8, ends=TERMINATED)
+    rows, actions = drive_wheel("100ms", 8, terminated=True)
     # Round trip 2 ticks: hands off in ticks 0 and 1; tick n obeys the answer to n - 2.
     assert actions == pytest.approx([0, 0, 0, 0.01, 0.02, 0.03, 0.04, 0.05])
     wanted = [(n, pytest.approx(n / 100), n + 2.0, n + 1, n == 5, False) for n in range(6)]
@@ -111,11 +108,6 @@ def test_a_humans_action_stands_beside_what_the_policy_would_have_had_to_answer(
     rows, _ = drive_wheel("100ms", 8, human=(4,))
     (row,) = [row for row in rows if row[5]]
     assert row == (2, pytest.approx(0.9), 4.0, 3, False, True)
-
-
-def test_a_timeout_is_no_end_of_the_road():
-    rows, _ = drive_wheel("100ms", 8, ends=TRUNCATED)
-    assert not any(row[4] for row in rows)
 
 
 @pytest.mark.parametrize("spec", ["up.loss=30%", "60ms+-50ms", "down.loss=20%,delay=120ms"])

@@ -64,6 +64,67 @@ def test_a_batch_holds_only_what_was_stored_and_not_yet_forgotten(episodes, capa
         assert batch.rewards[row] == step
 
 
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 12), st.sampled_from(["goal", "timeout"])), min_size=1, max_size=8
+    ),
+    st.integers(8, 60),
+    st.integers(1, 10),
+)
+def test_n_step_returns_are_those_of_the_episode_written_out(episodes, capacity, steps):
+    """Real terminals end a sum; a timeout, or the newest step, is bootstrapped from."""
+    gamma = 0.5
+    buffer = ReplayBuffer(capacity, steps=steps, gamma=gamma)
+    written: dict[int, tuple[list[float], bool, int]] = {}
+    running = 0
+    for length, outcome in episodes:
+        pictures = [frame(running + n) for n in range(length + 1)]
+        running += length + 1
+        buffer.start_episode(np.stack([pictures[0], pictures[0]]))
+        for step in range(length):
+            terminal = outcome == "goal" and step == length - 1
+            buffer.add(
+                np.zeros(1, np.float32),
+                float(step + 1),
+                np.stack(pictures[step : step + 2]),
+                terminal,
+                human=step % 3 == 0,
+            )
+            rest = [float(n + 1) for n in range(step, min(step + steps, length))]
+            ends = outcome == "goal" and step + steps >= length
+            written[number(pictures[step])] = (rest, ends, number(pictures[step + len(rest)]))
+    if len(buffer) == 0:
+        return
+    batch = buffer.sample(64, np.random.default_rng(0))
+    assert isinstance(batch.spans, np.ndarray)
+    for row in range(64):
+        first = number(batch.frames[row, 1])
+        rewards, terminal, last = written[first]
+        assert batch.spans[row] == len(rewards)
+        assert batch.rewards[row] == sum(gamma**k * reward for k, reward in enumerate(rewards))
+        assert bool(batch.terminals[row]) == terminal
+        assert number(batch.next_frames[row, 1]) == last
+        # Delta is the first step's.
+        assert bool(batch.human[row]) == ((round(rewards[0]) - 1) % 3 == 0)
+
+
+def test_the_overruled_action_is_kept_beside_the_humans():
+    buffer = ReplayBuffer(10)
+    buffer.start_episode(np.stack([frame(0), frame(0)]))
+    action, overruled = np.array([0.25], np.float32), np.array([-1.0], np.float32)
+    buffer.add(action, 0.0, np.stack([frame(0), frame(1)]), False, False)
+    buffer.add(action, 0.0, np.stack([frame(1), frame(2)]), False, True, overruled, penalised=True)
+    copy = ReplayBuffer(10)
+    copy.load_state_dict(buffer.state_dict())
+    for one in (buffer, copy):
+        batch = one.sample(16, np.random.default_rng(0))
+        assert batch.overruled is not None
+        assert batch.penalised is not None
+        np.testing.assert_array_equal(batch.overruled[:, 0], np.where(batch.human, -1.0, 0.25))
+        np.testing.assert_array_equal(batch.penalised, batch.human)
+
+
 def test_a_full_ring_keeps_the_newest():
     buffer = ReplayBuffer(50)
     source = Source(buffer)

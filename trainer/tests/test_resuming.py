@@ -11,7 +11,7 @@ from trainer.training.config import RunConfig
 @pytest.fixture
 def run_dir(tmp_path):
     (tmp_path / "checkpoint.pt").write_bytes(b"none that could be read")
-    values = RunConfig(seed=3, episodes=4, evaluate_every=7, human="person").as_dict()
+    values = RunConfig(seed=3, episodes=4, evaluate_every_steps=7, human="person").as_dict()
     values["learner"]["batch_size"] = 8
     (tmp_path / "config.json").write_text(json.dumps(values))
     return tmp_path
@@ -19,7 +19,7 @@ def run_dir(tmp_path):
 
 GIVEN = (
     "--resume", "--seed", "3", "--episodes", "4", "--human", "keyboard", "--set", "batch_size=8",
-    "--set", "evaluate_every=7",
+    "--set", "evaluate_every_steps=7",
 )  # fmt: skip
 
 
@@ -28,7 +28,7 @@ def test_changed_settings_are_named_as_they_are_given(run_dir, capsys):
     assert (status, len(err.splitlines())) == (2, 1)
     assert (
         "was trained with --seed 3 (now 0), --human keyboard|gamepad|wheel|web (now expert), "
-        "--set evaluate_every=7 (now 20), --set batch_size=8 (now 128): repeat"
+        "--set evaluate_every_steps=7 (now 500), --set batch_size=8 (now 128): repeat"
     ) in err
 
 
@@ -36,7 +36,6 @@ def test_the_same_settings_are_let_in_as_far_as_the_checkpoint(run_dir, capsys):
     path = run_dir / "config.json"
     values = json.loads(path.read_text())
     values["human"] = "expert"
-    del values["latency"], values["printed_reward"]  # A run from before them.
     path.write_text(json.dumps(values))
     given = tuple("expert" if word == "keyboard" else word for word in GIVEN)
     _, _, err = call(capsys, "train", "--out", str(run_dir), *given)

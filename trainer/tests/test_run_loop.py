@@ -1,13 +1,17 @@
 """The training loop around a scripted road, a scripted human and a learner that only listens."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edge_runtime.latency.model import parse_spec
 from trainer.learner import equations
 from trainer.tests.scripted import CONFIG, HUMAN, LEARNER, POLICY, scripted_run
+from trainer.training.run import WRONG_ACTIONS
 from trainer.training.wheel import make_wheel
 
 
@@ -22,14 +26,23 @@ from trainer.training.wheel import make_wheel
         ("phil_without_shaping", "stuck", True, 0.0),
     ],
 )
+@pytest.mark.parametrize("penalty_on", ["human", "overruled"])
 def test_what_was_done_is_stored_and_only_taking_over_is_penalised(
-    tmp_path, algorithm, reason, penalise_stuck, penalty
+    tmp_path, algorithm, reason, penalise_stuck, penalty, penalty_on
 ):
-    config = replace(CONFIG, algorithm=algorithm, penalise_stuck=penalise_stuck)
+    config = replace(
+        CONFIG,
+        algorithm=algorithm,
+        penalise_stuck=penalise_stuck,
+        learner=replace(LEARNER, penalty_on=penalty_on),
+    )
     run = scripted_run(tmp_path, config, length=5, human_steps=(2, 3), reason=reason)
     returns: list[float] = []
     run.train(lambda metrics: returns.append(metrics.episode_return))
     assert returns == [15.0]  # what the road paid, whatever the penalty
+    overruled = [(POLICY, step == 2 and penalty < 0.0) for step in range(1, 6)]
+    assert run.guidance_stored == overruled
+    penalty = penalty if penalty_on == "human" else 0.0
     assert run.stored == [
         (POLICY, 1.0, False, False),
         (HUMAN, 2.0 + penalty, False, True),
@@ -108,8 +121,8 @@ def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_netwo
     assert run.env.braked == [False, False, True, False, False, True, True]
 
 
-def test_the_human_watches_one_episode_in_guided_share(tmp_path):
-    config = replace(CONFIG, episodes=7, guided_share=3)
+def test_the_human_watches_its_share_of_the_episodes(tmp_path):
+    config = replace(CONFIG, episodes=7, guided_share=1 / 3)
     run = scripted_run(tmp_path, config, length=2, human_steps=(2,))
     run.train()
     assert run.guide.asked == [0, 0, 3, 3, 6, 6]
@@ -117,6 +130,34 @@ def test_the_human_watches_one_episode_in_guided_share(tmp_path):
     assert [human for *_, human in run.stored] == [
         step == 2 and episode % 3 == 0 for episode in range(7) for step in (1, 2)
     ]
+
+
+@given(st.floats(0.0, 1.0), st.integers(1, 300))
+def test_the_share_of_watched_episodes_is_met_at_any_time(share, episodes):
+    config = replace(CONFIG, guided_share=share)
+    watched = sum(config.guided(episode, 0) for episode in range(episodes))
+    assert watched == math.ceil(episodes * share)
+
+
+def test_the_human_leaves_after_so_many_steps(tmp_path):
+    config = replace(CONFIG, episodes=4, guided_until_step=3)
+    run = scripted_run(tmp_path, config, length=2, human_steps=(2,))
+    run.train()
+    assert [human for *_, human in run.stored] == [False, True] * 2 + [False] * 4
+
+
+def test_a_budget_in_steps_ends_the_run_with_the_episode_under_way(tmp_path):
+    run = scripted_run(tmp_path, replace(CONFIG, episodes=100, steps=5), length=2)
+    run.train()
+    assert (run.episode, run.steps) == (3, 6)
+
+
+def test_validation_is_due_by_environment_steps(tmp_path):
+    run = scripted_run(tmp_path, replace(CONFIG, episodes=6, evaluate_every_steps=5), length=3)
+    judged: list[int] = []
+    run.validation.judge = lambda metrics, episode, due: judged.append(episode)
+    run.train()
+    assert judged == [2, 4, 5, 6]
 
 
 def test_poor_guidance_replaces_its_share_of_the_demonstrations_by_random_actions(tmp_path):
@@ -129,3 +170,12 @@ def test_poor_guidance_replaces_its_share_of_the_demonstrations_by_random_action
     assert np.abs(poor).max() <= 1.0
     assert np.std(poor) == pytest.approx(3**-0.5, abs=0.08)  # uniform over the whole range
     assert all(human for *_, human in run.stored)
+
+
+def test_biased_guidance_replaces_its_share_by_the_same_wrong_action(tmp_path):
+    config = replace(CONFIG, poor_guidance_share=0.5, poor_guidance="biased")
+    run = scripted_run(tmp_path, config, length=200, human_steps=tuple(range(1, 201)))
+    run.train()
+    done = [action for action, *_ in run.stored]
+    assert set(done) == {HUMAN, WRONG_ACTIONS["left_turn"]}
+    assert done.count(HUMAN) == pytest.approx(100, abs=30)

@@ -12,7 +12,7 @@ from trainer.learner.reference import ReferenceLearner
 from trainer.learner.replay import Batch
 from trainer.learner.td3 import TD3Learner
 
-SMALL = LearnerConfig(batch_size=12, precision="float32")
+SMALL = LearnerConfig(batch_size=12, precision="float32", saturation_weight=0.0, tau=1e-3)
 
 
 def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:
@@ -27,6 +27,9 @@ def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:
         terminals=(random.random(size) < 0.2).astype(np.float32),
         human=np.arange(size) < humans,
         probabilities=random.uniform(0.5, 1.5, size) / size,
+        spans=random.integers(1, 9, size),
+        overruled=random.uniform(-1, 1, (size, 1)).astype(np.float32),
+        penalised=(np.arange(size) < humans) & (np.arange(size) % 2 == 0),
     )
 
 
@@ -99,12 +102,18 @@ def test_an_update_is_the_papers_losses_and_plain_adam(split):
         noise = smoothing_noise(learner, actions.shape)
         next_actions = (learner.target_actor(next_frames) + noise).clamp(-1.0, 1.0)
         first, second = (q(next_frames, next_actions) for q in learner.target_critics.pair)
-        target = torch.from_numpy(batch.rewards) + 0.95 * (
+        target = torch.from_numpy(batch.rewards) + 0.95 ** torch.as_tensor(batch.spans) * (
             1 - torch.from_numpy(batch.terminals)
         ) * torch.minimum(first, second)
     values = [critic(frames, actions) for critic in learner.critics.pair]
     errors = [(target - value) ** 2 for value in values]
+    assert batch.overruled is not None
+    missed = [
+        -10.0 - critic(frames, torch.from_numpy(batch.overruled)) for critic in learner.critics.pair
+    ]
     critic_loss = sum(e[human].mean() + e[~human].mean() if split else e.mean() for e in errors)
+    penalised = torch.from_numpy(batch.penalised)
+    critic_loss += sum((m**2 * penalised).mean() for m in missed)
     gradients = torch.autograd.grad(critic_loss, list(learner.critics.parameters()))
     policy = learner.actor(frames)
     policy_values = learner.critics.first(frames, policy)
@@ -117,7 +126,8 @@ def test_an_update_is_the_papers_losses_and_plain_adam(split):
     with torch.no_grad():
         critic = learner.target_critics.first
         advantage = torch.exp(critic(frames, actions) - critic(frames, policy))
-    wanted_priorities = (target - values[0]).abs() + 1e-3 + advantage * human
+    worst = torch.maximum((target - values[0]).abs(), missed[0].abs() * penalised)
+    wanted_priorities = worst + 1e-3 + advantage * human
 
     losses = learner.update(batch)
 
@@ -190,7 +200,8 @@ def test_every_algorithm_updates_and_its_priorities_follow_its_row(name):
     losses = learner.update(batch)
     assert np.isfinite(losses[:4]).all()
     assert (losses.cloning > 0) == row.behaviour_cloning
-    td_only = TD3Learner(SMALL, ALGORITHMS["ia_td3"], seed=0).update(batch).priorities
+    plain = replace(ALGORITHMS["ia_td3"], penalty=row.penalty)
+    td_only = TD3Learner(SMALL, plain, seed=0).update(batch).priorities
     human = batch.human
     np.testing.assert_allclose(losses.priorities[~human], td_only[~human], rtol=1e-5)
     if row.advantage_weight:
@@ -248,3 +259,34 @@ def test_importance_weights_reach_the_loss():
     weighted = TD3Learner(SMALL, PHIL, seed=0).update(batch, beta=1.0)
     assert weighted.critic < plain.critic
     assert equations.importance_weights(torch.tensor([0.5]), 0.0, True).item() == 1.0
+
+
+def test_a_penalised_action_is_learned_to_be_worth_the_penalty_and_the_humans_is_not():
+    batch = replace(
+        make_batch(size=8, humans=8),
+        rewards=np.full(8, 1.0, np.float32),
+        terminals=np.ones(8, np.float32),
+        actions=np.full((8, 1), -0.5, np.float32),
+        overruled=np.full((8, 1), 0.5, np.float32),
+        penalised=np.ones(8, np.bool_),
+    )
+    config = replace(SMALL, critic_learning_rate=2e-3, intervention_penalty=-2.0)
+    learner = TD3Learner(config, PHIL, seed=0)
+    for _ in range(150):
+        learner.update(batch)
+    frames = torch.from_numpy(batch.frames.copy())
+    for action, worth in ((-0.5, 1.0), (0.5, -2.0)):
+        with torch.no_grad():
+            value = learner.critics.first(frames, torch.full((8, 1), action))
+        torch.testing.assert_close(value, torch.full((8,), worth), atol=0.3, rtol=0)
+
+
+@pytest.mark.parametrize("change", [{"penalty_on": "human"}, {"algorithm": "phil_without_shaping"}])
+def test_overruled_actions_count_only_where_they_have_the_penalty(change):
+    algorithm = ALGORITHMS[change.pop("algorithm", "phil_td3")]
+    batch = make_batch()
+    learners = [TD3Learner(replace(SMALL, **change), algorithm, seed=0) for _ in range(2)]
+    ours = learners[0].update(batch)
+    theirs = learners[1].update(replace(batch, overruled=None, penalised=None))
+    assert ours.critic == theirs.critic
+    np.testing.assert_array_equal(ours.priorities, theirs.priorities)

@@ -24,14 +24,14 @@ from trainer.learner.replay import ReplayBuffer
 from trainer.plots import moving_average, write_learning_curve
 from trainer.training import validation
 from trainer.training.config import RunConfig
-from trainer.training.learning import ProcessorLearning
+from trainer.training.learning import LearningThread
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import TrainingRun
 
 TINY = RunConfig(
     seed=3,
     episodes=4,
-    evaluate_every=2,
+    evaluate_every_steps=250,  # after two and four episodes
     evaluation_runs=2,
     checkpoint_every=1,
     learner=LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=100),
@@ -50,7 +50,7 @@ def actor_weights(run: TrainingRun) -> torch.Tensor:
 
 
 def replay(run: TrainingRun) -> ReplayBuffer:
-    assert isinstance(run.learning, ProcessorLearning)
+    assert isinstance(run.learning, LearningThread)
     return run.learning.replay
 
 
@@ -98,7 +98,7 @@ def test_a_run_in_two_parts_ends_with_the_same_weights_and_metrics(trained, tmp_
 
 def command(directory: Path, *extra: str) -> list[str]:
     settings = ("batch_size=4", "replay_capacity=2000", "warmup_steps=100", "checkpoint_every=1",
-                "evaluate_every=0")  # fmt: skip
+                "evaluate_every_steps=0")  # fmt: skip
     chosen = [part for setting in settings for part in ("--set", setting)]
     return [
         sys.executable, "-m", "trainer", "train", "--seed", "3", "--episodes", "8", "--threads",
@@ -259,7 +259,7 @@ def test_metrics_are_plain_csv(trained):
 @pytest.mark.parametrize(("averaged", "name"), [(True, "target_actor"), (False, "actor")])
 def test_what_is_kept_is_the_network_that_was_validated(averaged, name, tmp_path):
     run = TrainingRun(
-        replace(TINY, episodes=1, evaluate_every=1, averaged_actor=averaged), tmp_path
+        replace(TINY, episodes=1, evaluate_every_steps=1, averaged_actor=averaged), tmp_path
     )
     asked, act = [], run.learning.act
 

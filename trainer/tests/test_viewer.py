@@ -34,12 +34,12 @@ ROOT = Path(__file__).parents[2]
 TINY = RunConfig(
     seed=3,
     episodes=1,
-    evaluate_every=1,
+    evaluate_every_steps=1,
     evaluation_runs=1,
     threads=1,
     learner=LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=60),
 )
-QUICK = ["--episodes", "1", "--threads", "1", "--set", "evaluate_every=0",
+QUICK = ["--episodes", "1", "--threads", "1", "--set", "evaluate_every_steps=0",
          "--set", "warmup_steps=100000"]  # fmt: skip
 """Options of a run that learns nothing."""
 TIMINGS = [name for name in NAMES if name.endswith("_s")]

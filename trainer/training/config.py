@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from trainer.learner.config import LearnerConfig
+from edge_runtime.errors import UserError
+from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
 from trainer.ranges import FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
 MOST_THREADS = 1024
@@ -13,14 +15,18 @@ MOST_THREADS = 1024
 RANGES = {
     "seed": (0, 2**63 - 1),
     "episodes": FROM_ONE,
-    "guided_share": FROM_ONE,
+    "steps": FROM_ZERO,
+    "guided_share": SHARE,
+    "guided_until_step": FROM_ZERO,
     "poor_guidance_share": SHARE,
-    "evaluate_every": FROM_ZERO,
+    "evaluate_every_steps": FROM_ZERO,
     "evaluation_runs": FROM_ONE,
     "checkpoint_every": FROM_ONE,
     "threads": (0, MOST_THREADS),
 }
 """What each number may be."""
+RANDOM, BIASED = GUIDANCE = ("random", "biased")
+"""How a human of poor guidance is wrong: each time another way, or always the same."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +39,16 @@ class RunConfig:
     algorithm: str = "phil_td3"
     seed: int = 0
     episodes: int = 400
-    """Episodes to train (table A5: at most 400)."""
+    """Episodes to train, at most (table A5: 400)."""
+    steps: int = 0
+    """Environment steps after which the episode under way is the last; 0: episodes decide."""
     human: str = "expert"
     """Who guides: the word expert, or a human model's directory."""
-    guided_share: int = 1
-    """The human watches one episode in this many. (The authors' code: 3 in the left turn.)"""
+    guided_share: float = 1.0
+    """Share of the episodes that the human watches. (The authors' code: a third in the left
+    turn.)"""
+    guided_until_step: int = 0
+    """Environment steps after which the human leaves for good; 0: never."""
     penalise_stuck: bool = False
     """Whether taking over from a car that only waits too long is penalised, too. A stuck car
     looks like one that rightly waits, so the penalty teaches to fear waiting."""
@@ -45,13 +56,15 @@ class RunConfig:
     """Whether the target actor is what is validated, kept and exported. It is a running average
     (Polyak and Juditsky, 1992) of the actor that learns, which swings from episode to episode."""
     poor_guidance_share: float = 0.0
-    """Share of the human's actions that are replaced by random ones (section VII-E: one third)."""
+    """Share of the human's actions that are replaced by wrong ones (section VII-E: one third)."""
+    poor_guidance: str = RANDOM
+    """How they are wrong: ``random`` (the paper's), or ``biased``, always the same."""
     printed_reward: bool = False
     """Weight 1 on the term of eq. 31 or 32, as the equations are printed, instead of the scenario's
     own (``LeftTurnConfig.speed_weight``, ``CongestionConfig.steer_weight``)."""
-    evaluate_every: int = 20
-    """Episodes between two evaluations on the validation seeds; 0: never."""
-    evaluation_runs: int = 20
+    evaluate_every_steps: int = 500
+    """Environment steps between two evaluations on the validation seeds; 0: never."""
+    evaluation_runs: int = 30
     """Episodes of such an evaluation."""
     checkpoint_every: int = 10
     """Episodes between two checkpoints."""
@@ -66,6 +79,16 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
+        if self.poor_guidance not in GUIDANCE:
+            raise UserError(
+                f"poor_guidance must be one of {', '.join(GUIDANCE)}: {self.poor_guidance}"
+            )
+
+    def guided(self, episode: int, steps: int) -> bool:
+        """Whether the human watches an episode that begins after so many environment steps."""
+        if self.guided_until_step and steps >= self.guided_until_step:
+            return False
+        return math.ceil((episode + 1) * self.guided_share) > math.ceil(episode * self.guided_share)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
@@ -85,8 +108,8 @@ class RunConfig:
             "episode": episode,
         }
 
-    @staticmethod
-    def completed(values: dict[str, Any]) -> dict[str, Any]:
-        """A config of before the network, or before the switch of the reward, with their fields."""
-        later = {"latency": RunConfig.latency, "printed_reward": RunConfig.printed_reward}
-        return {**later, **values}
+
+PRINTED = RunConfig(averaged_actor=False, printed_reward=True, learner=PRINTED_LEARNER)
+"""What the paper prints, to the letter, and its least where it leaves a thing open."""
+PRESETS = {"ours": RunConfig(), "printed": PRINTED}
+"""Where the settings of a training start from, by the word behind ``--preset``."""

@@ -17,13 +17,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_runtime.errors import UserError
 from trainer import seeds
 from trainer.files import as_arrays, as_tensors
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
-from trainer.learner.minibatch import Losses
 from trainer.learner.replay import Batch, ReplayBuffer
-from trainer.learner.td3 import TD3Learner
+from trainer.learner.td3 import Losses, TD3Learner
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
@@ -50,9 +50,16 @@ class Learning(Protocol):
         """Take an episode's first observation."""
 
     def add(
-        self, action: Action, reward: float, observation: Observation, terminal: bool, human: bool
+        self,
+        action: Action,
+        reward: float,
+        observation: Observation,
+        terminal: bool,
+        human: bool,
+        overruled: Action | None = None,
+        penalised: bool = False,
     ) -> None:
-        """Store a transition that led to ``observation``."""
+        """Store a transition that led to ``observation``; arguments as ``ReplayBuffer.add``."""
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
@@ -120,8 +127,8 @@ class LearningDriver:
         return self.learning.act(observation, self.averaged)
 
 
-class ProcessorLearning:
-    """``Learning`` on the processor: updates run in a thread of their own.
+class LearningThread:
+    """``Learning`` whose updates run in a thread of their own.
 
     The policy acts in that thread, too, in validation as well: another would bring a second pool
     of OpenMP threads, and the two would fight for the same cores. Only a human who is a network
@@ -132,16 +139,36 @@ class ProcessorLearning:
         algorithm: the row of the table of switches.
         seed: of weights, noise and draws.
         action_size: length of an action.
+        device: where the networks are; the replay buffer is in the processor's memory.
+
+    Raises:
+        UserError: there is no memory for the replay buffer.
     """
 
     def __init__(
-        self, config: LearnerConfig, algorithm: Algorithm, seed: int, action_size: int
+        self,
+        config: LearnerConfig,
+        algorithm: Algorithm,
+        seed: int,
+        action_size: int,
+        device: str = "cpu",
     ) -> None:
         self.config = config
-        self.learner = TD3Learner(config, algorithm, seed, action_size)
-        self.replay = ReplayBuffer(
-            config.replay_capacity, action_size, config.alpha, algorithm.separate_buffers
-        )
+        self.learner = TD3Learner(config, algorithm, seed, action_size, device)
+        try:
+            self.replay = ReplayBuffer(
+                config.replay_capacity,
+                action_size,
+                config.alpha,
+                algorithm.separate_buffers,
+                config.return_steps,
+                config.gamma,
+            )
+        except MemoryError:
+            raise UserError(
+                f"there is no memory for a replay buffer of {config.replay_capacity} "
+                "transitions: --set replay_capacity=N, a smaller one"
+            ) from None
         self._random = seeds.stream(seed, seeds.REPLAY)
         self._thread = ThreadPoolExecutor(1, "learner")
         self._begun: tuple[Batch, Future[tuple[Losses, float]]] | None = None
@@ -174,11 +201,9 @@ class ProcessorLearning:
         """Take an episode's first observation."""
         self.replay.start_episode(observation)
 
-    def add(
-        self, action: Action, reward: float, observation: Observation, terminal: bool, human: bool
-    ) -> None:
-        """Store a transition that led to ``observation``."""
-        self.replay.add(action, reward, observation, terminal, human)
+    def add(self, *transition: Any, **guidance: Any) -> None:
+        """Store a transition; arguments as ``Learning.add``."""
+        self.replay.add(*transition, **guidance)
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored; ``beta`` is eq. 15's exponent."""

@@ -34,7 +34,9 @@ class EpisodeMetrics:
 
     episode: int
     total_steps: int
-    """Transitions stored since the run began; behind a network not an episode's first steps."""
+    """Environment steps since the run began."""
+    updates: int
+    """Updates since the run began."""
     steps: int
     episode_return: float
     """Sum of the rewards, without the shaping of eq. 17."""
@@ -55,16 +57,13 @@ class EpisodeMetrics:
     environment_s: float
     """Time spent in the environment and with the human, while the learner updates."""
     acting_s: float
-    """Time of the policy's actions. On an accelerator they queue behind the update, and the wait
-    for both is a part of this."""
+    """Time of the policy's actions."""
     storing_s: float
-    """Time of drawing minibatches, storing steps and their new priorities; on an accelerator, of
-    queueing the update that does so."""
+    """Time of drawing minibatches, storing steps and their new priorities."""
     learning_s: float
     """Time of the updates themselves, beside the parts above."""
     waiting_s: float
-    """How long the loop waited for an update after the environment's step was done; on an
-    accelerator, for the action behind it: counted in ``acting_s``, too."""
+    """How long the loop waited for an update after the environment's step was done."""
     validation_success: float
     """Success rate on the validation seeds (nan where the episode ended without one)."""
     validation_distance_m: float

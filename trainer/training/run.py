@@ -21,18 +21,20 @@ from trainer.files import load_torch, save_torch
 from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
 from trainer.learner.algorithms import ALGORITHMS
+from trainer.learner.config import HUMANS_ACTION
 from trainer.revision import source_revision
-from trainer.training.config import RunConfig
+from trainer.training.config import BIASED, RunConfig
 from trainer.training.divergence import check_weights, divergence_said, finite_action
-from trainer.training.learning import Learning
+from trainer.training.learning import Learning, LearningThread
 from trainer.training.metrics import EpisodeMetrics, MetricsWriter
-from trainer.training.placement import make_learning
 from trainer.training.seen import OnStep, Seen
 from trainer.training.tally import Tally
 from trainer.training.validation import Validation
-from trainer.training.wheel import Ends, make_wheel
+from trainer.training.wheel import make_wheel
 
 CONFIG_FILE = "config.json"
+WRONG_ACTIONS = {"left_turn": 1.0, "congestion": 0.5}
+"""What a human of biased guidance does whenever wrong: full throttle; half of the full angle."""
 
 
 class TrainingRun:
@@ -49,14 +51,16 @@ class TrainingRun:
         self.algorithm = ALGORITHMS[config.algorithm]
         self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
         action_size = self.env.action_space.shape[0]
-        self.learning = self._make_learning(action_size)
+        self.learning = self._around(
+            LearningThread(config.learner, self.algorithm, config.seed, action_size, config.device)
+        )
         self.network = parse_spec(config.latency)
         self.validation = Validation(config, run_dir, self.learning, self.network)
         self.wheel = make_wheel(self.learning, self.env, self.network)
         self.guide = self._make_guide()
         self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
         self.guidance = seeds.stream(config.seed, seeds.GUIDANCE)
-        self.episode = 0
+        self.episode = self.steps = 0
         self.on_step: OnStep | None = None
         """Called at the end of each control period, if anybody looks on."""
         self.quitting = False
@@ -69,7 +73,7 @@ class TrainingRun:
         on_episode: Callable[[EpisodeMetrics], None] = lambda metrics: None,
         deadline_s: float = math.inf,
     ) -> None:
-        """Train until the configured number of episodes, or ``time.monotonic() > deadline_s``.
+        """Train until the configured end, or ``time.monotonic() > deadline_s``.
 
         Not twice: however it ends, the learner lets go of its thread or graphs. A new run with
         ``resume`` goes on.
@@ -78,15 +82,14 @@ class TrainingRun:
         write_json(self.run_dir / CONFIG_FILE, about)
         metrics_writer = MetricsWriter(self.run_dir, self.episode)
         try:
-            while self.episode < self.config.episodes:
+            while not self.over:
                 metrics = self.advance()
-                last = self.episode == self.config.episodes
                 late = self._must_stop(deadline_s)
-                self._validate(metrics, at_end=last or late)
+                self._validate(metrics, at_end=self.over or late)
                 metrics_writer.add(metrics)
                 # Looked at once: what ends without a checkpoint is lost. Who quits waits for no
                 # validation that is not due anyway, so that a resumed run has had the same ones.
-                ending = last or late or self.quitting
+                ending = self.over or late or self.quitting
                 if ending or self.episode % self.config.checkpoint_every == 0:
                     self.save()
                 on_episode(metrics)
@@ -102,7 +105,19 @@ class TrainingRun:
             metrics = self._episode()
             check_weights(self.learning.learner)
         self.episode += 1
+        self.steps += metrics.steps
         return metrics
+
+    @property
+    def over(self) -> bool:
+        """Whether the configured episodes or steps are driven."""
+        return self.progress >= 1.0
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0 to 1."""
+        episodes = self.episode / self.config.episodes
+        return max(episodes, self.steps / self.config.steps) if self.config.steps else episodes
 
     def quit(self) -> bool:
         """Ask for the end after the episode under way, with a checkpoint; True: it will come."""
@@ -117,6 +132,7 @@ class TrainingRun:
                 **self.config.label(self.episode),
                 **self._more_state(),
                 "learning": self.learning.state_dict(),
+                "steps": self.steps,
                 "kept_actor": self.config.kept_actor,
                 "exploration": self.exploration.bit_generator.state,
                 "guidance": self.guidance.bit_generator.state,
@@ -136,7 +152,7 @@ class TrainingRun:
             raise UserError(f"{path} does not fit this run") from error
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.episode = state["episode"]
+        self.episode, self.steps = state["episode"], state["steps"]
         self.learning.load_state_dict(state["learning"])
         self.exploration.bit_generator.state = state["exploration"]
         self.guidance.bit_generator.state = state["guidance"]
@@ -146,8 +162,9 @@ class TrainingRun:
         """Whether the episode just driven is the last of this call."""
         return time.monotonic() > deadline_s
 
-    def _make_learning(self, action_size: int) -> Learning:
-        return make_learning(self.config, self.algorithm, action_size)
+    def _around(self, learning: LearningThread) -> Learning:
+        """What the loop asks in the learner's place."""
+        return learning
 
     def _make_guide(self) -> Guide | None:
         if not self.algorithm.guided:
@@ -162,7 +179,7 @@ class TrainingRun:
         seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
         self.wheel.start(observation, seed)
-        guided = self.guide is not None and self.episode % config.guided_share == 0
+        guided = self.guide is not None and config.guided(self.episode, self.steps)
         if self.guide is not None:
             self.guide.reset()
         ended = False
@@ -170,7 +187,8 @@ class TrainingRun:
             observation, ended, info = self._step(observation, guided, tally)
         return tally.summary(
             self.episode,
-            self.learning.added,
+            self.steps + tally.steps,
+            self.learning.learner.updates,
             self._exploration_std(),
             self.learning.end_episode(),
             info,
@@ -196,9 +214,15 @@ class TrainingRun:
         next_observation, reward, terminated, truncated, info = self.env.step(action)
         moved_s = time.perf_counter()
         waited_s = self.learning.finish()
-        shaped = self._shape(reward, intervention)
-        ends = Ends(terminated, truncated)
-        self.wheel.store(action, shaped, next_observation, ends, intervention is not None)
+        self.wheel.store(
+            action,
+            self._shape(reward, intervention),
+            next_observation,
+            terminated,
+            intervention is not None,
+            overruled=policy_action,
+            penalised=self._penalises(intervention),
+        )
         stored_s = time.perf_counter()
         tally.steps += 1
         tally.rewards += reward
@@ -213,12 +237,18 @@ class TrainingRun:
         return next_observation, terminated or truncated, info
 
     def _spoil(self, intervention: Intervention | None) -> Intervention | None:
-        """Make a demonstration a random action as often as the poor guidance setting asks for."""
-        share = self.config.poor_guidance_share
+        """Make a demonstration a wrong action as often as the poor guidance setting asks for."""
+        config = self.config
+        share = config.poor_guidance_share
         if intervention is None or not share or self.guidance.random() >= share:
             return intervention
-        random = self.guidance.uniform(-1.0, 1.0, intervention.action.shape)
-        return replace(intervention, action=random.astype(np.float32))
+        shape = intervention.action.shape
+        wrong = (
+            np.full(shape, WRONG_ACTIONS[config.scenario])
+            if config.poor_guidance == BIASED
+            else self.guidance.uniform(-1.0, 1.0, shape)
+        )
+        return replace(intervention, action=wrong.astype(np.float32))
 
     def _explore(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         action = finite_action(self.learning.act(observation))
@@ -234,27 +264,30 @@ class TrainingRun:
         c = self.config.learner
         return max(c.exploration_final, c.exploration_initial * c.exploration_decay**self.episode)
 
+    def _penalises(self, intervention: Intervention | None) -> bool:
+        """Whether an intervention begins that the policy is to be penalised for (eq. 17)."""
+        if intervention is None or not intervention.first or not self.algorithm.penalty:
+            return False
+        return intervention.reason != "stuck" or self.config.penalise_stuck
+
     def _shape(self, reward: float, intervention: Intervention | None) -> float:
-        if intervention is None or not self.algorithm.penalty:
+        """Eq. 17 as it is printed, unless the overruled action has the penalty."""
+        c = self.config.learner
+        if c.penalty_on != HUMANS_ACTION or not self._penalises(intervention):
             return reward
-        if intervention.reason == "stuck" and not self.config.penalise_stuck:
-            return reward
-        penalty = self.config.learner.intervention_penalty
-        return equations.shaped_reward(reward, penalty, True, not intervention.first)
+        return equations.shaped_reward(reward, c.intervention_penalty, True, False)
 
     def _beta(self) -> float:
         """Eq. 15's exponent: zero at the end of the run, or where its weights are not used."""
         c = self.config.learner
-        return (
-            c.beta * (1.0 - self.episode / self.config.episodes) if c.importance_sampling else 0.0
-        )
+        return c.beta * (1.0 - self.progress) if c.importance_sampling else 0.0
 
     def _validate(self, metrics: EpisodeMetrics, at_end: bool) -> None:
         """Judge the policy where that is due, and keep it if it is the best one."""
-        if self.config.evaluate_every and (at_end or self._due()):
-            self.validation.judge(metrics, self.episode, self._due())
+        if self.config.evaluate_every_steps and (at_end or self._due(metrics.steps)):
+            self.validation.judge(metrics, self.episode, self._due(metrics.steps))
 
-    def _due(self) -> bool:
-        """Whether a run that is never stopped validates now, too."""
-        every, episodes = self.config.evaluate_every, self.config.episodes
-        return self.episode % every == 0 or self.episode == episodes
+    def _due(self, last_steps: int) -> bool:
+        """Whether a run that is never stopped validates now, too, after an episode of so many."""
+        every = self.config.evaluate_every_steps
+        return self.over or self.steps // every > (self.steps - last_steps) // every

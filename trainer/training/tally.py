@@ -25,6 +25,7 @@ class Tally:
         self,
         episode: int,
         total_steps: int,
+        updates: int,
         exploration_std: float,
         learned: EpisodeLearning,
         info: dict[str, Any],
@@ -33,6 +34,7 @@ class Tally:
         return EpisodeMetrics(
             episode=episode,
             total_steps=total_steps,
+            updates=updates,
             steps=self.steps,
             episode_return=float(self.rewards),
             distance_m=float(info["distance_m"]),

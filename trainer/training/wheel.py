@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 from edge_runtime.latency.command_hold import COMMAND_WINDOW_S, ROUNDING_S
@@ -40,17 +39,16 @@ class Wheel(Protocol):
         """A human has taken over in this tick: only what they do moves the vehicle."""
 
     def store(
-        self, action: Action, reward: float, observation: Observation, ends: Ends, human: bool
+        self,
+        action: Action,
+        reward: float,
+        observation: Observation,
+        terminated: bool,
+        human: bool,
+        overruled: Action | None = None,
+        penalised: bool = False,
     ) -> None:
-        """Keep the tick that led to ``observation``; ``action`` is what was carried out."""
-
-
-@dataclass(frozen=True)
-class Ends:
-    """How a tick ends the episode, if it does."""
-
-    terminated: bool
-    truncated: bool
+        """Keep the tick that led to ``observation``; arguments as ``ReplayBuffer.add``."""
 
 
 class DirectWheel:
@@ -71,10 +69,10 @@ class DirectWheel:
         """The policy's action is not carried out; nothing else holds the vehicle."""
 
     def store(
-        self, action: Action, reward: float, observation: Observation, ends: Ends, human: bool
+        self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
     ) -> None:
         """Every tick is a transition."""
-        self._learning.add(action, reward, observation, ends.terminated, human)
+        self._learning.add(action, reward, observation, *rest, **guidance)
 
 
 class RemoteWheel:
@@ -105,12 +103,12 @@ class RemoteWheel:
         self._vehicle_end.release_brake()
 
     def store(
-        self, action: Action, reward: float, observation: Observation, ends: Ends, human: bool
+        self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
     ) -> None:
         """Keep the tick; the first d of an episode answer to nothing the policy could know."""
         if self._storing:
             following = [*self._known, observation][1]
-            self._learning.add(action, reward, following, ends.terminated, human)
+            self._learning.add(action, reward, following, *rest, **guidance)
 
 
 def ticks_late(spec: LatencySpec) -> int:

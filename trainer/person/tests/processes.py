@@ -18,7 +18,7 @@ from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
 from trainer.person.takeover import MAX_SLEW
 
 SOON_S = 60.0
-SMALL = ["--threads", "1", "--set", "batch_size=4", "--set", "evaluate_every=0"]
+SMALL = ["--threads", "1", "--set", "batch_size=4", "--set", "evaluate_every_steps=0"]
 """A learner that leaves the processor to the others."""
 
 

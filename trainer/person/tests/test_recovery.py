@@ -16,6 +16,10 @@ def shape(reward, intervention):
     return reward - 100.0 * (intervention is not None and intervention.first)
 
 
+def penalises(intervention):
+    return intervention is not None and intervention.first
+
+
 def episode(sitting: int, first: int, length: int, human: range):
     """A recorded episode whose steps in ``human`` are the person's."""
     return [
@@ -35,11 +39,15 @@ def episode(sitting: int, first: int, length: int, human: range):
 def test_steps_come_back_with_mask_action_reward_and_pictures():
     steps = [*episode(1, 0, 4, range(1, 3)), *episode(1, 4, 3, range(0))]
     buffer = ReplayBuffer(100)
-    assert store_again(buffer, steps, shape) == (7, 2)
+    assert store_again(buffer, steps, shape, penalises) == (7, 2)
     state = buffer.state_dict()
     assert state["human"].tolist() == [False, True, True, False, False, False, False]
     assert state["rewards"].tolist() == [0.0, -99.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0]
+    assert state["penalised"].tolist() == [False, True, False, False, False, False, False]
+    np.testing.assert_allclose(
+        state["overruled"][:, 0], [np.float32(step.policy_action) for step in steps]
+    )
     batch = buffer.sample(200, np.random.default_rng(0))
     for row, index in enumerate(batch.indices):
         np.testing.assert_array_equal(batch.frames[row], steps[index].observation)
@@ -49,7 +57,7 @@ def test_steps_come_back_with_mask_action_reward_and_pictures():
 def test_behind_a_network_the_action_answers_an_older_picture():
     steps = episode(1, 0, 5, range(0))
     buffer = ReplayBuffer(100)
-    assert store_again(buffer, steps, shape, ticks_late=2) == (3, 0)
+    assert store_again(buffer, steps, shape, penalises, ticks_late=2) == (3, 0)
     state = buffer.state_dict()
     assert state["rewards"].tolist() == [2.0, 3.0, 4.0]
     np.testing.assert_allclose(state["actions"][:, 0], [0.2, 0.3, 0.4])
@@ -61,7 +69,7 @@ def test_behind_a_network_the_action_answers_an_older_picture():
 
 def test_an_episode_killed_before_the_network_answered_stores_nothing():
     buffer = ReplayBuffer(100)
-    assert store_again(buffer, episode(1, 0, 2, range(0)), shape, ticks_late=2) == (0, 0)
+    assert store_again(buffer, episode(1, 0, 2, range(0)), shape, penalises, ticks_late=2) == (0, 0)
     assert buffer.added == 0
 
 

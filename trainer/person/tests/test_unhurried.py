@@ -11,7 +11,7 @@ import pytest
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.learner.config import LearnerConfig
 from trainer.person.unhurried import UnhurriedLearning
-from trainer.training.learning import ProcessorLearning
+from trainer.training.learning import LearningThread
 
 CONFIG = LearnerConfig(batch_size=2, replay_capacity=50, warmup_steps=1)
 SOON_S = 30.0
@@ -25,7 +25,7 @@ def frames(value: int):
 class Gate:
     """Holds updates up until it is opened."""
 
-    def __init__(self, learning: ProcessorLearning, monkeypatch) -> None:
+    def __init__(self, learning: LearningThread, monkeypatch) -> None:
         self.open, self.begun = threading.Event(), 0
         update = learning.learner.update
 
@@ -39,7 +39,7 @@ class Gate:
 
 @pytest.fixture
 def learning(one_thread):
-    inner = ProcessorLearning(CONFIG, ALGORITHMS["phil_td3"], 0, 1)
+    inner = LearningThread(CONFIG, ALGORITHMS["phil_td3"], 0, 1)
     unhurried = UnhurriedLearning(inner)
     unhurried.start_episode(frames(0))
     for value in range(3):
@@ -111,7 +111,7 @@ def test_a_restored_learner_acts_as_the_one_that_was_saved(learning):
     unhurried.begin(0.0)
     unhurried.settle()
     state, action = unhurried.state_dict(), unhurried.act(frames(7))
-    other = UnhurriedLearning(ProcessorLearning(CONFIG, ALGORITHMS["phil_td3"], 5, 1))
+    other = UnhurriedLearning(LearningThread(CONFIG, ALGORITHMS["phil_td3"], 5, 1))
     assert np.any(other.act(frames(7)) != action)
     other.load_state_dict(state)
     np.testing.assert_array_equal(other.act(frames(7)), action)

@@ -13,7 +13,7 @@ from trainer.person.recording import find_recordings, read_steps
 from trainer.person.takeover import MAX_SLEW
 
 APPLIED = "document.querySelector('.bar.applied output').textContent"
-QUICK = ("--threads", "1", "--set", "evaluate_every=0", "--set", "warmup_steps=8")
+QUICK = ("--threads", "1", "--set", "evaluate_every_steps=0", "--set", "warmup_steps=8")
 
 
 pytestmark = pytest.mark.skipif(

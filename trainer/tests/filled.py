@@ -1,14 +1,10 @@
-"""A small learner on some device, and what it is filled and compared with."""
-
-from dataclasses import replace
+"""A small learner, and what it is filled and compared with."""
 
 import numpy as np
 import torch
 
-from trainer.learner.algorithms import ALGORITHMS
 from trainer.learner.config import LearnerConfig
 from trainer.learner.td3 import TD3Learner
-from trainer.training.accelerator import AcceleratorLearning
 
 SMALL = LearnerConfig(batch_size=8, replay_capacity=60, warmup_steps=1)
 
@@ -28,11 +24,3 @@ def fill(learning, steps: int = 20) -> None:
 def weights(learner: TD3Learner) -> torch.Tensor:
     networks = (learner.actor, learner.critics, learner.target_actor, learner.target_critics)
     return torch.cat([p.detach().flatten() for n in networks for p in n.parameters()]).cpu()
-
-
-def small(device: str = "cpu", algorithm: str = "phil_td3", **changes) -> AcceleratorLearning:
-    learning = AcceleratorLearning(
-        replace(SMALL, **changes), ALGORITHMS[algorithm], seed=1, action_size=1, device=device
-    )
-    fill(learning)
-    return learning
