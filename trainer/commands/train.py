@@ -33,7 +33,7 @@ from trainer.plots import write_learning_curve
 from trainer.progress import ProgressBar
 from trainer.signals import quit_on_signals
 from trainer.training.config import PRESETS, RunConfig
-from trainer.training.metrics import EpisodeMetrics
+from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
 
 EXAMPLE = examples(
@@ -124,12 +124,25 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
             training.train(_both(_Reporter(bar, bool(config.steps)), watch), end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
-    steps = counted(training.steps, "step")
-    print(f"{counted(training.episode, 'episode')}, {steps}: {run_dir}")
+    print(f"{_summary(run_dir)}: {run_dir}")
     if training.quitting and not training.over:
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def _summary(run_dir: Path) -> str:
+    found = totals(read_metrics(run_dir))
+    if not found:
+        return "no episodes"
+    parts = [
+        counted(found["episodes"], "episode"),
+        counted(found["steps"], "step"),
+        counted(found["updates"], "update"),
+        f"{counted(found['takeovers'], 'take-over')} with {counted(found['human_steps'], 'step')}",
+        counted(sum(found["failures"].values()), "failure"),
+    ]
+    return ", ".join(parts)
 
 
 def _extent(training: TrainingRun) -> tuple[int, int]:

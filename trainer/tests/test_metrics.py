@@ -8,7 +8,7 @@ import pytest
 
 from edge_runtime.errors import UserError
 from trainer.tests.test_commands import call
-from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics
+from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics, totals
 
 OLDER = [name for name in NAMES if name != "validation_reward"]
 
@@ -90,3 +90,29 @@ def test_a_full_disk_is_one_line(tmp_path):
         with pytest.raises(UserError, match="No space left on device"):
             writer.add(metrics_of(0))
         writer.close()
+
+
+def test_a_run_is_summed_up():
+    def driven(steps, updates, outcome, validation):
+        return {
+            "total_steps": str(steps), "updates": str(updates), "human_steps": "3",
+            "interventions": "1", "outcome": outcome, "validation_success": validation,
+        }  # fmt: skip
+
+    rows = [
+        driven(20, 0, "collision", "nan"),
+        driven(90, 50, "goal", "0.5"),
+        driven(150, 110, "timeout", "0.9"),
+        driven(210, 170, "collision", "0.9"),
+        driven(280, 240, "goal", "0.8"),
+    ]
+    assert totals(rows) == {
+        "episodes": 5,
+        "steps": 280,
+        "updates": 240,
+        "human_steps": 15,
+        "takeovers": 5,
+        "failures": {"collision": 2, "timeout": 1},
+        "validation": {"best": 0.9, "best_at_step": 150, "last": 0.8},
+    }
+    assert totals([]) == {}

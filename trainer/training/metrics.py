@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
@@ -14,7 +17,7 @@ from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes, write_atomic
 
-METRICS_FILE = "metrics.csv"
+METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
 ALWAYS = (
     "episode",
     "total_steps",
@@ -155,3 +158,33 @@ def _whole(row: dict[str, str]) -> bool:
     except ValueError:
         return False
     return True
+
+
+def totals(rows: Sequence[dict[str, str]]) -> dict[str, Any]:
+    """What a run cost and came to, from its rows; empty where there is none.
+
+    ``failures`` are the training episodes, with the human's help, that missed the goal, by outcome;
+    ``validation`` has the best and the last success rate, and after how many steps the best was
+    first reached, or nothing where none was measured.
+    """
+    if not rows:
+        return {}
+    measured = [
+        (float(row["validation_success"]), int(row["total_steps"]))
+        for row in rows
+        if row["validation_success"] not in ("", "nan")
+    ]
+    validation = {}
+    if measured:
+        best, at_step = max(measured, key=lambda one: (one[0], -one[1]))
+        validation = {"best": best, "best_at_step": at_step, "last": measured[-1][0]}
+    failures = Counter(row["outcome"] for row in rows if row["outcome"] != GOAL)
+    return {
+        "episodes": len(rows),
+        "steps": int(rows[-1]["total_steps"]),
+        "updates": int(rows[-1]["updates"]),
+        "human_steps": sum(int(row["human_steps"]) for row in rows),
+        "takeovers": sum(int(row["interventions"]) for row in rows),
+        "failures": dict(sorted(failures.items())),
+        "validation": validation,
+    }

@@ -26,7 +26,13 @@ from trainer.revision import source_revision
 from trainer.training.config import BIASED, RunConfig
 from trainer.training.divergence import check_weights, divergence_said, finite_action
 from trainer.training.learning import Learning, LearningThread
-from trainer.training.metrics import EpisodeMetrics, MetricsWriter
+from trainer.training.metrics import (
+    REPORT_FILE,
+    EpisodeMetrics,
+    MetricsWriter,
+    read_metrics,
+    totals,
+)
 from trainer.training.seen import OnStep, Seen
 from trainer.training.tally import Tally
 from trainer.training.validation import Validation
@@ -98,6 +104,7 @@ class TrainingRun:
         finally:
             metrics_writer.close()
             self.learning.close()
+        write_json(self.run_dir / REPORT_FILE, totals(read_metrics(self.run_dir)))
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, without validation and checkpoint; UserError where it diverges."""
