@@ -50,11 +50,16 @@ class NetworkDriver:
     def reset(self) -> None:
         """Networks have no memory."""
 
-    @torch.no_grad()
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         """pi(s), float32 [action size]."""
-        frames = torch.from_numpy(observation)[None].to(self.device)
-        return self.actor(frames)[0].cpu().numpy()
+        return self.act_together(observation[None])[0]
+
+    @torch.no_grad()
+    def act_together(self, observations: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The same for observations [n, 2, 45, 80]: float32 [n, action size]."""
+        frames = torch.from_numpy(observations).to(self.device)
+        actions: NDArray[np.float32] = self.actor(frames).cpu().numpy()
+        return actions
 
 
 class ConstantDriver:

@@ -2,20 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.latency.model import LatencySpec
-from trainer.human.guide import Driver
+from trainer.human.guide import Action, Driver
 from trainer.remote.vehicle_end import RemoteDriver
 
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
 CONDITIONS = ("nominal", "noise", "variant")
 NO_NETWORK = LatencySpec()
+ActTogether = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
+
+
+class Drive:
+    """One episode under way; ``observation`` is what its driver sees next.
+
+    Args:
+        env: a scenario.
+        seed: of the episode, and of the noise.
+        noise_std: standard deviation of Gaussian noise on the command.
+    """
+
+    def __init__(self, env: Any, seed: int, noise_std: float = 0.0) -> None:
+        self.env, self.seed, self.noise_std = env, seed, noise_std
+        self.over = False
+        self.observation, self._info = env.reset(seed=seed)
+        self._noise = np.random.default_rng([seed, 1])
+        self._actions: list[list[float]] = []
+        self._rewards: list[float] = []
+        self._lateral: list[float] = []
+        self._longitudinal: list[float] = []
+
+    def step(self, action: Action) -> None:
+        """One control period."""
+        if self.noise_std:
+            disturbed = action + self._noise.normal(0.0, self.noise_std, action.shape)
+            action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
+        self.observation, reward, terminated, truncated, info = self.env.step(action)
+        self._actions.append([float(a) for a in action])
+        self._rewards.append(reward)
+        self._lateral.append(abs(info["lateral_acceleration_mps2"]))
+        self._longitudinal.append(abs(info["longitudinal_acceleration_mps2"]))
+        self._info, self.over = info, terminated or truncated
+
+    def result(self) -> EpisodeResult:
+        """What it came to, once it is over."""
+        return EpisodeResult(
+            seed=self.seed,
+            outcome=self._info["outcome"],
+            distance_m=float(self._info["distance_m"]),
+            reward=float(sum(self._rewards)),
+            time_s=len(self._actions) * self.env.config.control_period_s,
+            lateral_acceleration_mps2=float(np.mean(self._lateral)),
+            longitudinal_acceleration_mps2=float(np.mean(self._longitudinal)),
+            steps=len(self._actions),
+            actions=self._actions,
+        )
 
 
 def drive_episode(
@@ -25,44 +74,47 @@ def drive_episode(
     noise_std: float = 0.0,
     latency: LatencySpec = NO_NETWORK,
 ) -> EpisodeResult:
-    """Drive one episode.
+    """Drive one episode; ``latency`` is the network between driver and vehicle, in virtual time.
 
-    Args:
-        env: a scenario.
-        driver: who drives.
-        seed: of the episode, and of the noise.
-        noise_std: standard deviation of Gaussian noise on the command.
-        latency: the network between driver and vehicle, in virtual time.
+    The other arguments are as for ``Drive``.
     """
-    noise = np.random.default_rng([seed, 1])
-    observation, info = env.reset(seed=seed)
+    drive = Drive(env, seed, noise_std)
     if latency != NO_NETWORK:
         driver = RemoteDriver(driver, env, latency, seed)
     driver.reset()
-    actions, rewards, lateral, longitudinal = [], [], [], []
-    ended = False
-    while not ended:
-        action = driver.act(observation)
-        if noise_std:
-            disturbed = action + noise.normal(0.0, noise_std, action.shape)
-            action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
-        observation, reward, terminated, truncated, info = env.step(action)
-        actions.append([float(a) for a in action])
-        rewards.append(reward)
-        lateral.append(abs(info["lateral_acceleration_mps2"]))
-        longitudinal.append(abs(info["longitudinal_acceleration_mps2"]))
-        ended = terminated or truncated
-    return EpisodeResult(
-        seed=seed,
-        outcome=info["outcome"],
-        distance_m=float(info["distance_m"]),
-        reward=float(sum(rewards)),
-        time_s=len(actions) * env.config.control_period_s,
-        lateral_acceleration_mps2=float(np.mean(lateral)),
-        longitudinal_acceleration_mps2=float(np.mean(longitudinal)),
-        steps=len(actions),
-        actions=actions,
-    )
+    while not drive.over:
+        drive.step(driver.act(drive.observation))
+    return drive.result()
+
+
+def drive_together(
+    envs: Sequence[Any], act: ActTogether, seeds: Sequence[int], condition: str = "nominal"
+) -> list[EpisodeResult]:
+    """Drive an episode for each seed, as many at once as there are environments.
+
+    A network answers many pictures much sooner than each alone; its last bits may differ.
+
+    Args:
+        envs: of one scenario and condition.
+        act: actions [n, action size] for observations [n, 2, 45, 80], of a driver without memory.
+        seeds: of the episodes.
+        condition: one of ``CONDITIONS``.
+    """
+    noise_std = COMMAND_NOISE if condition == "noise" else 0.0
+    results: dict[int, EpisodeResult] = {}
+    waiting, free = deque(seeds), deque(envs)
+    under_way: list[Drive] = []
+    while waiting or under_way:
+        while waiting and free:
+            under_way.append(Drive(free.popleft(), waiting.popleft(), noise_std))
+        actions = act(np.stack([drive.observation for drive in under_way]))
+        for drive, action in zip(under_way, actions, strict=True):
+            drive.step(action)
+        for drive in (drive for drive in under_way if drive.over):
+            results[drive.seed] = drive.result()
+            free.append(drive.env)
+        under_way = [drive for drive in under_way if not drive.over]
+    return [results[seed] for seed in seeds]
 
 
 def drive_episodes(

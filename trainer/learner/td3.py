@@ -72,12 +72,18 @@ class TD3Learner:
         self.updates = 0
         self._charges_overruled = algorithm.penalty and config.penalty_on == OVERRULED_ACTION
 
-    @torch.no_grad()
     def act(self, frames: NDArray[np.uint8], averaged: bool = False) -> NDArray[np.float32]:
         """pi(s) for one observation [2, 45, 80], or the target actor's: float32 [action size]."""
-        batch = torch.from_numpy(frames)[None].to(self.device)
+        return self.act_together(frames[None], averaged)[0]
+
+    @torch.no_grad()
+    def act_together(
+        self, frames: NDArray[np.uint8], averaged: bool = False
+    ) -> NDArray[np.float32]:
+        """The same for observations [n, 2, 45, 80]: float32 [n, action size]."""
         actor = self.target_actor if averaged else self.actor
-        return actor(batch)[0].cpu().numpy()
+        actions: NDArray[np.float32] = actor(torch.from_numpy(frames).to(self.device)).cpu().numpy()
+        return actions
 
     def update(self, batch: Batch, beta: float = 0.0) -> Losses:
         """One step of algorithm 1 on a drawn minibatch; ``beta`` is eq. 15's exponent."""

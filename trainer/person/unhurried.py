@@ -61,14 +61,14 @@ class UnhurriedLearning:
         return not self._inner.updating
 
     @torch.no_grad()
-    def act(self, observation: Observation, averaged: bool = False) -> Action:
-        """The action of the actor's copy, float32 [action size]; the averaged one's, for
-        validation between sittings, waits.
-        """
-        if averaged:
-            self.settle()
-            return self._inner.act(observation, averaged)
+    def act(self, observation: Observation) -> Action:
+        """The action of the actor's copy, float32 [action size]."""
         return self._actor(torch.from_numpy(observation)[None])[0].numpy()
+
+    def act_together(self, observations: Observation, averaged: bool) -> Action:
+        """For validation between sittings: waits for the update, as ``Learning.act_together``."""
+        self.settle()
+        return self._inner.act_together(observations, averaged)
 
     def start_episode(self, observation: Observation) -> None:
         """Take an episode's first observation."""

@@ -127,6 +127,6 @@ def scripted_run(
         return Losses(0.0, 0.0, 0.0, 0.0, priorities)
 
     replay.add, replay.update_priorities = spy_add, spy_write
-    learner.act = lambda observation, averaged: np.array([POLICY], np.float32)
+    learner.act = lambda observation: np.array([POLICY], np.float32)
     learner.update = update
     return run

@@ -72,7 +72,7 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
         threads.append(threading.current_thread())
         return losses(1.0)
 
-    def act(seen, averaged):
+    def act(seen):
         threads.append(threading.current_thread())
         return np.zeros(1, np.float32)
 
@@ -92,18 +92,23 @@ def test_validation_acts_in_the_learners_thread(tmp_path):
     run = scripted_run(
         tmp_path, replace(CONFIG, evaluate_every_steps=1, evaluation_runs=2), length=3
     )
-    run.validation.env = ScriptedEnv(3, "goal")
-    act, threads = run.learning.learner.act, []
+    run.validation.envs = [ScriptedEnv(3, "goal") for _ in range(2)]
+    learner, threads = run.learning.learner, []
+    act = learner.act
 
-    def spy(seen, averaged):
+    def spy(seen):
         threads.append(threading.current_thread())
-        return act(seen, averaged)
+        return act(seen)
 
-    run.learning.learner.act = spy
+    def spy_together(seen, averaged):
+        threads.append(threading.current_thread())
+        return np.zeros((len(seen), 1), np.float32)
+
+    learner.act, learner.act_together = spy, spy_together
     validations = []
     run.train(lambda metrics: validations.append(metrics.validation_distance_m))
     assert validations == [3.0]
-    assert len(threads) == 3 + 2 * 3
+    assert len(threads) == 3 + 3  # two episodes of three steps, side by side
     assert len(set(threads)) == 1
     assert threads[0] is not threading.current_thread()
 

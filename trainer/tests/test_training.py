@@ -213,7 +213,7 @@ def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path
     def drive(*_, **__) -> list[SimpleNamespace]:
         return [SimpleNamespace(outcome=COLLISION, reward=rewards[next(episodes)], distance_m=1.0)]
 
-    monkeypatch.setattr(validation, "drive_episodes", drive)
+    monkeypatch.setattr(validation, "drive_together", drive)
     train(TINY, tmp_path / "whole")
     parts = tmp_path / "parts"
     parts.mkdir()
@@ -261,13 +261,13 @@ def test_what_is_kept_is_the_network_that_was_validated(averaged, name, tmp_path
     run = TrainingRun(
         replace(TINY, episodes=1, evaluate_every_steps=1, averaged_actor=averaged), tmp_path
     )
-    asked, act = [], run.learning.act
+    asked, act = [], run.learning.act_together
 
-    def spy(frames, judged=False):
+    def spy(frames, judged):
         asked.append(judged)
         return act(frames, judged)
 
-    run.learning.act = spy  # type: ignore[method-assign]
+    run.learning.act_together = spy  # type: ignore[method-assign]
     run.advance()
     with torch.no_grad():
         run.learning.learner.actor.head.output.bias.add_(0.5)  # now the two differ

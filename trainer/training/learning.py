@@ -42,8 +42,12 @@ class Learning(Protocol):
         """The networks, as of the last finished update."""
         ...
 
-    def act(self, observation: Observation, averaged: bool = False) -> Action:
-        """The actor's action, or the target actor's, float32 [action size]; not while updating."""
+    def act(self, observation: Observation) -> Action:
+        """The actor's action, float32 [action size]; not while updating."""
+        ...
+
+    def act_together(self, observations: Observation, averaged: bool) -> Action:
+        """The actor's actions, or the target actor's, [n, action size]; not while updating."""
         ...
 
     def start_episode(self, observation: Observation) -> None:
@@ -124,7 +128,11 @@ class LearningDriver:
 
     def act(self, observation: Observation) -> Action:
         """The action, float32 [action size]; not while an update is under way."""
-        return self.learning.act(observation, self.averaged)
+        return self.act_together(observation[None])[0]
+
+    def act_together(self, observations: Observation) -> Action:
+        """The same for observations [n, 2, 45, 80]: float32 [n, action size]."""
+        return self.learning.act_together(observations, self.averaged)
 
 
 class LearningThread:
@@ -189,9 +197,13 @@ class LearningThread:
         """Whether ``finish`` would wait now."""
         return self._begun is not None and not self._begun[1].done()
 
-    def act(self, observation: Observation, averaged: bool = False) -> Action:
-        """The actor's action, or the target actor's, float32 [action size]; not while updating."""
-        return self.in_thread(self.learner.act, observation, averaged)
+    def act(self, observation: Observation) -> Action:
+        """The actor's action, float32 [action size]; not while updating."""
+        return self.in_thread(self.learner.act, observation)
+
+    def act_together(self, observations: Observation, averaged: bool) -> Action:
+        """The actor's actions, or the target actor's, [n, action size]; not while updating."""
+        return self.in_thread(self.learner.act_together, observations, averaged)
 
     def in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
         """What ``work(*arguments)`` returns in the updates' thread, after the update under way."""

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.episode_report import GOAL
+from edge_runtime.episode_report import GOAL, EpisodeResult
 from edge_runtime.latency.model import LatencySpec
 from trainer import seeds
 from trainer.drivers import BEST_FILE, make_environment
-from trainer.evaluation import drive_episodes
-from trainer.files import load_torch, save_torch
+from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together
+from trainer.files import save_torch
 from trainer.training.config import RunConfig
 from trainer.training.learning import Learning, LearningDriver
 from trainer.training.metrics import EpisodeMetrics
@@ -34,15 +34,18 @@ class Validation:
     ) -> None:
         self.config, self.run_dir = config, run_dir
         self.learning, self.network = learning, network
-        self.env = make_environment(config.scenario, printed_reward=config.printed_reward)
-        self.best = (-1.0, -1.0)
-        """Success and return of the best actor of those validated when it was due."""
-        self._best_actor: dict[str, Any] | None = None
-        """As in its file; None before the first one."""
         self._seeds = [
             seeds.episode_seed(config.seed, seeds.VALIDATION, run)
             for run in range(config.evaluation_runs)
         ]
+        self.envs = [
+            make_environment(config.scenario, printed_reward=config.printed_reward)
+            for _ in self._seeds
+        ]
+        self.best = (-1.0, -1.0)
+        """Success and return of the best actor of those validated when it was due."""
+        self._best_actor: dict[str, Any] | None = None
+        """As in its file; None before the first one."""
 
     def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
         """Add to ``metrics`` how the policy drives after ``episode`` episodes.
@@ -50,8 +53,7 @@ class Validation:
         One that was not ``due``, since the run stops early, may be kept as the best so far, but a
         resumed run forgets it: which actor a run ends with must not depend on when it was stopped.
         """
-        driver = LearningDriver(self.learning, self.config.averaged_actor)
-        results = drive_episodes(self.env, driver, self._seeds, latency=self.network)
+        results = self._drive()
         success = float(np.mean([result.outcome == GOAL for result in results]))
         reward = float(np.mean([result.reward for result in results]))
         metrics.validation_success, metrics.validation_reward = success, reward
@@ -60,6 +62,12 @@ class Validation:
             state = self._keep(episode)
             if due:
                 self.best, self._best_actor = (success, reward), copy.deepcopy(state)
+
+    def _drive(self) -> list[EpisodeResult]:
+        driver = LearningDriver(self.learning, self.config.averaged_actor)
+        if self.network == NO_NETWORK:
+            return drive_together(self.envs, driver.act_together, self._seeds)
+        return drive_episodes(self.envs[0], driver, self._seeds, latency=self.network)
 
     def _keep(self, episode: int) -> dict[str, Any]:
         actor = getattr(self.learning.learner, self.config.kept_actor)
@@ -74,10 +82,6 @@ class Validation:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave, and keep that actor again."""
         self.best = tuple(state["best_validation"])
-        path = self.run_dir / BEST_FILE
-        if "best_actor" not in state:  # an older checkpoint: what was kept then is the best known
-            self._best_actor = load_torch(path) if path.is_file() else None
-            return
         self._best_actor = state["best_actor"]
         if self._best_actor is not None:
-            save_torch(path, self._best_actor)
+            save_torch(self.run_dir / BEST_FILE, self._best_actor)
