@@ -37,6 +37,7 @@ from trainer.scenarios.vehicle_types import CAR
 
 TABLE = Path("results/choices/state_grid.csv")
 BATCH, WARMUP, EVERY, DRIVES, LONGEST = 128, 256, 500, 50, 8000
+SENSOR = np.random.default_rng(0)
 BIASED_ACTION = {"left_turn": 1.0, "congestion": 0.5}
 
 
@@ -68,16 +69,24 @@ class Setting:
     width: int = 64
     steps: int = 4000
     seeds: int = 6
+    coarse: float = 0.0
+    """The congestion seen less well: noise of so many times 0.1 m on all places across the road
+    and 0.02 rad on the heading, anew in each step, as a stand-in for a picture's pixels."""
 
 
 # --- Observation: the same from one environment a seed and from arrays of drives.
 
 
-def observe(scenario: str, ego: NDArray, cars: NDArray) -> NDArray[np.float32]:
+def observe(
+    scenario: str, ego: NDArray, cars: NDArray, coarse: float, random: np.random.Generator
+) -> NDArray[np.float32]:
     """Some 20 numbers [drives, k] from ego [drives, (x, y, heading, speed, distance)] and
     cars [drives, cars, (x, y, speed, length, width)].
     """
     x, y, heading, speed, distance = ego.T
+    if coarse:
+        y = y + coarse * random.normal(0, 0.1, len(y))
+        heading = heading + coarse * random.normal(0, 0.02, len(y))
     if scenario == "left_turn":
         own = np.stack([speed / 6, distance / 20], 1)
         along = np.clip(cars[..., 0] / 20, -3, 1.5)
@@ -144,7 +153,8 @@ def overlaps(ego: NDArray, cars: NDArray) -> NDArray[np.bool_]:
 class TestDrives:
     """Each of ``actors`` policies drives the same test drives; all in step."""
 
-    def __init__(self, scenario: str, actors: int) -> None:
+    def __init__(self, scenario: str, actors: int, coarse: float = 0.0) -> None:
+        self.coarse, self.random = coarse, np.random.default_rng(0)
         self.scenario, self.env = scenario, blind_environment(scenario)
         self.env.reset(seed=0)
         starts, self.cars = recorded(scenario)
@@ -157,7 +167,7 @@ class TestDrives:
         running, goals = np.ones(len(self.ego), bool), np.zeros(len(self.ego), bool)
         for step in range(self.env.config.max_steps):
             cars = np.tile(self.cars[step], (self.actors, 1, 1))
-            seen = observe(self.scenario, self.ego, cars)
+            seen = observe(self.scenario, self.ego, cars, self.coarse, self.random)
             action = policy(torch.from_numpy(seen).view(self.actors, DRIVES, -1)).reshape(-1)
             self._move(np.clip(action, -1, 1).astype(float), cars)
             hit = overlaps(self.ego, np.tile(self.cars[step + 1], (self.actors, 1, 1)))
@@ -409,7 +419,7 @@ class Learner:
             torch.cat([w, v])
             for w, v in zip(self.actor.weights, self.actor.slow_weights, strict=True)
         ]
-        drives = TestDrives(self.c.scenario, 2 * self.c.seeds)
+        drives = TestDrives(self.c.scenario, 2 * self.c.seeds, self.c.coarse)
         return drives.success(lambda x: forward(both, x).tanh_().numpy()).reshape(2, -1)
 
 
@@ -507,7 +517,8 @@ class Seat:
 def look(setting: Setting, seats: list[Seat]) -> NDArray[np.float32]:
     """What each seed sees now."""
     ego = np.array([ego_state(seat.env) for seat in seats])
-    return observe(setting.scenario, ego, np.array([car_states(seat.env) for seat in seats]))
+    cars = np.array([car_states(seat.env) for seat in seats])
+    return observe(setting.scenario, ego, cars, setting.coarse, SENSOR)
 
 
 def train(c: Setting) -> list[dict[str, Any]]:
@@ -537,7 +548,8 @@ def train(c: Setting) -> list[dict[str, Any]]:
         for seat, row in zip(seats, rows, strict=True):
             if row["stop"]:
                 seat.start()
-        seen = look(c, seats)
+        ended = np.array(column["stop"], bool)
+        seen = np.where(ended[:, None], look(c, seats), after) if ended.any() else after
         if (step + 1) % EVERY == 0:
             judged.append(learner.judge())
     return [report(c, seat, np.array(judged)[:, :, i], learner) for i, seat in enumerate(seats)]
@@ -558,12 +570,16 @@ def report(c: Setting, seat: Seat, judged: NDArray, learner: Learner) -> dict[st
 
 def columns() -> list[str]:
     """The table's header."""
-    names = [f.name for f in fields(Setting)] + ["seed", "episodes", "human_share"]
+    names = [f.name for f in fields(Setting) if f.name != "coarse"] + [
+        "seed",
+        "episodes",
+        "human_share",
+    ]
     names += ["interventions", "failures", "mean_score", "mean_q"]
     for actor in ("online", "averaged"):
         names += [f"{actor}_best", f"{actor}_last"]
         names += [f"{actor}_{at}" for at in range(EVERY, LONGEST + 1, EVERY)]
-    return names
+    return [*names, "coarse"]
 
 
 def main() -> None:
