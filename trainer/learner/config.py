@@ -37,14 +37,14 @@ class LearnerConfig:
     """Standard deviation of the target policy smoothing (table A5: noise scale)."""
     target_noise_bound: float = 0.5
     """Bound of that noise; TD3's own value, the paper has none."""
-    exploration_initial: float = 1.0
-    """Standard deviation of the exploration noise in the first episode (table A5)."""
+    exploration_initial: float = 0.5
+    """Standard deviation of the exploration noise in the first episode (table A5: 1). More of it,
+    and the human takes over for the noise's sake: the policy hardly drives, and the critic sees
+    hardly anything but the human's steps. Less, and the left turn learns more slowly."""
     exploration_final: float = 0.05
     """What it falls to (table A5)."""
     exploration_decay: float = 0.985
-    """Factor on it, once an episode: 0.05 is reached after 199 episodes, and 0.22 after 100. Not in
-    the paper. Chosen on single runs: with 0.9 (0.05 after 29) the congestion was unlearned again,
-    perhaps because critics then see one action in each state only."""
+    """Factor on it, once an episode: 0.05 is reached after 153 episodes. Not in the paper."""
     exploration_bound: float = 1.0
     """Bound of the exploration noise (table A5: c)."""
     replay_capacity: int = 100_000
@@ -128,6 +128,7 @@ RANGES = {
 """What each number may be."""
 
 PRINTED_LEARNER = LearnerConfig(
+    exploration_initial=1.0,
     actor_learning_rate=5e-4,
     critic_learning_rate=2e-4,
     return_steps=1,
