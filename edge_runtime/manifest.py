@@ -43,10 +43,10 @@ class Action(msgspec.Struct, frozen=True, kw_only=True):
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     """All of it. `training` holds at least seed, episodes, config and source revision.
 
-    `policy_id` is the SHA-256 of the graph's weights (onnx_file.py), `created` ISO 8601 in UTC.
+    `created` is ISO 8601 in UTC. A field that is not listed, like an earlier version's `policy_id`,
+    is not looked at.
     """
 
-    policy_id: str
     scenario: str
     algorithm: str
     observation: Observation

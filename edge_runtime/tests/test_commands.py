@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -31,7 +32,8 @@ def test_check_prints_manifest_and_latency(make_policy, tmp_path):
     assert (result.returncode, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     assert report == json.loads(out.read_text())
-    assert report["manifest"]["policy_id"] == report["policy_id"] == signed.policy_id
+    assert report["policy_id"] == hashlib.sha256(signed.path.read_bytes()).hexdigest()
+    assert report["manifest"]["scenario"] == "left_turn"
     assert 0 < report["inference_ms"]["p50"] <= report["inference_ms"]["max"]
 
 

@@ -1,13 +1,19 @@
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
+
 import numpy as np
+import onnx
 import pytest
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from onnx import helper
 
+import edge_runtime
 from edge_runtime import signature
 from edge_runtime.errors import UserError
 from edge_runtime.policy import load_policy
@@ -31,6 +37,31 @@ def test_a_signed_policy_drives(make_policy):
         action = policy.act(np.full((2, 45, 80), level, np.uint8))
         assert action.dtype == np.float32
         np.testing.assert_allclose(action, [level / 127.5 - 1], atol=1e-6)
+
+
+def test_two_files_that_act_differently_never_share_an_id(tmp_path):
+    """One of the same weights that answers full throttle whatever it sees, for a start."""
+    paths = [tmp_path / name for name in ("good.onnx", "bad.onnx")]
+    write_policy(paths[0], "mean")
+    model = onnx.load(str(paths[0]))
+    model.graph.node[-1].output[0] = "unused"
+    model.graph.node.append(helper.make_node("Sign", ["mean"], ["sign"]))
+    model.graph.node.append(helper.make_node("Abs", ["sign"], ["throttle"]))
+    model.graph.node.append(helper.make_node("Unsqueeze", ["throttle", "last_axis"], ["action"]))
+    onnx.save(model, str(paths[1]))
+    good, bad = (load_policy(path, allow_unsigned=True) for path in paths)
+    assert bad.act(np.full((2, 45, 80), 9, np.uint8)) == [1.0]
+    assert good.policy_id != bad.policy_id
+
+
+@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
+def test_a_policy_from_before_with_an_id_in_its_manifest_still_drives(scenario):
+    root = Path(edge_runtime.__file__).parents[1] / "results" / "policies"
+    path = root / f"{scenario}.onnx"
+    assert b'"policy_id":' in path.read_bytes()
+    policy = load_policy(path, root / "policy.pub")
+    assert policy.trust == signature.VERIFIED
+    assert policy.policy_id == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def test_two_actions(tmp_path):
@@ -105,7 +136,6 @@ def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path,
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"manifest_changes": {"policy_id": "0" * 64}}, "its manifest names weights 000"),
         ({"manifest_changes": {"action": [PEDAL, STEERING]}}, "its output must be action"),
         ({"manifest_changes": {"action": []}}, "no action"),
         ({"manifest_changes": {"control_period_s": 0.05}}, "control period"),
