@@ -72,8 +72,13 @@ class Controller:
         self._newest = received
         self._begun_s = now_s
 
-    def finish(self, output: np.ndarray, inference_ns: int, now_s: float) -> Optional[Order]:
-        """The policy's answer (float [n]) to the state of `begin`; None where it came too late."""
+    def finish(
+        self, output: Optional[np.ndarray], inference_ns: int, now_s: float
+    ) -> Optional[Order]:
+        """The policy's answer to the state of `begin`; no order where it came too late.
+
+        An answer that is not float32 [n], or None, is a failed inference.
+        """
         if self._begun_s is None or self._newest is None:
             return None
         overdue = now_s - self._begun_s > rules.MAX_INFERENCE_S
@@ -83,7 +88,7 @@ class Controller:
         self._begun_s = None
         if now_s - self._newest.arrived_s > CONTROL_PERIOD_S:
             self.deadline_misses += 1
-        wanted: List[float] = output.tolist()
+        wanted = self._read(output)
         self._apply(self._event_of(wanted))
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + CONTROL_PERIOD_S
@@ -143,7 +148,16 @@ class Controller:
             return None
         return self._stop_order(0)._replace(reason="runtime_ended")
 
+    def _read(self, output: Optional[np.ndarray]) -> List[float]:
+        """The numbers of an answer, one for each action; none where it has another form."""
+        if output is None or output.dtype != np.float32 or output.shape != (len(self._rows),):
+            return []
+        numbers: List[float] = output.tolist()
+        return numbers
+
     def _event_of(self, wanted: List[float]) -> Event:
+        if not wanted:
+            return Event.FAILED
         # One or two numbers: numpy would take ten times as long for them.
         if not all(map(math.isfinite, wanted)):
             return Event.NOT_FINITE

@@ -37,9 +37,15 @@ class Policy:
         self._session = session
 
     def act(self, frames: np.ndarray) -> np.ndarray:
-        """The action, float32 [n], for frames uint8 [2, 45, 80]. It may hold NaN: check it."""
-        outputs: List[np.ndarray] = self._session.run([OUTPUT], {INPUT: frames[np.newaxis]})
-        return outputs[0][0]
+        """The action, float32 [n], for frames uint8 [2, 45, 80]. It may hold NaN: check it.
+
+        Raises UserError for another type or shape (which can depend on the picture), and
+        whatever onnxruntime raises.
+        """
+        answer: np.ndarray = self._session.run([OUTPUT], {INPUT: frames[np.newaxis]})[0]
+        if answer.dtype != np.float32 or answer.shape != (1, len(self.manifest.action)):
+            raise UserError(f"the policy answers with {answer.dtype} {list(answer.shape)}")
+        return answer[0]
 
 
 def load_policy(
@@ -146,9 +152,6 @@ def _probe(policy: Policy) -> None:
 
 def _try(policy: Policy, frames: np.ndarray) -> np.ndarray:
     try:
-        action = policy.act(frames)
+        return policy.act(frames)
     except Exception as error:  # as in _open
         raise UserError(f"onnxruntime does not run it: {error}") from None
-    if action.shape != (len(policy.manifest.action),):
-        raise UserError(f"it answers a probe picture with shape {action.shape}")
-    return action

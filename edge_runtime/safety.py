@@ -37,6 +37,7 @@ class Event(str, Enum):
     FINAL = "final_state"  # the episode ends with it
     SILENT = "no_fresh_state"  # for longer than SILENCE_S
     NOT_FINITE = "output_not_finite"
+    FAILED = "inference_failed"  # the policy raised, or answered with another type or shape
     TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than SILENCE_S
     PAUSED = "pause_too_long"  # a vehicle stood by for more than MAX_PAUSE_S
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
@@ -53,6 +54,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_S, Event.FINAL): _S,
     (_S, Event.SILENT): _S,  # between two episodes nothing is due
     (_S, Event.NOT_FINITE): _X,
+    (_S, Event.FAILED): _X,
     (_S, Event.TOO_LONG): _X,
     (_S, Event.PAUSED): _X,
     (_S, Event.OTHER_SESSION): _X,
@@ -64,6 +66,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_D, Event.FINAL): _S,
     (_D, Event.SILENT): _X,
     (_D, Event.NOT_FINITE): _X,
+    (_D, Event.FAILED): _X,
     (_D, Event.TOO_LONG): _X,
     (_D, Event.PAUSED): _X,
     (_D, Event.OTHER_SESSION): _X,
@@ -75,6 +78,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_X, Event.FINAL): _X,  # the end of an episode is no way around the condition
     (_X, Event.SILENT): _X,
     (_X, Event.NOT_FINITE): _X,
+    (_X, Event.FAILED): _X,
     (_X, Event.TOO_LONG): _X,
     (_X, Event.PAUSED): _X,
     (_X, Event.OTHER_SESSION): _X,
@@ -85,6 +89,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
 FAULTS = (
     Event.SILENT,
     Event.NOT_FINITE,
+    Event.FAILED,
     Event.TOO_LONG,
     Event.PAUSED,
     Event.OTHER_SESSION,

@@ -42,16 +42,20 @@ def write_policy(
     opset: int = 17,
     ir_version: int = 8,
     loops: int = SLOW_LOOPS,
+    odd_shape: Sequence[int] = (1, 0),
 ) -> str:
     """Write a policy file and return its policy_id; sign it as `path`.sig where a key is given.
 
     kind: "constant" always answers `value`; "mean" answers the mean brightness scaled to
     [-1, 1], a different number for different frames; "nan" is "constant" until the frames are
     brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then takes about a second at
-    SLOW_LOOPS `loops`, and in proportion at others.
+    SLOW_LOOPS `loops`, and in proportion at others; "odd" likewise, then answers with a tensor of
+    `odd_shape`.
     `manifest_changes` replaces fields of the manifest, to write files that must be refused.
     """
-    graph = _graph(kind, value, len(actions), loops)
+    graph = _graph("constant" if kind == "odd" else kind, value, len(actions), loops)
+    if kind == "odd":
+        _answer_oddly(graph, odd_shape)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
     manifest = _manifest(actions, manifest_changes or {})
@@ -161,6 +165,25 @@ def _slow(weights: Dict[str, np.ndarray]) -> List[onnx.NodeProto]:
         helper.make_node("Mul", ["level", "zero"], ["nothing"]),
         helper.make_node("Add", ["nothing", "value"], ["answer"]),
     ]
+
+
+def _answer_oddly(graph: onnx.GraphProto, shape: Sequence[int]) -> None:
+    """For bright frames a tensor of another shape than the graph says of its output."""
+    graph.node[-1].output[0] = "as_said"
+    branches = {}
+    for name, node in (
+        ("then", helper.make_node("Identity", ["odd"], ["then"])),
+        ("else", helper.make_node("Identity", ["as_said"], ["else"])),
+    ):
+        output = helper.make_tensor_value_info(name, TensorProto.FLOAT, None)
+        branches[f"{name}_branch"] = helper.make_graph([node], name, [], [output])
+    graph.initializer.append(numpy_helper.from_array(np.full(shape, 0.5, np.float32), "odd"))
+    graph.node.extend(
+        [
+            helper.make_node("Greater", ["mean", "fault_brightness"], ["is_bright"]),
+            helper.make_node("If", ["is_bright"], ["action"], **branches),
+        ]
+    )
 
 
 _ANSWERS = {"constant": _constant, "mean": _mean, "nan": _nan, "slow": _slow}

@@ -77,6 +77,20 @@ def test_a_nan_stops_with_the_very_state_and_every_further_one():
     assert [o.answers.state.step for o in orders] == list(range(1, 9))
 
 
+@pytest.mark.parametrize(
+    "output",
+    [None, NAN.astype(np.float64), np.float32(0.5), GOOD[:0], GOOD.reshape(1, 1), np.tile(GOOD, 2),
+     np.array([1], np.int64), np.array([[[0.5]]], np.float32)],
+)  # fmt: skip
+def test_an_answer_of_another_form_is_a_failed_inference(output):
+    controller = make()
+    answer(controller, 0, 0.0)
+    orders = [answer(controller, step, step * 0.1, output) for step in (1, 2)]
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", "inference_failed")}
+    assert [o.action for o in orders] == [[-1.0]] * 2
+    assert [answer(controller, s, s * 0.1).mode for s in range(3, 8)][-1] == "drive"
+
+
 def test_an_inference_longer_than_a_period_stops_while_it_runs():
     controller = make()
     answer(controller, 0, 0.0)

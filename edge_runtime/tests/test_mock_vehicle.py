@@ -109,3 +109,10 @@ def test_it_does_not_move_before_it_is_enabled():
     vehicle = MockVehicle()
     vehicle.command({"pedal": 1.0}, 0.0)
     assert vehicle.feedback(0.2).speed_mps == 0.0
+
+
+def test_a_command_without_an_action_is_refused():
+    vehicle = MockVehicle()
+    vehicle.enable(0.0)
+    with pytest.raises(ValueError, match="lacks an action"):
+        vehicle.command({}, 0.1, 6.0)

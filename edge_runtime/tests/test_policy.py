@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from onnx import helper
 import edge_runtime
 from edge_runtime import signature
 from edge_runtime.errors import UserError
+from edge_runtime.inference import infer
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import PEDAL, STEERING, public_pem, write_policy
 
@@ -37,6 +39,18 @@ def test_a_signed_policy_drives(make_policy):
         action = policy.act(np.full((2, 45, 80), level, np.uint8))
         assert action.dtype == np.float32
         np.testing.assert_allclose(action, [level / 127.5 - 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 0), (2, 1), (1, 2), (), (1,), (0, 1), (1, 1, 1)])
+def test_an_answer_of_another_shape_than_one_row_of_actions_is_none(tmp_path, shape):
+    """Probe pictures cannot find it out: the shape hangs on the picture."""
+    write_policy(tmp_path / "p.onnx", "odd", odd_shape=shape)
+    policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
+    assert policy.act(np.zeros((2, 45, 80), np.uint8)).shape == (1,)
+    white = np.full((2, 45, 80), 255, np.uint8)
+    with pytest.raises(UserError, match=re.escape(f"float32 {list(shape)}")):
+        policy.act(white)
+    assert infer(policy, white).output is None
 
 
 def test_two_files_that_act_differently_never_share_an_id(tmp_path):

@@ -145,6 +145,19 @@ def test_an_output_that_is_not_finite_stops(edge_and_simulator):
         assert simulator.ask(make_state(step, frames=WHITE_FRAMES)).mode == "safe_stop"
 
 
+@pytest.mark.parametrize("shape", [(1, 0), (), (1, 1, 1)])
+def test_an_answer_of_the_wrong_shape_stops_and_is_no_last_word(edge_and_simulator, shape):
+    edge, simulator = edge_and_simulator("odd", odd_shape=shape)
+    assert simulator.ask(make_state(0)).mode == "drive"
+    for step in range(1, 4):
+        command = simulator.ask(make_state(step, frames=WHITE_FRAMES))
+        assert (command.mode, command.reason) == ("safe_stop", "inference_failed")
+        assert command.action == [-1.0]
+    assert "drive" in {command.mode for command in drive(simulator, range(4, 24))}
+    assert edge.end() == 0
+    assert "Traceback" not in edge.log
+
+
 def test_an_inference_that_takes_too_long_stops_while_it_runs(edge_and_simulator):
     _, simulator = edge_and_simulator("slow")
     assert simulator.ask(make_state(0)).mode == "drive"

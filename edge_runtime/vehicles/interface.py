@@ -56,6 +56,8 @@ class Vehicle(abc.ABC):
     ) -> None:
         """Ask for an action; it holds for 2 T, after which the vehicle brakes by itself.
 
+        Raises ValueError for one that lacks what the vehicle needs: it never guesses.
+
         `scenario_speed_mps` is the speed of the scenario's car: what a policy without a pedal
         has in place of one. Moves nothing while the vehicle is stopped (`brake`, or a fault).
         """

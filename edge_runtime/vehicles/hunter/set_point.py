@@ -30,10 +30,15 @@ class Wish(NamedTuple):
 
 
 def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wish:
-    """The command of an action, within -1 to 1. Raises ValueError for what is not finite."""
+    """The command of an action, within -1 to 1.
+
+    Raises ValueError for what is not finite, and for what leaves out how fast to drive.
+    """
     wish = Wish(action.get("pedal"), scenario_speed_mps, action.get("steering"))
     if not all(math.isfinite(value) for value in wish if value is not None):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
+    if not action or (wish.pedal is None and scenario_speed_mps is None):
+        raise ValueError(f"a command that lacks an action: {action}, {scenario_speed_mps} m/s")
     return Wish(_within(wish.pedal), scenario_speed_mps, _within(wish.steering))
 
 

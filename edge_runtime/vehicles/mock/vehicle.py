@@ -85,7 +85,9 @@ class MockVehicle(Vehicle):
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """An action that a policy leaves out is zero: no pedal, wheels straight."""
+        """An action that a policy does not have is zero: no pedal, wheels straight."""
+        if not action:
+            raise ValueError("a command that lacks an action")
         self._integrate(now_s)
         if self._latched:
             return
