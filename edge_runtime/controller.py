@@ -49,6 +49,7 @@ class Controller:
         self._rows = rows
         self._needs_rearm = needs_rearm
         self._last_action = neutral_action(rows)
+        self._ordered_s = -math.inf  # when that was said
         self._newest: Optional[Received] = None
         self._begun_s: Optional[float] = None
         self._next_stop_s = math.inf  # the first safe stop is an answer
@@ -92,11 +93,13 @@ class Controller:
         self._apply(self._event_of(wanted))
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + CONTROL_PERIOD_S
-            return self._stop_order(inference_ns)
+            return self._stop_order(inference_ns, now_s)
         if self._needs_rearm and self._newest.state.final:
             # A vehicle that is told to drive on would do so until its own watchdog ends it.
-            return self._stop_order(inference_ns)._replace(reason=Event.FINAL.value)
-        self._last_action = limit_action(wanted, self._last_action, self._rows)
+            return self._stop_order(inference_ns, now_s)._replace(reason=Event.FINAL.value)
+        elapsed_s = now_s - self._ordered_s
+        self._last_action = limit_action(wanted, self._last_action, self._rows, elapsed_s)
+        self._ordered_s = now_s
         return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
 
     def tick(self, now_s: float) -> Optional[Order]:
@@ -115,7 +118,7 @@ class Controller:
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:
             return None
         self._schedule_stop(now_s, on_grid=was is Mode.SAFE_STOP)
-        return self._stop_order(0)
+        return self._stop_order(0, now_s)
 
     def next_deadline_s(self) -> Optional[float]:
         """When `tick` must be called next; None while nothing is due by time alone."""
@@ -146,7 +149,7 @@ class Controller:
         """The safe stop that goes out when the runtime is ended while it answers a simulator."""
         if self.safety.mode is Mode.STANDBY or self._newest is None:
             return None
-        return self._stop_order(0)._replace(reason="runtime_ended")
+        return self._stop_order(0, self._ordered_s)._replace(reason="runtime_ended")
 
     def _read(self, output: Optional[np.ndarray]) -> List[float]:
         """The numbers of an answer, one for each action; none where it has another form."""
@@ -172,16 +175,17 @@ class Controller:
         self.deadline_misses += 1
         self._apply(Event.TOO_LONG)
         self._schedule_stop(now_s, on_grid=False)
-        return self._stop_order(0)
+        return self._stop_order(0, now_s)
 
     def _schedule_stop(self, now_s: float, on_grid: bool) -> None:
         """Repetitions stand on a grid, so that late wake-ups do not lower the rate of 1/T."""
         grid_s = self._next_stop_s + CONTROL_PERIOD_S
         self._next_stop_s = grid_s if on_grid and grid_s > now_s else now_s + CONTROL_PERIOD_S
 
-    def _stop_order(self, inference_ns: int) -> Order:
+    def _stop_order(self, inference_ns: int, now_s: float) -> Order:
         assert self._newest is not None  # a safe stop is an answer to a state
         self._last_action = stop_action(self._last_action, self._rows)
+        self._ordered_s = now_s
         return Order(self._newest, SAFE_STOP, self._last_action, self.safety.reason, inference_ns)
 
     def _apply(self, event: Event) -> None:

@@ -228,10 +228,35 @@ def test_a_state_in_hand_is_due_before_the_silence_after_it():
 
 
 def test_a_rate_limit_counts_from_the_last_order_whatever_its_mode():
-    rows = [LimitRow("pedal", -1.0, 1.0, 0.25)]
+    rows = [LimitRow("pedal", -1.0, 1.0, 2.5)]
     controller = Controller(rows, needs_rearm=False)
     assert answer(controller, 0, 0.0).action == [0.25]
-    assert answer(controller, 1, 0.1).action == [0.5]
+    assert answer(controller, 1, 0.1).action == pytest.approx([0.5])
     controller.tick(0.4)
-    actions = [answer(controller, step, step * 0.1 + 0.2).action for step in range(2, 8)]
-    assert actions == [[-1.0]] * 4 + [[-0.75], [-0.5]]
+    actions = [answer(controller, step, step * 0.1 + 0.2).action[0] for step in range(2, 8)]
+    assert actions == pytest.approx([-1.0] * 4 + [-0.75, -0.5])
+
+
+@pytest.mark.parametrize("states_per_s", [10, 200, 1000])
+def test_a_rate_limit_is_per_second_however_many_states_come(states_per_s):
+    rows = [LimitRow("steering", -1.0, 1.0, 2.0)]
+    controller = Controller(rows, needs_rearm=False)
+    steps = range(states_per_s // 2 + 1)
+    told = [answer(controller, step, step / states_per_s).action[0] for step in steps]
+    assert told == sorted(told)
+    # It wants 0.5, and begins at 0 with a step of one period: half a second is more than enough.
+    assert told[0] == pytest.approx(0.2)
+    assert max(b - a for a, b in zip(told, told[1:])) <= 2.0 / states_per_s + 1e-9
+    assert told[-1] == 0.5
+
+
+def test_a_stop_between_two_drives_gives_no_time_away():
+    rows = [LimitRow("pedal", -1.0, 1.0, 2.0)]
+    controller = Controller(rows, needs_rearm=False)
+    answer(controller, 0, 0.0)
+    controller.tick(0.3)
+    for step in range(1, 5):
+        answer(controller, step, 0.4 + step * 0.1)
+    order = answer(controller, 5, 0.81)
+    assert order.mode == "drive"
+    assert order.action == pytest.approx([-1.0 + 2.0 * 0.01])

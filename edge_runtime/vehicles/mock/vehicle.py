@@ -61,11 +61,11 @@ class MockVehicle(Vehicle):
     """Takes pedal and steering; brakes by itself when no command came for 2 T."""
 
     name: ClassVar[str] = "mock"
-    # A full swing within one control period: 20 / s is 2.0 in T = 0.1 s, so that every action
-    # of a policy goes through unchanged. What the body does with it is the lag's business.
+    # Every action of a policy goes through unchanged, in lock-step, too, where states follow one
+    # another faster than its time. What the body does with it is the lag's business.
     limits: Dict[str, ActionLimit] = {  # noqa: RUF012
-        "pedal": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
-        "steering": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
+        "pedal": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
+        "steering": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
     }
 
     def __init__(self, parameters: Optional[MockParameters] = None) -> None:
