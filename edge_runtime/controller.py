@@ -46,6 +46,7 @@ class Controller:
         self.safety = Safety()
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
+        self._policy_is_dead = False
         self._rows = rows
         self._needs_rearm = needs_rearm
         self._last_action = neutral_action(rows)
@@ -102,6 +103,12 @@ class Controller:
         self._ordered_s = now_s
         return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
 
+    def policy_died(self) -> None:
+        """Nobody finishes what was begun, or begins again. It stops for good; `tick` is due."""
+        self._policy_is_dead = True
+        self._begun_s, self._next_stop_s = None, -math.inf
+        self._apply(Event.DEAD)
+
     def tick(self, now_s: float) -> Optional[Order]:
         """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
         if self._newest is None:
@@ -109,7 +116,9 @@ class Controller:
         if self._begun_s is not None and now_s - self._begun_s > rules.MAX_INFERENCE_S:
             return self._give_up(now_s)
         was = self.safety.mode
-        if was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
+        if self._policy_is_dead:
+            pass  # whatever else is wrong, this is why it stands
+        elif was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
         elif self.vehicle_fault and (was is Mode.DRIVE or self.safety.rearmed):
             self._apply(Event.VEHICLE)  # it may be over before the next state
@@ -135,6 +144,8 @@ class Controller:
         """An operator's permission to drive again. Empty when taken, else why it is refused."""
         if self.safety.mode is not Mode.SAFE_STOP:
             return f"nothing to re-arm: the mode is {self.safety.mode.value}"
+        if self._policy_is_dead:
+            return "the policy's thread is dead: restart the runtime"
         if not self._needs_rearm:
             return "no vehicle is attached: it drives again by itself after fresh states"
         if self.vehicle_fault:

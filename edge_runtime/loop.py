@@ -3,7 +3,8 @@
 Three kinds of threads meet here, under one lock:
 - Zenoh's receiving thread calls `_on_state`, which judges a message and leaves the newest state
   in a slot;
-- the policy's thread takes the slot, infers outside the lock, and sends the answer;
+- the policy's thread takes the slot, infers outside the lock, and sends the answer; an exception
+  that ends it is a fault of its own;
 - the main thread is the watchdog: it wakes at absolute deadlines, sends safe stops and health,
   and tells systemd that all of this works.
 A command is sent under the lock, so that no late answer can follow a safe stop.
@@ -15,6 +16,7 @@ import math
 import queue
 import threading
 import time
+import traceback
 from typing import Optional
 
 from edge_runtime import log
@@ -161,6 +163,18 @@ class ControlLoop:
             self._wakes.put(None)
 
     def _work(self) -> None:
+        try:
+            self._answer()
+        except BaseException as error:  # whatever it is, the watchdog must know
+            with self._lock:
+                self._busy_since_s = None
+                self._controller.policy_died()
+                self._timer.notify()
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{place.filename}:{place.lineno}"
+            log.event("error", "policy_thread_dead", detail=repr(error), where=where)
+
+    def _answer(self) -> None:
         while True:
             self._wakes.get()
             with self._lock:
@@ -183,7 +197,9 @@ class ControlLoop:
                     self._command_window.add(int(took_s * 1e9))
 
     def _is_hung(self, now_s: float) -> bool:
-        """Whether policy or driver keep their thread: a new process may help, and nothing else."""
+        """Whether policy or driver keep or lost their thread: only a new process may help."""
+        if not self._worker.is_alive():
+            return True
         if self._vehicle is not None and self._vehicle.busy_s(now_s) > _HUNG_S:
             return True
         return self._busy_since_s is not None and now_s - self._busy_since_s > _HUNG_S

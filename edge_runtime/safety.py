@@ -38,6 +38,7 @@ class Event(str, Enum):
     SILENT = "no_fresh_state"  # for longer than SILENCE_S
     NOT_FINITE = "output_not_finite"
     FAILED = "inference_failed"  # the policy raised, or answered with another type or shape
+    DEAD = "policy_thread_dead"  # an exception has ended it: only a new process helps
     TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than SILENCE_S
     PAUSED = "pause_too_long"  # a vehicle stood by for more than MAX_PAUSE_S
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
@@ -55,6 +56,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_S, Event.SILENT): _S,  # between two episodes nothing is due
     (_S, Event.NOT_FINITE): _X,
     (_S, Event.FAILED): _X,
+    (_S, Event.DEAD): _X,
     (_S, Event.TOO_LONG): _X,
     (_S, Event.PAUSED): _X,
     (_S, Event.OTHER_SESSION): _X,
@@ -67,6 +69,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_D, Event.SILENT): _X,
     (_D, Event.NOT_FINITE): _X,
     (_D, Event.FAILED): _X,
+    (_D, Event.DEAD): _X,
     (_D, Event.TOO_LONG): _X,
     (_D, Event.PAUSED): _X,
     (_D, Event.OTHER_SESSION): _X,
@@ -79,6 +82,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_X, Event.SILENT): _X,
     (_X, Event.NOT_FINITE): _X,
     (_X, Event.FAILED): _X,
+    (_X, Event.DEAD): _X,
     (_X, Event.TOO_LONG): _X,
     (_X, Event.PAUSED): _X,
     (_X, Event.OTHER_SESSION): _X,
@@ -90,6 +94,7 @@ FAULTS = (
     Event.SILENT,
     Event.NOT_FINITE,
     Event.FAILED,
+    Event.DEAD,
     Event.TOO_LONG,
     Event.PAUSED,
     Event.OTHER_SESSION,

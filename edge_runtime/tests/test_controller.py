@@ -119,6 +119,31 @@ def test_between_episodes_there_is_no_watchdog():
     assert controller.safety.safe_stops == 0
 
 
+@pytest.mark.parametrize("needs_rearm", [False, True])
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_policy_that_died_stops_for_good_and_says_so(needs_rearm, begun):
+    controller = make(needs_rearm=needs_rearm)
+    answer(controller, 0, 0.0)
+    if begun:
+        controller.begin(Received(make_state(1), 0.1, 0), 0.1)
+    controller.policy_died()
+    orders = [controller.tick(0.11)]
+    assert controller.tick(0.15) is None
+    for _ in range(20):  # past the time for an inference, and past silence
+        orders.append(controller.tick(controller.next_deadline_s() + 1e-6))
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", "policy_thread_dead")}
+    assert controller.deadline_misses == 0
+    assert "restart the runtime" in controller.rearm(0.12)
+
+
+def test_a_policy_that_died_before_the_first_state_tells_nobody_and_stands():
+    controller = make()
+    controller.policy_died()
+    assert controller.tick(0.0) is None
+    assert controller.next_deadline_s() is None
+    assert controller.safety.reason == "policy_thread_dead"
+
+
 def test_nothing_is_due_before_the_first_state():
     controller = make()
     assert controller.next_deadline_s() is None

@@ -35,6 +35,7 @@ EXPECTED = {
     Event.SILENT: (STANDBY, STOP, STOP),
     Event.NOT_FINITE: (STOP, STOP, STOP),
     Event.FAILED: (STOP, STOP, STOP),
+    Event.DEAD: (STOP, STOP, STOP),
     Event.TOO_LONG: (STOP, STOP, STOP),
     Event.PAUSED: (STOP, STOP, STOP),
     Event.OTHER_SESSION: (STOP, STOP, STOP),
@@ -47,7 +48,8 @@ EXPECTED = {
 GOOD = {"fresh_state", "recovered", "final_state"}
 # The words that health and commands say: a reader on the other end compares with them.
 BAD = {
-    "no_fresh_state", "output_not_finite", "inference_failed", "inference_too_long",
+    "no_fresh_state", "output_not_finite", "inference_failed", "policy_thread_dead",
+    "inference_too_long",
     "pause_too_long", "other_session", "not_armed", "vehicle_fault",
 }  # fmt: skip
 

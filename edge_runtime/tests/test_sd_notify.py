@@ -9,6 +9,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 from types import SimpleNamespace
 from typing import Any, List
 
@@ -123,12 +124,15 @@ class FakeLink:
 
     def __init__(self) -> None:
         self.sent = {"command": 0, "health": 0}
+        self.commands: list = []
 
     def declare(self, on_state: Any, *_: Any) -> None:
         self.state_comes = on_state
 
     def send(self, topic: str, message: Any) -> None:
         self.sent[topic] += 1
+        if topic == "command":
+            self.commands = [message]
 
 
 @pytest.fixture
@@ -168,6 +172,27 @@ def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     assert link.sent["command"] > before  # the safe stops go on
     policy.free.set()
     assert systemd.next() == "WATCHDOG=1"
+
+
+def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running, systemd):
+    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
+    control, link, policy = running(notifier)
+    link.state_comes(encode(make_state(0)))
+    assert systemd.until("STATUS")[-1] == "STATUS=drive"
+    policy.act = lambda frames: sys.exit("no exception that inference catches")
+    link.state_comes(encode(make_state(1)))
+    assert systemd.until("STATUS")[-1] == "STATUS=safe_stop policy_thread_dead"
+    wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message any more")
+    before = link.sent["command"]
+    for step in range(2, 8):  # a simulator that lives on changes nothing
+        link.state_comes(encode(make_state(step)))
+        time.sleep(0.1)
+    assert link.sent["command"] > before  # the safe stops go on
+    health = control.health()
+    assert (health.mode, health.reason) == ("safe_stop", "policy_thread_dead")
+    assert health.deadline_misses == 0
+    assert link.commands[-1].reason == "policy_thread_dead"
+    assert "restart" in control._rearm()
 
 
 def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):
