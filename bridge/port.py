@@ -109,14 +109,14 @@ class SimulatorPort:
         self.note_edge_counts()
         return self.edge_counts.policy_id
 
-    def edge_action_names(self) -> tuple[str, ...]:
-        """Return the names of the actions of the edge runtime's policy; none if it says nothing."""
+    def edge_manifest(self) -> Manifest | None:
+        """Return the manifest of the edge runtime's policy; None if it says nothing."""
         for reply in self._status_replies():
             if reply.ok is not None:
                 with contextlib.suppress(msgspec.MsgspecError):
                     status = msgspec.json.decode(reply.ok.payload.to_bytes(), type=_Status)
-                    return tuple(action.name for action in status.manifest.action)
-        return ()
+                    return status.manifest
+        return None
 
     def _edge_is_there(self) -> bool:
         """Its token is seen, or it answers: the board's Zenoh can lose the token for a while."""

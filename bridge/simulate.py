@@ -14,7 +14,14 @@ from bridge.arguments import add_tls, add_vehicle_id, add_wait_edge, add_where, 
 from bridge.clock import Clock
 from bridge.clocks import CLOCKS, REALTIME, running_clock
 from bridge.command_check import CommandCheck
-from bridge.environments import CONDITIONS, NOMINAL, SCENARIOS, make_environment, scenario_of
+from bridge.environments import (
+    CONDITIONS,
+    NOMINAL,
+    SCENARIOS,
+    make_environment,
+    scenario_of,
+    task_of,
+)
 from bridge.episode import EpisodeRunner
 from bridge.feedback_check import FeedbackCheck
 from bridge.port import SimulatorPort, open_port
@@ -28,7 +35,7 @@ from edge_runtime.files import check_writable
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.option_types import not_negative, positive
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.topics import check_vehicle_id
+from edge_runtime.topics import CONTROL_PERIOD_S, check_vehicle_id
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 
@@ -189,7 +196,9 @@ def _drive(
         standing=settings.standing,
         # Copies, made at once: other threads go on counting.
         rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
+        task=task_of(environment, settings.env),
     )
+    _meet(settings, environment, port, runner)
     results = []
     port.note_edge_counts()
     started_s = time.monotonic()
@@ -219,6 +228,26 @@ def _drive(
         settings={**_as_asked(settings), "policy_ids": check.policy_ids, "wall_s": wall_s},
         vehicle=vehicle.report() if vehicle else None,
     )
+
+
+def _meet(
+    settings: SimulateSettings,
+    environment: gymnasium.Env[Any, Any],
+    port: SimulatorPort,
+    runner: EpisodeRunner,
+) -> None:
+    """Compare tasks with the edge runtime; UserError where its policy is for another one."""
+    manifest = port.edge_manifest()
+    if manifest is None:
+        return  # It compares by itself what the states say.
+    task = task_of(environment, settings.env, manifest)
+    if manifest.task != task:
+        runner.show_task(settings.seed)
+        time.sleep(CONTROL_PERIOD_S)  # Its safe stop still finds this end of the wire.
+        raise UserError(
+            f"the edge runtime's policy is for another task ({manifest.task}) than --env"
+            f" {settings.env} ({task}); start it with a policy of this one, or choose another --env"
+        )
 
 
 def _as_asked(settings: SimulateSettings) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import math
 from typing import List, NamedTuple, Optional, Sequence
 
 import numpy as np
+from msgspec import UNSET
 
 from edge_runtime import safety as rules
 from edge_runtime.limiter import LimitRow, limit_action, neutral_action, stop_action
@@ -41,12 +42,17 @@ class Controller:
     """
 
     def __init__(
-        self, rows: Sequence[LimitRow], needs_rearm: bool, armed_at_start: bool = True
+        self,
+        rows: Sequence[LimitRow],
+        needs_rearm: bool,
+        armed_at_start: bool = True,
+        task: str = "",
     ) -> None:
         self.safety = Safety()
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
         self._policy_is_dead = False
+        self._task = task  # the policy's; states that name another one are a fault
         self._rows = rows
         self._needs_rearm = needs_rearm
         self._last_action = neutral_action(rows)
@@ -170,6 +176,9 @@ class Controller:
         return numbers
 
     def _event_of(self, wanted: List[float]) -> Event:
+        assert self._newest is not None
+        if self._task and self._newest.state.task not in (UNSET, self._task):
+            return Event.OTHER_TASK
         if not wanted:
             return Event.FAILED
         # One or two numbers: numpy would take ten times as long for them.
@@ -177,7 +186,6 @@ class Controller:
             return Event.NOT_FINITE
         if self.vehicle_fault:
             return Event.VEHICLE
-        assert self._newest is not None
         return rules.classify_fresh(self.safety, self._newest.state.final, self._needs_rearm)
 
     def _give_up(self, now_s: float) -> Order:

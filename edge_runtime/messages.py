@@ -43,7 +43,10 @@ class Rejection(NamedTuple):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the simulator sees at one step. `frames`: 2x45x80 uint8 in C order, [t-1, t]."""
+    """What the simulator sees at one step. `frames`: 2x45x80 uint8 in C order, [t-1, t].
+
+    `task` is what its environment is for, as `manifest.task_text` says it; left out where unknown.
+    """
 
     session: str
     episode: int
@@ -53,6 +56,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     frames: bytes
     speed_mps: float
     final: bool
+    task: Union[str, msgspec.UnsetType] = msgspec.UNSET
     schema: int = SCHEMA
 
     def frames_array(self) -> np.ndarray:

@@ -60,7 +60,8 @@ def _run(config: Config) -> int:
     vehicle = make_vehicle(config.vehicle, config.vehicle_setup(policy.manifest.scenario))
     with _closed_on_error(vehicle):
         rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
-    controller = Controller(rows, vehicle is not None, config.armed_at_start)
+    task = policy.manifest.task
+    controller = Controller(rows, vehicle is not None, config.armed_at_start, task)
     return _serve(config, tls, policy, controller, vehicle, stop)
 
 

@@ -42,6 +42,7 @@ class Event(str, Enum):
     TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than SILENCE_S
     PAUSED = "pause_too_long"  # a vehicle stood by for more than MAX_PAUSE_S
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
+    OTHER_TASK = "other_task"  # the state is of another task than the policy
     NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
     VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
     REARM = "rearm"  # an operator allows driving again
@@ -60,6 +61,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_S, Event.TOO_LONG): _X,
     (_S, Event.PAUSED): _X,
     (_S, Event.OTHER_SESSION): _X,
+    (_S, Event.OTHER_TASK): _X,
     (_S, Event.NOT_ARMED): _X,
     (_S, Event.VEHICLE): _X,
     (_S, Event.REARM): _S,
@@ -73,6 +75,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_D, Event.TOO_LONG): _X,
     (_D, Event.PAUSED): _X,
     (_D, Event.OTHER_SESSION): _X,
+    (_D, Event.OTHER_TASK): _X,
     (_D, Event.NOT_ARMED): _X,
     (_D, Event.VEHICLE): _X,
     (_D, Event.REARM): _D,
@@ -86,6 +89,7 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_X, Event.TOO_LONG): _X,
     (_X, Event.PAUSED): _X,
     (_X, Event.OTHER_SESSION): _X,
+    (_X, Event.OTHER_TASK): _X,
     (_X, Event.NOT_ARMED): _X,
     (_X, Event.VEHICLE): _X,
     (_X, Event.REARM): _X,  # a fresh state must follow
@@ -98,6 +102,7 @@ FAULTS = (
     Event.TOO_LONG,
     Event.PAUSED,
     Event.OTHER_SESSION,
+    Event.OTHER_TASK,
     Event.NOT_ARMED,
     Event.VEHICLE,
 )

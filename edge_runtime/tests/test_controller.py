@@ -77,6 +77,16 @@ def test_a_nan_stops_with_the_very_state_and_every_further_one():
     assert [o.answers.state.step for o in orders] == list(range(1, 9))
 
 
+def test_states_of_another_task_stop_for_as_long_as_they_come():
+    controller = make(task="left_turn, pedal -1 to 1")
+    assert answer(controller, 0, 0.0).mode == "drive"  # an older simulator does not say
+    assert answer(controller, 1, 0.1, task="left_turn, pedal -1 to 1").mode == "drive"
+    other = {"task": "congestion, steering -1 to 1"}
+    orders = [answer(controller, step, step * 0.1, **other) for step in range(2, 9)]
+    orders.append(answer(controller, 9, 0.9, NAN, final=True, **other))
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", "other_task")}
+
+
 @pytest.mark.parametrize(
     "output",
     [None, NAN.astype(np.float64), np.float32(0.5), GOOD[:0], GOOD.reshape(1, 1), np.tile(GOOD, 2),

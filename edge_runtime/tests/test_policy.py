@@ -18,8 +18,10 @@ import edge_runtime
 from edge_runtime import signature
 from edge_runtime.errors import UserError
 from edge_runtime.inference import infer
+from edge_runtime.manifest import task_text
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import PEDAL, STEERING, public_pem, write_policy
+from edge_runtime.wire import MAX_TEXT_CHARS
 
 KEY = Ed25519PrivateKey.generate()
 
@@ -76,6 +78,14 @@ def test_a_policy_from_before_with_an_id_in_its_manifest_still_drives(scenario):
     policy = load_policy(path, root / "policy.pub")
     assert policy.trust == signature.VERIFIED
     assert policy.policy_id == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_the_task_is_scenario_and_actions_and_fits_the_wire(tmp_path):
+    half = type(PEDAL)(name="steering", meaning="m", unit="u", low=-0.5, high=0.25)
+    write_policy(tmp_path / "p.onnx", value=0.1, actions=(PEDAL, half))
+    manifest = load_policy(tmp_path / "p.onnx", allow_unsigned=True).manifest
+    assert manifest.task == "left_turn, pedal -1 to 1, steering -0.5 to 0.25"
+    assert len(task_text("s" * 300, [])) == MAX_TEXT_CHARS
 
 
 def test_two_actions(tmp_path):

@@ -158,6 +158,17 @@ def test_an_answer_of_the_wrong_shape_stops_and_is_no_last_word(edge_and_simulat
     assert "Traceback" not in edge.log
 
 
+def test_states_of_another_task_are_answered_with_a_safe_stop(edge_and_simulator):
+    edge, simulator = edge_and_simulator()
+    for step in range(3):
+        command = simulator.ask(make_state(step, task="congestion, steering -1 to 1"))
+        assert (command.mode, command.reason) == ("safe_stop", "other_task")
+    own = drive(simulator, range(3, 23), task="left_turn, pedal -1 to 1")
+    assert "drive" in {command.mode for command in own}
+    assert edge.end() == 0
+    assert "reason=other_task" in edge.log
+
+
 def test_an_inference_that_takes_too_long_stops_while_it_runs(edge_and_simulator):
     _, simulator = edge_and_simulator("slow")
     assert simulator.ask(make_state(0)).mode == "drive"

@@ -39,6 +39,7 @@ EXPECTED = {
     Event.TOO_LONG: (STOP, STOP, STOP),
     Event.PAUSED: (STOP, STOP, STOP),
     Event.OTHER_SESSION: (STOP, STOP, STOP),
+    Event.OTHER_TASK: (STOP, STOP, STOP),
     Event.NOT_ARMED: (STOP, STOP, STOP),
     Event.VEHICLE: (STOP, STOP, STOP),
     Event.REARM: (STANDBY, DRIVE, STOP),
@@ -50,7 +51,7 @@ GOOD = {"fresh_state", "recovered", "final_state"}
 BAD = {
     "no_fresh_state", "output_not_finite", "inference_failed", "policy_thread_dead",
     "inference_too_long",
-    "pause_too_long", "other_session", "not_armed", "vehicle_fault",
+    "pause_too_long", "other_session", "other_task", "not_armed", "vehicle_fault",
 }  # fmt: skip
 
 
