@@ -245,8 +245,8 @@ def _meet(
         runner.show_task(settings.seed)
         time.sleep(CONTROL_PERIOD_S)  # Its safe stop still finds this end of the wire.
         raise UserError(
-            f"the edge runtime's policy is for another task ({manifest.task}) than --env"
-            f" {settings.env} ({task}); start it with a policy of this one, or choose another --env"
+            f"the edge runtime's policy is for another task ({manifest.task!r}) than --env"
+            f" {settings.env} ({task!r}); start it with a policy of this, or choose another --env"
         )
 
 

@@ -112,7 +112,7 @@ def test_a_foreign_environment_refuses_another_number_of_actions(tmp_path):
     policy = policy_of(tmp_path, "left_turn", PEDAL, STEERING)
     endpoint, out = free_endpoint(), tmp_path / "never.json"
     with start_edge(endpoint, policy), start_simulate(endpoint, out, TOY) as run:
-        refused(run, out, "(left_turn, pedal -1 to 1)", "steering")
+        refused(run, out, "('left_turn, pedal -1 to 1')", "steering")
 
 
 def test_another_runtime_in_the_middle_of_a_drive_ends_it(tmp_path):
