@@ -19,6 +19,7 @@ from edge_runtime.link import Link
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import Policy, load_policy
 from edge_runtime.sd_notify import Notifier
+from edge_runtime.signals import ending_signals
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.interface import Vehicle
@@ -28,12 +29,12 @@ from edge_runtime.wire import key
 
 
 class StopSignal:
-    """SIGTERM and SIGINT: remembered from the start, handed on once there is a loop to stop."""
+    """Whatever would end it: remembered from the start, handed on once there is a loop to stop."""
 
     def __init__(self) -> None:
         self.came = False
         self.on_stop: Callable[[], None] = lambda: None
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in {signal.SIGTERM, signal.SIGINT, *ending_signals()}:
             signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: Any) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
 import time
 
 import pytest
 
 from edge_runtime.tests.harness import (
     BLACK,
+    PATIENCE_S,
     WHITE,
     EdgeProcess,
     Simulator,
@@ -87,6 +89,38 @@ def test_lock_step_drives_from_the_first_state_and_ends_cleanly(edge_and_simulat
     assert time.monotonic() - begun_s < 5.0
     assert "Traceback" not in edge.log
     wait_until(lambda: not simulator.alive.is_set(), "the token is gone")
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGABRT, signal.SIGRTMIN]
+)
+def test_every_signal_that_would_end_it_in_mid_drive_is_a_stop(edge_and_simulator, number):
+    ours = signal.signal(number, signal.SIG_DFL)  # under nohup SIGHUP would be ignored
+    try:
+        edge, simulator = edge_and_simulator("constant", "--vehicle", "mock")
+    finally:
+        signal.signal(number, ours)
+    drive(simulator, range(5))
+    edge.process.send_signal(number)
+    last = wait_until(
+        lambda: next((c for c in simulator.drain() if c.reason == "runtime_ended"), None),
+        "a last safe stop",
+    )
+    assert (last.mode, last.action) == ("safe_stop", [-1.0])
+    _, log = edge.process.communicate(timeout=PATIENCE_S)
+    assert edge.process.returncode == 0
+    assert " ended " in log
+
+
+def test_a_hangup_that_is_ignored_from_the_start_stays_so(edge_and_simulator):
+    ours = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        edge, simulator = edge_and_simulator()
+    finally:
+        signal.signal(signal.SIGHUP, ours)
+    edge.process.send_signal(signal.SIGHUP)
+    assert simulator.ask(make_state(0, final=True)).mode == "drive"
+    assert edge.end() == 0
 
 
 def test_the_process_imports_nothing_of_the_workstation(make_policy, tmp_path):
