@@ -135,6 +135,7 @@ class Controller:
             # Kept for later, the permission would move the vehicle when the link returns.
             return "no fresh states arrive; re-arm when the link is back"
         self._apply(Event.REARM)
+        self.safety = self.safety._replace(permitted_s=now_s)
         return ""
 
     def farewell(self) -> Optional[Order]:
