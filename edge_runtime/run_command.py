@@ -8,6 +8,7 @@ import gc
 import os
 import signal
 import sys
+from functools import partial
 from typing import Any, Callable, Iterator, Optional
 
 from edge_runtime import access, log, presence, realtime
@@ -91,15 +92,15 @@ def _serve(
     vehicle: Optional[Vehicle],
     stop: StopSignal,
 ) -> int:
-    def open_client() -> Any:
-        return open_session(connect=config.connect, mode="client", tls=tls)
-
+    # Both of its sessions hear only whom this vehicle's edge may hear.
+    rules = None if tls is None else access.rules_for_edge(config.vehicle_id)
+    connected = partial(open_session, connect=config.connect, tls=tls, access=rules)
+    open_client = partial(connected, mode="client")
     notifier = Notifier()
     with _closed_on_error(vehicle):
         alive = key(config.vehicle_id, "alive")
         router_is_there = presence.require_free(open_client, alive, config.vehicle_id)
-        rules = None if tls is None else access.rules_for_edge(config.vehicle_id)
-        session = open_session(connect=config.connect, mode="peer", tls=tls, access=rules)
+        session = connected(mode="peer")
         try:
             link = Link(session, config.vehicle_id, policy.manifest)
             runner = _attach(vehicle, policy, link)
