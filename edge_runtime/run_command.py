@@ -26,6 +26,7 @@ from edge_runtime.transport import open_session
 from edge_runtime.vehicles.interface import Vehicle
 from edge_runtime.vehicles.registry import make_vehicle
 from edge_runtime.vehicles.runner import VehicleRunner
+from edge_runtime.waiting import Waiting, why_no_state
 from edge_runtime.wire import key
 
 
@@ -116,6 +117,8 @@ def _serve(
         loop.stop()
 
     stop.on_stop = loop.stop
+    why = partial(why_no_state, session, config.connect, config.vehicle_id, tls)
+    waiting = Waiting(loop.has_heard, why)
     # What is loaded stays: the collector need not look at it again in the middle of a drive.
     gc.collect()
     gc.freeze()
@@ -127,10 +130,12 @@ def _serve(
             presence.wait_for_router(session)
         link.appear(open_client, give_way)
         _say_ready(config, policy, tls)
+        waiting.start(bool(session.info.routers_zid()))
         notifier.ready(controller.safety.mode.value)
         if not stop.came:
             loop.run()
     finally:
+        waiting.stop()
         notifier.stopping()
         ended = loop.close()
         if runner is not None:

@@ -302,6 +302,27 @@ def test_it_waits_for_a_simulator_and_ends_without_one(make_policy):
         assert edge.end() == 0
 
 
+def test_it_says_at_once_and_again_what_it_waits_for(make_policy):
+    with EdgeProcess(*make_policy().flags, "--connect", "tcp/127.0.0.1:1") as edge:
+        assert edge.process.stderr is not None
+        waits = (line for line in edge.process.stderr if " waiting " in line)
+        begun_s = time.monotonic()
+        for _ in range(2):
+            assert "nobody listens on port 1 of 127.0.0.1 (connection refused)" in next(waits)
+        assert 4.0 < time.monotonic() - begun_s < 15.0
+        assert edge.end() == 0
+
+
+def test_a_simulator_of_another_vehicle_is_named_as_what_it_waits_for(make_policy):
+    endpoint = free_endpoint()
+    flags = [*make_policy().flags, "--connect", endpoint]
+    with Simulator(endpoint, "hunter02"), EdgeProcess(*flags) as edge:
+        assert edge.process.stderr is not None
+        line = next(line for line in edge.process.stderr if " waiting " in line)
+        assert f"{endpoint} is there, and has sent no state for vehicle id hunter01" in line
+        assert edge.end() == 0
+
+
 def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
     endpoint = free_endpoint()
     with EdgeProcess(*make_policy().flags, "--connect", endpoint):

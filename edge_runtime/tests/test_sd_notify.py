@@ -93,11 +93,12 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
         assert systemd.until("STOPPING")[-1] == "STOPPING=1"
         assert edge.end() == 0
     lines = [json.loads(line) for line in edge.log.splitlines()]
-    assert [line["event"] for line in lines] == ["not_permitted", "ended"]
+    assert [line["event"] for line in lines] == ["not_permitted", "waiting", "ended"]
     assert list(lines[0])[:3] == ["time", "level", "event"]
     assert (lines[0]["level"], lines[0]["key"], lines[0]["value"]) == ("warning", "cpus", [4095])
     assert "this process may use" in lines[0]["help"]
-    assert lines[1]["accepted"] == 0
+    assert "connection refused" in lines[1]["why"]
+    assert lines[2]["accepted"] == 0
 
 
 class FakePolicy:
