@@ -113,7 +113,7 @@ class SimulatorPort:
         """Return the names of the actions of the edge runtime's policy; none if it says nothing."""
         for reply in self._status_replies():
             if reply.ok is not None:
-                with contextlib.suppress(msgspec.MsgspecError):
+                with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
                     status = msgspec.json.decode(reply.ok.payload.to_bytes(), type=_Status)
                     return tuple(action.name for action in status.manifest.action)
         return ()

@@ -8,7 +8,7 @@ from typing import Any, Dict, Optional
 
 from edge_runtime import access
 from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable, write_json
+from edge_runtime.files import check_writable, parse_json, write_json
 from edge_runtime.status_table import render_status
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import check_endpoint, open_session
@@ -50,13 +50,21 @@ def ask(
     try:
         for reply in session.get(selector, timeout=_TIMEOUT_S):
             if reply.ok is not None:
-                return dict(json.loads(bytes(reply.ok.payload)))
+                answer = parse_json(bytes(reply.ok.payload), f"the answer of {vehicle_id}")
+                return _checked(answer, topic, vehicle_id)
     finally:
         session.close()
     raise UserError(
         f"no edge runtime with vehicle id {vehicle_id} is connected to {connect};"
         " start one, or name it with --vehicle-id" + _hint(tls, topic)
     )
+
+
+def _checked(answer: Any, topic: str, vehicle_id: str) -> Dict[str, Any]:
+    needed = {"accepted", "detail"} if topic == "rearm" else {"manifest", "policy_id"}
+    if not isinstance(answer, dict) or not needed <= set(answer):
+        raise UserError(f"what answers for {vehicle_id} is no edge runtime")
+    return answer
 
 
 def _hint(tls: Optional[TlsFiles], topic: str) -> str:
