@@ -11,7 +11,7 @@ import errno
 import json
 import re
 import socket
-from typing import Any, Dict, List, Optional, Sequence, Union
+from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
@@ -162,6 +162,19 @@ def _explain(text: str, listens: List[str], connect: Optional[str], tls: Optiona
         f"nobody answers at {connect}{why and f': {why}'}; start the simulator first, or name its"
         " address with --connect"
     )
+
+
+def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
+    """A subscriber's callback that takes only what was put to this very key.
+
+    Zenoh gives it whatever intersects: a put to `phil/*/state` comes to every vehicle.
+    """
+
+    def take(sample: zenoh.Sample) -> None:
+        if str(sample.key_expr) == key:
+            hear(sample)
+
+    return take
 
 
 def free_endpoint(protocol: str = "tcp") -> str:

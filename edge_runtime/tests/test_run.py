@@ -211,6 +211,16 @@ def test_bad_states_are_counted_by_reason_and_not_answered(edge_and_simulator):
     assert simulator.drain() == []
 
 
+def test_a_state_that_was_put_to_every_vehicle_is_not_its_own(edge_and_simulator):
+    _, simulator = edge_and_simulator()
+    wild = ("phil/*/state", "phil/hunter$*/state", "*/hunter01/state", "**/state")
+    for number, key in enumerate(wild):
+        simulator.send(make_state(number), key)
+    assert simulator.ask(make_state(0)).mode == "drive"
+    health = last_health(simulator, lambda h: h.accepted == 1)
+    assert health.rejected == {}
+
+
 def test_a_second_simulator_is_rejected_until_the_first_is_silent(edge_and_simulator):
     _, simulator = edge_and_simulator()
     for step in range(10):
