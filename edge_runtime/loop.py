@@ -143,7 +143,7 @@ class ControlLoop:
                 uptime_s=time.monotonic() - self._started_s,
                 sent_ns=time.time_ns(),
                 rivals=self._link.rivals,
-                vehicle_fault=self._controller.vehicle_fault[:MAX_TEXT_CHARS],
+                vehicle_fault=self._controller.vehicle_words[:MAX_TEXT_CHARS],
                 **self._board.last._asdict(),
             )
 

@@ -163,6 +163,29 @@ def test_a_vehicle_at_fault_stops_at_the_next_tick_and_is_not_rearmed():
     assert modes[-1] == "drive"
 
 
+def test_what_stopped_a_vehicle_is_said_until_it_is_rearmed_though_it_has_passed():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0)
+    controller.vehicle_fault = "vehicle_lying"
+    controller.tick(0.01)
+    controller.vehicle_fault = "vehicle_silent"
+    answer(controller, 1, 0.1)
+    assert controller.vehicle_words == "vehicle_silent"
+    controller.vehicle_fault = ""
+    for step in range(2, 6):
+        answer(controller, step, step * 0.1)
+        assert controller.vehicle_words == "vehicle_lying"  # the first of them
+    controller.tick(1.0)
+    assert (controller.safety.reason, controller.vehicle_words) == (
+        "no_fresh_state",
+        "vehicle_lying",
+    )
+    for step in range(11, 16):
+        answer(controller, step, step * 0.1)
+    assert controller.rearm(1.51) == ""
+    assert controller.vehicle_words == ""
+
+
 def test_a_vehicle_at_fault_never_begins_to_drive():
     controller = make(needs_rearm=True)
     controller.vehicle_fault = "vehicle_lying"

@@ -9,6 +9,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 from types import SimpleNamespace
 from typing import Any, List
 
@@ -188,6 +189,21 @@ def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     finally:
         vehicle.released.set()
         runner.close()
+
+
+def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
+    vehicle = BrokenVehicle()
+    runner = VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
+    control, link, _ = running(Notifier({}), runner)
+    runner.start()
+    link.state_comes(encode(make_state(0)))
+    vehicle.says = ["the battery is hot"]
+    wait_until(lambda: control.health().reason == "vehicle_fault", "the safe stop")
+    vehicle.says = []
+    wait_until(lambda: not runner.fault(time.monotonic()), "the end of the fault")
+    time.sleep(0.2)
+    assert control.health().vehicle_fault == "the battery is hot"
+    runner.close()
 
 
 def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):
