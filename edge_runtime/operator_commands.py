@@ -15,6 +15,7 @@ from edge_runtime.transport import check_endpoint, open_session
 from edge_runtime.wire import key
 
 _TIMEOUT_S = 2.0
+_STRANGER = "what answers for {} is no edge runtime of this kind"
 
 
 def status(arguments: argparse.Namespace) -> int:
@@ -23,7 +24,10 @@ def status(arguments: argparse.Namespace) -> int:
         check_writable(arguments.out)
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
-    print(json.dumps(reply, indent=2) if arguments.json else render_status(reply))
+    try:
+        print(json.dumps(reply, indent=2) if arguments.json else render_status(reply))
+    except (LookupError, TypeError, ValueError, AttributeError):
+        raise UserError(_STRANGER.format(arguments.vehicle_id)) from None
     if arguments.out is not None:
         write_json(arguments.out, reply)
     return 0
@@ -35,8 +39,9 @@ def rearm(arguments: argparse.Namespace) -> int:
     if tls is not None:
         access.check_name(tls.name, access.common_name(access.OPERATOR, arguments.vehicle_id))
     reply = ask(arguments.connect, arguments.vehicle_id, "rearm", tls)
-    if not reply["accepted"]:
-        raise UserError(f"{arguments.vehicle_id} was not re-armed: {reply['detail']}")
+    if reply.get("accepted") is not True:
+        why = reply.get("detail", "it does not say why")
+        raise UserError(f"{arguments.vehicle_id} was not re-armed: {why}")
     print(f"{arguments.vehicle_id} is re-armed; it drives after 5 fresh states in a row")
     return 0
 
@@ -51,20 +56,15 @@ def ask(
         for reply in session.get(selector, timeout=_TIMEOUT_S):
             if reply.ok is not None:
                 answer = parse_json(bytes(reply.ok.payload), f"the answer of {vehicle_id}")
-                return _checked(answer, topic, vehicle_id)
+                if not isinstance(answer, dict):
+                    raise UserError(_STRANGER.format(vehicle_id))
+                return answer
     finally:
         session.close()
     raise UserError(
         f"no edge runtime with vehicle id {vehicle_id} is connected to {connect};"
         " start one, or name it with --vehicle-id" + _hint(tls, topic)
     )
-
-
-def _checked(answer: Any, topic: str, vehicle_id: str) -> Dict[str, Any]:
-    needed = {"accepted", "detail"} if topic == "rearm" else {"manifest", "policy_id"}
-    if not isinstance(answer, dict) or not needed <= set(answer):
-        raise UserError(f"what answers for {vehicle_id} is no edge runtime")
-    return answer
 
 
 def _hint(tls: Optional[TlsFiles], topic: str) -> str:

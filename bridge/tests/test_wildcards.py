@@ -34,7 +34,8 @@ def put_wildly(session, topic):
 
 def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
     _, router, client = sessions
-    port, heard = SimulatorPort(router, "v1"), []
+    port = SimulatorPort(router, "v1")
+    heard: list[bytes] = []
     port.on_command(heard.append)
     port.on_feedback(heard.append)
     time.sleep(HEARS_S)
