@@ -61,7 +61,7 @@ class EdgeCounts:
         """Take the JSON answer to the status query, which holds the fields of a health message."""
         try:
             self.observe(msgspec.json.decode(payload, type=Health))
-        except msgspec.MsgspecError:
+        except (msgspec.MsgspecError, ValueError, RecursionError):
             return
 
     def observe(self, health: Health) -> None:

@@ -72,7 +72,7 @@ def build_parser() -> ArgumentParser:
         return added
 
     _add_check(add("check", "may this policy drive, and how fast is it here"))
-    _add_run(add("run", "answer states with commands until SIGTERM or ^C"))
+    _add_run(add("run", "answer states with commands until a signal ends it"))
     _add_operator(add("status", "print how a running edge runtime is"), with_out=True)
     _add_operator(add("rearm", "let a vehicle drive again after a safe stop"), with_out=False)
     return parser

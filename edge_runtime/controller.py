@@ -53,6 +53,7 @@ class Controller:
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
         self._policy_is_dead = False
         self._task = task  # the policy's; states that name another one are a fault
+        self._latched_fault = ""  # what stopped it, until it is re-armed
         self._rows = rows
         self._needs_rearm = needs_rearm
         self._last_action = neutral_action(rows)
@@ -68,6 +69,11 @@ class Controller:
         """Whether only an operator can let it drive again."""
         stopped = self.safety.mode is Mode.SAFE_STOP
         return self._needs_rearm and stopped and not self.safety.rearmed
+
+    @property
+    def vehicle_words(self) -> str:
+        """What is wrong with the vehicle; where that has passed, what has stopped it."""
+        return self.vehicle_fault or self._latched_fault
 
     def begin(self, received: Received, now_s: float) -> None:
         """The policy starts on the newest state."""
@@ -160,6 +166,7 @@ class Controller:
             # Kept for later, the permission would move the vehicle when the link returns.
             return "no fresh states arrive; re-arm when the link is back"
         self._apply(Event.REARM)
+        self.safety = self.safety._replace(permitted_s=now_s)
         return ""
 
     def farewell(self) -> Optional[Order]:
@@ -209,3 +216,7 @@ class Controller:
 
     def _apply(self, event: Event) -> None:
         self.safety = rules.advance(self.safety, event)
+        if event is Event.VEHICLE:
+            self._latched_fault = self._latched_fault or self.vehicle_fault
+        elif event is Event.REARM or self.safety.mode is not Mode.SAFE_STOP:
+            self._latched_fault = ""

@@ -2,22 +2,51 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import stat
 import tempfile
 from pathlib import Path
-from typing import Any, Union
+from typing import Any, BinaryIO, Dict, Union
+
+import msgspec
 
 from edge_runtime.errors import UserError
 
 PathLike = Union[str, "os.PathLike[str]"]
 
 
+MAX_FILE_MIB = 64
+"""More than any policy, certificate, configuration or report needs."""
+
+
+def open_regular(path: PathLike) -> BinaryIO:
+    """Open an existing file to read; OSError where it cannot be, or is no regular file.
+
+    A pipe would be waited for, and a device may have no end.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise OSError(errno.EINVAL, "it is no regular file", str(path))
+
+
 def read_bytes(path: PathLike, what: str) -> bytes:
-    """The bytes of an existing file. `what` names it in the error, as in "policy file"."""
+    """The bytes of an existing regular file. `what` names it in the error, as in "policy file".
+
+    Raises UserError where it cannot be read, or holds more than MAX_FILE_MIB.
+    """
+    limit = MAX_FILE_MIB << 20
     try:
-        return Path(path).read_bytes()
+        with open_regular(path) as stream:
+            # The size first; and no more than that, for a file of /proc has none.
+            is_small = os.fstat(stream.fileno()).st_size <= limit
+            data = stream.read(limit + 1) if is_small else b""
     except FileNotFoundError:
         raise UserError(f"{what} {path} does not exist") from None
     except IsADirectoryError:
@@ -26,6 +55,32 @@ def read_bytes(path: PathLike, what: str) -> bytes:
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
     except ValueError as error:  # a NUL inside the name
         raise UserError(f"{what} {path!r} is not a file name: {error}") from None
+    if not is_small or len(data) > limit:
+        raise UserError(f"{what} {path} is larger than {MAX_FILE_MIB} MiB")
+    return data
+
+
+def read_json(path: PathLike, what: str) -> Any:
+    """The value in a JSON file. Raises UserError where there is none."""
+    return parse_json(read_bytes(path, what), f"{what} {path}")
+
+
+def parse_json(data: bytes, what: str) -> Any:
+    """The value of a JSON text. Raises UserError where it is none, or nested too deep."""
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{what} is not JSON: {error}") from None
+
+
+def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
+    """The tables of a TOML file. Raises UserError where it is none, or nested too deep."""
+    data = read_bytes(path, what)
+    try:
+        tables: Dict[str, Any] = msgspec.toml.decode(data)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise UserError(f"{what} {path} is no TOML: {error}") from None
+    return tables
 
 
 def write_atomic(path: PathLike, data: bytes | memoryview) -> None:

@@ -120,6 +120,10 @@ class ControlLoop:
             self._send(self._controller.farewell())
         return not self._worker.is_alive()
 
+    def has_heard(self) -> bool:
+        """Whether any state has come, also one that was rejected."""
+        return bool(self._latest.accepted or self._latest.rejected)
+
     def health(self) -> Health:
         """The message of the health topic and of the status query."""
         with self._lock:
@@ -141,7 +145,7 @@ class ControlLoop:
                 uptime_s=time.monotonic() - self._started_s,
                 sent_ns=time.time_ns(),
                 rivals=self._link.rivals,
-                vehicle_fault=self._controller.vehicle_fault[:MAX_TEXT_CHARS],
+                vehicle_fault=self._controller.vehicle_words[:MAX_TEXT_CHARS],
                 **self._board.last._asdict(),
             )
 

@@ -115,7 +115,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     p99 and max over the last 1,024 (0 before the first). `superseded` counts accepted states that
     a newer one replaced before the policy took them, `rivals` other runtimes that were seen under
     this vehicle id. `temperature_c` is the board's hottest sensor, None where it has none.
-    `vehicle_fault` is what is wrong with the vehicle in words, empty if nothing.
+    `vehicle_fault` is what is wrong with the vehicle in words, or what has stopped it and waits for
+    a re-arm; empty if nothing.
     """
 
     vehicle_id: str

@@ -71,7 +71,7 @@ def holder(path: Path) -> str:
     try:
         who = json.loads(path.read_bytes())
         return f"process {who['pid']} on {who['host']}"
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return "another process"
 
 

@@ -8,10 +8,8 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from types import FrameType
 from typing import NamedTuple
 from urllib.parse import quote
 
@@ -20,6 +18,7 @@ import rerun.blueprint as rrb
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import behind_link, check_writable
+from edge_runtime.signals import sigterm_as_interrupt
 
 LOOPBACK = "127.0.0.1"
 GRPC_PORT = 9876
@@ -73,7 +72,7 @@ def open_sink(
     is to be finished, and a server not to be left behind.
     """
     recording = rr.RecordingStream(application)
-    with _sigterm_as_interrupt(), _opened(recording, sink, blueprint):
+    with sigterm_as_interrupt(), _opened(recording, sink, blueprint):
         yield recording
 
 
@@ -83,23 +82,6 @@ def _opened(
     if sink.path:
         return save_to(recording, sink.path, blueprint)
     return (serve_page if sink.kind == SERVE else spawn_window)(recording, blueprint)
-
-
-@contextlib.contextmanager
-def _sigterm_as_interrupt() -> Iterator[None]:
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @contextlib.contextmanager

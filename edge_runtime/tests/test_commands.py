@@ -173,3 +173,19 @@ def test_a_busy_port_is_named():
 def test_malformed_endpoints(endpoint):
     with pytest.raises(UserError, match="write it as"):
         open_session(connect=endpoint)
+
+
+@pytest.mark.parametrize(
+    "answer", [b"[" * 100_000, b"3", b"\xff", b"{}", b'{"vehicle_id": 1, "manifest": 3}']
+)
+def test_a_stranger_that_answers_for_the_runtime_is_one_line(answer):
+    endpoint = free_endpoint()
+    session = open_session(listen=endpoint, mode="router")
+    for topic in ("status", "rearm"):
+        queryable = session.declare_queryable(
+            f"phil/hunter01/{topic}", lambda query: query.reply(query.key_expr, answer)
+        )
+        done = run_command(topic, "--connect", endpoint)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+        queryable.undeclare()
+    session.close()

@@ -94,11 +94,12 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
         assert systemd.until("STOPPING")[-1] == "STOPPING=1"
         assert edge.end() == 0
     lines = [json.loads(line) for line in edge.log.splitlines()]
-    assert [line["event"] for line in lines] == ["not_permitted", "ended"]
+    assert [line["event"] for line in lines] == ["not_permitted", "waiting", "ended"]
     assert list(lines[0])[:3] == ["time", "level", "event"]
     assert (lines[0]["level"], lines[0]["key"], lines[0]["value"]) == ("warning", "cpus", [4095])
     assert "this process may use" in lines[0]["help"]
-    assert lines[1]["accepted"] == 0
+    assert "connection refused" in lines[1]["why"]
+    assert lines[2]["accepted"] == 0
 
 
 class FakePolicy:
@@ -212,6 +213,21 @@ def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     finally:
         vehicle.released.set()
         runner.close()
+
+
+def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
+    vehicle = BrokenVehicle()
+    runner = VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
+    control, link, _ = running(Notifier({}), runner)
+    runner.start()
+    link.state_comes(encode(make_state(0)))
+    vehicle.says = ["the battery is hot"]
+    wait_until(lambda: control.health().reason == "vehicle_fault", "the safe stop")
+    vehicle.says = []
+    wait_until(lambda: not runner.fault(time.monotonic()), "the end of the fault")
+    time.sleep(0.2)
+    assert control.health().vehicle_fault == "the battery is hot"
+    runner.close()
 
 
 def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):

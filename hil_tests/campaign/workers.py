@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import queue
 import shlex
 import tempfile
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_json
 from edge_runtime.transport import free_endpoint
 from hil_tests.campaign.chunks import Chunk, Task, halve, join_reports
 from hil_tests.commands import BackgroundCommand, CommandTimeoutError
@@ -127,7 +126,7 @@ class _Worker:
         here = ("--listen", self._endpoint, "--vehicle-id", VEHICLE, "--out", str(self._report))
         with BackgroundCommand(*arguments, *here, quiet=True) as simulator:
             simulator.wait(CHUNK_LIMIT_S)
-        report: dict[str, Any] = json.loads(read_bytes(self._report, "report"))
+        report: dict[str, Any] = read_json(self._report, "report")
         return {**report, "command": f"python -m {shlex.join(arguments)}"}
 
 

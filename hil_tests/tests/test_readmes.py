@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT
+
 ROOT = Path(__file__).parents[2]
 READMES = sorted(
     path.relative_to(ROOT)
@@ -28,3 +30,9 @@ def test_links_and_kept_files_exist_and_nothing_is_left_to_fill_in(readme):
     for path in kept:
         assert (ROOT / path).exists(), path
     assert "<!--" not in text
+
+
+def test_security_names_every_port_that_speaks_plain_text_beside_tls():
+    text = (ROOT / "SECURITY.md").read_text()
+    assert f"`{DEFAULT_ROS2_ENDPOINT}`" in text
+    assert "--vehicle ros2" in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import tempfile
 from collections.abc import Mapping
@@ -10,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_json
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand
 from hil_tests.faults.chassis import free_bus
@@ -78,5 +77,5 @@ def _simulate(drive: Drive, endpoint: str, out: Path) -> dict[str, Any]:
     here = ("--listen", endpoint, "--vehicle-id", VEHICLE_ID, "--out", str(out))
     with BackgroundCommand(*arguments, *here, quiet=True) as simulator:
         simulator.wait(LONGEST_EPISODE_S * (1 + drive.episodes))
-    report: dict[str, Any] = json.loads(read_bytes(out, "report"))
+    report: dict[str, Any] = read_json(out, "report")
     return {**report, "command": f"python -m {shlex.join(arguments)}"}

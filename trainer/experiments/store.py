@@ -75,7 +75,7 @@ class Store:
             tests = json.loads(path.read_bytes())
         except (FileNotFoundError, NotADirectoryError):
             return False
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise UserError(f"{path} is broken: {error}") from error
         if not isinstance(tests, dict):
             raise UserError(f"{path} is broken: it names no conditions")

@@ -26,6 +26,7 @@ from zstandard import ZstdError
 from edge_runtime import __version__
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import hold
+from edge_runtime.files import open_regular
 from trainer.files import make_directory
 from trainer.person.interface import Control
 
@@ -180,7 +181,7 @@ def read_steps(path: Path) -> Iterator[Step]:
         UserError: no such file, or not one of ours.
     """
     try:
-        stream = path.open("rb")
+        stream = open_regular(path)
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
     with stream:

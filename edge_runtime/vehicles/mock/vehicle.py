@@ -20,13 +20,17 @@ _LONGEST_GAP_S = 10.0
 
 
 class MockParameters(NamedTuple):
-    """The actuators and the body of the mock. Rates are in full pedal or steering per second."""
+    """The actuators and the body of the mock. Rates are in full pedal or steering per second.
+
+    The body's numbers are the car's of this repository's scenarios (similarity.CARS).
+    """
 
     dead_time_s: float = 0.02
     time_constant_s: float = 0.05
     slew_per_s: float = 40.0
-    acceleration_mps2: float = 5.0  # at full pedal, the same for the brake
-    max_speed_mps: float = 15.0
+    throttle_mps2: float = 3.0  # at full pedal
+    brake_mps2: float = 4.0
+    max_speed_mps: float = 6.0
 
 
 class MockState(NamedTuple):
@@ -42,7 +46,8 @@ def advance(
 ) -> MockState:
     """One integration step towards the targets `pedal` and `steering`."""
     position = _follow(state.pedal, pedal, step_s, parameters)
-    speed_mps = state.speed_mps + position * parameters.acceleration_mps2 * step_s
+    full_mps2 = parameters.throttle_mps2 if position > 0.0 else parameters.brake_mps2
+    speed_mps = state.speed_mps + position * full_mps2 * step_s
     return MockState(
         pedal=position,
         steering=_follow(state.steering, steering, step_s, parameters),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 from typing import cast
 
@@ -112,6 +113,9 @@ def test_another_file_is_refused(tmp_path, data):
         list(read_steps(path))
     with pytest.raises(UserError, match="cannot be read"):
         list(read_steps(tmp_path / "none.mcap"))
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match="no regular file"):
+        list(read_steps(tmp_path / "pipe"))
 
 
 def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
