@@ -29,6 +29,7 @@ from viewing.series import (
     style_lines,
     style_points,
 )
+from viewing.viewer import flush
 
 POLICY = "policy"
 DRIVERS = {
@@ -132,6 +133,7 @@ class TrainingLog:
             steps = np.array([correction.step for correction in episode.corrections])
             values = [q_advantage(episode.critic, each) for each in episode.corrections]
             self._columns("advantage/of_the_human", steps, np.array(values))
+        flush(self._recording)  # A viewer that is gone takes everything without a word.
 
     def _numbers(self, metrics: EpisodeMetrics) -> dict[str, float]:
         return {
