@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -208,7 +207,7 @@ def test_a_slow_view_holds_nobody_up():
         go_on.wait(10.0)
         drawn.append(entry)
 
-    background = Background(partial(nullcontext, draw))
+    background = Background(lambda: nullcontext(draw))
     entries = [Steps([], None) for _ in range(MOST_WAITING + 100)]
     for entry in entries:
         background.put(entry)
@@ -228,7 +227,7 @@ def test_a_view_that_fails_does_not_end_the_run(capsys, error):
     def draw(_entry):
         raise error
 
-    background = Background(partial(nullcontext, draw))
+    background = Background(lambda: nullcontext(draw))
     for _ in range(3):
         background.put(Steps([], None))
     background.close()

@@ -6,9 +6,9 @@ import signal
 import socket
 from pathlib import Path
 
-import rerun_cli
+import rerun
 
-PROGRAM = Path(rerun_cli.__file__).parent / "rerun"
+PROGRAM = Path(rerun.__file__).parents[1] / "rerun_cli" / "rerun"
 NO_GPU = "app creation error: The GPU/graphics driver is lacking some abilities"
 KINDS = {
     "ends at once": f'echo "Error: {NO_GPU}" >&2; exit 1',
