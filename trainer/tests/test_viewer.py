@@ -19,8 +19,8 @@ from trainer.__main__ import main
 from trainer.human.guide import Intervention
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Critic
-from trainer.tests.drawn import values_in
 from trainer.plots import CURVE_FILE
+from trainer.tests.drawn import values_in
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import TrainingRun
