@@ -89,7 +89,7 @@ class PersonRun(TrainingRun):
         self.sitting.progress = (
             f"{counted(self.learning.added, 'step')} stored, {self.sitting.human_steps} yours in "
             f"{counted(self.sitting.interventions, 'intervention')} of this sitting; "
-            f"critic loss {metrics.critic_loss:.3f}, return {metrics.episode_return:.1f}"
+            f"{self._learned(metrics.critic_loss)}, return {metrics.episode_return:.1f}"
         )
         return metrics
 
@@ -100,6 +100,13 @@ class PersonRun(TrainingRun):
         with divergence_said(self.episode):  # The update under way may be the one.
             super().save()
         self.longest_save_s = max(self.longest_save_s, time.perf_counter() - began_s)
+
+    def _learned(self, critic_loss: float) -> str:
+        """What the learner did in an episode: nothing before its warm-up is over."""
+        warmup = self.config.learner.warmup_steps
+        if self.learning.added < warmup:
+            return f"not learning yet ({self.learning.added} of {warmup} steps)"
+        return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
 
     def _make_learning(self, action_size: int) -> Learning:
         learning = super()._make_learning(action_size)

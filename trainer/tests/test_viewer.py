@@ -8,7 +8,7 @@ import time
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import cast, get_args
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ import torch
 
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
-from trainer.human.guide import Intervention
+from trainer.human.guide import Intervention, Reason
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Critic
 from trainer.plots import CURVE_FILE
@@ -27,10 +27,12 @@ from trainer.training.run import TrainingRun
 from trainer.training.seen import Seen
 from trainer.viewer.advantage import q_advantage
 from trainer.viewer.background import MOST_WAITING, Background
+from trainer.viewer.blueprint import LINES
 from trainer.viewer.command import watched
 from trainer.viewer.entries import Correction, Entry, Episode, Steps
-from trainer.viewer.training_log import TrainingLog
+from trainer.viewer.training_log import DRIVERS, TrainingLog
 from trainer.viewer.watcher import CORRECTIONS, STEPS_TOGETHER, Watcher
+from viewing.colours import APPLIED, HUMAN, POLICY
 from viewing.sinks import Sink
 from viewing.tests.viewers import in_place
 
@@ -123,6 +125,11 @@ def test_interventions_are_on_the_time_line_with_their_reasons(shown):
     corrected = [step for step, _ in found["/advantage/of_the_human"]]
     assert corrected
     assert all(human[step] for step in corrected)
+
+
+def test_on_the_time_line_policy_and_human_have_their_colours_of_every_view():
+    assert {"policy": POLICY, **dict.fromkeys(get_args(Reason), HUMAN)} == DRIVERS
+    assert (LINES["action/policy"], LINES["action/applied"]) == (POLICY, APPLIED)
 
 
 def test_the_q_advantage_is_the_critics():

@@ -23,6 +23,7 @@ from trainer.person.interface import View
 from trainer.person.web.door import Door
 from trainer.person.web.messages import END, MAX_INPUT_BYTES, decode_input, encode_echo, encode_view
 from trainer.person.web.seat import Seat
+from viewing.colours import BY_NAME
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 GONE_S = 2.0
@@ -216,4 +217,6 @@ async def _say_goodbye(socket: web.WebSocketResponse) -> None:
 
 def _page_files() -> dict[str, bytes]:
     folder = files("trainer.person.web") / "page"
-    return {entry.name: entry.read_bytes() for entry in folder.iterdir() if "." in entry.name}
+    found = {entry.name: entry.read_bytes() for entry in folder.iterdir() if "." in entry.name}
+    colours = "".join(f"--{name}: rgb{colour}; " for name, colour in BY_NAME.items())
+    return {**found, "colours.css": f":root {{ {colours}}}".encode()}
