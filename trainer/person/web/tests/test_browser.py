@@ -192,6 +192,10 @@ def test_buttons_and_keys_wish_once_and_quitting_asks_again(runner, browser, coc
         await reads(cockpit, lambda r: r.wishes == {"pause"})
         await browser.tap("KeyR")
         await reads(cockpit, lambda r: r.wishes == {"restart"})
+        await browser.value("document.querySelector('[data-wish=discard]').click()")
+        await reads(cockpit, lambda r: r.wishes == {"discard"})
+        await browser.value("dispatchEvent(new KeyboardEvent('keydown', {code: 'Backspace'}))")
+        await reads(cockpit, lambda r: r.wishes == {"discard"})
         await browser.tap("KeyQ")
         await browser.until("document.querySelector('[data-wish=quit]').textContent[0] === 'R'")
         assert not poll(cockpit).wishes
