@@ -90,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_place,
         metavar="SITTING[:EPISODE]",
         help="of --from: what is not to be imitated, as 3 (sitting-0003.mcap) or 3:7 (its episode "
-        "7, as the window shows it); an episode thrown away at the wheel is left out anyway",
+        "7, as the window shows it); an episode discarded at the wheel is left out anyway",
     )
     add_time_limit(
         parser,

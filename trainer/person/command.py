@@ -43,7 +43,7 @@ def summary(training: PersonRun) -> str:
     sitting = training.sitting
     if not sitting.recorder.index:
         return "nothing was driven, and nothing recorded"
-    discarded = f"{counted(sitting.discarded, 'episode')} thrown away, " * bool(sitting.discarded)
+    discarded = f"{counted(sitting.discarded, 'episode')} discarded, " * bool(sitting.discarded)
     return (
         f"{counted(sitting.episodes, 'episode')}, {discarded}"
         f"{counted(sitting.interventions, 'intervention')}, "

@@ -29,7 +29,7 @@ WISH_KEYS: dict[int, Wish] = {
     pygame.K_q: "quit",
 }
 WISH_HELP = (
-    "P: pause    R: restart the episode    Backspace: throw it away, or the one that has just ended"
+    "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
     "    Q / Esc: quit, all is kept"
 )
 SHIPPED_PROFILES = {"gamepad": SHIPPED / "gamepad.toml", "wheel": SHIPPED / "g29.toml"}

@@ -227,7 +227,7 @@ def test_a_person_is_not_imitated_in_what_they_threw_away(
     quick = ["--threads", "1", "--set", "evaluate_every=0", "--set", "warmup_steps=8"]
     status, out, errors = call(capsys, *command, *quick)
     assert status == 0, errors
-    assert "2 episodes, 1 episode thrown away" in errors
+    assert "2 episodes, 1 episode discarded" in errors
     rows = read_metrics(run_dir)
     assert [row["outcome"] == "discarded" for row in rows] == [False, True, False]
     lengths = [int(row["steps"]) for row in rows]

@@ -31,7 +31,7 @@ HELP = (
     "Space: take over without driving",
     "or slide on the pad, or use a gamepad or wheel",
     "P: pause    R: restart the episode    Q: quit",
-    "Backspace: throw the episode away, or the one that has just ended",
+    "Backspace: discard the episode, or the one that has just ended",
 )
 
 
