@@ -147,6 +147,7 @@ def test_a_crowd_that_says_nothing_takes_no_descriptors_and_fills_no_log(cockpit
                     socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S)
                 )
                 stranger.sendall(said)
+                await say(link)  # A page that falls silent is shown out.
             assert (await status_of(cockpit.url))[0] == 200
             assert (await say(link))["driving"], "who was there first stays"
 
