@@ -133,6 +133,8 @@ class Sitting:
         end_s = time.monotonic() + REST_S * self.pacer.period_s / self.env.config.control_period_s
         while not self.stop and time.monotonic() < end_s:
             self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
+            if self._discard:
+                self._write_last_step()  # At once: no kill shall take that back.
         self._write_last_step()
         if self._discard:
             self.discarded += 1
