@@ -70,6 +70,7 @@ class Buttons(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hold: tuple[Number, ...] = ()
     pause: tuple[Number, ...] = ()
     restart: tuple[Number, ...] = ()
+    discard: tuple[Number, ...] = ()
     quit: tuple[Number, ...] = ()
 
 

@@ -2,15 +2,17 @@
 
 One MCAP file a sitting, ``sitting-0001.mcap`` and so on, whose messages are whole transitions
 (``Step``) in MessagePack. Each step is a chunk of its own and handed to the operating system at
-once, so whatever ends the process, at most the step that was being taken is lost; 30 minutes are
-about 12 MB. Nothing is ever overwritten: sittings add up.
+once, so whatever ends the process, at most one step is lost, the one that was being taken or an
+episode's last, which says whether the person discarded it; 30 minutes are about 12 MB. Nothing is
+ever overwritten: sittings add up.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import IO
 
@@ -35,6 +37,8 @@ WIRE = ("phil/", "view/")
 """How the topics of the wire's recordings begin, and those of their copies for viewers."""
 DIRECTORY = "sittings"
 """Where a training run keeps its recordings."""
+DISCARDED = "discarded"
+"""Outcome of an episode that the person threw away: it is shown, and nothing learns from it."""
 FRAME_SHAPE = (45, 80)
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 TORN = (
@@ -196,6 +200,14 @@ def read_steps(path: Path) -> Iterator[Step]:
             raise UserError(f"{path} was recorded by another version: {error}") from None
         except TORN:
             return
+
+
+def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
+    """Recorded steps by the episode, without the episodes that the person discarded."""
+    for _, drive in groupby(steps, key=lambda step: (step.sitting, step.index - step.step)):
+        episode = list(drive)
+        if episode[-1].outcome != DISCARDED:
+            yield episode
 
 
 def _messages(stream: IO[bytes], path: Path) -> Iterator[Message]:
