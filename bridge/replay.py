@@ -21,6 +21,7 @@ from edge_runtime.policy import load_policy
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
+from edge_runtime.words import printable
 
 DEFAULT_TOLERANCE = 1e-5
 """Two processors round differently; a graph of the same weights stays far below this."""
@@ -150,7 +151,7 @@ def _told(row: dict[str, Any]) -> str:
     def text(answers: list[dict[str, Any]]) -> str:
         parts = [
             f"{answer['mode']} {[round(value, 4) for value in answer['action']]}"
-            + (f" ({answer['reason']})" if answer["reason"] else "")
+            + (f" ({printable(answer['reason'])})" if answer["reason"] else "")
             for answer in answers
         ]
         return ", then ".join(parts) or "nothing"
