@@ -19,7 +19,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import behind_link, check_writable
+from edge_runtime.files import behind_link, check_writable, make_directory
 
 LOOPBACK = "127.0.0.1"
 GRPC_PORT = 9876
@@ -108,6 +108,7 @@ def save_to(
 ) -> Iterator[rr.RecordingStream]:
     """Record into a file that appears under its name when it is complete."""
     target = behind_link(path)
+    make_directory(target.parent)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         recording.save(temporary, default_blueprint=blueprint)

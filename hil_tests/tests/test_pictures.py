@@ -89,7 +89,8 @@ def test_one_that_cannot_be_made_does_not_keep_the_others_from_it(monkeypatch, t
 
 
 @pytest.mark.parametrize(
-    ("words", "part"), [(["x.png"], "no picture 'x.png'"), (["--out", "/none"], "does not exist")]
+    ("words", "part"),
+    [(["x.png"], "no picture 'x.png'"), (["--out", "/dev/null"], "Not a directory")],
 )
 def test_bad_input_is_one_line(words, part, capsys):
     assert run_cli(main, ["pictures", *words]) == 2

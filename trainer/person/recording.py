@@ -23,7 +23,7 @@ from bridge.recording.records import Records
 from edge_runtime import __version__
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import hold
-from trainer.files import make_directory
+from edge_runtime.files import make_directory
 from trainer.person.interface import Control
 
 TOPIC = "person/step"

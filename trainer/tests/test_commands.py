@@ -47,7 +47,7 @@ WRONG = [
     ("evaluate", "{tmp}/file"),
     ("evaluate", "expert", "--runs", "-1"),
     ("evaluate", "expert", "--condition", "rain"),
-    ("evaluate", "expert", "--out", "{tmp}/no/such/r.json"),
+    ("evaluate", "expert", "--out", "/dev/null/r.json"),
     ("export", "{tmp}/nothing", "--out", "{tmp}/p.onnx"),
     ("export", "{tmp}", "--out", "{tmp}/p.onnx"),
     ("export", "{tmp}", "--out", "{tmp}/p.onnx", "--key", "{tmp}/no.key"),
@@ -55,7 +55,7 @@ WRONG = [
     ("picture", "expert", "--time", "-1", "--out", "{tmp}/p.png"),
     ("picture", "expert", "--out", "{tmp}/p.jpg"),
     ("plot", "{tmp}"),
-    ("picture", "expert", "--out", "{tmp}/no/such/p.png"),
+    ("picture", "expert", "--out", "/dev/null/p.png"),
     ("picture", "{tmp}/nobody", "--out", "{tmp}/p.png"),
     ("human", "--out", "{tmp}/file"),
     ("bench", "--threads", "-1"),
@@ -73,7 +73,7 @@ WRONG = [
     ("view", "{tmp}", "--save", ""),
     ("bench", "--out", ""),
     ("experiment", "status", "--results", ""),
-    ("bench", "--out", "{tmp}/no/such/b.json"),
+    ("bench", "--out", "/dev/null/b.json"),
     (),
 ]
 
