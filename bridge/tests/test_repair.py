@@ -164,13 +164,15 @@ def test_a_file_without_a_checksum_over_all_of_it_is_not_called_whole(copy, tmp_
     assert "is whole" in capsys.readouterr().out
 
 
-def test_a_change_outside_of_the_chunks_is_said_and_mended(copy, capsys):
-    flip(copy, chunks(LEFT_TURN)[3].chunk_start_offset + 9)  # when its first message came
-    assert bridge_status(["repair", str(copy)]) == 0
+def test_a_change_outside_of_the_chunks_is_said_and_mended(copy, tmp_path, capsys):
+    whole = tmp_path / "whole.mcap"
+    assert bridge_status(["repair", str(copy), "--out", str(whole)]) == 0
+    flip(whole, chunks(whole)[3].chunk_start_offset + 9)  # when its first message came
+    assert bridge_status(["repair", str(whole)]) == 0
     said = capsys.readouterr().out
     assert f"{MESSAGES} messages; left out: bytes that changed outside of its chunks" in said
-    assert copy.with_name("drive.mcap.damaged").exists()
-    assert bridge_status(["repair", str(copy)]) == 0
+    assert whole.with_name("whole.mcap.damaged").exists()
+    assert bridge_status(["repair", str(whole)]) == 0
     assert "is whole" in capsys.readouterr().out
 
 
