@@ -26,13 +26,15 @@ from bridge.episode import EpisodeRunner
 from bridge.feedback_check import FeedbackCheck
 from bridge.port import SimulatorPort, open_port
 from bridge.progress import EpisodeBar, episode_bar
-from bridge.report import make_report, rejections, summary_line
+from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.signals import sigterm_as_interrupt
 from bridge.vehicle_clock import VehicleClock
 from bridge.vehicle_loop import VehicleInLoop
 from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
+from edge_runtime.latency.command_hold import Decision
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
+from edge_runtime.operator_commands import rearm_command
 from edge_runtime.option_types import not_negative, positive
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.topics import CONTROL_PERIOD_S, check_vehicle_id
@@ -186,12 +188,17 @@ def _drive(
     bar: EpisodeBar,
     vehicle: VehicleInLoop | None,
 ) -> dict[str, Any]:
+    rearm = rearm_command(str(settings.connect or settings.listen), settings.vehicle_id)
+
+    def on_tick(episode: int, step: int, decision: Decision) -> None:
+        bar.tick(episode, step, decision, rearm if port.edge_counts.waits_for_rearm else "")
+
     runner = EpisodeRunner(
         environment,
         clock,
         port.session,
         port.publish_scene,
-        bar.tick,
+        on_tick,
         apply=vehicle.apply if vehicle else policy_action,
         standing=settings.standing,
         # Copies, made at once: other threads go on counting.
@@ -206,7 +213,8 @@ def _drive(
         if vehicle is not None:
             vehicle.clock.wait_for_standstill()
         results.append(runner.run(episode, settings.seed + episode))
-        bar.done(episode + 1)
+        stops = [event for event in runner.safe_stops.events if event.episode == episode]
+        bar.done(episode + 1, episode_line(episode + 1, settings.episodes, results[-1], stops))
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
     unbelieved = Counter(port.edge_counts.unreadable)

@@ -23,6 +23,7 @@ __all__ = [
     "ArgumentParser",
     "HelpFormatter",
     "UserError",
+    "add_public_key",
     "dispatch",
     "examples",
     "run_cli",
@@ -94,6 +95,16 @@ def refuse_empty(arguments: List[str], error: Callable[[str], NoReturn]) -> None
 def examples(*commands: str) -> str:
     """A parser's epilog: commands as a person would type them, continued after a backslash."""
     return "\n".join(["examples:", *("  " + text.replace("\n", "\n  ") for text in commands)])
+
+
+def add_public_key(parser: argparse.ArgumentParser) -> None:
+    """``--public-key``, of every command that reads a policy."""
+    parser.add_argument(
+        "--public-key",
+        metavar="FILE",
+        help="Ed25519 public key of the policy's signer, PEM (default: keys/policy.pub where it"
+        " exists; where an unsigned policy may drive, first policy.pub beside the policy)",
+    )
 
 
 def dispatch(parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv: List[str]) -> int:

@@ -86,10 +86,12 @@ def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
 def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """Write `data` so that a reader or a crash sees the old file or the new one, nothing between.
 
-    A symbolic link stays, and the file behind it is written. Raises UserError when the directory
-    does not exist or cannot be written, and for a path that is there and is no regular file.
+    A symbolic link stays, and the file behind it is written. Its directory is made. Raises
+    UserError when that cannot be made or written, and for a path that is there and is no regular
+    file.
     """
     target = _checked(path)
+    make_directory(target.parent)
     try:
         descriptor, temporary = tempfile.mkstemp(dir=str(target.parent), prefix=f".{target.name}.")
     except OSError as error:
@@ -114,12 +116,24 @@ def behind_link(path: PathLike) -> Path:
 
 
 def check_writable(path: PathLike) -> None:
-    """Raise UserError now if `write_atomic(path)` would fail later, after the long work."""
+    """Raise UserError now if `write_atomic(path)` would fail later, after the long work.
+
+    It makes nothing: whatever else is wrong with the command leaves no empty directory behind.
+    """
     target = _checked(path)
-    if not target.parent.is_dir():
-        raise UserError(f"cannot write {target}: the directory {target.parent} does not exist")
-    if not os.access(str(target.parent), os.W_OK | os.X_OK):
-        raise UserError(f"cannot write {target}: the directory {target.parent} is read-only")
+    directory = next(place for place in target.absolute().parents if os.path.exists(place))
+    if not directory.is_dir():
+        raise UserError(f"cannot write {target}: {directory} is no directory")
+    if not os.access(str(directory), os.W_OK | os.X_OK):
+        raise UserError(f"cannot write {target}: the directory {directory} is read-only")
+
+
+def make_directory(path: PathLike) -> None:
+    """Make a directory, and those above it, where it is not there; UserError where it cannot be."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot create the directory {path}: {error.strerror}") from None
 
 
 def write_json(path: PathLike, value: Any) -> None:
@@ -132,7 +146,12 @@ def _checked(path: PathLike) -> Path:
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
-        return behind_link(path)
+        target = behind_link(path)
+        if os.path.islink(path) and not target.parent.is_dir():  # a disk that is not there?
+            raise UserError(
+                f"cannot write {path}: it leads to {target.parent}, which does not exist"
+            ) from None
+        return target
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from None
     except ValueError as error:  # a NUL inside the name

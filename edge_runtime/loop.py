@@ -52,6 +52,7 @@ class ControlLoop:
         vehicle: Optional[VehicleRunner],
         notifier: Notifier,
         hold: Optional[Hold] = None,
+        rearm_command: str = "",
     ) -> None:
         self._policy = policy
         self._controller = controller
@@ -59,6 +60,7 @@ class ControlLoop:
         self._vehicle = vehicle
         self._notifier = notifier
         self._hold = hold or Hold()
+        self._rearm_command = rearm_command
         self._board = BoardWatch()
         self._latest = LatestState()
         self._inference_window = LatencyWindow()
@@ -69,6 +71,7 @@ class ControlLoop:
         self._superseded = 0
         self._stopping = False
         self._logged = Safety()
+        self._logged_wait = False
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
         self._lock = threading.RLock()
@@ -282,6 +285,10 @@ class ControlLoop:
             )
             self._logged = safety
             self._notifier.status(f"{safety.mode.value} {safety.reason}".rstrip())
+        waits = self._controller.waits_for_rearm
+        if waits and not self._logged_wait:
+            log.event("warning", "waits_for_rearm", command=self._rearm_command)
+        self._logged_wait = waits
 
     def _log_rejection(self, rejection: Rejection, now_s: float) -> None:
         """The first of each reason, then one a second: all are counted in the health message."""

@@ -10,7 +10,7 @@ from edge_runtime import access
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, parse_json, write_json
 from edge_runtime.status_table import render_status
-from edge_runtime.tls import TlsFiles, tls_for
+from edge_runtime.tls import TlsFiles, is_tls, tls_for
 from edge_runtime.transport import check_endpoint, open_session
 from edge_runtime.wire import key
 
@@ -44,6 +44,12 @@ def rearm(arguments: argparse.Namespace) -> int:
         raise UserError(f"{arguments.vehicle_id} was not re-armed: {why}")
     print(f"{arguments.vehicle_id} is re-armed; it drives after 5 fresh states in a row")
     return 0
+
+
+def rearm_command(connect: str, vehicle_id: str) -> str:
+    """What an operator types to let a vehicle drive again."""
+    tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
+    return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"
 
 
 def ask(

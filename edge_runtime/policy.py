@@ -53,7 +53,8 @@ def load_policy(
 ) -> Policy:
     """Load a policy that may drive: trusted, whole, its manifest and graph of one mind, probed.
 
-    `public_key` is a PEM file; without it `keys/policy.pub` is taken where it exists.
+    `public_key` is a PEM file; without it `keys/policy.pub` is taken where it exists, and with
+    `allow_unsigned` before it a `policy.pub` beside the policy.
     Raises UserError with the first reason why the policy may not drive.
     """
     # Read once: what is verified is what is loaded, even if the file is replaced meanwhile.

@@ -18,6 +18,7 @@ from edge_runtime.hold import Hold
 from edge_runtime.limiter import limit_rows
 from edge_runtime.link import Link
 from edge_runtime.loop import ControlLoop
+from edge_runtime.operator_commands import rearm_command
 from edge_runtime.policy import Policy, load_policy
 from edge_runtime.sd_notify import Notifier
 from edge_runtime.signals import ending_signals
@@ -106,7 +107,8 @@ def _serve(
         try:
             link = Link(session, config.vehicle_id, policy.manifest)
             runner = _attach(vehicle, policy, link)
-            loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold))
+            rearm = rearm_command(config.connect, config.vehicle_id)
+            loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold), rearm)
         except BaseException:
             session.close()  # An open session would hang the process at its exit.
             raise

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_json, write_json
+from edge_runtime.files import make_directory, read_json, write_json
 from trainer.drivers import make_environment
 from trainer.experiments.units import digest
-from trainer.files import make_directory
 
 
 class KeptResults:

@@ -50,15 +50,3 @@ def as_arrays(values: dict[str, Any]) -> dict[str, Any]:
         name: value.numpy() if isinstance(value, torch.Tensor) else value
         for name, value in values.items()
     }
-
-
-def make_directory(path: Path) -> None:
-    """Create a result directory.
-
-    Raises:
-        UserError: a file is in the way, or it is not allowed.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot create the directory {path}: {error.strerror}") from error

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from edge_runtime.errors import UserError
-from trainer.files import make_directory
+from edge_runtime.files import make_directory
 
 LOCK_FILE = ".lock"
 """In a directory that is claimed, for as long as it is."""

@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import behind_link, check_writable
+from edge_runtime.files import behind_link, check_writable, make_directory
 from edge_runtime.signals import sigterm_as_interrupt
 from viewing.viewer import END_S, LOOPBACK, Viewer, ViewerGone, flush, free_port
 
@@ -91,6 +91,7 @@ def save_to(
 ) -> Iterator[rr.RecordingStream]:
     """Record into a file that appears under its name when it is complete."""
     target = behind_link(path)
+    make_directory(target.parent)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         recording.save(temporary, default_blueprint=blueprint)

@@ -157,6 +157,25 @@ def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path,
     assert load_policy(signed.path).trust == signature.VERIFIED
 
 
+def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
+    make_policy, tmp_path, monkeypatch
+):
+    """Whoever brings a policy can bring a key, too; the one of the working directory is mine."""
+    (tmp_path / "home" / "keys").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "home")
+    mine = Path("keys/policy.pub")
+    mine.write_bytes(public_pem(Ed25519PrivateKey.generate()))
+    signed = make_policy()
+    refused(signed.path, f"public key {mine}: .* --public-key", allow_unsigned=True)
+    beside = signed.public_key.rename(tmp_path / "policy.pub")
+    assert load_policy(signed.path, allow_unsigned=True).trust == signature.BESIDE
+    assert load_policy(signed.path, beside).trust == signature.VERIFIED
+    for options in ({}, {"public_key": mine, "allow_unsigned": True}):
+        refused(signed.path, f"public key {mine}: .* --public-key", **options)
+    mine.unlink()
+    refused(signed.path, "no public key")
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [

@@ -1,5 +1,6 @@
 import pytest
 
+from edge_runtime.errors import UserError
 from edge_runtime.words import counted, printable
 
 
@@ -23,3 +24,7 @@ def test_one_is_not_many(count, words):
 )
 def test_what_a_terminal_acts_upon_is_written_out(text, shown):
     assert printable(text) == shown
+
+
+def test_an_error_is_one_line_that_no_terminal_obeys():
+    assert str(UserError("file \x1b]0;x\x07\nis not")) == "file \\x1b]0;x\\x07 is not"

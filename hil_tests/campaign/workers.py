@@ -17,6 +17,7 @@ from edge_runtime.files import read_json
 from edge_runtime.transport import free_endpoint
 from hil_tests.campaign.chunks import Chunk, Task, halve, join_reports
 from hil_tests.commands import BackgroundCommand, CommandTimeoutError
+from hil_tests.options import trusting
 
 VEHICLE = "campaign01"
 ATTEMPTS = 6
@@ -78,7 +79,7 @@ class _Worker:
         task = self._task
         self._endpoint = free_endpoint()
         self._edge = BackgroundCommand(
-            "edge_runtime", "run", "--policy", str(task.policy), "--allow-unsigned",
+            "edge_runtime", "run", *trusting(task.policy, task.public_key),
             "--connect", self._endpoint, "--vehicle-id", VEHICLE, ready="ready", quiet=True,
         )  # fmt: skip
 

@@ -14,6 +14,7 @@ from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand
 from hil_tests.faults.chassis import free_bus
 from hil_tests.operator import Operator
+from hil_tests.options import trusting
 
 VEHICLE_ID = "rig01"
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
@@ -31,6 +32,7 @@ class Drive(NamedTuple):
     first_seed: int
     episodes: int
     changes: Mapping[str, float]
+    public_key: str | None = None
 
 
 def run_rig(drive: Drive) -> dict[str, Any]:
@@ -45,7 +47,7 @@ def run_rig(drive: Drive) -> dict[str, Any]:
         edge = _start_vehicle(drive, directory, stack) if drive.loop == VEHICLE else ()
         stack.enter_context(
             BackgroundCommand(
-                "edge_runtime", "run", "--policy", str(drive.policy), "--allow-unsigned",
+                "edge_runtime", "run", *trusting(drive.policy, drive.public_key),
                 "--connect", endpoint, "--vehicle-id", VEHICLE_ID, *edge, ready="ready", quiet=True,
             )
         )  # fmt: skip

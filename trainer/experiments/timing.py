@@ -19,14 +19,13 @@ import torch
 from matplotlib.figure import Figure
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_json, write_json
+from edge_runtime.files import make_directory, read_json, write_json
 from trainer.benches.machine import about
 from trainer.experiments.figures.style import colour, label, new_figure, note_missing
 from trainer.experiments.plan import NORMAL, Plan
 from trainer.experiments.statistics import CONFIDENCE, RESAMPLES, Estimate, Holds
 from trainer.experiments.units import Unit, obstacle, run_config, unit_id
 from trainer.experiments.verdict import BAR, Claim, claim
-from trainer.files import make_directory
 from trainer.progress import ProgressBar
 from trainer.training.run import TrainingRun
 

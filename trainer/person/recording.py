@@ -10,7 +10,6 @@ ever overwritten: sittings add up.
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -18,18 +17,15 @@ from typing import IO
 
 import msgspec
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, McapRecord, Message
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Channel, Message
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from numpy.typing import NDArray
-from zstandard import ZstdError
 
+from bridge.recording.records import Records
 from edge_runtime import __version__
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import hold
-from edge_runtime.files import open_regular
-from trainer.files import make_directory
+from edge_runtime.files import make_directory, open_regular
 from trainer.person.interface import Control
 
 TOPIC = "person/step"
@@ -41,13 +37,6 @@ DISCARDED = "discarded"
 """Outcome of an episode that the person threw away: it is shown, and nothing learns from it."""
 FRAME_SHAPE = (45, 80)
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
-TORN = (
-    McapError, struct.error, ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
-    MemoryError,
-)  # fmt: skip
-"""What the libraries raise for a file that was cut off."""
-MAX_RECORD_BYTES = 64 << 20
-"""A torn length must not ask for more memory than any chunk of ours needs."""
 
 
 class Step(msgspec.Struct, frozen=True):
@@ -118,7 +107,7 @@ class Recorder:
         except OSError as error:
             raise UserError(f"cannot write {self.path}: {error.strerror}") from None
         hold(self._file.fileno())  # `bridge repair` keeps away meanwhile.
-        self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
+        self._mcap = Writer(self._file, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._mcap.start(profile="", library=f"phil-hil {__version__}")
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)
         self._flush()
@@ -185,21 +174,16 @@ def read_steps(path: Path) -> Iterator[Step]:
         UserError: no such file, or not one of ours.
     """
     try:
-        stream = open_regular(path)
+        with open_regular(path) as stream:
+            if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                raise UserError(f"{path} is no recording of a sitting")
+            for message in _messages(Records(stream, path.stat().st_size), path):
+                yield msgspec.msgpack.decode(message.data, type=Step)
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
-    with stream:
-        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise UserError(f"{path} is no recording of a sitting")
-        stream.seek(0)
-        try:
-            for message in _messages(stream, path):
-                yield msgspec.msgpack.decode(message.data, type=Step)
-        # Of a chunk whose checksum is right: no kill does that.
-        except msgspec.DecodeError as error:
-            raise UserError(f"{path} was recorded by another version: {error}") from None
-        except TORN:
-            return
+    # Of a chunk whose checksum is right: no kill does that.
+    except msgspec.DecodeError as error:
+        raise UserError(f"{path} was recorded by another version: {error}") from None
 
 
 def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
@@ -210,17 +194,14 @@ def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
             yield episode
 
 
-def _messages(stream: IO[bytes], path: Path) -> Iterator[Message]:
-    reader = StreamReader(stream, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
-    for record in reader.records:
-        parts: Sequence[McapRecord] = (
-            breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
-        )
-        for part in parts:
-            if isinstance(part, Channel) and part.topic != TOPIC and isinstance(record, Chunk):
-                raise UserError(_foreign(path, part.topic))
-            if isinstance(part, Message):
-                yield part
+def _messages(records: Records, path: Path) -> Iterator[Message]:
+    for record in records.walk():
+        if records.damaged_places:
+            return
+        if isinstance(record, Channel) and record.topic != TOPIC:
+            raise UserError(_foreign(path, record.topic))
+        if isinstance(record, Message):
+            yield record
 
 
 def _foreign(path: Path, topic: str) -> str:

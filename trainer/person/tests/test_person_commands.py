@@ -43,7 +43,7 @@ WRONG = [
     (DRIVE, ("--calibrate", "{tmp}/p.toml"), "not allowed with argument --out"),
     (("drive", "--calibrate", "{tmp}/p.toml"), (), "--calibrate asks a --human gamepad or wheel"),
     (("drive", "--calibrate", "{tmp}/p.toml"), ("--human", "wheel"), "no wheel is plugged in"),
-    (("drive", "--calibrate", "{tmp}/no/p.toml"), ("--human", "wheel"), "cannot write"),
+    (("drive", "--calibrate", "{tmp}/file/p.toml"), ("--human", "wheel"), "cannot write"),
     (TRAIN, ("--human", "keyboard", "--algorithm", "per_td3"), "takes no guidance"),
     (TRAIN, ("--human", "keyboard", "--set", "guided_share=3"), "watches every episode"),
     (TRAIN, ("--human", "keyboard", "--set", "poor_guidance_share=0.3"), "not replaced"),
