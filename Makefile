@@ -77,7 +77,6 @@ $(PEERS_STAMP): requirements/peers.txt | $(STAMP)
 	@touch $@
 
 bench: $(STAMP) $(PEERS_STAMP)  ## speed and memory beside peers: tables, and JSON in results/bench
-	@mkdir -p $(BENCH)
 	for threads in 1 2; do \
 		$(BIN)/python -m trainer bench --threads $$threads --peers $(PEERS)/bin/python \
 			--out $(BENCH)/threads_$$threads.json || exit; \
@@ -87,38 +86,30 @@ bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table 
 	$(BIN)/python -m trainer bench --quick --threads 1
 
 network: $(STAMP)  ## TCP, UDP, relay and virtual time on the same network; needs root, some 25 minutes
-	@mkdir -p results/network
 	$(BIN)/python -m hil_tests network --out results/network/network.json --report results/network
 	$(BIN)/python -m hil_tests.network.variants --out results/network/variants.json
 
 board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
-	@mkdir -p results/deploy
 	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
 	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
 	$(BIN)/python -m hil_tests board --boards systemd --out results/deploy/systemd.json
 
 fleet: $(STAMP)  ## a router with 1, 5, 10 and 20 edge runtimes: processor, memory, bandwidth each
-	@mkdir -p results/deploy
 	$(BIN)/python -m hil_tests fleet --out results/deploy/fleet.json
 
 bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and eight at once
-	@mkdir -p $(BENCH)
 	$(BIN)/python -m trainer.benches.accelerator --runs 8 --out $(BENCH)/gpu.json
 
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
-	@mkdir -p $(BENCH)
 	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
 
 bench-view: $(STAMP)  ## what looking on costs the training loop and the simulator
-	@mkdir -p $(BENCH)
 	$(BIN)/python -m hil_tests.benches.viewing --out $(BENCH)/viewing.json
 
 bench-can: $(STAMP)  ## ten minutes of the 50 Hz CAN stream, every core busy, beside a bare sender
-	@mkdir -p $(BENCH)
 	$(BIN)/python -m hil_tests.benches.can_stream --out $(BENCH)/can_stream.json
 
 vehicle: $(STAMP)  ## policy in the loop against a mock Hunter in the loop, and the lag it may have; some 15 minutes
-	@mkdir -p results/vehicle
 	$(BIN)/python -m hil_tests vehicle --out results/vehicle/left_turn.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against

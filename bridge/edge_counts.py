@@ -1,4 +1,4 @@
-"""What the edge runtime rejected during a drive, from its health messages. No socket."""
+"""What the edge runtime says of itself during a drive, in its health messages. No socket."""
 
 from __future__ import annotations
 
@@ -48,6 +48,12 @@ class EdgeCounts:
         with self._lock:
             return "" if self._last is None else self._last.policy_id
 
+    @property
+    def waits_for_rearm(self) -> bool:
+        """Return whether, by the newest health, only an operator can let the vehicle drive."""
+        with self._lock:
+            return self._last is not None and self._last.needs_rearm
+
     def observe_message(self, payload: bytes) -> None:
         """Take a health message; one that cannot be read is counted, as ``health_REASON``."""
         health = decode_health(payload)
@@ -61,7 +67,7 @@ class EdgeCounts:
         """Take the JSON answer to the status query, which holds the fields of a health message."""
         try:
             self.observe(msgspec.json.decode(payload, type=Health))
-        except msgspec.MsgspecError:
+        except (msgspec.MsgspecError, ValueError, RecursionError):
             return
 
     def observe(self, health: Health) -> None:

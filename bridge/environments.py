@@ -17,6 +17,7 @@ from gymnasium.envs.registration import namespace
 from gymnasium.spaces import Box
 
 from edge_runtime.cli import UserError
+from edge_runtime.manifest import Manifest, task_text
 from edge_runtime.wire import FRAMES_SHAPE
 
 SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"}
@@ -60,6 +61,28 @@ def scenario_of(name: str) -> str:
     """Return the scenario word for any form of an environment's name; the name if it has none."""
     words = {environment_id: word for word, environment_id in SCENARIOS.items()}
     return words.get(_bare_id(name), name)
+
+
+def task_of(
+    environment: gymnasium.Env[Any, Any], name: str, manifest: Manifest | None = None
+) -> str:
+    """Return what the environment is for, as a policy's manifest says it of itself.
+
+    The scenario is known by its word or id, the actions' names of an environment that has
+    ``action_names``, their ranges always. What is not known is taken from ``manifest``; without
+    one the answer is empty then.
+    """
+    scenario = scenario_of(name)
+    names = list(getattr(environment.unwrapped, "action_names", ()))
+    if manifest is not None:
+        scenario = scenario if scenario in SCENARIOS else manifest.scenario
+        names = names or [action.name for action in manifest.action]
+    elif scenario not in SCENARIOS or not names:
+        return ""
+    space = environment.action_space
+    assert isinstance(space, Box)
+    names += ["an action"] * (len(space.low) - len(names))
+    return task_text(scenario, list(zip(names, space.low, space.high, strict=False)))
 
 
 def _bare_id(name: str) -> str:

@@ -17,6 +17,7 @@ from bridge.scene import Stamps
 from edge_runtime.cli import UserError
 from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.latency.command_hold import Decision
+from edge_runtime.safety import Event
 from edge_runtime.wire import CONTROL_PERIOD_S, State
 
 PublishScene = Callable[[Any, Stamps], None]
@@ -38,6 +39,7 @@ class EpisodeRunner:
         apply: Apply = policy_action,
         standing: bool = False,
         rejected: Callable[[], Mapping[str, int]] = dict,
+        task: str = "",
     ) -> None:
         self.safe_stops = SafeStopLog(CONTROL_PERIOD_S)
         self.deadline_misses = 0
@@ -51,7 +53,14 @@ class EpisodeRunner:
         self._on_tick = on_tick
         self._apply = apply
         self._rejected = rejected
+        self._task = task or msgspec.UNSET
         self._options = {"standing": True} if standing else None
+
+    def show_task(self, seed: int) -> None:
+        """Send one state, the final one already, so that the edge runtime compares it as well."""
+        observation, info = self._environment.reset(seed=seed, options=self._options)
+        self._clock.begin(0, seed)
+        self._clock.finish(self._state(0, 0, observation, info, final=True))
 
     def run(self, episode: int, seed: int) -> EpisodeResult:
         """Drive one episode to its end; the seed decides the environment and the link.
@@ -79,6 +88,11 @@ class EpisodeRunner:
             self._show(state)
             self._under_way = state
             decision = self._clock.exchange(state)
+            if decision.brake_reason == Event.OTHER_TASK.value:
+                raise UserError(
+                    "the edge runtime's policy is for another task than this environment"
+                    f" ({self._task}); start it with a policy of this one"
+                )
             action = self._apply(self._environment, decision)
             observation, reward, terminated, truncated, info = self._environment.step(action)
             steps.append(_Step(action, float(reward), info))
@@ -107,6 +121,7 @@ class EpisodeRunner:
             frames=np.ascontiguousarray(observation, dtype=np.uint8).tobytes(),
             speed_mps=_speed_mps(info),
             final=final,
+            task=self._task,
         )
 
     def _show(self, state: State) -> None:

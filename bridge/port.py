@@ -19,7 +19,7 @@ from edge_runtime import access
 from edge_runtime.cli import UserError
 from edge_runtime.manifest import Manifest
 from edge_runtime.tls import TlsFiles
-from edge_runtime.transport import open_session
+from edge_runtime.transport import only_own, open_session
 from edge_runtime.wire import key
 
 PayloadHandler = Callable[[bytes], None]
@@ -57,22 +57,20 @@ class SimulatorPort:
         self._commands: Any = None
         self._feedback: Any = None
         self.edge_counts = EdgeCounts()
-        self._health = zenoh_session.declare_subscriber(
-            key(vehicle_id, "health"),
-            lambda sample: self.edge_counts.observe_message(sample.payload.to_bytes()),
-        )
+        self._health = self._subscribe("health", self.edge_counts.observe_message)
 
     def on_command(self, handler: PayloadHandler) -> None:
         """Call ``handler(payload)`` for every command, on Zenoh's thread: it must be quick."""
-        self._commands = self._zenoh.declare_subscriber(
-            key(self.vehicle_id, "command"), lambda sample: handler(sample.payload.to_bytes())
-        )
+        self._commands = self._subscribe("command", handler)
 
     def on_feedback(self, handler: PayloadHandler) -> None:
         """Call ``handler(payload)`` for every feedback of the vehicle, as ``on_command`` does."""
-        self._feedback = self._zenoh.declare_subscriber(
-            key(self.vehicle_id, "feedback"), lambda sample: handler(sample.payload.to_bytes())
-        )
+        self._feedback = self._subscribe("feedback", handler)
+
+    def _subscribe(self, topic: str, handler: PayloadHandler) -> Any:
+        own = key(self.vehicle_id, topic)
+        hear = only_own(own, lambda sample: handler(sample.payload.to_bytes()))
+        return self._zenoh.declare_subscriber(own, hear)
 
     def publish_state(self, payload: bytes) -> None:
         """Send an encoded state to the edge runtime (and to viewers)."""
@@ -109,14 +107,14 @@ class SimulatorPort:
         self.note_edge_counts()
         return self.edge_counts.policy_id
 
-    def edge_action_names(self) -> tuple[str, ...]:
-        """Return the names of the actions of the edge runtime's policy; none if it says nothing."""
+    def edge_manifest(self) -> Manifest | None:
+        """Return the manifest of the edge runtime's policy; None if it says nothing."""
         for reply in self._status_replies():
             if reply.ok is not None:
-                with contextlib.suppress(msgspec.MsgspecError):
+                with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
                     status = msgspec.json.decode(reply.ok.payload.to_bytes(), type=_Status)
-                    return tuple(action.name for action in status.manifest.action)
-        return ()
+                    return status.manifest
+        return None
 
     def _edge_is_there(self) -> bool:
         """Its token is seen, or it answers: the board's Zenoh can lose the token for a while."""

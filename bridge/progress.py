@@ -1,4 +1,4 @@
-"""The progress bar of ``bridge simulate``; only where a person watches."""
+"""How ``bridge simulate`` goes: a bar where a person watches, else a line an episode."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from edge_runtime.latency.command_hold import Decision
+from edge_runtime.words import printable
 
 
 class EpisodeBar:
@@ -18,22 +19,33 @@ class EpisodeBar:
     def __init__(self, progress: Progress, episodes: int) -> None:
         self._progress = progress
         self._task = progress.add_task("waiting for an edge runtime", total=episodes)
+        self._waits_for = ""
 
-    def tick(self, episode: int, step: int, decision: Decision) -> None:
-        """Show one tick."""
-        doing = f"braking: {decision.brake_reason}" if decision.brake_reason else "driving"
+    def tick(self, episode: int, step: int, decision: Decision, waits_for: str = "") -> None:
+        """Show one tick; ``waits_for`` is the command that the vehicle needs to drive again."""
+        reason = printable(decision.brake_reason)
+        doing = f"braking: {reason}" if reason else "driving"
         self._progress.update(
             self._task, completed=episode, description=f"step {step:3d}  {doing[:40]}"
         )
+        if waits_for and not self._waits_for:
+            self._say(f"the vehicle stands until it is re-armed: {waits_for}")
+        self._waits_for = waits_for
 
-    def done(self, episodes: int) -> None:
-        """Show how many episodes are done."""
+    def done(self, episodes: int, told: str) -> None:
+        """Show how many episodes are done, and without a bar what became of the last one."""
         self._progress.update(self._task, completed=episodes)
+        if self._progress.disable:
+            self._say(told)
+
+    def _say(self, line: str) -> None:
+        """Print a line above the bar, as it is."""
+        self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 @contextlib.contextmanager
 def episode_bar(episodes: int) -> Iterator[EpisodeBar]:
-    """Show a bar on stderr while the block runs; nothing if stderr is no terminal."""
+    """Show a bar on stderr while the block runs; lines if stderr is no terminal."""
     with _progress("episodes") as progress:
         yield EpisodeBar(progress, episodes)
 

@@ -16,7 +16,7 @@ from bridge.port import simulator_key
 from bridge.relay_traffic import DOWN, RelayTraffic
 from edge_runtime.latency.model import LatencySpec
 from edge_runtime.topics import key
-from edge_runtime.transport import open_session
+from edge_runtime.transport import only_own, open_session
 
 REARM = "rearm"
 QUERIES = ("status", REARM)
@@ -77,9 +77,9 @@ class Relay:
 
     def _hear(self, session: zenoh.Session, topic: str) -> Any:
         take = self.traffic.handler(topic)
-        return session.declare_subscriber(
-            key(self._vehicle_id, topic), lambda sample: take(sample.payload.to_bytes())
-        )
+        own = key(self._vehicle_id, topic)
+        hear = only_own(own, lambda sample: take(sample.payload.to_bytes()))
+        return session.declare_subscriber(own, hear)
 
     def _answer(self, topic: str) -> Any:
         """Ask the edge runtime what the simulator's side asks; the query ends when it is freed."""

@@ -56,12 +56,22 @@ def run(arguments: Any) -> int:
         if not messages:
             raise UserError(f"{source} holds no whole message; there is nothing to repair")
         if not recording.trouble() and arguments.out is None:
-            print(f"{source} is whole: {counted(messages, 'message')}; nothing done")
+            print(_nothing_done(recording, messages))
             return 0
         kept = _write(data, recording, arguments.out)
     left_out = recording.missing() and f"; left out: {recording.missing()}"
     print(f"wrote {arguments.out or source}: {counted(messages, 'message')}{left_out}{kept}")
     return 0
+
+
+def _nothing_done(recording: Recording, messages: int) -> str:
+    found = counted(messages, "message")
+    if recording.has_checksums:
+        return f"{recording.path} is whole: {found}; nothing done"
+    return (
+        f"{recording.path} can be read to its end: {found}; nothing done. It has no checksum over"
+        " all of it, so a change in its index would not show; --out G.mcap writes it with one"
+    )
 
 
 @contextlib.contextmanager
@@ -113,7 +123,7 @@ def _link(file: Path, kept: Path) -> None:
 def _rewrite(recording: Recording) -> tuple[bytes, int]:
     """Copy every message into a new recording, held in memory."""
     stream = io.BytesIO()
-    writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD)
+    writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
     writer.start()
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}

@@ -13,7 +13,7 @@ from bridge.replaying.comparison import compare
 from bridge.replaying.in_process import Answers, replay_in_process
 from bridge.replaying.live import replay_live
 from bridge.replaying.recorded import RecordedDrive, key_of
-from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
+from edge_runtime.cli import ArgumentParser, UserError, add_public_key, examples, write_json_out
 from edge_runtime.config import load_config
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import not_negative_number
@@ -21,6 +21,7 @@ from edge_runtime.policy import load_policy
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
+from edge_runtime.words import printable
 
 DEFAULT_TOLERANCE = 1e-5
 """Two processors round differently; a graph of the same weights stays far below this."""
@@ -52,9 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="replay in real time to an edge runtime behind this router",
     )
     add_tls(parser)
-    parser.add_argument(
-        "--public-key", metavar="FILE", help="Ed25519 public key of the policy, PEM"
-    )
+    add_public_key(parser)
     parser.add_argument(
         "--allow-unsigned",
         action="store_true",
@@ -150,7 +149,7 @@ def _told(row: dict[str, Any]) -> str:
     def text(answers: list[dict[str, Any]]) -> str:
         parts = [
             f"{answer['mode']} {[round(value, 4) for value in answer['action']]}"
-            + (f" ({answer['reason']})" if answer["reason"] else "")
+            + (f" ({printable(answer['reason'])})" if answer["reason"] else "")
             for answer in answers
         ]
         return ", then ".join(parts) or "nothing"

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from bridge.safe_stops import SafeStopEvent
-from edge_runtime.episode_report import EpisodeResult, summarise
-from edge_runtime.words import counted
+from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
+from edge_runtime.words import counted, printable
 
 QUANTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 
@@ -75,20 +75,44 @@ def make_report(
 
 
 def summary_line(report: Mapping[str, Any]) -> str:
-    """Return the report in one line for a terminal."""
+    """Return the report in one line for a terminal.
+
+    Ticks without a new command are not in it: those of a stop are told as that, and of the others
+    the latency tells.
+    """
     latency = report["latency_ms"]
     times = "no command came"
     if latency["p50"] is not None:
         times = f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
-    rejected = sum(report["rejected"].values())
-    vehicle = "" if report["vehicle"] is None else f"; {_vehicle_words(report['vehicle'])}"
-    return (
-        f"{counted(report['episodes'], 'episode')}: {report['success_rate']:.0%} goal, "
-        f"{report['collision_rate']:.0%} collision; {times}; "
-        f"{counted(report['safe_stops'], 'safe stop')}, "
-        f"{report['deadline_misses']} deadline misses, "
-        f"{counted(rejected, 'rejected message')}{vehicle}"
+    outcomes = Counter({GOAL: 0})
+    outcomes.update(row["outcome"] for row in report["per_episode"])
+    ends = (
+        f"{count} {name} ({count / report['episodes']:.0%})" for name, count in outcomes.items()
     )
+    stops = Counter(event["reason"] for event in report["safe_stop_events"])
+    vehicle = "" if report["vehicle"] is None else f"; {_vehicle_words(report['vehicle'])}"
+    return printable(
+        f"{counted(report['episodes'], 'episode')}: {', '.join(ends)}; {times}; "
+        f"{_reasons('safe stop', stops)}; "
+        f"{_reasons('rejected message', report['rejected'])}{vehicle}"
+    )
+
+
+def episode_line(
+    number: int, episodes: int, result: EpisodeResult, stops: Sequence[SafeStopEvent]
+) -> str:
+    """Return what became of an episode, as in "episode 2 of 5: goal after 12.3 s"."""
+    reasons = Counter(event.reason for event in stops)
+    braked = f"; {_reasons('safe stop', reasons)}" if reasons else ""
+    return printable(
+        f"episode {number} of {episodes}: {result.outcome} after {result.time_s:.1f} s{braked}"
+    )
+
+
+def _reasons(noun: str, counts: Mapping[str, int]) -> str:
+    """As in "3 safe stops (2 no_command, 1 vehicle_fault)"."""
+    each = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
+    return counted(sum(counts.values()), noun) + (f" ({each})" if each else "")
 
 
 def _vehicle_words(vehicle: Mapping[str, Any]) -> str:

@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import time
-from collections.abc import Iterator
-from types import FrameType
 from typing import NoReturn
 
+from edge_runtime.signals import sigterm_as_interrupt
+
+__all__ = ["sigterm_as_interrupt", "wait_to_be_told"]
+
 _LOOK_S = 0.2
-
-
-@contextlib.contextmanager
-def sigterm_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt inside the block (main thread only)."""
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def wait_to_be_told() -> NoReturn:

@@ -14,21 +14,30 @@ from bridge.arguments import add_tls, add_vehicle_id, add_wait_edge, add_where, 
 from bridge.clock import Clock
 from bridge.clocks import CLOCKS, REALTIME, running_clock
 from bridge.command_check import CommandCheck
-from bridge.environments import CONDITIONS, NOMINAL, SCENARIOS, make_environment, scenario_of
+from bridge.environments import (
+    CONDITIONS,
+    NOMINAL,
+    SCENARIOS,
+    make_environment,
+    scenario_of,
+    task_of,
+)
 from bridge.episode import EpisodeRunner
 from bridge.feedback_check import FeedbackCheck
 from bridge.port import SimulatorPort, open_port
 from bridge.progress import EpisodeBar, episode_bar
-from bridge.report import make_report, rejections, summary_line
+from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.signals import sigterm_as_interrupt
 from bridge.vehicle_clock import VehicleClock
 from bridge.vehicle_loop import VehicleInLoop
 from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
+from edge_runtime.latency.command_hold import Decision
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
+from edge_runtime.operator_commands import rearm_command
 from edge_runtime.option_types import not_negative, positive
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.topics import check_vehicle_id
+from edge_runtime.topics import CONTROL_PERIOD_S, check_vehicle_id
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 
@@ -179,17 +188,24 @@ def _drive(
     bar: EpisodeBar,
     vehicle: VehicleInLoop | None,
 ) -> dict[str, Any]:
+    rearm = rearm_command(str(settings.connect or settings.listen), settings.vehicle_id)
+
+    def on_tick(episode: int, step: int, decision: Decision) -> None:
+        bar.tick(episode, step, decision, rearm if port.edge_counts.waits_for_rearm else "")
+
     runner = EpisodeRunner(
         environment,
         clock,
         port.session,
         port.publish_scene,
-        bar.tick,
+        on_tick,
         apply=vehicle.apply if vehicle else policy_action,
         standing=settings.standing,
         # Copies, made at once: other threads go on counting.
         rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
+        task=task_of(environment, settings.env),
     )
+    _meet(settings, environment, port, runner)
     results = []
     port.note_edge_counts()
     started_s = time.monotonic()
@@ -197,7 +213,8 @@ def _drive(
         if vehicle is not None:
             vehicle.clock.wait_for_standstill()
         results.append(runner.run(episode, settings.seed + episode))
-        bar.done(episode + 1)
+        stops = [event for event in runner.safe_stops.events if event.episode == episode]
+        bar.done(episode + 1, episode_line(episode + 1, settings.episodes, results[-1], stops))
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
     unbelieved = Counter(port.edge_counts.unreadable)
@@ -219,6 +236,26 @@ def _drive(
         settings={**_as_asked(settings), "policy_ids": check.policy_ids, "wall_s": wall_s},
         vehicle=vehicle.report() if vehicle else None,
     )
+
+
+def _meet(
+    settings: SimulateSettings,
+    environment: gymnasium.Env[Any, Any],
+    port: SimulatorPort,
+    runner: EpisodeRunner,
+) -> None:
+    """Compare tasks with the edge runtime; UserError where its policy is for another one."""
+    manifest = port.edge_manifest()
+    if manifest is None:
+        return  # It compares by itself what the states say.
+    task = task_of(environment, settings.env, manifest)
+    if manifest.task != task:
+        runner.show_task(settings.seed)
+        time.sleep(CONTROL_PERIOD_S)  # Its safe stop still finds this end of the wire.
+        raise UserError(
+            f"the edge runtime's policy is for another task ({manifest.task!r}) than --env"
+            f" {settings.env} ({task!r}); start it with a policy of this, or choose another --env"
+        )
 
 
 def _as_asked(settings: SimulateSettings) -> dict[str, Any]:

@@ -16,7 +16,8 @@ class VehicleInLoop:
 
     def __init__(self, clock: VehicleClock, port: SimulatorPort, wait_s: float) -> None:
         self.clock = clock
-        self._action_names = port.edge_action_names()
+        manifest = port.edge_manifest()
+        self._action_names = [action.name for action in manifest.action] if manifest else []
         self.apply: Apply = vehicle_action(self._action_names)
         port.on_feedback(clock.receive_feedback)
         clock.wait_for_vehicle(wait_s, port.vehicle_id)

@@ -25,6 +25,7 @@ from edge_runtime.transport import check_endpoint
 from viewing.options import add_sink, chosen_sink
 from viewing.pace import PICTURE_INTERVAL_S
 from viewing.sinks import SERVE, Sink, check_sink, open_sink
+from viewing.viewer import flush
 
 POLL_S = 0.1
 
@@ -90,7 +91,7 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
             text = f"the recording {file.trouble()}; what is whole of it is shown"
             print(text, file=sys.stderr, flush=True)
         if sink.kind == SERVE:
-            recording.flush()
+            flush(recording)
             print("all of it is there; ^C ends", flush=True)
             wait_to_be_told()
 

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import write_atomic
+from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.signature import DEFAULT_PUBLIC_KEY
 
 DEFAULT_DIRECTORY = str(DEFAULT_PUBLIC_KEY.parent)
@@ -31,10 +31,7 @@ def write_key_pair(directory: Path) -> tuple[Path, Path]:
     for path in (private_path, public_path):
         if path.exists():
             raise UserError(f"{path} exists and is not overwritten; choose another --out")
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot create the directory {directory}: {error.strerror}") from error
+    make_directory(directory)
     key = Ed25519PrivateKey.generate()
     # The umask, not a later chmod: the private key is never readable by others, even briefly.
     before = os.umask(0o077)

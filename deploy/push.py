@@ -29,7 +29,8 @@ _UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 """A password asked for in the middle would hang a script, and so would a board without power."""
 SSH, SCP = ("ssh", *_UNATTENDED), ("scp", "-q", "-p", *_UNATTENDED)
 _HOST = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]*@)?[A-Za-z0-9\[][A-Za-z0-9_.:\]-]*")
-_TRUST = "trust.pub"
+_TRUST, _BUNDLE = "trust.pub", "bundle.tar"
+"""Names over there, whatever the files are called here: a bundle may be called `install.pyz`."""
 _SSH_FAILED = 255
 """ssh's own status; any other is that of the command over there."""
 
@@ -71,10 +72,11 @@ def push(arguments: argparse.Namespace) -> int:
         raise UserError(f"host {arguments.host!r} is not valid: write name or user@name")
     manifest = _verify(arguments)
     with tempfile.TemporaryDirectory() as place:
+        files = {name: Path(place) / name for name in (NAME, _TRUST)}
+        files[NAME].write_bytes(build_installer())
+        files[_TRUST].write_bytes(read_bytes(arguments.trust, "public key"))
         # Absolute: scp would take "a:b" for a file of the host a.
-        files = [Path(place) / NAME, Path(place) / _TRUST, Path(arguments.bundle).absolute()]
-        files[0].write_bytes(build_installer())
-        files[1].write_bytes(read_bytes(arguments.trust, "public key"))
+        files[_BUNDLE] = Path(arguments.bundle).absolute()
         before, install, after = steps(arguments, manifest, files)
         if arguments.dry_run:
             for step in (*before, install, after):
@@ -84,9 +86,12 @@ def push(arguments: argparse.Namespace) -> int:
 
 
 def steps(
-    arguments: argparse.Namespace, manifest: Manifest, files: list[Path]
+    arguments: argparse.Namespace, manifest: Manifest, files: dict[str, Path]
 ) -> tuple[list[Step], Step, Step]:
-    """What comes before the installation, the installation, and what is done in any case."""
+    """What comes before the installation, the installation, and what is done in any case.
+
+    `files` are those to copy, by their names over there.
+    """
     host, target = arguments.host, manifest.target
     folder = f"phil-push-{manifest.version}"
     python = f"python{target.python}"
@@ -96,17 +101,17 @@ def steps(
         f' "this board is " + platform.machine() + ", the bundle is for {target.machine}")\''
     )
     sudo = [] if arguments.no_sudo else ["sudo", "-n"]
-    remote = [f"{folder}/{path.name}" for path in files]
     install = [
-        *sudo, python, remote[0], "install", remote[2], "--trust", remote[1],
-        "--root", arguments.root, *(["--service", arguments.service] if arguments.service else []),
+        *sudo, python, f"{folder}/{NAME}", "install", f"{folder}/{_BUNDLE}",
+        "--trust", f"{folder}/{_TRUST}", "--root", arguments.root,
+        *(["--service", arguments.service] if arguments.service else []),
     ]  # fmt: skip
     before = [
         Step(f"has it Python {target.python} on {target.machine}?", [*SSH, host, probe]),
         Step("a folder of its own there", [*SSH, host, f"umask 077 && mkdir -p {folder}"]),
-        Step(
-            "the installer, the key to trust, the bundle",
-            [*SCP, *map(str, files), f"{host}:{folder}/"],
+        *(
+            Step(f"{name} into it", [*SCP, str(path), f"{host}:{folder}/{name}"])
+            for name, path in files.items()
         ),
     ]
     return (

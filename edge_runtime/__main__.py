@@ -7,7 +7,7 @@ import sys
 from typing import List
 
 from edge_runtime import __version__, log
-from edge_runtime.cli import ArgumentParser, examples, run_cli
+from edge_runtime.cli import ArgumentParser, add_public_key, examples, run_cli
 from edge_runtime.config import Config
 from edge_runtime.vehicles.registry import VEHICLE_NAMES
 
@@ -72,7 +72,7 @@ def build_parser() -> ArgumentParser:
         return added
 
     _add_check(add("check", "may this policy drive, and how fast is it here"))
-    _add_run(add("run", "answer states with commands until SIGTERM or ^C"))
+    _add_run(add("run", "answer states with commands until a signal ends it"))
     _add_operator(add("status", "print how a running edge runtime is"), with_out=True)
     _add_operator(add("rearm", "let a vehicle drive again after a safe stop"), with_out=False)
     return parser
@@ -125,11 +125,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_trust(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--public-key",
-        metavar="FILE",
-        help="Ed25519 public key, PEM (default: keys/policy.pub where it exists)",
-    )
+    add_public_key(parser)
     parser.add_argument(
         "--allow-unsigned",
         action="store_true",

@@ -7,6 +7,7 @@ UserError is re-exported here, so that a command needs this module only.
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
 from importlib import import_module
@@ -14,6 +15,7 @@ from typing import Any, Callable, Dict, List, NoReturn, Optional, Tuple
 
 from edge_runtime import files
 from edge_runtime.errors import UserError
+from edge_runtime.words import printable
 
 __all__ = [
     "BAD_INPUT",
@@ -21,6 +23,7 @@ __all__ = [
     "ArgumentParser",
     "HelpFormatter",
     "UserError",
+    "add_public_key",
     "dispatch",
     "examples",
     "run_cli",
@@ -29,6 +32,7 @@ __all__ = [
 
 BAD_INPUT = 2
 INTERRUPTED = 130
+_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _WITHOUT_DEFAULT = (None, False, argparse.SUPPRESS)
 
 
@@ -75,7 +79,7 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print "prog: what is wrong (see prog --help)" and exit with status 2."""
-        line = " ".join(message.split())
+        line = printable(" ".join(message.split()))
         self.exit(BAD_INPUT, f"{self.prog}: {line} (see {self.prog} --help)\n")
 
 
@@ -91,6 +95,16 @@ def refuse_empty(arguments: List[str], error: Callable[[str], NoReturn]) -> None
 def examples(*commands: str) -> str:
     """A parser's epilog: commands as a person would type them, continued after a backslash."""
     return "\n".join(["examples:", *("  " + text.replace("\n", "\n  ") for text in commands)])
+
+
+def add_public_key(parser: argparse.ArgumentParser) -> None:
+    """``--public-key``, of every command that reads a policy."""
+    parser.add_argument(
+        "--public-key",
+        metavar="FILE",
+        help="Ed25519 public key of the policy's signer, PEM (default: keys/policy.pub where it"
+        " exists; where an unsigned policy may drive, first policy.pub beside the policy)",
+    )
 
 
 def dispatch(parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv: List[str]) -> int:
@@ -117,11 +131,15 @@ def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) 
     """Run `main(argv)` and return its exit status; `argv` defaults to the command line.
 
     UserError becomes one line on stderr and status 2, and so does a file that the system does not
-    let us use; ^C status 130, and a reader that closed the pipe (`| head`) status 141 as the shell
-    would show it. Use: `sys.exit(run_cli(main))`.
+    let us use, or a full disk, also behind stdout; ^C status 130, and a reader that closed the
+    pipe (`| head`) status 141 as the shell would show it. Use: `sys.exit(run_cli(main))`.
     """
     try:
-        return main(sys.argv[1:] if argv is None else argv)
+        try:
+            return main(sys.argv[1:] if argv is None else argv)
+        finally:
+            if sys.stdout is not None:  # now: at the exit nobody could say what is wrong
+                sys.stdout.flush()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -129,14 +147,23 @@ def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) 
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # Python flushes stdout once more at exit; give it somewhere to go.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_stdout()
         return 141
     except OSError as error:
-        if error.filename is None:
+        if error.filename is not None:
+            what = printable(str(error.filename))
+        elif error.errno in _DISK_IS_FULL:
+            what = "cannot write"
+            _drop_stdout()  # it may be that which takes no more
+        else:
             raise  # nothing that a person named
-        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
+        print(f"error: {what}: {error.strerror}", file=sys.stderr)
         return BAD_INPUT
+
+
+def _drop_stdout() -> None:
+    """Python flushes stdout once more at exit; give it somewhere to go."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def write_json_out(path: Optional[files.PathLike], value: Any) -> None:

@@ -11,7 +11,7 @@ import msgspec
 
 from edge_runtime import log
 from edge_runtime.errors import UserError
-from edge_runtime.files import PathLike, read_bytes
+from edge_runtime.files import PathLike, read_toml
 from edge_runtime.tls import check_fits
 from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
@@ -83,13 +83,11 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
 
 
 def _read(path: PathLike) -> Config:
-    data = read_bytes(path, "config file")
+    tables = read_toml(path, "config file")
     try:
-        return msgspec.toml.decode(data, type=Config)
+        return msgspec.convert(tables, Config)
     except msgspec.ValidationError as error:
         raise UserError(f"config file {path}: {_explain(str(error))}") from None
-    except (msgspec.MsgspecError, ValueError) as error:
-        raise UserError(f"config file {path} is no TOML: {error}") from None
 
 
 def _explain(text: str) -> str:

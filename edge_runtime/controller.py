@@ -9,6 +9,7 @@ import math
 from typing import List, NamedTuple, Optional, Sequence
 
 import numpy as np
+from msgspec import UNSET
 
 from edge_runtime import safety as rules
 from edge_runtime.limiter import LimitRow, limit_action, neutral_action, stop_action
@@ -41,14 +42,22 @@ class Controller:
     """
 
     def __init__(
-        self, rows: Sequence[LimitRow], needs_rearm: bool, armed_at_start: bool = True
+        self,
+        rows: Sequence[LimitRow],
+        needs_rearm: bool,
+        armed_at_start: bool = True,
+        task: str = "",
     ) -> None:
         self.safety = Safety()
         self.deadline_misses = 0
         self.vehicle_fault = ""  # what is wrong with the vehicle now; the shell keeps it current
+        self._policy_is_dead = False
+        self._task = task  # the policy's; states that name another one are a fault
+        self._latched_fault = ""  # what stopped it, until it is re-armed
         self._rows = rows
         self._needs_rearm = needs_rearm
         self._last_action = neutral_action(rows)
+        self._ordered_s = -math.inf  # when that was said
         self._newest: Optional[Received] = None
         self._begun_s: Optional[float] = None
         self._next_stop_s = math.inf  # the first safe stop is an answer
@@ -61,6 +70,11 @@ class Controller:
         stopped = self.safety.mode is Mode.SAFE_STOP
         return self._needs_rearm and stopped and not self.safety.rearmed
 
+    @property
+    def vehicle_words(self) -> str:
+        """What is wrong with the vehicle; where that has passed, what has stopped it."""
+        return self.vehicle_fault or self._latched_fault
+
     def begin(self, received: Received, now_s: float) -> None:
         """The policy starts on the newest state."""
         session = received.state.session
@@ -72,8 +86,13 @@ class Controller:
         self._newest = received
         self._begun_s = now_s
 
-    def finish(self, output: np.ndarray, inference_ns: int, now_s: float) -> Optional[Order]:
-        """The policy's answer (float [n]) to the state of `begin`; None where it came too late."""
+    def finish(
+        self, output: Optional[np.ndarray], inference_ns: int, now_s: float
+    ) -> Optional[Order]:
+        """The policy's answer to the state of `begin`; no order where it came too late.
+
+        An answer that is not float32 [n], or None, is a failed inference.
+        """
         if self._begun_s is None or self._newest is None:
             return None
         overdue = now_s - self._begun_s > rules.MAX_INFERENCE_S
@@ -83,16 +102,24 @@ class Controller:
         self._begun_s = None
         if now_s - self._newest.arrived_s > CONTROL_PERIOD_S:
             self.deadline_misses += 1
-        wanted: List[float] = output.tolist()
+        wanted = self._read(output)
         self._apply(self._event_of(wanted))
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + CONTROL_PERIOD_S
-            return self._stop_order(inference_ns)
+            return self._stop_order(inference_ns, now_s)
         if self._needs_rearm and self._newest.state.final:
             # A vehicle that is told to drive on would do so until its own watchdog ends it.
-            return self._stop_order(inference_ns)._replace(reason=Event.FINAL.value)
-        self._last_action = limit_action(wanted, self._last_action, self._rows)
+            return self._stop_order(inference_ns, now_s)._replace(reason=Event.FINAL.value)
+        elapsed_s = now_s - self._ordered_s
+        self._last_action = limit_action(wanted, self._last_action, self._rows, elapsed_s)
+        self._ordered_s = now_s
         return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
+
+    def policy_died(self) -> None:
+        """Nobody finishes what was begun, or begins again. It stops for good; `tick` is due."""
+        self._policy_is_dead = True
+        self._begun_s, self._next_stop_s = None, -math.inf
+        self._apply(Event.DEAD)
 
     def tick(self, now_s: float) -> Optional[Order]:
         """The safe stop that is due by time alone: a fault just noticed, or the next repetition."""
@@ -101,7 +128,9 @@ class Controller:
         if self._begun_s is not None and now_s - self._begun_s > rules.MAX_INFERENCE_S:
             return self._give_up(now_s)
         was = self.safety.mode
-        if was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
+        if self._policy_is_dead:
+            pass  # whatever else is wrong, this is why it stands
+        elif was is not Mode.STANDBY and rules.is_silent(self.safety, now_s):
             self._apply(Event.SILENT)
         elif self.vehicle_fault and (was is Mode.DRIVE or self.safety.rearmed):
             self._apply(Event.VEHICLE)  # it may be over before the next state
@@ -110,7 +139,7 @@ class Controller:
         if was is Mode.SAFE_STOP and now_s < self._next_stop_s:
             return None
         self._schedule_stop(now_s, on_grid=was is Mode.SAFE_STOP)
-        return self._stop_order(0)
+        return self._stop_order(0, now_s)
 
     def next_deadline_s(self) -> Optional[float]:
         """When `tick` must be called next; None while nothing is due by time alone."""
@@ -127,6 +156,8 @@ class Controller:
         """An operator's permission to drive again. Empty when taken, else why it is refused."""
         if self.safety.mode is not Mode.SAFE_STOP:
             return f"nothing to re-arm: the mode is {self.safety.mode.value}"
+        if self._policy_is_dead:
+            return "the policy's thread is dead: restart the runtime"
         if not self._needs_rearm:
             return "no vehicle is attached: it drives again by itself after fresh states"
         if self.vehicle_fault:
@@ -135,21 +166,33 @@ class Controller:
             # Kept for later, the permission would move the vehicle when the link returns.
             return "no fresh states arrive; re-arm when the link is back"
         self._apply(Event.REARM)
+        self.safety = self.safety._replace(permitted_s=now_s)
         return ""
 
     def farewell(self) -> Optional[Order]:
         """The safe stop that goes out when the runtime is ended while it answers a simulator."""
         if self.safety.mode is Mode.STANDBY or self._newest is None:
             return None
-        return self._stop_order(0)._replace(reason="runtime_ended")
+        return self._stop_order(0, self._ordered_s)._replace(reason="runtime_ended")
+
+    def _read(self, output: Optional[np.ndarray]) -> List[float]:
+        """The numbers of an answer, one for each action; none where it has another form."""
+        if output is None or output.dtype != np.float32 or output.shape != (len(self._rows),):
+            return []
+        numbers: List[float] = output.tolist()
+        return numbers
 
     def _event_of(self, wanted: List[float]) -> Event:
+        assert self._newest is not None
+        if self._task and self._newest.state.task not in (UNSET, self._task):
+            return Event.OTHER_TASK
+        if not wanted:
+            return Event.FAILED
         # One or two numbers: numpy would take ten times as long for them.
         if not all(map(math.isfinite, wanted)):
             return Event.NOT_FINITE
         if self.vehicle_fault:
             return Event.VEHICLE
-        assert self._newest is not None
         return rules.classify_fresh(self.safety, self._newest.state.final, self._needs_rearm)
 
     def _give_up(self, now_s: float) -> Order:
@@ -158,17 +201,22 @@ class Controller:
         self.deadline_misses += 1
         self._apply(Event.TOO_LONG)
         self._schedule_stop(now_s, on_grid=False)
-        return self._stop_order(0)
+        return self._stop_order(0, now_s)
 
     def _schedule_stop(self, now_s: float, on_grid: bool) -> None:
         """Repetitions stand on a grid, so that late wake-ups do not lower the rate of 1/T."""
         grid_s = self._next_stop_s + CONTROL_PERIOD_S
         self._next_stop_s = grid_s if on_grid and grid_s > now_s else now_s + CONTROL_PERIOD_S
 
-    def _stop_order(self, inference_ns: int) -> Order:
+    def _stop_order(self, inference_ns: int, now_s: float) -> Order:
         assert self._newest is not None  # a safe stop is an answer to a state
         self._last_action = stop_action(self._last_action, self._rows)
+        self._ordered_s = now_s
         return Order(self._newest, SAFE_STOP, self._last_action, self.safety.reason, inference_ns)
 
     def _apply(self, event: Event) -> None:
         self.safety = rules.advance(self.safety, event)
+        if event is Event.VEHICLE:
+            self._latched_fault = self._latched_fault or self.vehicle_fault
+        elif event is Event.REARM or self.safety.mode is not Mode.SAFE_STOP:
+            self._latched_fault = ""

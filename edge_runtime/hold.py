@@ -7,9 +7,10 @@ an installer that dies leaves nobody silent. Once free, this process never asks 
 from __future__ import annotations
 
 import fcntl
-from typing import Optional, TextIO
+from typing import BinaryIO, Optional
 
 from edge_runtime.errors import UserError
+from edge_runtime.files import open_regular
 
 
 class Hold:
@@ -19,10 +20,10 @@ class Hold:
     """
 
     def __init__(self, path: Optional[str] = None) -> None:
-        self._stream: Optional[TextIO] = None
+        self._stream: Optional[BinaryIO] = None
         if path is not None:
             try:
-                self._stream = open(path)  # noqa: SIM115 - kept until it is free
+                self._stream = open_regular(path)  # kept until it is free
             except FileNotFoundError:
                 return
             except OSError as error:

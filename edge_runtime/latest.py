@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from typing import Dict, NamedTuple, Optional, Tuple
+from typing import Dict, NamedTuple, Optional, Set, Tuple
 
 from edge_runtime.wire import CONTROL_PERIOD_S, Reason, Rejection, State
 
 TAKEOVER_SILENCE_S = 2 * CONTROL_PERIOD_S
+# Of so many past sessions it is known where they stood: they may come back with newer states. Of
+# all before them only that they are over, by a hash of 8 bytes.
 _REMEMBERED_SESSIONS = 16
+MAX_FORGOTTEN_SESSIONS = 100_000  # some 8 MB, and 5 h of one take-over after the other
 # One message from far ahead would make all that follow it old. So much may be lost on the way,
 # and besides as many as a quick simulator counts while nothing arrives.
 MAX_SKIPPED_EPISODES = 10
@@ -42,6 +45,7 @@ class LatestState:
         self._heard_s = -math.inf
         # Where each session stood: a delayed message of an earlier one never goes back either.
         self._lasts: OrderedDict[str, _Last] = OrderedDict()
+        self._forgotten: Set[int] = set()
 
     def offer(self, state: State, now_s: float) -> Optional[Rejection]:
         """Accept the state (None) or say why not. `now_s`: monotonic time of arrival."""
@@ -74,18 +78,27 @@ class LatestState:
     def _judge_order(self, state: State, now_s: float) -> Optional[Rejection]:
         last = self._lasts.get(state.session)
         if last is None:
-            return None
+            return self._judge_session(state.session)
         position = (state.episode, state.step)
         if position > last.position:
             return _judge_skip(position, last, now_s)
         reason = Reason.DUPLICATE if position == last.position else Reason.STALE
         return _rejection(reason, position, last)
 
+    def _judge_session(self, session: str) -> Optional[Rejection]:
+        """Reject one that is over, and any other where there were too many to know that."""
+        if hash(session) in self._forgotten:
+            return Rejection(Reason.STALE, f"session {session!r} ended many simulators ago")
+        if len(self._forgotten) >= MAX_FORGOTTEN_SESSIONS:
+            words = f"there were {len(self._forgotten)} simulators before; start the runtime again"
+            return Rejection(Reason.FOREIGN_SESSION, words)
+        return None
+
     def _remember(self, state: State, now_s: float) -> None:
         self._lasts[state.session] = _Last((state.episode, state.step), now_s)
         self._lasts.move_to_end(state.session)
         while len(self._lasts) > _REMEMBERED_SESSIONS:
-            self._lasts.popitem(last=False)
+            self._forgotten.add(hash(self._lasts.popitem(last=False)[0]))
 
 
 def _judge_skip(position: Position, last: _Last, now_s: float) -> Optional[Rejection]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Dict, List, NamedTuple, Sequence
 
 from edge_runtime.errors import UserError
@@ -11,12 +12,12 @@ from edge_runtime.wire import CONTROL_PERIOD_S
 
 
 class LimitRow(NamedTuple):
-    """What one action may be: its range, and how far it may move in one control period."""
+    """What one action may be: its range, and how fast it may change (inf: at once)."""
 
     name: str
     low: float
     high: float
-    max_step: float
+    slew_per_s: float
 
 
 def limit_rows(actions: Sequence[Action], limits: Dict[str, ActionLimit]) -> List[LimitRow]:
@@ -30,7 +31,7 @@ def limit_rows(actions: Sequence[Action], limits: Dict[str, ActionLimit]) -> Lis
 
 def _row(action: Action, limits: Dict[str, ActionLimit]) -> LimitRow:
     if not limits:
-        return LimitRow(action.name, action.low, action.high, float("inf"))
+        return LimitRow(action.name, action.low, action.high, math.inf)
     if action.name not in limits:
         raise UserError(
             f"the vehicle has no {action.name!r}, which the policy acts on;"
@@ -40,20 +41,24 @@ def _row(action: Action, limits: Dict[str, ActionLimit]) -> LimitRow:
     low, high = max(action.low, limit.low), min(action.high, limit.high)
     if low > high:
         raise UserError(f"the policy's and the vehicle's range of {action.name!r} do not meet")
-    return LimitRow(action.name, low, high, limit.slew_per_s * CONTROL_PERIOD_S)
+    return LimitRow(action.name, low, high, limit.slew_per_s)
 
 
 def limit_action(
-    wanted: Sequence[float], last: Sequence[float], rows: Sequence[LimitRow]
+    wanted: Sequence[float], last: Sequence[float], rows: Sequence[LimitRow], elapsed_s: float
 ) -> List[float]:
-    """`wanted` within each row's range and no further from `last` than the row's step.
+    """`wanted` within each row's range, and as near to `last` as the time between them demands.
 
-    A limit that does not bite leaves the number as it is, to the last bit.
+    More than a control period counts as one: a vehicle need not leap after a pause. A limit that
+    does not bite leaves the number as it is, to the last bit.
     """
+    elapsed_s = min(max(elapsed_s, 0.0), CONTROL_PERIOD_S)
     limited = []
     for value, previous, row in zip(wanted, last, rows):
-        near = min(max(value, previous - row.max_step), previous + row.max_step)
-        limited.append(min(max(near, row.low), row.high))
+        if row.slew_per_s < math.inf:
+            most = row.slew_per_s * elapsed_s
+            value = min(max(value, previous - most), previous + most)
+        limited.append(min(max(value, row.low), row.high))
     return limited
 
 

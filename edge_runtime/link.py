@@ -12,6 +12,7 @@ from edge_runtime import __version__, log
 from edge_runtime.manifest import Manifest
 from edge_runtime.native_thread import keep_state
 from edge_runtime.presence import OpenClient, Presence
+from edge_runtime.transport import only_own
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
 _PUBLISHED = ("command", "feedback", "health")
@@ -61,9 +62,10 @@ class Link:
             refusal = rearm()
             _reply(query, {"accepted": not refusal, "detail": refusal, "mode": health().mode})
 
-        session, rearm_key = self._session, key(self.vehicle_id, "rearm")
+        session, state_key = self._session, key(self.vehicle_id, "state")
+        rearm_key = key(self.vehicle_id, "rearm")
         self._declared = [
-            session.declare_subscriber(key(self.vehicle_id, "state"), _at_once(state_came)),
+            session.declare_subscriber(state_key, _at_once(only_own(state_key, state_came))),
             session.declare_queryable(key(self.vehicle_id, "status"), status_asked),
             session.declare_queryable(rearm_key, rearm_asked),
         ]

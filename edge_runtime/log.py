@@ -99,4 +99,6 @@ def _time(record: logging.LogRecord) -> str:
 
 def _quoted(value: Any) -> str:
     text = str(value)
-    return repr(text) if not text or any(c.isspace() or c in "\"'=" for c in text) else text
+    # Other parties' words may hold what a terminal would act upon: repr writes it as escapes.
+    is_plain = text and text.isprintable() and not any(c in " \"'=" for c in text)
+    return text if is_plain else repr(text)

@@ -3,7 +3,8 @@
 Three kinds of threads meet here, under one lock:
 - Zenoh's receiving thread calls `_on_state`, which judges a message and leaves the newest state
   in a slot;
-- the policy's thread takes the slot, infers outside the lock, and sends the answer;
+- the policy's thread takes the slot, infers outside the lock, and sends the answer; an exception
+  that ends it is a fault of its own;
 - the main thread is the watchdog: it wakes at absolute deadlines, sends safe stops and health,
   and tells systemd that all of this works.
 A command is sent under the lock, so that no late answer can follow a safe stop.
@@ -15,6 +16,7 @@ import math
 import queue
 import threading
 import time
+import traceback
 from typing import Optional
 
 from edge_runtime import log
@@ -50,6 +52,7 @@ class ControlLoop:
         vehicle: Optional[VehicleRunner],
         notifier: Notifier,
         hold: Optional[Hold] = None,
+        rearm_command: str = "",
     ) -> None:
         self._policy = policy
         self._controller = controller
@@ -57,6 +60,7 @@ class ControlLoop:
         self._vehicle = vehicle
         self._notifier = notifier
         self._hold = hold or Hold()
+        self._rearm_command = rearm_command
         self._board = BoardWatch()
         self._latest = LatestState()
         self._inference_window = LatencyWindow()
@@ -67,6 +71,7 @@ class ControlLoop:
         self._superseded = 0
         self._stopping = False
         self._logged = Safety()
+        self._logged_wait = False
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
         self._lock = threading.RLock()
@@ -118,6 +123,10 @@ class ControlLoop:
             self._send(self._controller.farewell())
         return not self._worker.is_alive()
 
+    def has_heard(self) -> bool:
+        """Whether any state has come, also one that was rejected."""
+        return bool(self._latest.accepted or self._latest.rejected)
+
     def health(self) -> Health:
         """The message of the health topic and of the status query."""
         with self._lock:
@@ -139,7 +148,7 @@ class ControlLoop:
                 uptime_s=time.monotonic() - self._started_s,
                 sent_ns=time.time_ns(),
                 rivals=self._link.rivals,
-                vehicle_fault=self._controller.vehicle_fault[:MAX_TEXT_CHARS],
+                vehicle_fault=self._controller.vehicle_words[:MAX_TEXT_CHARS],
                 **self._board.last._asdict(),
             )
 
@@ -161,6 +170,18 @@ class ControlLoop:
             self._wakes.put(None)
 
     def _work(self) -> None:
+        try:
+            self._answer()
+        except BaseException as error:  # whatever it is, the watchdog must know
+            with self._lock:
+                self._busy_since_s = None
+                self._controller.policy_died()
+                self._timer.notify()
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{place.filename}:{place.lineno}"
+            log.event("error", "policy_thread_dead", detail=repr(error), where=where)
+
+    def _answer(self) -> None:
         while True:
             self._wakes.get()
             with self._lock:
@@ -183,7 +204,9 @@ class ControlLoop:
                     self._command_window.add(int(took_s * 1e9))
 
     def _is_hung(self, now_s: float) -> bool:
-        """Whether policy or driver keep their thread: a new process may help, and nothing else."""
+        """Whether policy or driver keep or lost their thread: only a new process may help."""
+        if not self._worker.is_alive():
+            return True
         if self._vehicle is not None and self._vehicle.busy_s(now_s) > _HUNG_S:
             return True
         return self._busy_since_s is not None and now_s - self._busy_since_s > _HUNG_S
@@ -262,6 +285,10 @@ class ControlLoop:
             )
             self._logged = safety
             self._notifier.status(f"{safety.mode.value} {safety.reason}".rstrip())
+        waits = self._controller.waits_for_rearm
+        if waits and not self._logged_wait:
+            log.event("warning", "waits_for_rearm", command=self._rearm_command)
+        self._logged_wait = waits
 
     def _log_rejection(self, rejection: Rejection, now_s: float) -> None:
         """The first of each reason, then one a second: all are counted in the health message."""

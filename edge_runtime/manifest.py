@@ -6,7 +6,7 @@ Contract, section 4. It is JSON in the ONNX metadata under MANIFEST_KEY.
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, List
+from typing import Any, Dict, List, Sequence, Tuple
 
 import msgspec
 
@@ -43,10 +43,10 @@ class Action(msgspec.Struct, frozen=True, kw_only=True):
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     """All of it. `training` holds at least seed, episodes, config and source revision.
 
-    `policy_id` is the SHA-256 of the graph's weights (onnx_file.py), `created` ISO 8601 in UTC.
+    `created` is ISO 8601 in UTC. A field that is not listed, like an earlier version's `policy_id`,
+    is not looked at.
     """
 
-    policy_id: str
     scenario: str
     algorithm: str
     observation: Observation
@@ -55,6 +55,17 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     created: str
     control_period_s: float = wire.CONTROL_PERIOD_S
     schema: int = MANIFEST_SCHEMA
+
+    @property
+    def task(self) -> str:
+        """What the policy is for: what it is compared by when it meets a simulator."""
+        return task_text(self.scenario, [(row.name, row.low, row.high) for row in self.action])
+
+
+def task_text(scenario: str, actions: Sequence[Tuple[str, float, float]]) -> str:
+    """Scenario, and each action's name, low and high: `left_turn, pedal -1 to 1`."""
+    rows = (f"{name} {low:g} to {high:g}" for name, low, high in actions)
+    return ", ".join((scenario, *rows))[: wire.MAX_TEXT_CHARS]
 
 
 def encode_manifest(manifest: Manifest) -> str:

@@ -43,7 +43,10 @@ class Rejection(NamedTuple):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the simulator sees at one step. `frames`: 2x45x80 uint8 in C order, [t-1, t]."""
+    """What the simulator sees at one step. `frames`: 2x45x80 uint8 in C order, [t-1, t].
+
+    `task` is what its environment is for, as `manifest.task_text` says it; left out where unknown.
+    """
 
     session: str
     episode: int
@@ -53,6 +56,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     frames: bytes
     speed_mps: float
     final: bool
+    task: Union[str, msgspec.UnsetType] = msgspec.UNSET
     schema: int = SCHEMA
 
     def frames_array(self) -> np.ndarray:
@@ -111,7 +115,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     p99 and max over the last 1,024 (0 before the first). `superseded` counts accepted states that
     a newer one replaced before the policy took them, `rivals` other runtimes that were seen under
     this vehicle id. `temperature_c` is the board's hottest sensor, None where it has none.
-    `vehicle_fault` is what is wrong with the vehicle in words, empty if nothing.
+    `vehicle_fault` is what is wrong with the vehicle in words, or what has stopped it and waits for
+    a re-arm; empty if nothing.
     """
 
     vehicle_id: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 from pathlib import Path
 from typing import Iterator, List, Optional, Tuple
@@ -28,21 +29,23 @@ class Policy:
     """A network that may drive. Make it with `load_policy`."""
 
     def __init__(
-        self, session: onnxruntime.InferenceSession, manifest: Manifest, trust: str
+        self, session: onnxruntime.InferenceSession, manifest: Manifest, trust: str, policy_id: str
     ) -> None:
         self.manifest = manifest
         self.trust = trust
+        self.policy_id = policy_id
         self._session = session
 
-    @property
-    def policy_id(self) -> str:
-        """SHA-256 of the weights, in hex."""
-        return self.manifest.policy_id
-
     def act(self, frames: np.ndarray) -> np.ndarray:
-        """The action, float32 [n], for frames uint8 [2, 45, 80]. It may hold NaN: check it."""
-        outputs: List[np.ndarray] = self._session.run([OUTPUT], {INPUT: frames[np.newaxis]})
-        return outputs[0][0]
+        """The action, float32 [n], for frames uint8 [2, 45, 80]. It may hold NaN: check it.
+
+        Raises UserError for another type or shape (which can depend on the picture), and
+        whatever onnxruntime raises.
+        """
+        answer: np.ndarray = self._session.run([OUTPUT], {INPUT: frames[np.newaxis]})[0]
+        if answer.dtype != np.float32 or answer.shape != (1, len(self.manifest.action)):
+            raise UserError(f"the policy answers with {answer.dtype} {list(answer.shape)}")
+        return answer[0]
 
 
 def load_policy(
@@ -50,7 +53,8 @@ def load_policy(
 ) -> Policy:
     """Load a policy that may drive: trusted, whole, its manifest and graph of one mind, probed.
 
-    `public_key` is a PEM file; without it `keys/policy.pub` is taken where it exists.
+    `public_key` is a PEM file; without it `keys/policy.pub` is taken where it exists, and with
+    `allow_unsigned` before it a `policy.pub` beside the policy.
     Raises UserError with the first reason why the policy may not drive.
     """
     # Read once: what is verified is what is loaded, even if the file is replaced meanwhile.
@@ -60,11 +64,16 @@ def load_policy(
         model = read_onnx(data)
         manifest = _read_manifest(model)
         _compare(manifest, model)
-        policy = Policy(_open(data), manifest, trust)
+        policy = Policy(_open(data), manifest, trust, policy_id_of(data))
         _probe(policy)
     except UserError as error:
         raise UserError(f"policy {Path(path)} may not drive: {error}") from None
     return policy
+
+
+def policy_id_of(data: bytes) -> str:
+    """The name of a policy: SHA-256 of its whole file, in hex. Two that act differently differ."""
+    return hashlib.sha256(data).hexdigest()
 
 
 def _read_manifest(model: OnnxFile) -> Manifest:
@@ -79,11 +88,6 @@ def _compare(manifest: Manifest, model: OnnxFile) -> None:
         raise UserError(
             f"it has opset {model.opset} and IR version {model.ir_version};"
             f" opset {OPSET} and IR version {MAX_IR_VERSION} or lower are needed"
-        )
-    if manifest.policy_id != model.weights_sha256:
-        raise UserError(
-            f"its manifest names weights {manifest.policy_id[:12]}...,"
-            f" its graph holds {model.weights_sha256[:12]}..."
         )
     _compare_tensor("input", model.inputs, (INPUT, UINT8, FRAMES_SHAPE))
     _compare_tensor("output", model.outputs, (OUTPUT, FLOAT32, (len(manifest.action),)))
@@ -114,6 +118,8 @@ def _open(data: bytes) -> onnxruntime.InferenceSession:
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 4
+    # Read as what was checked: bytes can be an ONNX file and one of onnxruntime's own format.
+    options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         # It prints "EP Error" on stdout for some broken files; stdout belongs to our reports.
         with contextlib.redirect_stdout(io.StringIO()):
@@ -147,9 +153,6 @@ def _probe(policy: Policy) -> None:
 
 def _try(policy: Policy, frames: np.ndarray) -> np.ndarray:
     try:
-        action = policy.act(frames)
+        return policy.act(frames)
     except Exception as error:  # as in _open
         raise UserError(f"onnxruntime does not run it: {error}") from None
-    if action.shape != (len(policy.manifest.action),):
-        raise UserError(f"it answers a probe picture with shape {action.shape}")
-    return action

@@ -5,7 +5,7 @@ https://protobuf.dev/programming-guides/encoding/
 
 from __future__ import annotations
 
-from typing import Dict, Iterator, List, Tuple, Union
+from typing import Dict, Iterator, List, Set, Tuple, Union
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _MAX_VARINT_BYTES = 10
@@ -29,6 +29,10 @@ class Fields:
     def has(self, number: int) -> bool:
         """Whether the field is there at all."""
         return number in self._values
+
+    def numbers(self) -> Set[int]:
+        """Those of all fields that are there."""
+        return set(self._values)
 
     def integer(self, number: int) -> int:
         """The last value of an integer field, as protobuf defines it; 0 where absent."""

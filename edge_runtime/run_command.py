@@ -8,6 +8,7 @@ import gc
 import os
 import signal
 import sys
+from functools import partial
 from typing import Any, Callable, Iterator, Optional
 
 from edge_runtime import access, log, presence, realtime
@@ -17,23 +18,26 @@ from edge_runtime.hold import Hold
 from edge_runtime.limiter import limit_rows
 from edge_runtime.link import Link
 from edge_runtime.loop import ControlLoop
+from edge_runtime.operator_commands import rearm_command
 from edge_runtime.policy import Policy, load_policy
 from edge_runtime.sd_notify import Notifier
+from edge_runtime.signals import ending_signals
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.interface import Vehicle
 from edge_runtime.vehicles.registry import make_vehicle
 from edge_runtime.vehicles.runner import VehicleRunner
+from edge_runtime.waiting import Waiting, why_no_state
 from edge_runtime.wire import key
 
 
 class StopSignal:
-    """SIGTERM and SIGINT: remembered from the start, handed on once there is a loop to stop."""
+    """Whatever would end it: remembered from the start, handed on once there is a loop to stop."""
 
     def __init__(self) -> None:
         self.came = False
         self.on_stop: Callable[[], None] = lambda: None
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in {signal.SIGTERM, signal.SIGINT, *ending_signals()}:
             signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: Any) -> None:
@@ -60,7 +64,8 @@ def _run(config: Config) -> int:
     vehicle = make_vehicle(config.vehicle, config.vehicle_setup(policy.manifest.scenario))
     with _closed_on_error(vehicle):
         rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
-    controller = Controller(rows, vehicle is not None, config.armed_at_start)
+    task = policy.manifest.task
+    controller = Controller(rows, vehicle is not None, config.armed_at_start, task)
     return _serve(config, tls, policy, controller, vehicle, stop)
 
 
@@ -90,19 +95,20 @@ def _serve(
     vehicle: Optional[Vehicle],
     stop: StopSignal,
 ) -> int:
-    def open_client() -> Any:
-        return open_session(connect=config.connect, mode="client", tls=tls)
-
+    # Both of its sessions hear only whom this vehicle's edge may hear.
+    rules = None if tls is None else access.rules_for_edge(config.vehicle_id)
+    connected = partial(open_session, connect=config.connect, tls=tls, access=rules)
+    open_client = partial(connected, mode="client")
     notifier = Notifier()
     with _closed_on_error(vehicle):
         alive = key(config.vehicle_id, "alive")
         router_is_there = presence.require_free(open_client, alive, config.vehicle_id)
-        rules = None if tls is None else access.rules_for_edge(config.vehicle_id)
-        session = open_session(connect=config.connect, mode="peer", tls=tls, access=rules)
+        session = connected(mode="peer")
         try:
             link = Link(session, config.vehicle_id, policy.manifest)
             runner = _attach(vehicle, policy, link)
-            loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold))
+            rearm = rearm_command(config.connect, config.vehicle_id)
+            loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold), rearm)
         except BaseException:
             session.close()  # An open session would hang the process at its exit.
             raise
@@ -114,6 +120,8 @@ def _serve(
         loop.stop()
 
     stop.on_stop = loop.stop
+    why = partial(why_no_state, session, config.connect, config.vehicle_id, tls)
+    waiting = Waiting(loop.has_heard, why)
     # What is loaded stays: the collector need not look at it again in the middle of a drive.
     gc.collect()
     gc.freeze()
@@ -125,10 +133,12 @@ def _serve(
             presence.wait_for_router(session)
         link.appear(open_client, give_way)
         _say_ready(config, policy, tls)
+        waiting.start(bool(session.info.routers_zid()))
         notifier.ready(controller.safety.mode.value)
         if not stop.came:
             loop.run()
     finally:
+        waiting.stop()
         notifier.stopping()
         ended = loop.close()
         if runner is not None:

@@ -37,9 +37,12 @@ class Event(str, Enum):
     FINAL = "final_state"  # the episode ends with it
     SILENT = "no_fresh_state"  # for longer than SILENCE_S
     NOT_FINITE = "output_not_finite"
+    FAILED = "inference_failed"  # the policy raised, or answered with another type or shape
+    DEAD = "policy_thread_dead"  # an exception has ended it: only a new process helps
     TOO_LONG = "inference_too_long"  # longer than T, or its answer is older than SILENCE_S
-    PAUSED = "pause_too_long"  # a vehicle stood by for more than MAX_PAUSE_S
+    PAUSED = "pause_too_long"  # a vehicle had leave to drive and did not for MAX_PAUSE_S
     OTHER_SESSION = "other_session"  # a vehicle's states come from another simulator than before
+    OTHER_TASK = "other_task"  # the state is of another task than the policy
     NOT_ARMED = "not_armed"  # a vehicle whose driver was not started as a permission to move
     VEHICLE = "vehicle_fault"  # it is silent, does not obey, or reports what cannot be
     REARM = "rearm"  # an operator allows driving again
@@ -53,9 +56,12 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_S, Event.FINAL): _S,
     (_S, Event.SILENT): _S,  # between two episodes nothing is due
     (_S, Event.NOT_FINITE): _X,
+    (_S, Event.FAILED): _X,
+    (_S, Event.DEAD): _X,
     (_S, Event.TOO_LONG): _X,
     (_S, Event.PAUSED): _X,
     (_S, Event.OTHER_SESSION): _X,
+    (_S, Event.OTHER_TASK): _X,
     (_S, Event.NOT_ARMED): _X,
     (_S, Event.VEHICLE): _X,
     (_S, Event.REARM): _S,
@@ -64,9 +70,12 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_D, Event.FINAL): _S,
     (_D, Event.SILENT): _X,
     (_D, Event.NOT_FINITE): _X,
+    (_D, Event.FAILED): _X,
+    (_D, Event.DEAD): _X,
     (_D, Event.TOO_LONG): _X,
     (_D, Event.PAUSED): _X,
     (_D, Event.OTHER_SESSION): _X,
+    (_D, Event.OTHER_TASK): _X,
     (_D, Event.NOT_ARMED): _X,
     (_D, Event.VEHICLE): _X,
     (_D, Event.REARM): _D,
@@ -75,9 +84,12 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
     (_X, Event.FINAL): _X,  # the end of an episode is no way around the condition
     (_X, Event.SILENT): _X,
     (_X, Event.NOT_FINITE): _X,
+    (_X, Event.FAILED): _X,
+    (_X, Event.DEAD): _X,
     (_X, Event.TOO_LONG): _X,
     (_X, Event.PAUSED): _X,
     (_X, Event.OTHER_SESSION): _X,
+    (_X, Event.OTHER_TASK): _X,
     (_X, Event.NOT_ARMED): _X,
     (_X, Event.VEHICLE): _X,
     (_X, Event.REARM): _X,  # a fresh state must follow
@@ -85,9 +97,12 @@ TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
 FAULTS = (
     Event.SILENT,
     Event.NOT_FINITE,
+    Event.FAILED,
+    Event.DEAD,
     Event.TOO_LONG,
     Event.PAUSED,
     Event.OTHER_SESSION,
+    Event.OTHER_TASK,
     Event.NOT_ARMED,
     Event.VEHICLE,
 )
@@ -98,7 +113,8 @@ class Safety(NamedTuple):
     """Where the machine stands. `reason` is the fault that stopped it, empty elsewhere.
 
     `last_fresh_s` and `session` are the monotonic arrival of the newest state and the simulator
-    that sent it, None before the first one.
+    that sent it, None before the first one. `permitted_s` is when it last drove or was re-armed,
+    or the arrival of the very first state.
     """
 
     mode: Mode = Mode.STANDBY
@@ -108,6 +124,7 @@ class Safety(NamedTuple):
     last_fresh_s: Optional[float] = None
     session: Optional[str] = None
     safe_stops: int = 0
+    permitted_s: Optional[float] = None
 
 
 def is_silent(safety: Safety, now_s: float) -> bool:
@@ -124,8 +141,10 @@ def classify_arrival(
     if session != safety.session:
         # It was let in because the one before was silent for 2 T, whatever GRACE_S says.
         return Event.OTHER_SESSION if needs_rearm else Event.SILENT
-    pause_s = arrived_s - safety.last_fresh_s
-    if needs_rearm and safety.mode is Mode.STANDBY and pause_s > MAX_PAUSE_S:
+    may_drive = needs_rearm and (safety.mode is Mode.STANDBY or safety.rearmed)
+    # Not from the last state: final ones may come for hours, and nobody drives.
+    since_s = arrived_s if safety.permitted_s is None else safety.permitted_s
+    if may_drive and arrived_s - since_s > MAX_PAUSE_S:
         return Event.PAUSED
     return Event.SILENT if is_silent(safety, arrived_s) else None
 
@@ -162,7 +181,12 @@ def advance(safety: Safety, event: Event) -> Safety:
 
 def note_arrival(safety: Safety, session: str, arrived_s: float) -> Safety:
     """Remember whose newest state arrived when, before anyone knows what the policy makes of it."""
-    return safety._replace(last_fresh_s=arrived_s, session=session)
+    drives = safety.mode is Mode.DRIVE or safety.permitted_s is None
+    return safety._replace(
+        last_fresh_s=arrived_s,
+        permitted_s=arrived_s if drives else safety.permitted_s,
+        session=session,
+    )
 
 
 def _count_fresh(safety: Safety, event: Event) -> int:

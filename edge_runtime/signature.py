@@ -20,6 +20,7 @@ SIGNATURE_BYTES = 64
 DEFAULT_PUBLIC_KEY = Path("keys/policy.pub")
 
 VERIFIED = "verified"
+BESIDE = "signed by the key beside it"
 UNVERIFIED = "signed, not verified"
 UNSIGNED = "unsigned"
 
@@ -41,10 +42,12 @@ def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None
 def check_trust(
     path: PathLike, policy_bytes: bytes, public_key: Optional[PathLike], allow_unsigned: bool
 ) -> str:
-    """VERIFIED, UNVERIFIED or UNSIGNED for a policy that may drive; UserError for all others.
+    """VERIFIED, BESIDE, UNVERIFIED or UNSIGNED for a policy that may drive; UserError for others.
 
     A signature is always verified where a public key is known; `allow_unsigned` lets through
-    only what cannot be verified, never what fails to.
+    only what cannot be verified, never what fails to. With it, a key beside the policy comes before
+    that of the working directory. Without it, such a key counts for nothing: who brings a policy
+    could bring it, too.
     """
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     if not signature_path.exists():
@@ -55,14 +58,19 @@ def check_trust(
             " sign it, or allow it with --allow-unsigned"
         )
     signature = read_bytes(signature_path, "signature")
-    key_path = _find_public_key(public_key)
+    beside = Path(path).with_name(DEFAULT_PUBLIC_KEY.name)
+    is_beside = allow_unsigned and public_key is None and beside.exists()
+    key_path = beside if is_beside else _find_public_key(public_key)
     if key_path is not None:
         key_pem = read_bytes(key_path, "public key")
         try:
             verify(policy_bytes, signature, key_pem)
         except UserError as error:
-            raise UserError(f"signature {signature_path}, public key {key_path}: {error}") from None
-        return VERIFIED
+            raise UserError(
+                f"signature {signature_path}, public key {key_path}: {error};"
+                " name the key of its signer with --public-key"
+            ) from None
+        return BESIDE if is_beside else VERIFIED
     if allow_unsigned:
         return UNVERIFIED
     raise UserError(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Callable, Dict, List, Tuple
 
+from edge_runtime.words import printable
+
 _Row = Tuple[str, Callable[[Dict[str, Any]], str]]
 
 # What a row says of a reply; a runtime of an earlier version may not tell all of it.
@@ -30,7 +32,7 @@ _ROWS: List[_Row] = [
 def render_status(status: Dict[str, Any]) -> str:
     """One line for each row; `status` is the reply of the queryable."""
     width = max(len(label) for label, _ in _ROWS)
-    return "\n".join(f"{label:<{width}}  {say(status)}" for label, say in _ROWS)
+    return "\n".join(f"{label:<{width}}  {printable(say(status))}" for label, say in _ROWS)
 
 
 def _mode(status: Dict[str, Any]) -> str:

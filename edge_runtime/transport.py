@@ -11,13 +11,13 @@ import errno
 import json
 import re
 import socket
-from typing import Any, Dict, List, Optional, Sequence, Union
+from typing import Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
 from edge_runtime.errors import UserError
+from edge_runtime.link_probe import addresses, why_refused, why_unreachable
 from edge_runtime.tls import TLS_PROTOCOLS, TlsFiles, check_fits, zenoh_rows
-from edge_runtime.tls_probe import why_refused
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 MODES = ("router", "peer", "client")
@@ -78,7 +78,7 @@ def open_session(
 def _check_refusal(session: zenoh.Session, connect: str, tls: TlsFiles) -> None:
     """A peer goes on trying for ever, also where it will never be let in: say so now."""
     refusal = why_refused(connect, tls)
-    if refusal is not None and not session.info.routers_zid():
+    if refusal and not session.info.routers_zid():
         session.close()
         raise UserError(refusal)
 
@@ -131,7 +131,7 @@ def _check_port_is_free(endpoint: str) -> None:
     host, port = address.rsplit(":", 1)
     kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
     try:
-        family, _, _, _, target = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
+        family, _, _, _, target = addresses(endpoint)[0]
     except OSError:
         raise UserError(f"host {host!r} of endpoint {endpoint} cannot be resolved") from None
     with socket.socket(family, kind) as probe:
@@ -154,18 +154,27 @@ def _explain_bind(error: OSError, host: str, port: str) -> str:
 def _explain(text: str, listens: List[str], connect: Optional[str], tls: Optional[TlsFiles]) -> str:
     if connect is None or listens:
         return f"Zenoh cannot open {', '.join(listens) or connect}: {text}"
-    refusal = None if tls is None else why_refused(connect, tls)
+    why = why_unreachable(connect)
+    refusal = "" if why else why_refused(connect, tls)
+    if connect.startswith("quic/"):  # such a link does not say why it fails
+        why = why or "or one end does not believe the other's certificate"
     return refusal or (
-        f"nobody answers at {connect}; start the simulator first, or name its address with"
-        " --connect" + ("" if connect.startswith("tls/") else _hint(connect))
+        f"nobody answers at {connect}{why and f': {why}'}; start the simulator first, or name its"
+        " address with --connect"
     )
 
 
-def _hint(connect: str) -> str:
-    """What else it may be: these links do not say why they fail."""
-    if connect.startswith("quic/"):
-        return "; or one end does not believe the other's certificate"
-    return "; or it listens with TLS and wants --tls"
+def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
+    """A subscriber's callback that takes only what was put to this very key.
+
+    Zenoh gives it whatever intersects: a put to `phil/*/state` comes to every vehicle.
+    """
+
+    def take(sample: zenoh.Sample) -> None:
+        if str(sample.key_expr) == key:
+            hear(sample)
+
+    return take
 
 
 def free_endpoint(protocol: str = "tcp") -> str:

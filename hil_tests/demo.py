@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
 import time
@@ -14,7 +13,7 @@ from rich.console import Console
 
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_json
 from edge_runtime.option_types import not_negative, positive, positive_number
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand, run_command
@@ -192,9 +191,7 @@ class Demo:
 
     def show(self) -> bool:
         """The table, where everything is, and whether the policy drives as well as it should."""
-        reports = {
-            name: json.loads(read_bytes(path, "report")) for name, path in self.reports.items()
-        }
+        reports = {name: read_json(path, "report") for name, path in self.reports.items()}
         Console().print("\n", drives_table(reports))
         print(f"learning curve  {self.directory}/learning_curve.png")
         print(f"recording       {self.recording}   (see it: .venv/bin/rerun {self.recording})")

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes, write_json
+from edge_runtime.files import make_directory, read_json, write_json
 from trainer.drivers import make_environment
 from trainer.experiments.units import digest
-from trainer.files import make_directory
 
 
 class KeptResults:
@@ -43,9 +41,9 @@ class KeptResults:
         if not path.is_file():
             return None
         try:
-            result: dict[str, Any] = json.loads(read_bytes(path, "kept result"))
-        except ValueError:
-            raise UserError(f"kept result {path} is damaged; remove it") from None
+            result: dict[str, Any] = read_json(path, "kept result")
+        except UserError as error:
+            raise UserError(f"{error}; remove it") from None
         return result
 
     def save(self, one: Mapping[str, Any], result: Mapping[str, Any]) -> None:

@@ -17,6 +17,12 @@ def several(text: str) -> int:
     return count
 
 
+def trusting(policy: object, public_key: str | None) -> tuple[str, ...]:
+    """The edge runtime's options where the loop is measured and whoever made the policy may be."""
+    named = () if public_key is None else ("--public-key", public_key)
+    return ("--policy", str(policy), "--allow-unsigned", *named)
+
+
 def this_command() -> str:
     """The command line that makes a report, to stand in it."""
     return "python -m hil_tests " + shlex.join(sys.argv[1:])

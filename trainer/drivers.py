@@ -79,10 +79,10 @@ class ConstantDriver:
 class OnnxDriver:
     """An exported policy file at the wheel, run by the edge runtime's own loader."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, public_key: str | None = None) -> None:
         from edge_runtime.policy import load_policy
 
-        self.policy = load_policy(str(path), allow_unsigned=True)
+        self.policy = load_policy(str(path), public_key, allow_unsigned=True)
 
     def reset(self) -> None:
         """Policies have no memory."""
@@ -115,8 +115,10 @@ def make_environment(
     return env
 
 
-def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
+def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[Driver, str]:
     """The driver that the word or path ``policy`` names, and its policy id.
+
+    ``public_key`` is a PEM file to verify an .onnx file with; see `edge_runtime.policy`.
 
     Raises:
         UserError: nothing there that drives.
@@ -127,7 +129,7 @@ def load_driver(policy: str, env: Any) -> tuple[Driver, str]:
         return ConstantDriver(_constant_action(policy)), policy
     path = Path(policy)
     if path.suffix == ".onnx":
-        driver = OnnxDriver(path)
+        driver = OnnxDriver(path, public_key)
         _check_action(driver, env.scenario, policy)
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():

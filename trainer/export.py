@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.manifest import MANIFEST_KEY, Manifest, Observation, encode_manifest
-from edge_runtime.onnx_file import read_onnx
+from edge_runtime.policy import policy_id_of
 from edge_runtime.private_keys import read_signing_key
 from edge_runtime.signature import SIGNATURE_SUFFIX
 from trainer.actions import ACTIONS
@@ -52,9 +52,7 @@ def export_policy(actor: Actor, label: dict[str, Any], training: dict[str, Any])
         UserError: the file would not do what the network does.
     """
     graph = _to_onnx(actor)
-    policy_id = read_onnx(graph.SerializeToString()).weights_sha256
     manifest = Manifest(
-        policy_id=policy_id,
         scenario=label["scenario"],
         algorithm=label["algorithm"],
         observation=Observation(),
@@ -77,7 +75,7 @@ def export_policy(actor: Actor, label: dict[str, Any], training: dict[str, Any])
             f"onnxruntime and torch differ by {difference:.1e} (allowed: {PARITY_TOLERANCE:.0e}); "
             "nothing was written"
         )
-    return Export(model, policy_id, difference)
+    return Export(model, policy_id_of(model), difference)
 
 
 def write_policy(export: Export, path: Path, key_file: Path | None) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import write_atomic
+from edge_runtime.files import open_regular, write_atomic
 
 
 def save_torch(path: Path, state: Any) -> None:
@@ -27,7 +27,8 @@ def load_torch(path: Path) -> Any:
         UserError: not such a file. Only tensors and plain values are unpickled.
     """
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        with open_regular(path) as stream:
+            return torch.load(stream, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, ValueError, EOFError) as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
     except Exception as error:
@@ -49,15 +50,3 @@ def as_arrays(values: dict[str, Any]) -> dict[str, Any]:
         name: value.numpy() if isinstance(value, torch.Tensor) else value
         for name, value in values.items()
     }
-
-
-def make_directory(path: Path) -> None:
-    """Create a result directory.
-
-    Raises:
-        UserError: a file is in the way, or it is not allowed.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot create the directory {path}: {error.strerror}") from error

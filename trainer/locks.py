@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from edge_runtime.errors import UserError
-from trainer.files import make_directory
+from edge_runtime.files import make_directory
 
 LOCK_FILE = ".lock"
 """In a directory that is claimed, for as long as it is."""
@@ -71,7 +71,7 @@ def holder(path: Path) -> str:
     try:
         who = json.loads(path.read_bytes())
         return f"process {who['pid']} on {who['host']}"
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return "another process"
 
 

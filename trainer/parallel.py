@@ -48,6 +48,7 @@ def drive_episodes_in_parallel(
     condition: str = "nominal",
     on_episode: Callable[[EpisodeResult], None] = lambda result: None,
     latency: LatencySpec = NO_NETWORK,
+    public_key: str | None = None,
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition, in ``jobs`` worker processes.
 
@@ -59,6 +60,7 @@ def drive_episodes_in_parallel(
         condition: one of `trainer.evaluation.CONDITIONS`.
         on_episode: called with each result, in the order of the seeds.
         latency: the network between driver and vehicle, in virtual time.
+        public_key: what an .onnx file is verified with.
 
     Returns:
         The results in the order of the seeds; to the bit what `drive_episodes` gives on one torch
@@ -73,7 +75,8 @@ def drive_episodes_in_parallel(
     try:
         with interrupts_blocked():
             futures: list[Future[EpisodeResult]] = [
-                pool.submit(_drive, policy, scenario, seed, condition, latency) for seed in seeds
+                pool.submit(_drive, policy, scenario, seed, condition, latency, public_key)
+                for seed in seeds
             ]
         for future in futures:
             results.append(future.result())
@@ -120,14 +123,21 @@ def die_with_parent() -> None:
 
 
 @cache
-def _cockpit(policy: str, scenario: str, condition: str) -> tuple[Any, Driver]:
+def _cockpit(
+    policy: str, scenario: str, condition: str, public_key: str | None
+) -> tuple[Any, Driver]:
     """Environment and driver, made once in a worker; here, so that a UserError finds its way."""
     env = make_environment(scenario, condition)
-    return env, load_driver(policy, env)[0]
+    return env, load_driver(policy, env, public_key)[0]
 
 
 def _drive(
-    policy: str, scenario: str, seed: int, condition: str, latency: LatencySpec
+    policy: str,
+    scenario: str,
+    seed: int,
+    condition: str,
+    latency: LatencySpec,
+    public_key: str | None,
 ) -> EpisodeResult:
-    env, driver = _cockpit(policy, scenario, condition)
+    env, driver = _cockpit(policy, scenario, condition, public_key)
     return drive_episodes(env, driver, [seed], condition, latency=latency)[0]

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-Colour = tuple[int, int, int]
+from viewing.colours import Colour
+
 BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
 PURPLE, GREY = (150, 80, 200), (120, 124, 130)
 

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import socket
-import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from types import FrameType
 from typing import NamedTuple
 from urllib.parse import quote
 
@@ -19,9 +15,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import behind_link, check_writable
+from edge_runtime.files import behind_link, check_writable, make_directory
+from edge_runtime.signals import sigterm_as_interrupt
+from viewing.viewer import END_S, LOOPBACK, Viewer, ViewerGone, flush, free_port
 
-LOOPBACK = "127.0.0.1"
 GRPC_PORT = 9876
 WEB_PORT = 9090
 SPAWN, SERVE = "spawn", "serve"
@@ -71,9 +68,12 @@ def open_sink(
 
     SIGTERM raises KeyboardInterrupt meanwhile, unless the command has another use for it: a file
     is to be finished, and a server not to be left behind.
+
+    Raises:
+        ViewerGone: there is none any more, or none has come.
     """
     recording = rr.RecordingStream(application)
-    with _sigterm_as_interrupt(), _opened(recording, sink, blueprint):
+    with sigterm_as_interrupt(), _opened(recording, sink, blueprint):
         yield recording
 
 
@@ -86,28 +86,12 @@ def _opened(
 
 
 @contextlib.contextmanager
-def _sigterm_as_interrupt() -> Iterator[None]:
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-@contextlib.contextmanager
 def save_to(
     recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
     """Record into a file that appears under its name when it is complete."""
     target = behind_link(path)
+    make_directory(target.parent)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         recording.save(temporary, default_blueprint=blueprint)
@@ -133,8 +117,9 @@ def spawn_window(
     recording: rr.RecordingStream, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
     """Show in rerun's own window, which stays open afterwards."""
-    recording.spawn(default_blueprint=blueprint)
-    with _disconnected(recording):
+    port = free_port()
+    viewer = Viewer(["--port", str(port), "--expect-data-soon"], [port])
+    with _connected(recording, viewer, port, blueprint):
         yield recording
 
 
@@ -153,37 +138,32 @@ def check_ports() -> None:
 def serve_page(
     recording: rr.RecordingStream, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
-    """Show in a browser on this machine only: rerun's own server would bind all interfaces."""
-    with _web_server():
-        url = f"rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy"
-        recording.connect_grpc(url, default_blueprint=blueprint)
-        print(f"open http://{LOOPBACK}:{WEB_PORT}/?url={quote(url, safe='')}", flush=True)
-        with _disconnected(recording):
+    """Show in a browser on this machine only."""
+    options = ["--serve-web", "--port", str(GRPC_PORT), "--web-viewer-port", str(WEB_PORT)]
+    viewer = Viewer(options, [GRPC_PORT, WEB_PORT])
+    try:
+        with _connected(recording, viewer, GRPC_PORT, blueprint) as url:
+            print(f"open http://{LOOPBACK}:{WEB_PORT}/?url={quote(url, safe='')}", flush=True)
             yield recording
+    finally:
+        viewer.end()
 
 
 @contextlib.contextmanager
-def _web_server() -> Iterator[None]:
-    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", LOOPBACK]
-    command += ["--port", str(GRPC_PORT), "--web-viewer-port", str(WEB_PORT)]
-    # A group of its own: the module starts the real server as a child, which must end with it.
-    server = subprocess.Popen(
-        command,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+def _connected(
+    recording: rr.RecordingStream, viewer: Viewer, port: int, blueprint: rrb.Blueprint
+) -> Iterator[str]:
+    """Draw for a viewer, at the address that is yielded; ViewerGone where it does not last."""
+    url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+    recording.connect_grpc(url, default_blueprint=blueprint)
     try:
-        yield
+        try:
+            yield url
+        finally:
+            flush(recording)
+    except ViewerGone as gone:
+        why = viewer.last_words(END_S) or gone.why
+        viewer.end()
+        raise ViewerGone(why) from None
     finally:
-        os.killpg(server.pid, signal.SIGTERM)
-        server.wait()
-
-
-@contextlib.contextmanager
-def _disconnected(recording: rr.RecordingStream) -> Iterator[None]:
-    try:
-        yield
-    finally:
-        recording.flush(timeout_sec=5.0)
-        recording.disconnect()
+        viewer.leave(recording)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import hold
-from edge_runtime.files import check_writable
+from edge_runtime.files import check_writable, make_directory
 
 MAX_PENDING_BYTES = 4 << 20
 NEVER_OVER = "choose another name: no recording is lost"
@@ -30,6 +30,7 @@ class FlushedFile:
 
     def __init__(self, path: Path) -> None:
         """Raise UserError where the file exists already, or cannot be made."""
+        make_directory(path.parent)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
         try:
             self._descriptor = os.open(path, flags, 0o666)

@@ -37,17 +37,22 @@ class Recording:
         """Of what was being written when the file was cut off."""
         self.nameless_messages = 0
         """Whole ones whose topic stood in a broken part alone."""
+        self.is_altered = False
+        """The checksum over the data is wrong, though nothing in it is broken."""
+        self.has_checksums = False
+        """Nothing could change without being noticed."""
         self.metadata: dict[str, str] = {}
 
     @property
     def is_damaged(self) -> bool:
         """Whether more is amiss than a kill leaves behind."""
-        return self.damaged_places > 0 or self.nameless_messages > 0
+        return self.damaged_places > 0 or self.nameless_messages > 0 or self.is_altered
 
     def messages(self) -> Iterator[Stored]:
         """Yield the messages as they stand in the file, which is the order of their arrival.
 
-        UserError for a file that is not there, cannot be read, or is no MCAP at all.
+        UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
+        work than its size accounts for.
         """
         self.cut_off, self.nameless_messages, self.metadata = True, 0, {}
         try:
@@ -62,6 +67,8 @@ class Recording:
         if self.damaged_places:
             places = counted(self.damaged_places, "damaged place")
             parts.append(f"{places} of {counted(self.damaged_bytes, 'byte')}")
+        if self.is_altered:
+            parts.append("bytes that changed outside of its chunks")
         if self.nameless_messages:
             messages = counted(self.nameless_messages, "message")
             parts.append(f"{messages} whose topic was in a damaged place")
@@ -94,6 +101,8 @@ class Recording:
         self.damaged_places = records.damaged_places
         self.damaged_bytes = records.damaged_bytes
         self.torn_bytes = records.torn_bytes
+        self.is_altered = records.is_altered
+        self.has_checksums = records.has_checksums
 
 
 def _open(path: Path) -> IO[bytes]:

@@ -39,7 +39,7 @@ class RecordingWriter:
         self._file = FlushedFile(path)
         # Writer tells streams apart by their methods; its annotation names file types only.
         stream: Any = self._file
-        self._mcap = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD)
+        self._mcap = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
         self._mcap.start(profile="", library=f"phil-hil {__version__}")
         self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
         self._channels: dict[str, int] = {}

@@ -49,7 +49,7 @@ class _Replay:
         self._needs_rearm = needs_rearm
         self._restarts_s: Iterator[float] = iter(drive.runtime_starts_s[1:])
         self._next_restart_s = next(self._restarts_s, float("inf"))
-        self._controller = Controller(rows, needs_rearm)
+        self._controller = self._make_controller()
         self._last_heard_s = 0.0
         self._answers: Answers = {}
 
@@ -63,8 +63,11 @@ class _Replay:
     def _restart(self, now_s: float) -> None:
         while now_s >= self._next_restart_s:
             self._pass_time(self._last_heard_s)
-            self._controller = Controller(self._rows, self._needs_rearm)
+            self._controller = self._make_controller()
             self._next_restart_s = next(self._restarts_s, float("inf"))
+
+    def _make_controller(self) -> Controller:
+        return Controller(self._rows, self._needs_rearm, task=self._policy.manifest.task)
 
     def _answer(self, recorded: RecordedState) -> None:
         state, exchange = recorded

@@ -28,6 +28,7 @@ def checking(newest_step=5):
         (encode(make_command(5, action=[1.5])), "malformed"),
         (encode(make_command(5, session="elsewhere")), "foreign_session"),
         (encode(make_command(5, action=[0.1, 0.1])), "action_size"),
+        (encode(make_command(5, action=[])), "malformed"),
         (encode(make_command(6)), "unknown_step"),
         (encode(make_command(0, episode=1)), "unknown_step"),
     ],

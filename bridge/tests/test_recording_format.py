@@ -29,14 +29,14 @@ def heard(topic: str, payload: bytes, arrived_ns: int = 1, key: str = "") -> Hea
 
 def test_the_picture_is_what_the_policy_saw(tmp_path):
     frames = bytes(range(256)) * (FRAMES_BYTES // 256) + bytes(FRAMES_BYTES % 256)
-    writer = RecordingWriter(tmp_path / "a.mcap")
+    writer = RecordingWriter(tmp_path / "runs" / "a.mcap")
     writer.write(heard("state", encode(make_state(3, frames=frames)), arrived_ns=5 * SECOND_NS + 7))
     schema, _ = writer._schemas["RawImage"]
     writer.finish(dropped=0)
     writer.close()
     (data,) = (
         stored.message.data
-        for stored in Recording(tmp_path / "a.mcap").messages()
+        for stored in Recording(tmp_path / "runs" / "a.mcap").messages()
         if stored.channel.topic == "view/v/frames"
     )
     image = schema.make.FromString(data)

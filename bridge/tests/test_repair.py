@@ -150,6 +150,32 @@ def test_a_damaged_file_is_not_kept_over_an_earlier_one(copy, capsys):
     assert (kept.read_text(), copy.read_bytes()) == ("mine", damaged)
 
 
+def test_a_file_without_a_checksum_over_all_of_it_is_not_called_whole(copy, tmp_path, capsys):
+    """As other programs write them. --out writes it with one."""
+    data, out = bytearray(copy.read_bytes()), tmp_path / "out.mcap"
+    end = data.index(b"\x0f" + (4).to_bytes(8, "little"), chunks(copy)[-1].chunk_start_offset)
+    data[end + 9 : end + 13] = bytes(4)
+    copy.write_bytes(data)
+    assert bridge_status(["repair", str(copy)]) == 0
+    assert f"can be read to its end: {MESSAGES} messages; nothing done" in capsys.readouterr().out
+    assert copy.read_bytes() == data
+    assert bridge_status(["repair", str(copy), "--out", str(out)]) == 0
+    assert bridge_status(["repair", str(out)]) == 0
+    assert "is whole" in capsys.readouterr().out
+
+
+def test_a_change_outside_of_the_chunks_is_said_and_mended(copy, tmp_path, capsys):
+    whole = tmp_path / "whole.mcap"
+    assert bridge_status(["repair", str(copy), "--out", str(whole)]) == 0
+    flip(whole, chunks(whole)[3].chunk_start_offset + 9)  # when its first message came
+    assert bridge_status(["repair", str(whole)]) == 0
+    said = capsys.readouterr().out
+    assert f"{MESSAGES} messages; left out: bytes that changed outside of its chunks" in said
+    assert whole.with_name("whole.mcap.damaged").exists()
+    assert bridge_status(["repair", str(whole)]) == 0
+    assert "is whole" in capsys.readouterr().out
+
+
 def test_a_repair_that_was_killed_can_be_done_again(copy):
     flip_chunk(copy, 3)
     copy.with_name("drive.mcap.damaged").hardlink_to(copy)

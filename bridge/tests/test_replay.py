@@ -259,6 +259,24 @@ def test_of_several_vehicles_one_is_named(hand, path, tmp_path, capsys):
     assert "no answered state" in capsys.readouterr().err
 
 
+def test_no_terminal_obeys_what_a_recording_holds(hand, path, tmp_path, capsys):
+    """Its topics, and the reasons in its commands."""
+    hand.drive(0, 3, action=[0.1], reason="\x1b]0;title\x07")
+    policy = make_policy(tmp_path, "constant", 0.3)
+    hand.close()
+    assert replay(path, policy)[0] == 1
+    hand = Hand(tmp_path / "other.mcap")
+    for vehicle_id in ("v", "\x1b[2J\x9b"):
+        hand.hear(0.0, "state", make_state(1), vehicle_id)
+    hand.close()
+    for command in (["replay", "--policy", str(policy)], ["view", "--save", "none.rrd"]):
+        assert bridge_status([*command, str(tmp_path / "other.mcap")]) == 2
+    said = capsys.readouterr()
+    assert "\\x1b]0;title\\x07" in said.out
+    assert "\\x1b[2J" in said.err
+    assert all(line.isprintable() for line in (said.out + said.err).splitlines())
+
+
 def test_through_a_running_edge_runtime(hand, path, tmp_path):
     hand.drive(0, 10)
     for step in range(10, 12):
@@ -291,7 +309,7 @@ def test_through_a_running_edge_runtime(hand, path, tmp_path):
         (["--listen", "here"], "endpoint"),
         (["--listen", free_endpoint(), "--wait-edge-s", "0"], "python -m edge_runtime run"),
         (["--policy", "a.onnx", "--tolerance", "-1"], "tolerance"),
-        (["--policy", "a.onnx", "--out", "/no/such/folder/r.json"], "does not exist"),
+        (["--policy", "a.onnx", "--out", "/dev/null/r.json"], "Not a directory"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(options, part, hand, path, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from bridge.scene import Scene
+from viewing.colours import APPLIED, POLICY
 from viewing.layout import frames_view, full_blueprint, road_view
 from viewing.series import ALL_OF_IT, BLUE, GREEN, ORANGE, PURPLE, Plot, plot_view
 
@@ -17,8 +18,8 @@ PLOTS = (
 )
 """From top to bottom."""
 SERIES = {
-    "action/asked": BLUE,
-    "action/achieved": ORANGE,
+    "action/asked": POLICY,
+    "action/achieved": APPLIED,
     "speed/simulated": BLUE,
     "speed/vehicle": ORANGE,
     "latency/uplink": BLUE,

@@ -12,6 +12,7 @@ from bridge.scene import Scene
 from bridge.viewer.blueprint import SERIES, make_blueprint
 from edge_runtime.latency.command_hold import SILENCE_LIMIT_S
 from edge_runtime.wire import Command, Feedback, Health, State
+from viewing.colours import POLICY
 from viewing.pace import Pace
 from viewing.road import draw_cars, draw_ground
 from viewing.series import BLUE, GREY, ORANGE, RED, style_lines
@@ -21,7 +22,7 @@ SILENT = "no command"
 NOTHING_WRONG = "-"
 REMEMBERED_STATES = 64
 """States whose sending time is kept, for the latency of their commands."""
-EGO = {"drive": BLUE, "safe_stop": RED, SILENT: (160, 30, 120)}
+EGO = {"drive": POLICY, "safe_stop": RED, SILENT: (160, 30, 120)}
 """Colour of the ego car by what it is told."""
 ALL = "all"
 """The sum over the reasons, which has a line from the start."""

@@ -49,7 +49,10 @@ def main(argv: list[str]) -> int:
     """Run one command; the exit status."""
     os.umask(0o022)  # The service's user must read the release, whatever the caller's umask.
     try:
-        return _dispatch(_parser().parse_args(argv))
+        try:
+            return _dispatch(_parser().parse_args(argv))
+        finally:
+            sys.stdout.flush()  # at the exit nobody could say what is wrong
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -57,6 +60,7 @@ def main(argv: list[str]) -> int:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return UNHEALTHY
     except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # it may be stdout that takes no more
         print(f"error: {error.filename or 'the disk'}: {error.strerror}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:

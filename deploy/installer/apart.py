@@ -32,6 +32,7 @@ def can_isolate() -> bool:
 
 def before_exec(isolated: bool, account: Account | None) -> Callable[[], None]:
     """What a child does before it becomes the runtime (`preexec_fn`)."""
+    parent = os.getpid()
 
     def prepare() -> None:
         if isolated and not _isolate():
@@ -40,10 +41,16 @@ def before_exec(isolated: bool, account: Account | None) -> Callable[[], None]:
             os.setgroups([])
             os.setgid(account.gid)
             os.setuid(account.uid)
-        # Last: another user id would undo it.
-        _C.prctl(_SET_PARENT_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
+        end_with_parent(parent)  # Last: another user id would undo it.
 
     return prepare
+
+
+def end_with_parent(parent: int) -> None:
+    """Let the kernel kill this process when its parent, of that process id, has ended."""
+    _C.prctl(_SET_PARENT_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
+    if os.getppid() != parent:  # It had ended before it was asked for.
+        os._exit(1)
 
 
 def _isolate() -> bool:

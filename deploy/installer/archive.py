@@ -103,7 +103,7 @@ def open_bundle(path: str, public_key: bytes) -> Iterator[Bundle]:
 
     `public_key` is the 32 bytes of the key that this board trusts.
     """
-    with _open(path) as stream:
+    with open_file(path, "bundle") as stream:
         try:
             bundle = _verify(stream, public_key)
         except UserError as error:
@@ -113,15 +113,20 @@ def open_bundle(path: str, public_key: bytes) -> Iterator[Bundle]:
         yield bundle
 
 
-def _open(path: str) -> BinaryIO:
+def open_file(path: str, what: str) -> BinaryIO:
+    """Open a regular file to read. UserError for all else: a pipe would be waited for."""
     try:
-        stream = open(path, "rb")  # noqa: SIM115 - open_bundle closes it
+        stream = open(path, "rb", opener=_at_once)  # noqa: SIM115 - whoever asked for it closes it
     except OSError as error:
-        raise UserError(f"bundle {path} cannot be read: {error.strerror}") from None
+        raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
-        raise UserError(f"bundle {path} is not a file")
+        raise UserError(f"{what} {path} is not a file")
     return stream
+
+
+def _at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def _verify(stream: BinaryIO, public_key: bytes) -> Bundle:

@@ -8,7 +8,9 @@ class UserError(Exception):
 
     def __str__(self) -> str:
         """The text on one line, whatever a file name or the system put into it."""
-        return " ".join(super().__str__().split())
+        line = " ".join(super().__str__().split())
+        # What a terminal would act upon is written as its escape.
+        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 class UnhealthyError(Exception):

@@ -106,7 +106,11 @@ class Layout:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Make the root and be the only installer in it. The lock goes with the process."""
+        """Make the root and be the only installer in it. The lock goes with the process.
+
+        It is `lockf`'s, which no child inherits: `flock`'s lives as long as any process that was
+        forked with it, so a killed installer's compilers would keep it.
+        """
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             stream = self._open_lock(self.root / ".lock")
@@ -114,7 +118,7 @@ class Layout:
             raise UserError(f"cannot write to {self.root}: {error.strerror}") from None
         with stream:
             try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 raise UserError(f"another installer is at work in {self.root}") from None
             for folder in (self.releases, self.state):

@@ -67,7 +67,7 @@ def parse_manifest(data: bytes) -> Manifest:
             files=[FileEntry(**entry) for entry in value["files"]],
         )
         _check(manifest)
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         raise UserError("its manifest is not valid") from None
     return manifest
 

@@ -9,17 +9,19 @@ contents.json     the SHA-256 of every file, by which a release is known to be w
 from __future__ import annotations
 
 import compileall
+import functools
 import hashlib
 import json
+import multiprocessing
 import os
-import re
 import shlex
 import shutil
 import subprocess
 import sys
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
 from pathlib import Path
 
+from deploy.installer.apart import end_with_parent
 from deploy.installer.archive import MANIFEST, SIGNATURE, Bundle
 from deploy.installer.errors import UnhealthyError, UserError
 from deploy.installer.layout import Layout, remove_tree, sync_all, sync_folder
@@ -28,7 +30,7 @@ from deploy.installer.wheels import unpack_wheel
 SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"
 WHEELS, TLS = "wheels/", "tls/"
 POLICY, PUBLIC_KEY, CONFIG = "policy.onnx", "policy.pub", "config.toml"
-_NOT_COMPILED = re.compile(r"/tests/")
+_NOT_COMPILED = "tests"
 """numpy's own tests are a quarter of all files, and nobody imports them here."""
 CHECK_LIMIT_S = 120.0
 _LAUNCH = """\
@@ -129,9 +131,16 @@ def _fill(bundle: Bundle, draft: Path, folder: Path, group: int | None) -> None:
 
 def _compile(site: Path) -> None:
     """Now, because the service may not write here, and compiling at each start takes seconds."""
-    workers = os.cpu_count() or 1
+    sources = [str(p) for p in site.rglob("*.py") if _NOT_COMPILED not in p.relative_to(site).parts]
+    # Forked, so that they are this thread's own children and end with it.
+    pool = ProcessPoolExecutor(
+        mp_context=multiprocessing.get_context("fork"),
+        initializer=end_with_parent,
+        initargs=(os.getpid(),),
+    )
     try:
-        compileall.compile_dir(str(site), quiet=2, workers=workers, rx=_NOT_COMPILED)
+        with pool:
+            list(pool.map(functools.partial(compileall.compile_file, quiet=2), sources))
     except BrokenProcessPool:
         raise UserError(
             "a process that compiled the release was killed; is there too little memory?"

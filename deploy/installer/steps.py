@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from deploy.installer import ed25519
-from deploy.installer.archive import Bundle, open_bundle
+from deploy.installer.archive import Bundle, open_bundle, open_file
 from deploy.installer.errors import UnhealthyError, UserError
 from deploy.installer.fits import check_fits
 from deploy.installer.health import Limits
@@ -25,6 +25,7 @@ from deploy.installer.release import MANIFEST, check_policy, make_release, why_n
 from deploy.installer.service import remember
 from deploy.installer.trial import try_release
 
+_MAX_KEY_BYTES = 65536
 _ENDS_A_SWITCH = (UnhealthyError, UserError, OSError, KeyboardInterrupt)
 """The old service is stopped then, so whatever goes wrong, somebody must start it again."""
 
@@ -123,10 +124,8 @@ def trusted_key(layout: Layout, trust: str | None) -> bytes:
 
 
 def _read_key(path: str) -> bytes:
-    try:
-        pem = Path(path).read_bytes()
-    except OSError as error:
-        raise UserError(f"public key {path} cannot be read: {error.strerror}") from None
+    with open_file(path, "public key") as stream:
+        pem = stream.read(_MAX_KEY_BYTES)
     try:
         ed25519.parse_public_key(pem)
     except UserError as error:

@@ -29,10 +29,15 @@ RESTART_PAUSE_S = 0.5
 MAX_STARTS, IN_S = 5, 60.0
 _START_LIMIT_S = 30.0
 _END_LIMIT_S = 5.0
+# Its own death kills the runtime (apart.py), and a vehicle in mid-drive is to be stopped instead.
+_ENDS = (
+    *(signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM),
+    *(signal.SIGABRT, signal.SIGALRM, signal.SIGUSR1, signal.SIGUSR2),
+)
 
 
 def supervise(layout: Layout) -> int:
-    """Run until SIGTERM or ^C. Raises UserError where another one runs, or nothing is installed."""
+    """Run until a signal. Raises UserError where another one runs, or nothing is installed."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(_single(layout))
         place = stack.enter_context(tempfile.TemporaryDirectory(prefix="phil-service-"))
@@ -47,8 +52,9 @@ class _Supervisor:
         self._stopping = False
         self._starts: list[float] = []
         self._process: subprocess.Popen | None = None
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._stop)
+        for number in _ENDS:
+            if signal.getsignal(number) is not signal.SIG_IGN:  # SIGHUP under nohup
+                signal.signal(number, self._stop)
 
     def run(self) -> int:
         while not self._stopping:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import random
 import subprocess
 import tarfile
@@ -15,7 +16,9 @@ from deploy.bundle import _write
 from deploy.campaigns.light import HERE
 from deploy.installer.archive import CONTEXT, END, MANIFEST, SIGNATURE, header, open_bundle, padding
 from deploy.installer.errors import UserError
+from deploy.installer.layout import Layout
 from deploy.installer.manifest import FileEntry, Manifest, parse_manifest, to_json
+from deploy.installer.steps import trusted_key
 
 CONTENTS = {"config.toml": b"a = 1\n", "empty": b"", "wheels/a-1.whl": bytes(range(256)) * 5}
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(32))
@@ -119,7 +122,10 @@ def test_another_format_is_said():
         parse_manifest(raw)
 
 
-@pytest.mark.parametrize("name", ["missing.tar", "."])
+@pytest.mark.parametrize("name", ["missing.tar", ".", "pipe", "/dev/zero"])
 def test_what_cannot_be_read_is_one_line(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match=r"cannot be read|is not a file"):
+        trusted_key(Layout(str(tmp_path)), str(tmp_path / name))
     with pytest.raises(UserError, match=r"cannot be read|is not a file"):
         open_bundle(str(tmp_path / name), PUBLIC).__enter__()

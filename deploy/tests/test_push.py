@@ -33,7 +33,7 @@ with open({log!r}, "a") as log:
     log.write(f"scp {{host}} {{folder}}\\n")
 assert all(file.startswith("/") for file in files), files  # or scp would look for a host
 for file in files:
-    if host == "full" and file.endswith(".tar"):
+    if host == "full" and target.endswith(".tar"):
         sys.exit("scp: write remote: No space left on device")
     shutil.copy2(file, {home!r} + "/" + folder)
 """
@@ -67,17 +67,27 @@ def test_a_push_installs_and_leaves_nothing_behind(far, board, workshop, capfd):
     assert board.status()["current"] == made.manifest.version
     assert list((far / "home").iterdir()) == []
     log = (far / "log").read_text().splitlines()
-    assert [line.split()[0] for line in log] == ["ssh", "ssh", "scp", "ssh", "ssh"]
+    assert [line.split()[0] for line in log] == ["ssh", "ssh", "scp", "scp", "scp", "ssh", "ssh"]
+
+
+@pytest.mark.parametrize("name", ["install.pyz", "trust.pub", "-q.tar", "two words;id.tar"])
+def test_a_bundle_may_have_any_name(far, board, workshop, tmp_path, name):
+    made = workshop.make(0.1)
+    bundle = tmp_path / name
+    bundle.write_bytes(made.path.read_bytes())
+    assert push(board, workshop, "board", bundle, "--service", "none") == 0
+    assert board.status()["current"] == made.manifest.version
 
 
 def test_a_dry_run_says_each_step_and_does_none(far, board, workshop, capsys):
     made = workshop.make(0.1)
     assert push(board, workshop, "board", made.path, "--dry-run") == 0
     said = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in said] == ["#", "ssh", "#", "ssh", "#", "scp", "#", "ssh",
-                                                  "#", "ssh"]  # fmt: skip
-    assert str(made.path) in said[5]
-    assert "install" in said[7]
+    programs = ["ssh", "ssh", "scp", "scp", "scp", "ssh", "ssh"]
+    assert [line.split()[0] for line in said[::2]] == ["#"] * len(programs)
+    assert [line.split()[0] for line in said[1::2]] == programs
+    assert str(made.path) in said[9]
+    assert "install" in said[11]
     assert not (far / "log").read_text()
     assert not board.root.exists()
 

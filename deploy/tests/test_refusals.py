@@ -100,8 +100,8 @@ def test_one_installer_at_a_time(board: Board, workshop):
     made = workshop.make(0.1)
     assert board.install(made.path).returncode == 0
     before = board.fingerprint()
-    with open(board.root / ".lock") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
+    with open(board.root / ".lock", "r+") as other:
+        fcntl.lockf(other, fcntl.LOCK_EX)
         refused(board.install(made.path), "another installer is at work")
         refused(board.run("rollback"), "another installer is at work")
     assert [row[0] for row in board.fingerprint()] == [row[0] for row in before]

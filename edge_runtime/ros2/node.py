@@ -10,6 +10,7 @@ import zenoh
 from edge_runtime.messages import Reason, Rejection
 from edge_runtime.ros2 import cdr, names
 from edge_runtime.ros2.messages import AckermannDriveStamped, Image, Odometry, Twist
+from edge_runtime.transport import only_own
 
 _M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry, Image)
 
@@ -61,7 +62,7 @@ class Ros2Node:
             else:
                 take(message)
 
-        self._declared.append(self._session.declare_subscriber(key, hear))
+        self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
         self._announce_topic(names.SUBSCRIBER, key, kind, names.BEST_EFFORT)
 
     def close(self) -> None:

@@ -121,11 +121,11 @@ class Simulator:
         assert self.alive.wait(PATIENCE_S), "no edge runtime came"
         wait_until(lambda: self.health, "a health message")
 
-    def send(self, state: Any) -> None:
+    def send(self, state: Any, key: str = "") -> None:
         """Publish a State, or bytes as they are; all arrive, on however busy a machine."""
         payload = state if isinstance(state, bytes) else wire.encode(state)
         self._session.put(
-            wire.key(self.vehicle_id, "state"),
+            key or wire.key(self.vehicle_id, "state"),
             payload,
             congestion_control=zenoh.CongestionControl.BLOCK,
         )

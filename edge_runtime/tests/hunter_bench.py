@@ -27,6 +27,7 @@ class Bench:
         self.speed_mps = self.inner_rad = 0.0
         self.sent = []
         self.ticks = 0
+        self.counter = 0  # of 0x211; None: it stands still
 
     def step(self, count=1, action=None, scenario_speed_mps=None):
         """Ticks of 20 ms; with an action, a command every 100 ms."""
@@ -53,6 +54,9 @@ class Bench:
             self.tell(frames.SYSTEM_STATUS, self.status)
 
     def tell(self, frame, message):
+        if isinstance(message, frames.SystemStatus) and self.counter is not None:
+            self.counter = (self.counter + 1) % 256
+            message = message._replace(counter=self.counter)
         self.core.hear(frame.can_id, frames.encode(frame, message), self.now_s)
 
     def enabled(self):

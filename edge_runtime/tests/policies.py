@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence
 
@@ -13,6 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from onnx import TensorProto, helper, numpy_helper
 
 from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
+from edge_runtime.policy import policy_id_of
 
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.
@@ -42,26 +42,29 @@ def write_policy(
     opset: int = 17,
     ir_version: int = 8,
     loops: int = SLOW_LOOPS,
+    odd_shape: Sequence[int] = (1, 0),
 ) -> str:
     """Write a policy file and return its policy_id; sign it as `path`.sig where a key is given.
 
     kind: "constant" always answers `value`; "mean" answers the mean brightness scaled to
     [-1, 1], a different number for different frames; "nan" is "constant" until the frames are
     brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then takes about a second at
-    SLOW_LOOPS `loops`, and in proportion at others.
+    SLOW_LOOPS `loops`, and in proportion at others; "odd" likewise, then answers with a tensor of
+    `odd_shape`.
     `manifest_changes` replaces fields of the manifest, to write files that must be refused.
     """
-    graph = _graph(kind, value, len(actions), loops)
-    policy_id = _weights_sha256(graph)
+    graph = _graph("constant" if kind == "odd" else kind, value, len(actions), loops)
+    if kind == "odd":
+        _answer_oddly(graph, odd_shape)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
-    manifest = _manifest(policy_id, actions, manifest_changes or {})
+    manifest = _manifest(actions, manifest_changes or {})
     helper.set_model_props(model, {MANIFEST_KEY: encode_manifest(manifest)})
     data = model.SerializeToString()
     Path(path).write_bytes(data)
     if key is not None:
         Path(f"{path}.sig").write_bytes(key.sign(data))
-    return policy_id
+    return policy_id_of(data)
 
 
 def public_pem(key: Ed25519PrivateKey) -> bytes:
@@ -71,9 +74,8 @@ def public_pem(key: Ed25519PrivateKey) -> bytes:
     )
 
 
-def _manifest(policy_id: str, actions: Sequence[Action], changes: Dict[str, Any]) -> Manifest:
+def _manifest(actions: Sequence[Action], changes: Dict[str, Any]) -> Manifest:
     fields: Dict[str, Any] = {
-        "policy_id": policy_id,
         "scenario": "left_turn",
         "algorithm": "test",
         "observation": Observation(),
@@ -84,21 +86,12 @@ def _manifest(policy_id: str, actions: Sequence[Action], changes: Dict[str, Any]
     return Manifest(**{**fields, **changes})
 
 
-def _weights_sha256(graph: onnx.GraphProto) -> str:
-    """The definition of policy_id, written a second time and with the onnx package."""
-    digest = hashlib.sha256()
-    for tensor in sorted(graph.initializer, key=lambda t: t.name):
-        digest.update(tensor.name.encode() + b"\0" + tensor.raw_data)
-    return digest.hexdigest()
-
-
 def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphProto:
     weights: Dict[str, np.ndarray] = {
         "value": np.array([value], np.float32),
         "zero": np.array([0.0], np.float32),
         "half_range": np.array([127.5], np.float32),
         "fault_brightness": np.array([FAULT_BRIGHTNESS], np.float32),
-        # The name is part of the digest: every kind has a policy_id of its own.
         f"{kind}_ones": np.ones((1, n_actions), np.float32),
         "loops": np.array([loops], np.int64),
     }
@@ -172,6 +165,25 @@ def _slow(weights: Dict[str, np.ndarray]) -> List[onnx.NodeProto]:
         helper.make_node("Mul", ["level", "zero"], ["nothing"]),
         helper.make_node("Add", ["nothing", "value"], ["answer"]),
     ]
+
+
+def _answer_oddly(graph: onnx.GraphProto, shape: Sequence[int]) -> None:
+    """For bright frames a tensor of another shape than the graph says of its output."""
+    graph.node[-1].output[0] = "as_said"
+    branches = {}
+    for name, node in (
+        ("then", helper.make_node("Identity", ["odd"], ["then"])),
+        ("else", helper.make_node("Identity", ["as_said"], ["else"])),
+    ):
+        output = helper.make_tensor_value_info(name, TensorProto.FLOAT, None)
+        branches[f"{name}_branch"] = helper.make_graph([node], name, [], [output])
+    graph.initializer.append(numpy_helper.from_array(np.full(shape, 0.5, np.float32), "odd"))
+    graph.node.extend(
+        [
+            helper.make_node("Greater", ["mean", "fault_brightness"], ["is_bright"]),
+            helper.make_node("If", ["is_bright"], ["action"], **branches),
+        ]
+    )
 
 
 _ANSWERS = {"constant": _constant, "mean": _mean, "nan": _nan, "slow": _slow}

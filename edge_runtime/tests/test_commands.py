@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -31,7 +32,8 @@ def test_check_prints_manifest_and_latency(make_policy, tmp_path):
     assert (result.returncode, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     assert report == json.loads(out.read_text())
-    assert report["manifest"]["policy_id"] == report["policy_id"] == signed.policy_id
+    assert report["policy_id"] == hashlib.sha256(signed.path.read_bytes()).hexdigest()
+    assert report["manifest"]["scenario"] == "left_turn"
     assert 0 < report["inference_ms"]["p50"] <= report["inference_ms"]["max"]
 
 
@@ -171,3 +173,19 @@ def test_a_busy_port_is_named():
 def test_malformed_endpoints(endpoint):
     with pytest.raises(UserError, match="write it as"):
         open_session(connect=endpoint)
+
+
+@pytest.mark.parametrize(
+    "answer", [b"[" * 100_000, b"3", b"\xff", b"{}", b'{"vehicle_id": 1, "manifest": 3}']
+)
+def test_a_stranger_that_answers_for_the_runtime_is_one_line(answer):
+    endpoint = free_endpoint()
+    session = open_session(listen=endpoint, mode="router")
+    for topic in ("status", "rearm"):
+        queryable = session.declare_queryable(
+            f"phil/hunter01/{topic}", lambda query: query.reply(query.key_expr, answer)
+        )
+        done = run_command(topic, "--connect", endpoint)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+        queryable.undeclare()
+    session.close()

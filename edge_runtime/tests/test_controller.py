@@ -77,6 +77,30 @@ def test_a_nan_stops_with_the_very_state_and_every_further_one():
     assert [o.answers.state.step for o in orders] == list(range(1, 9))
 
 
+def test_states_of_another_task_stop_for_as_long_as_they_come():
+    controller = make(task="left_turn, pedal -1 to 1")
+    assert answer(controller, 0, 0.0).mode == "drive"  # an older simulator does not say
+    assert answer(controller, 1, 0.1, task="left_turn, pedal -1 to 1").mode == "drive"
+    other = {"task": "congestion, steering -1 to 1"}
+    orders = [answer(controller, step, step * 0.1, **other) for step in range(2, 9)]
+    orders.append(answer(controller, 9, 0.9, NAN, final=True, **other))
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", "other_task")}
+
+
+@pytest.mark.parametrize(
+    "output",
+    [None, NAN.astype(np.float64), np.float32(0.5), GOOD[:0], GOOD.reshape(1, 1), np.tile(GOOD, 2),
+     np.array([1], np.int64), np.array([[[0.5]]], np.float32)],
+)  # fmt: skip
+def test_an_answer_of_another_form_is_a_failed_inference(output):
+    controller = make()
+    answer(controller, 0, 0.0)
+    orders = [answer(controller, step, step * 0.1, output) for step in (1, 2)]
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", "inference_failed")}
+    assert [o.action for o in orders] == [[-1.0]] * 2
+    assert [answer(controller, s, s * 0.1).mode for s in range(3, 8)][-1] == "drive"
+
+
 def test_an_inference_longer_than_a_period_stops_while_it_runs():
     controller = make()
     answer(controller, 0, 0.0)
@@ -103,6 +127,31 @@ def test_between_episodes_there_is_no_watchdog():
     assert controller.tick(9.0) is None
     assert answer(controller, 0, 10.0, episode=1).mode == "drive"
     assert controller.safety.safe_stops == 0
+
+
+@pytest.mark.parametrize("needs_rearm", [False, True])
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_policy_that_died_stops_for_good_and_says_so(needs_rearm, begun):
+    controller = make(needs_rearm=needs_rearm)
+    answer(controller, 0, 0.0)
+    if begun:
+        controller.begin(Received(make_state(1), 0.1, 0), 0.1)
+    controller.policy_died()
+    orders = [controller.tick(0.11)]
+    assert controller.tick(0.15) is None
+    for _ in range(20):  # past the time for an inference, and past silence
+        orders.append(controller.tick(controller.next_deadline_s() + 1e-6))
+    assert {(o.mode, o.reason) for o in orders} == {("safe_stop", "policy_thread_dead")}
+    assert controller.deadline_misses == 0
+    assert "restart the runtime" in controller.rearm(0.12)
+
+
+def test_a_policy_that_died_before_the_first_state_tells_nobody_and_stands():
+    controller = make()
+    controller.policy_died()
+    assert controller.tick(0.0) is None
+    assert controller.next_deadline_s() is None
+    assert controller.safety.reason == "policy_thread_dead"
 
 
 def test_nothing_is_due_before_the_first_state():
@@ -214,10 +263,35 @@ def test_a_state_in_hand_is_due_before_the_silence_after_it():
 
 
 def test_a_rate_limit_counts_from_the_last_order_whatever_its_mode():
-    rows = [LimitRow("pedal", -1.0, 1.0, 0.25)]
+    rows = [LimitRow("pedal", -1.0, 1.0, 2.5)]
     controller = Controller(rows, needs_rearm=False)
     assert answer(controller, 0, 0.0).action == [0.25]
-    assert answer(controller, 1, 0.1).action == [0.5]
+    assert answer(controller, 1, 0.1).action == pytest.approx([0.5])
     controller.tick(0.4)
-    actions = [answer(controller, step, step * 0.1 + 0.2).action for step in range(2, 8)]
-    assert actions == [[-1.0]] * 4 + [[-0.75], [-0.5]]
+    actions = [answer(controller, step, step * 0.1 + 0.2).action[0] for step in range(2, 8)]
+    assert actions == pytest.approx([-1.0] * 4 + [-0.75, -0.5])
+
+
+@pytest.mark.parametrize("states_per_s", [10, 200, 1000])
+def test_a_rate_limit_is_per_second_however_many_states_come(states_per_s):
+    rows = [LimitRow("steering", -1.0, 1.0, 2.0)]
+    controller = Controller(rows, needs_rearm=False)
+    steps = range(states_per_s // 2 + 1)
+    told = [answer(controller, step, step / states_per_s).action[0] for step in steps]
+    assert told == sorted(told)
+    # It wants 0.5, and begins at 0 with a step of one period: half a second is more than enough.
+    assert told[0] == pytest.approx(0.2)
+    assert max(b - a for a, b in zip(told, told[1:])) <= 2.0 / states_per_s + 1e-9
+    assert told[-1] == 0.5
+
+
+def test_a_stop_between_two_drives_gives_no_time_away():
+    rows = [LimitRow("pedal", -1.0, 1.0, 2.0)]
+    controller = Controller(rows, needs_rearm=False)
+    answer(controller, 0, 0.0)
+    controller.tick(0.3)
+    for step in range(1, 5):
+        answer(controller, step, 0.4 + step * 0.1)
+    order = answer(controller, 5, 0.81)
+    assert order.mode == "drive"
+    assert order.action == pytest.approx([-1.0 + 2.0 * 0.01])

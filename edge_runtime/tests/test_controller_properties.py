@@ -31,6 +31,10 @@ gaps = st.sampled_from([0.001, 0.05, T, T, T, 0.19, 0.2, 0.21, 0.23, 1.0, 9.0, 1
 durations = st.sampled_from([0.001, 0.001, 0.001, 0.06, 0.099, 0.101, 0.5])
 waits = st.sampled_from([0.0, 0.0, 0.0, 0.05, 0.3])
 numbers = st.one_of(st.floats(-3, 3), st.sampled_from([0.0, 0.0, math.nan, math.inf, -math.inf]))
+outputs = st.one_of(
+    st.lists(numbers, min_size=2, max_size=2),
+    st.sampled_from([[], [0.5], [0.5, 0.1, 0.0], [[0.5, 0.1]], 0.5]),
+)
 
 
 class AnyHistory(RuleBasedStateMachine):
@@ -48,6 +52,7 @@ class AnyHistory(RuleBasedStateMachine):
         self.good_in_a_row = 0
         self.permitted = self.armed_at_start
         self.last: Optional[Order] = None
+        self.last_s = -math.inf
         self.stop_s: Optional[float] = None  # the last safe stop, while the watchdog is on time
 
     @rule(count=st.integers(1, 7), gap_s=gaps, final=st.booleans(), late=st.booleans())
@@ -56,7 +61,7 @@ class AnyHistory(RuleBasedStateMachine):
             self._state([0.5, 0.1], gap_s, late=late, final=final and left == 0)
 
     @rule(
-        output=st.lists(numbers, min_size=2, max_size=2), gap_s=gaps, wait_s=waits,
+        output=outputs, gap_s=gaps, wait_s=waits,
         duration_s=durations, final=st.booleans(), late=st.booleans(),
     )  # fmt: skip
     def any_state(self, output, **how):
@@ -97,11 +102,11 @@ class AnyHistory(RuleBasedStateMachine):
         self.controller.begin(received, self.now_s)
         self._pass(duration_s, late)
         in_time = duration_s <= T and self.now_s - received.arrived_s <= SILENT_S
-        if in_time and np.all(np.isfinite(output)):
+        answer = np.array(output, np.float32)
+        if in_time and answer.shape == (2,) and np.all(np.isfinite(answer)):
             self.good_in_a_row += 1
         else:
             self._fault()
-        answer = np.array(output, np.float32)
         order = self.controller.finish(answer, int(duration_s * 1e9), self.now_s)
         if order is not None:
             self._note(order)
@@ -159,7 +164,7 @@ class AnyHistory(RuleBasedStateMachine):
             self.permitted = self.permitted and self._is_stopped()
         for value, row in zip(order.action, self.rows):
             assert row.low <= value <= row.high
-        self.last = order
+        self.last, self.last_s = order, self.now_s
         self.last_is_final = order.answers.state.final
         self.stop_s = self.now_s if self._is_stopped() else None
 
@@ -169,9 +174,11 @@ class AnyHistory(RuleBasedStateMachine):
         assert order.reason == ""
         assert self.now_s - order.answers.arrived_s <= SILENT_S
         before = self.last.action if self.last else [0.0, 0.0]
+        since_s = self.now_s - self.last_s
         for value, last, row in zip(order.action, before, self.rows):
             assert math.isfinite(value)
-            assert abs(value - last) <= row.max_step + 1e-9
+            if row.slew_per_s < math.inf:
+                assert abs(value - last) <= row.slew_per_s * min(since_s, T) + 1e-9
 
 
 class AnyHistoryWithVehicle(AnyHistory):

@@ -45,6 +45,38 @@ def test_a_vehicle_goes_on_between_two_episodes_of_one_drive():
     assert controller.safety.safe_stops == 0
 
 
+@pytest.mark.parametrize("drives_first", [True, False])
+def test_final_states_are_no_drive_and_do_not_keep_a_permission_alive(drives_first):
+    controller = make(needs_rearm=True)
+    if drives_first:
+        answer(controller, 0, 0.0)
+    for episode in range(1, 101):
+        order = answer(controller, 0, episode * 0.1 - 0.1, episode=episode, final=True)
+        assert (order.mode, order.reason) == ("safe_stop", "final_state")
+    order = answer(controller, 0, 10.2, episode=102)
+    assert (order.mode, order.reason) == ("safe_stop", "pause_too_long")
+    assert controller.waits_for_rearm
+
+
+def test_final_states_do_not_keep_a_rearm_alive_either():
+    controller = stop(make(needs_rearm=True))
+    for step in range(1, 6):
+        answer(controller, step, 20.0 + step * 0.1, final=True)
+    assert controller.rearm(20.6) == ""
+    for step in range(6, 110):
+        answer(controller, step, 20.1 + step * 0.1, final=True)
+    assert controller.waits_for_rearm
+    assert controller.safety.reason == "pause_too_long"
+
+
+def test_a_drive_of_two_states_begins_the_pause_anew():
+    controller = make(needs_rearm=True)
+    for episode in range(20):
+        assert answer(controller, 0, episode * 6.0, episode=episode).mode == "drive"
+        answer(controller, 1, episode * 6.0 + 0.1, episode=episode, final=True)
+    assert controller.safety.safe_stops == 0
+
+
 @pytest.mark.parametrize(
     ("now_s", "session", "reason"),
     [(10.1, "simulator-a", "pause_too_long"), (1.0, "simulator-b", "other_session")],
@@ -129,6 +161,29 @@ def test_a_vehicle_at_fault_stops_at_the_next_tick_and_is_not_rearmed():
     assert controller.rearm(1.01) == ""
     modes = [answer(controller, step, step * 0.1).mode for step in range(11, 16)]
     assert modes[-1] == "drive"
+
+
+def test_what_stopped_a_vehicle_is_said_until_it_is_rearmed_though_it_has_passed():
+    controller = make(needs_rearm=True)
+    answer(controller, 0, 0.0)
+    controller.vehicle_fault = "vehicle_lying"
+    controller.tick(0.01)
+    controller.vehicle_fault = "vehicle_silent"
+    answer(controller, 1, 0.1)
+    assert controller.vehicle_words == "vehicle_silent"
+    controller.vehicle_fault = ""
+    for step in range(2, 6):
+        answer(controller, step, step * 0.1)
+        assert controller.vehicle_words == "vehicle_lying"  # the first of them
+    controller.tick(1.0)
+    assert (controller.safety.reason, controller.vehicle_words) == (
+        "no_fresh_state",
+        "vehicle_lying",
+    )
+    for step in range(11, 16):
+        answer(controller, step, step * 0.1)
+    assert controller.rearm(1.51) == ""
+    assert controller.vehicle_words == ""
 
 
 def test_a_vehicle_at_fault_never_begins_to_drive():

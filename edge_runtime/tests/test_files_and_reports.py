@@ -32,12 +32,27 @@ def test_a_result_that_is_no_json_leaves_the_old_file(tmp_path):
 
 
 def test_where_nothing_can_be_written(tmp_path):
-    for bad in (tmp_path / "no" / "out.json", tmp_path):
+    (tmp_path / "file").touch()
+    for bad in (tmp_path / "file" / "out.json", tmp_path / "file" / "no" / "out.json", tmp_path):
         with pytest.raises(UserError):
             check_writable(bad)
         with pytest.raises(UserError):
             write_atomic(bad, b"x")
-    check_writable(tmp_path / "new.json")
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_the_folder_of_an_output_is_made_when_it_is_written_and_not_before(tmp_path):
+    path = tmp_path / "runs" / "today" / "out.json"
+    check_writable(path)
+    assert os.listdir(tmp_path) == []
+    write_json_out(path, {"a": 1})
+    assert json.loads(path.read_text()) == {"a": 1}
+
+
+def test_a_folder_that_may_not_be_written_is_said_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda place, _mode: place != str(tmp_path))
+    with pytest.raises(UserError, match=f"the directory {tmp_path} is read-only"):
+        check_writable(tmp_path / "runs" / "today" / "out.json")
 
 
 def test_what_is_no_regular_file_is_refused_and_stays(tmp_path):

@@ -59,6 +59,7 @@ class Chassis:
                 self.status = self.status._replace(brake=told.locked)
             elif isinstance(told, frames.MotionCommand) and self.answers:
                 self.send(frames.MOTION_STATUS, frames.MotionStatus(*told))
+                self.status = self.status._replace(counter=(self.status.counter + 1) % 256)
                 self.send(frames.SYSTEM_STATUS, self.status)
 
     def send(self, frame, message):

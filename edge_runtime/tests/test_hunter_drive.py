@@ -90,6 +90,18 @@ def test_a_command_that_is_not_finite_is_refused(value):
     assert bench.speed_mps == 0
 
 
+@pytest.mark.parametrize(
+    ("action", "speed_mps"), [({}, 6.0), ({}, None), ({"steering": 0.1}, None)]
+)
+def test_a_command_that_lacks_an_action_is_refused(action, speed_mps):
+    """No pedal means the speed of the scenario's car only where there is a steering beside it."""
+    bench = Bench().enabled()
+    with pytest.raises(ValueError, match="lacks an action"):
+        bench.core.command(action, bench.now_s, speed_mps)
+    bench.step(10)
+    assert bench.speed_mps == 0
+
+
 def test_the_remote_control_keeps_its_brake_and_its_control_at_the_end():
     bench = Bench().driving()
     bench.status = OK._replace(mode=frames.REMOTE_CONTROL)

@@ -74,6 +74,56 @@ def test_a_status_that_falls_silent_alone():
     assert bench.words == ["the chassis sends no 0x211"]
 
 
+FROZEN = "the chassis repeats itself: the counter of 0x211 stands still"
+
+
+def test_frames_that_repeat_themselves_are_silence_after_three_of_them():
+    bench = Bench().driving()
+    bench.obeys, bench.counter = False, None
+    bench.status = OK._replace(counter=bench.core.reports.status.counter)
+    bench.step(10, {"pedal": 1.0})
+    assert bench.core.state is State.ENABLED
+    bench.step(7, {"pedal": 1.0})
+    assert (bench.core.state, bench.core.cause) == (State.STOPPED, Event.SILENT)
+    assert bench.words == [FROZEN]
+    assert bench.core.standing(bench.now_s) == [FROZEN]  # it is not re-armed
+    bench.core.enable(bench.now_s)
+    bench.step(60, {"pedal": 1.0})
+    assert bench.core.state is State.STOPPED
+    assert bench.words[0] == f"not enabled within 1 s: {FROZEN}"
+    bench.obeys, bench.counter = True, bench.status.counter
+    bench.step(6)
+    assert bench.core.standing(bench.now_s) == []
+    bench.enabled()
+
+
+@pytest.mark.parametrize("count", [2, 7, 50])
+def test_frames_that_go_round_and_round_are_silence(count):
+    bench = Bench().driving(8.0)
+    newest = bench.core.reports.status.counter
+    bench.counter = None
+    for turn in range(20):
+        bench.status = OK._replace(counter=(newest - count + 1 + turn % count) % 256)
+        bench.step(5, {"pedal": 1.0})
+    assert bench.words == [FROZEN]
+
+
+def test_a_counter_that_runs_over_or_loses_two_frames_goes_on():
+    bench = Bench().driving(1.0)
+    for turn in range(600):
+        bench.counter += (turn % 5) // 4 * 2
+        bench.step(5, {"pedal": 1.0})
+        assert bench.core.state is State.ENABLED, bench.words
+
+
+def test_a_chassis_that_was_switched_off_may_count_from_0_again():
+    bench = Bench().driving(20.0)
+    bench.hears = False
+    bench.step(30)
+    bench.hears, bench.counter = True, 0
+    bench.step(12).enabled()
+
+
 @pytest.mark.parametrize(
     ("motion", "words"),
     [((3.0, 0.0), "the chassis reports 3.0 m/s"), ((0.0, 1.0), "a steering angle of 1.00 rad")],

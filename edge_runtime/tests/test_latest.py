@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge_runtime import latest as latest_module
 from edge_runtime.latest import TAKEOVER_SILENCE_S, LatestState
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import Reason
@@ -95,12 +97,12 @@ def test_a_rejection_says_both_places():
     assert rejection.detail == "episode 1 step 3 after episode 1 step 7"
 
 
-def test_only_sixteen_sessions_are_remembered():
+def test_sixteen_past_sessions_may_come_back_with_newer_states():
     latest = LatestState()
     for number in range(17):
         assert latest.offer(make_state(0, session=f"s{number}"), number * 1.0) is None
     assert reason_of(latest, make_state(0, session="s1"), 20.0) is Reason.DUPLICATE
-    assert reason_of(latest, make_state(0, session="s0"), 21.0) is None  # forgotten
+    assert reason_of(latest, make_state(1, session="s1"), 21.0) is None
 
 
 def test_a_session_that_is_heard_again_is_remembered_longest():
@@ -110,7 +112,35 @@ def test_a_session_that_is_heard_again_is_remembered_longest():
     latest.offer(make_state(1, session="s0"), 16.0)
     latest.offer(make_state(0, session="new"), 17.0)
     assert reason_of(latest, make_state(1, session="s0"), 18.0) is Reason.DUPLICATE
-    assert reason_of(latest, make_state(0, session="s1"), 19.0) is None
+    assert reason_of(latest, make_state(2, session="s0"), 19.0) is None
+    assert reason_of(latest, make_state(2, session="s1"), 20.0) is Reason.STALE
+
+
+@pytest.mark.parametrize("take_overs", [17, 100, 2000])
+def test_no_number_of_take_overs_makes_an_old_session_new(take_overs):
+    latest = LatestState()
+    latest.offer(make_state(0, session="old"), 0.0)
+    for number in range(take_overs):
+        assert latest.offer(make_state(0, session=f"s{number}"), 1.0 + number) is None
+    for step in (0, 1, 10**9):
+        state = make_state(step, session="old", episode=step)
+        assert reason_of(latest, state, 10.0 + take_overs) is Reason.STALE
+    assert reason_of(latest, make_state(0, session="new"), 20.0 + take_overs) is None
+
+
+def test_too_many_sessions_end_in_no_new_one_rather_than_in_an_old_one(monkeypatch):
+    monkeypatch.setattr(latest_module, "MAX_FORGOTTEN_SESSIONS", 3)
+    latest = LatestState()
+    for number in range(19):
+        assert latest.offer(make_state(0, session=f"s{number}"), number * 1.0) is None
+    rejection = latest.offer(make_state(0, session="s19"), 30.0)
+    assert rejection is not None
+    assert (rejection.reason, "start the runtime again" in rejection.detail) == (
+        Reason.FOREIGN_SESSION,
+        True,
+    )
+    assert reason_of(latest, make_state(1, session="s18"), 31.0) is None  # it goes on
+    assert reason_of(latest, make_state(0, session="s0"), 32.0) is Reason.STALE
 
 
 messages = st.tuples(

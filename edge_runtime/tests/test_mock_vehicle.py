@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from edge_runtime.errors import UserError
 from edge_runtime.vehicles.mock import MockParameters, MockState, MockVehicle, advance
 from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle, vehicle_limits
+from edge_runtime.vehicles.settings import CarSettings, SimilaritySettings
+from edge_runtime.vehicles.similarity import CARS
 
 
 def enabled(**parameters):
@@ -21,7 +23,40 @@ def test_first_order_lag_by_hand():
     parameters = MockParameters(time_constant_s=0.1, slew_per_s=1e9)
     after = advance(MockState(pedal=0.0), 1.0, 0.0, 0.1, parameters)
     assert after.pedal == pytest.approx(1 - math.exp(-1))
-    assert after.speed_mps == pytest.approx((1 - math.exp(-1)) * 5.0 * 0.1)
+    assert after.speed_mps == pytest.approx((1 - math.exp(-1)) * 3.0 * 0.1)
+
+
+@pytest.mark.parametrize("scenario", [*CARS, "another"])
+def test_it_is_no_quicker_than_the_policys_car(scenario):
+    car = CARS.get(scenario, CARS["left_turn"])
+    vehicle = make_vehicle("mock", VehicleSetup(scenario))
+    assert vehicle is not None
+    vehicle.enable(0.0)
+    speeds = []
+    for tick in range(400):
+        vehicle.command({"pedal": 1.0 if tick < 300 else -1.0}, tick * 0.1)
+        speeds.append(vehicle.feedback(tick * 0.1).speed_mps)
+    assert max(speeds) == car.max_speed_mps
+    changes = [(after - before) / 0.1 for before, after in zip(speeds, speeds[1:])]
+    assert max(changes) == pytest.approx(car.throttle_mps2, rel=0.01)
+    assert min(changes) == pytest.approx(-car.brake_mps2, rel=0.01)
+
+
+def test_a_car_of_the_settings_is_its_car():
+    car = CarSettings(
+        throttle_mps2=1.0,
+        brake_mps2=2.0,
+        max_speed_mps=0.5,
+        full_steering_rad=0.3,
+        wheelbase_m=1.0,
+    )
+    setup = VehicleSetup("left_turn", similarity=SimilaritySettings(car=car))
+    vehicle = make_vehicle("mock", setup)
+    assert vehicle is not None
+    vehicle.enable(0.0)
+    for tick in range(100):
+        vehicle.command({"pedal": 1.0}, tick * 0.1)
+    assert vehicle.feedback(10.0).speed_mps == 0.5
 
 
 def test_the_rate_limit_by_hand():
@@ -109,3 +144,10 @@ def test_it_does_not_move_before_it_is_enabled():
     vehicle = MockVehicle()
     vehicle.command({"pedal": 1.0}, 0.0)
     assert vehicle.feedback(0.2).speed_mps == 0.0
+
+
+def test_a_command_without_an_action_is_refused():
+    vehicle = MockVehicle()
+    vehicle.enable(0.0)
+    with pytest.raises(ValueError, match="lacks an action"):
+        vehicle.command({}, 0.1, 6.0)

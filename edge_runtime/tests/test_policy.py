@@ -1,17 +1,27 @@
 from __future__ import annotations
 
+import hashlib
+import re
+from pathlib import Path
+
 import numpy as np
+import onnx
 import pytest
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from onnx import helper
 
+import edge_runtime
 from edge_runtime import signature
 from edge_runtime.errors import UserError
+from edge_runtime.inference import infer
+from edge_runtime.manifest import task_text
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import PEDAL, STEERING, public_pem, write_policy
+from edge_runtime.wire import MAX_TEXT_CHARS
 
 KEY = Ed25519PrivateKey.generate()
 
@@ -31,6 +41,51 @@ def test_a_signed_policy_drives(make_policy):
         action = policy.act(np.full((2, 45, 80), level, np.uint8))
         assert action.dtype == np.float32
         np.testing.assert_allclose(action, [level / 127.5 - 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 0), (2, 1), (1, 2), (), (1,), (0, 1), (1, 1, 1)])
+def test_an_answer_of_another_shape_than_one_row_of_actions_is_none(tmp_path, shape):
+    """Probe pictures cannot find it out: the shape hangs on the picture."""
+    write_policy(tmp_path / "p.onnx", "odd", odd_shape=shape)
+    policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
+    assert policy.act(np.zeros((2, 45, 80), np.uint8)).shape == (1,)
+    white = np.full((2, 45, 80), 255, np.uint8)
+    with pytest.raises(UserError, match=re.escape(f"float32 {list(shape)}")):
+        policy.act(white)
+    assert infer(policy, white).output is None
+
+
+def test_two_files_that_act_differently_never_share_an_id(tmp_path):
+    """One of the same weights that answers full throttle whatever it sees, for a start."""
+    paths = [tmp_path / name for name in ("good.onnx", "bad.onnx")]
+    write_policy(paths[0], "mean")
+    model = onnx.load(str(paths[0]))
+    model.graph.node[-1].output[0] = "unused"
+    model.graph.node.append(helper.make_node("Sign", ["mean"], ["sign"]))
+    model.graph.node.append(helper.make_node("Abs", ["sign"], ["throttle"]))
+    model.graph.node.append(helper.make_node("Unsqueeze", ["throttle", "last_axis"], ["action"]))
+    onnx.save(model, str(paths[1]))
+    good, bad = (load_policy(path, allow_unsigned=True) for path in paths)
+    assert bad.act(np.full((2, 45, 80), 9, np.uint8)) == [1.0]
+    assert good.policy_id != bad.policy_id
+
+
+@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
+def test_a_policy_from_before_with_an_id_in_its_manifest_still_drives(scenario):
+    root = Path(edge_runtime.__file__).parents[1] / "results" / "policies"
+    path = root / f"{scenario}.onnx"
+    assert b'"policy_id":' in path.read_bytes()
+    policy = load_policy(path, root / "policy.pub")
+    assert policy.trust == signature.VERIFIED
+    assert policy.policy_id == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_the_task_is_scenario_and_actions_and_fits_the_wire(tmp_path):
+    half = type(PEDAL)(name="steering", meaning="m", unit="u", low=-0.5, high=0.25)
+    write_policy(tmp_path / "p.onnx", value=0.1, actions=(PEDAL, half))
+    manifest = load_policy(tmp_path / "p.onnx", allow_unsigned=True).manifest
+    assert manifest.task == "left_turn, pedal -1 to 1, steering -0.5 to 0.25"
+    assert len(task_text("s" * 300, [])) == MAX_TEXT_CHARS
 
 
 def test_two_actions(tmp_path):
@@ -102,10 +157,28 @@ def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path,
     assert load_policy(signed.path).trust == signature.VERIFIED
 
 
+def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
+    make_policy, tmp_path, monkeypatch
+):
+    """Whoever brings a policy can bring a key, too; the one of the working directory is mine."""
+    (tmp_path / "home" / "keys").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "home")
+    mine = Path("keys/policy.pub")
+    mine.write_bytes(public_pem(Ed25519PrivateKey.generate()))
+    signed = make_policy()
+    refused(signed.path, f"public key {mine}: .* --public-key", allow_unsigned=True)
+    beside = signed.public_key.rename(tmp_path / "policy.pub")
+    assert load_policy(signed.path, allow_unsigned=True).trust == signature.BESIDE
+    assert load_policy(signed.path, beside).trust == signature.VERIFIED
+    for options in ({}, {"public_key": mine, "allow_unsigned": True}):
+        refused(signed.path, f"public key {mine}: .* --public-key", **options)
+    mine.unlink()
+    refused(signed.path, "no public key")
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"manifest_changes": {"policy_id": "0" * 64}}, "its manifest names weights 000"),
         ({"manifest_changes": {"action": [PEDAL, STEERING]}}, "its output must be action"),
         ({"manifest_changes": {"action": []}}, "no action"),
         ({"manifest_changes": {"control_period_s": 0.05}}, "control period"),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
 import time
 
 import pytest
 
 from edge_runtime.tests.harness import (
     BLACK,
+    PATIENCE_S,
     WHITE,
     EdgeProcess,
     Simulator,
@@ -89,6 +91,38 @@ def test_lock_step_drives_from_the_first_state_and_ends_cleanly(edge_and_simulat
     wait_until(lambda: not simulator.alive.is_set(), "the token is gone")
 
 
+@pytest.mark.parametrize(
+    "number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGABRT, signal.SIGRTMIN]
+)
+def test_every_signal_that_would_end_it_in_mid_drive_is_a_stop(edge_and_simulator, number):
+    ours = signal.signal(number, signal.SIG_DFL)  # under nohup SIGHUP would be ignored
+    try:
+        edge, simulator = edge_and_simulator("constant", "--vehicle", "mock")
+    finally:
+        signal.signal(number, ours)
+    drive(simulator, range(5))
+    edge.process.send_signal(number)
+    last = wait_until(
+        lambda: next((c for c in simulator.drain() if c.reason == "runtime_ended"), None),
+        "a last safe stop",
+    )
+    assert (last.mode, last.action) == ("safe_stop", [-1.0])
+    _, log = edge.process.communicate(timeout=PATIENCE_S)
+    assert edge.process.returncode == 0
+    assert " ended " in log
+
+
+def test_a_hangup_that_is_ignored_from_the_start_stays_so(edge_and_simulator):
+    ours = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        edge, simulator = edge_and_simulator()
+    finally:
+        signal.signal(signal.SIGHUP, ours)
+    edge.process.send_signal(signal.SIGHUP)
+    assert simulator.ask(make_state(0, final=True)).mode == "drive"
+    assert edge.end() == 0
+
+
 def test_the_process_imports_nothing_of_the_workstation(make_policy, tmp_path):
     endpoint, imports = free_endpoint(), tmp_path / "imports.txt"
     flags = [*make_policy().flags, "--connect", endpoint]
@@ -145,6 +179,30 @@ def test_an_output_that_is_not_finite_stops(edge_and_simulator):
         assert simulator.ask(make_state(step, frames=WHITE_FRAMES)).mode == "safe_stop"
 
 
+@pytest.mark.parametrize("shape", [(1, 0), (), (1, 1, 1)])
+def test_an_answer_of_the_wrong_shape_stops_and_is_no_last_word(edge_and_simulator, shape):
+    edge, simulator = edge_and_simulator("odd", odd_shape=shape)
+    assert simulator.ask(make_state(0)).mode == "drive"
+    for step in range(1, 4):
+        command = simulator.ask(make_state(step, frames=WHITE_FRAMES))
+        assert (command.mode, command.reason) == ("safe_stop", "inference_failed")
+        assert command.action == [-1.0]
+    assert "drive" in {command.mode for command in drive(simulator, range(4, 24))}
+    assert edge.end() == 0
+    assert "Traceback" not in edge.log
+
+
+def test_states_of_another_task_are_answered_with_a_safe_stop(edge_and_simulator):
+    edge, simulator = edge_and_simulator()
+    for step in range(3):
+        command = simulator.ask(make_state(step, task="congestion, steering -1 to 1"))
+        assert (command.mode, command.reason) == ("safe_stop", "other_task")
+    own = drive(simulator, range(3, 23), task="left_turn, pedal -1 to 1")
+    assert "drive" in {command.mode for command in own}
+    assert edge.end() == 0
+    assert "reason=other_task" in edge.log
+
+
 def test_an_inference_that_takes_too_long_stops_while_it_runs(edge_and_simulator):
     _, simulator = edge_and_simulator("slow")
     assert simulator.ask(make_state(0)).mode == "drive"
@@ -175,6 +233,16 @@ def test_bad_states_are_counted_by_reason_and_not_answered(edge_and_simulator):
     health = last_health(simulator, lambda h: sum(h.rejected.values()) == len(bad))
     assert health.rejected == dict.fromkeys(bad, 1)
     assert simulator.drain() == []
+
+
+def test_a_state_that_was_put_to_every_vehicle_is_not_its_own(edge_and_simulator):
+    _, simulator = edge_and_simulator()
+    wild = ("phil/*/state", "phil/hunter$*/state", "*/hunter01/state", "**/state")
+    for number, key in enumerate(wild):
+        simulator.send(make_state(number), key)
+    assert simulator.ask(make_state(0)).mode == "drive"
+    health = last_health(simulator, lambda h: h.accepted == 1)
+    assert health.rejected == {}
 
 
 def test_a_second_simulator_is_rejected_until_the_first_is_silent(edge_and_simulator):
@@ -265,6 +333,27 @@ def test_of_two_runtimes_that_meet_later_the_younger_gives_way(make_policy):
 def test_it_waits_for_a_simulator_and_ends_without_one(make_policy):
     with EdgeProcess(*make_policy().flags, "--connect", free_endpoint()) as edge:
         assert edge.ready_line.startswith("ready ")
+        assert edge.end() == 0
+
+
+def test_it_says_at_once_and_again_what_it_waits_for(make_policy):
+    with EdgeProcess(*make_policy().flags, "--connect", "tcp/127.0.0.1:1") as edge:
+        assert edge.process.stderr is not None
+        waits = (line for line in edge.process.stderr if " waiting " in line)
+        begun_s = time.monotonic()
+        for _ in range(2):
+            assert "nobody listens on port 1 of 127.0.0.1 (connection refused)" in next(waits)
+        assert 4.0 < time.monotonic() - begun_s < 15.0
+        assert edge.end() == 0
+
+
+def test_a_simulator_of_another_vehicle_is_named_as_what_it_waits_for(make_policy):
+    endpoint = free_endpoint()
+    flags = [*make_policy().flags, "--connect", endpoint]
+    with Simulator(endpoint, "hunter02"), EdgeProcess(*flags) as edge:
+        assert edge.process.stderr is not None
+        line = next(line for line in edge.process.stderr if " waiting " in line)
+        assert f"{endpoint} is there, and has sent no state for vehicle id hunter01" in line
         assert edge.end() == 0
 
 

@@ -34,9 +34,12 @@ EXPECTED = {
     Event.FINAL: (STANDBY, STANDBY, STOP),
     Event.SILENT: (STANDBY, STOP, STOP),
     Event.NOT_FINITE: (STOP, STOP, STOP),
+    Event.FAILED: (STOP, STOP, STOP),
+    Event.DEAD: (STOP, STOP, STOP),
     Event.TOO_LONG: (STOP, STOP, STOP),
     Event.PAUSED: (STOP, STOP, STOP),
     Event.OTHER_SESSION: (STOP, STOP, STOP),
+    Event.OTHER_TASK: (STOP, STOP, STOP),
     Event.NOT_ARMED: (STOP, STOP, STOP),
     Event.VEHICLE: (STOP, STOP, STOP),
     Event.REARM: (STANDBY, DRIVE, STOP),
@@ -46,8 +49,9 @@ EXPECTED = {
 GOOD = {"fresh_state", "recovered", "final_state"}
 # The words that health and commands say: a reader on the other end compares with them.
 BAD = {
-    "no_fresh_state", "output_not_finite", "inference_too_long",
-    "pause_too_long", "other_session", "not_armed", "vehicle_fault",
+    "no_fresh_state", "output_not_finite", "inference_failed", "policy_thread_dead",
+    "inference_too_long",
+    "pause_too_long", "other_session", "other_task", "not_armed", "vehicle_fault",
 }  # fmt: skip
 
 
@@ -63,7 +67,7 @@ def test_every_pair(mode, event, rearmed):
     """Of the whole record: where it goes, why, and what it remembers."""
     expected = EXPECTED[event][list(Mode).index(mode)]
     stopped = mode is STOP
-    before = Safety(mode, "before" if stopped else "", 3, rearmed, 7.5, "s", 9)
+    before = Safety(mode, "before" if stopped else "", 3, rearmed, 7.5, "s", 9, 6.5)
     after = advance(before, event)
     assert after.mode is expected
     assert after.safe_stops == 9 + int(not stopped and expected is STOP)
@@ -74,14 +78,14 @@ def test_every_pair(mode, event, rearmed):
     assert after.fresh_in_a_row == (0 if event.value in BAD else 3 + int(event.value in GOOD))
     kept = rearmed or event is Event.REARM
     assert after.rearmed == (kept and expected is STOP and event.value not in BAD)
-    assert (after.last_fresh_s, after.session) == (7.5, "s")
+    assert (after.last_fresh_s, after.session, after.permitted_s) == (7.5, "s", 6.5)
 
 
 def test_the_limits_are_the_contracts():
     assert (MAX_INFERENCE_S, FRESH_STATES_TO_RECOVER) == (0.1, 5)
     assert round(SILENCE_S, 9) == 0.22  # 2 T and a grace within the promised 50 ms
     assert MAX_PAUSE_S == 10.0
-    assert Safety() == (STANDBY, "", 0, False, None, None, 0)
+    assert Safety() == (STANDBY, "", 0, False, None, None, 0, None)
 
 
 @pytest.mark.parametrize(
@@ -110,6 +114,14 @@ def test_what_the_time_before_a_state_means(mode, gap_s, session, without, with_
 @pytest.mark.parametrize("needs_rearm", [False, True])
 def test_before_the_first_state_of_all_nothing_was_due(needs_rearm):
     assert classify_arrival(Safety(), "a", 50.0, needs_rearm) is None
+
+
+@pytest.mark.parametrize(("mode", "is_drive"), [(STANDBY, False), (DRIVE, True), (STOP, False)])
+def test_only_the_first_state_and_those_that_come_in_drive_put_off_the_pause(mode, is_drive):
+    safety = note_arrival(Safety(mode), "a", 1.0)
+    assert (safety.last_fresh_s, safety.permitted_s) == (1.0, 1.0)
+    safety = note_arrival(safety, "a", 2.0)
+    assert (safety.last_fresh_s, safety.permitted_s) == (2.0, 2.0 if is_drive else 1.0)
 
 
 def test_the_table_holds_every_pair_and_no_other():

@@ -9,6 +9,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 from types import SimpleNamespace
 from typing import Any, List
 
@@ -93,11 +94,12 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
         assert systemd.until("STOPPING")[-1] == "STOPPING=1"
         assert edge.end() == 0
     lines = [json.loads(line) for line in edge.log.splitlines()]
-    assert [line["event"] for line in lines] == ["not_permitted", "ended"]
+    assert [line["event"] for line in lines] == ["not_permitted", "waiting", "ended"]
     assert list(lines[0])[:3] == ["time", "level", "event"]
     assert (lines[0]["level"], lines[0]["key"], lines[0]["value"]) == ("warning", "cpus", [4095])
     assert "this process may use" in lines[0]["help"]
-    assert lines[1]["accepted"] == 0
+    assert "connection refused" in lines[1]["why"]
+    assert lines[2]["accepted"] == 0
 
 
 class FakePolicy:
@@ -123,12 +125,15 @@ class FakeLink:
 
     def __init__(self) -> None:
         self.sent = {"command": 0, "health": 0}
+        self.commands: list = []
 
     def declare(self, on_state: Any, *_: Any) -> None:
         self.state_comes = on_state
 
     def send(self, topic: str, message: Any) -> None:
         self.sent[topic] += 1
+        if topic == "command":
+            self.commands = [message]
 
 
 @pytest.fixture
@@ -170,6 +175,27 @@ def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     assert systemd.next() == "WATCHDOG=1"
 
 
+def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running, systemd):
+    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
+    control, link, policy = running(notifier)
+    link.state_comes(encode(make_state(0)))
+    assert systemd.until("STATUS")[-1] == "STATUS=drive"
+    policy.act = lambda frames: sys.exit("no exception that inference catches")
+    link.state_comes(encode(make_state(1)))
+    assert systemd.until("STATUS")[-1] == "STATUS=safe_stop policy_thread_dead"
+    wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message any more")
+    before = link.sent["command"]
+    for step in range(2, 8):  # a simulator that lives on changes nothing
+        link.state_comes(encode(make_state(step)))
+        time.sleep(0.1)
+    assert link.sent["command"] > before  # the safe stops go on
+    health = control.health()
+    assert (health.mode, health.reason) == ("safe_stop", "policy_thread_dead")
+    assert health.deadline_misses == 0
+    assert link.commands[-1].reason == "policy_thread_dead"
+    assert "restart" in control._rearm()
+
+
 def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):
     monkeypatch.setattr(loop, "_HUNG_S", 0.2)
     vehicle = BrokenVehicle()
@@ -187,6 +213,21 @@ def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     finally:
         vehicle.released.set()
         runner.close()
+
+
+def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
+    vehicle = BrokenVehicle()
+    runner = VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
+    control, link, _ = running(Notifier({}), runner)
+    runner.start()
+    link.state_comes(encode(make_state(0)))
+    vehicle.says = ["the battery is hot"]
+    wait_until(lambda: control.health().reason == "vehicle_fault", "the safe stop")
+    vehicle.says = []
+    wait_until(lambda: not runner.fault(time.monotonic()), "the end of the fault")
+    time.sleep(0.2)
+    assert control.health().vehicle_fault == "the battery is hot"
+    runner.close()
 
 
 def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):

@@ -14,9 +14,9 @@ from edge_runtime.vehicles.watch import SILENT
 from edge_runtime.wire import Command
 
 
-def make_command(mode="drive", step=0):
+def make_command(mode="drive", step=0, action=(0.5,)):
     return Command(
-        session="s", episode=0, step=step, mode=mode, action=[0.5], policy_id="p",
+        session="s", episode=0, step=step, mode=mode, action=list(action), policy_id="p",
         received_ns=0, inference_ns=0, sent_ns=0,
     )  # fmt: skip
 
@@ -104,6 +104,16 @@ def test_a_driver_that_takes_no_command_is_at_fault_until_it_takes_one(vehicle, 
     runner.command(make_command("safe_stop", step=1))
     wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
     assert vehicle.asked == ["command", "brake"]
+
+
+@pytest.mark.parametrize("action", [[], [0.5, 0.5]])
+def test_a_command_without_just_the_policys_actions_is_a_fault(vehicle, runner, action):
+    runner.command(make_command(action=action))
+    wait_until(lambda: runner.faults, "the fault")
+    assert runner.fault(time.monotonic())
+    runner.command(make_command("safe_stop", step=1, action=action))
+    wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
+    assert vehicle.asked == ["brake"]  # a stop is one whatever stands beside it
 
 
 def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(vehicle, runner):

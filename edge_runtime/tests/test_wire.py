@@ -132,6 +132,14 @@ def test_the_state_has_exactly_the_contracts_fields():
     }  # fmt: skip
 
 
+def test_a_state_may_say_its_task():
+    state = make_state(0, task="left_turn, pedal -1 to 1")
+    assert wire.decode_state(wire.encode(state)) == state
+    assert make_state(0).task is msgspec.UNSET
+    refused = wire.decode_state(wire.encode(make_state(0, task="t" * 257)))
+    assert isinstance(refused, Rejection)
+
+
 def test_the_command_has_exactly_the_contracts_fields():
     assert set(Command.__struct_fields__) == {
         "schema", "session", "episode", "step", "mode", "action", "policy_id",

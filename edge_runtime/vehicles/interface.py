@@ -10,7 +10,7 @@ from typing import ClassVar, Dict, List, NamedTuple, Optional, Sequence
 
 
 class ActionLimit(NamedTuple):
-    """A vehicle's row for one action: its range, and the fastest change per second."""
+    """A vehicle's row for one action: its range, and the fastest change per second (inf: any)."""
 
     low: float
     high: float
@@ -55,6 +55,8 @@ class Vehicle(abc.ABC):
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
         """Ask for an action; it holds for 2 T, after which the vehicle brakes by itself.
+
+        Raises ValueError for one that lacks what the vehicle needs: it never guesses.
 
         `scenario_speed_mps` is the speed of the scenario's car: what a policy without a pedal
         has in place of one. Moves nothing while the vehicle is stopped (`brake`, or a fault).

@@ -11,10 +11,10 @@ from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
 from edge_runtime.vehicles.hunter.set_point import limits_of
 from edge_runtime.vehicles.hunter.specs import SPECS, HunterSpec
 from edge_runtime.vehicles.interface import ActionLimit, Vehicle
-from edge_runtime.vehicles.mock import MockVehicle
+from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 from edge_runtime.vehicles.ros2.settings import Ros2Settings
 from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
-from edge_runtime.vehicles.similarity import ScenarioCar, Similarity, car_of, similarity_to
+from edge_runtime.vehicles.similarity import CARS, ScenarioCar, Similarity, car_of, similarity_to
 
 NONE = "none"
 
@@ -30,7 +30,16 @@ class VehicleSetup(NamedTuple):
 
 
 def _mock(setup: VehicleSetup) -> Vehicle:
-    return MockVehicle()
+    """As quick as the policy's car, where that is known."""
+    car = setup.similarity.car or CARS.get(setup.scenario)
+    if car is None:
+        return MockVehicle()
+    limits = MockParameters(
+        throttle_mps2=car.throttle_mps2,
+        brake_mps2=car.brake_mps2,
+        max_speed_mps=car.max_speed_mps,
+    )
+    return MockVehicle(limits)
 
 
 def _robot(name: str, setup: VehicleSetup) -> Tuple[HunterSpec, Similarity]:

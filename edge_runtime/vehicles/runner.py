@@ -172,6 +172,8 @@ class VehicleRunner:
         try:
             if command.mode == SAFE_STOP:
                 self._vehicle.brake(now_s, task.latch)
+            elif len(command.action) != len(self._action_names):
+                raise ValueError(f"a command of {command.action} for {self._action_names}")
             elif now_s - task.given_s <= SILENCE_S:  # a driver that hung must not obey the past
                 self._vehicle.command(action, now_s, task.scenario_speed_mps)
         except Exception as error:  # a driver may raise anything; its thread must live on

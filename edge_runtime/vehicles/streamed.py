@@ -41,7 +41,7 @@ class Core(abc.ABC):
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """The newest command; forgotten where it may not drive. ValueError: not finite."""
+        """The newest command; forgotten where it may not drive. ValueError: unfit."""
 
     @abc.abstractmethod
     def brake(self, now_s: float, latch: bool = True) -> None:

@@ -23,9 +23,9 @@ from edge_runtime import wire
 from edge_runtime.access import rules_for_listener
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.option_types import positive
-from edge_runtime.signature import SIGNATURE_SUFFIX
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint, open_session
+from hil_tests.options import trusting
 
 VEHICLE_ID = "hunter01"
 PACE_S = 0.004
@@ -97,10 +97,7 @@ def edge_and_bench(policy: Path, folder: Path | None) -> Iterator[Bench]:
     endpoint = free_endpoint("tcp" if folder is None else "tls")
     bench = Bench(endpoint, folder)
     command = [sys.executable, "-m", "edge_runtime", "run", "--log-level", "error"]
-    command += ["--policy", str(policy), "--connect", endpoint, "--allow-unsigned"]
-    public_key = policy.with_name("policy.pub")
-    if policy.with_name(policy.name + SIGNATURE_SUFFIX).exists() and public_key.exists():
-        command += ["--public-key", str(public_key)]
+    command += [*trusting(policy, None), "--connect", endpoint]
     if folder is not None:
         command += ["--tls", str(folder / f"edge-{VEHICLE_ID}")]
     edge = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

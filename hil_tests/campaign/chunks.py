@@ -29,6 +29,7 @@ class Task:
     scenario: str
     condition: str
     clock: str
+    public_key: str | None = None
 
 
 @dataclass(frozen=True)

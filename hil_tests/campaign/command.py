@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.cli import ArgumentParser, add_public_key, examples
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_json
 from edge_runtime.latency.model import parse_spec
 from edge_runtime.option_types import not_negative, positive, share
 from hil_tests.campaign.axes import AXES, Axis
@@ -46,6 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="P.onnx",
         help="policy file (default: results/policies/SCENARIO.onnx)",
     )
+    add_public_key(parser)
     add_scenario(parser)
     parser.add_argument(
         "--condition", choices=("nominal", "variant"), default="nominal", help="scene"
@@ -162,7 +162,10 @@ def _run_faults(arguments: argparse.Namespace, names: list[str]) -> tuple[dict[s
         bar.advance({"row": row}, done - bar.done)
 
     try:
-        found = run_faults(arguments.tries, names or None, policy, on_progress, jobs=arguments.jobs)
+        found = run_faults(
+            arguments.tries, names or None, policy, on_progress, arguments.jobs,
+            arguments.public_key,
+        )  # fmt: skip
     finally:
         if bar is not None:
             bar.__exit__()
@@ -174,7 +177,7 @@ def _other(text: str) -> tuple[str, dict[str, Any]]:
     if not equals:
         raise UserError(f"--against {text}: write NAME=R.json")
     try:
-        latency: dict[str, Any] = json.loads(read_bytes(path, "report"))["latency"]
+        latency: dict[str, Any] = read_json(path, "report")["latency"]
         policy = Path(latency["policy"]).stem
         budget = latency["budget"]
         budget["sentence"] = name + budget["sentence"].removeprefix(policy)

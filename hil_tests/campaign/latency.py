@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,11 @@ def run_latency(
 ) -> dict[str, Any]:
     """Sweep the axes and check against real time; the part ``latency`` of the report."""
     # The edge runtime checks signatures where it matters; here the loop is measured.
-    policy_id = load_policy(str(policy), allow_unsigned=True).policy_id
-    task = Task(policy, policy_id, arguments.scenario, arguments.condition, arguments.clock)
+    policy_id = load_policy(str(policy), arguments.public_key, allow_unsigned=True).policy_id
+    task = Task(
+        policy, policy_id, arguments.scenario, arguments.condition, arguments.clock,
+        arguments.public_key,
+    )  # fmt: skip
     specs = list(dict.fromkeys(axis.spec(value) for axis in axes for value in axis.values))
     rows = drive_rows(task, specs, arguments.seed, arguments.runs, arguments.jobs, keep)
     checked = [str(parse_spec(spec)) for spec in arguments.check_realtime]
@@ -94,8 +97,7 @@ def _check_realtime(
     task: Task, specs: Sequence[str], arguments: argparse.Namespace, keep: Path
 ) -> dict[str, Any]:
     """Drive some rows in real time, too, and compare."""
-    real_task = Task(task.policy, task.policy_id, task.scenario, task.condition, "realtime")
-    virtual_task = Task(task.policy, task.policy_id, task.scenario, task.condition, "lockstep")
+    real_task, virtual_task = replace(task, clock="realtime"), replace(task, clock="lockstep")
     runs, seed = arguments.realtime_runs, arguments.seed
     virtual = drive_rows(virtual_task, specs, seed, runs, arguments.jobs, keep)
     real = drive_rows(real_task, specs, seed, runs, arguments.realtime_jobs, keep)

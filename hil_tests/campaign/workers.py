@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import queue
 import shlex
 import tempfile
@@ -14,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_json
 from edge_runtime.transport import free_endpoint
 from hil_tests.campaign.chunks import Chunk, Task, halve, join_reports
 from hil_tests.commands import BackgroundCommand, CommandTimeoutError
+from hil_tests.options import trusting
 
 VEHICLE = "campaign01"
 ATTEMPTS = 6
@@ -79,7 +79,7 @@ class _Worker:
         task = self._task
         self._endpoint = free_endpoint()
         self._edge = BackgroundCommand(
-            "edge_runtime", "run", "--policy", str(task.policy), "--allow-unsigned",
+            "edge_runtime", "run", *trusting(task.policy, task.public_key),
             "--connect", self._endpoint, "--vehicle-id", VEHICLE, ready="ready", quiet=True,
         )  # fmt: skip
 
@@ -127,7 +127,7 @@ class _Worker:
         here = ("--listen", self._endpoint, "--vehicle-id", VEHICLE, "--out", str(self._report))
         with BackgroundCommand(*arguments, *here, quiet=True) as simulator:
             simulator.wait(CHUNK_LIMIT_S)
-        report: dict[str, Any] = json.loads(read_bytes(self._report, "report"))
+        report: dict[str, Any] = read_json(self._report, "report")
         return {**report, "command": f"python -m {shlex.join(arguments)}"}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, add_public_key, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import positive
 from hil_tests.faults import render_faults, run_faults
@@ -23,13 +23,16 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--tries", type=positive, default=3, help="of each fault")
     parser.add_argument("--rows", help="names or patterns (hunter_*), commas between")
     parser.add_argument("--policy", type=Path, help="policy file (the left turn's if not given)")
+    add_public_key(parser)
     parser.add_argument("--jobs", type=positive, default=2, help="rigs at once")
     parser.add_argument("--out", metavar="R.json", help="write the report to this file")
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_writable(arguments.out)
     rows = arguments.rows.split(",") if arguments.rows else None
-    report = run_faults(arguments.tries, rows, arguments.policy, _tell, arguments.jobs)
+    report = run_faults(
+        arguments.tries, rows, arguments.policy, _tell, arguments.jobs, arguments.public_key
+    )
     write_json_out(arguments.out, report)
     print(render_faults(report))
     for row in report["rows"]:

@@ -20,6 +20,7 @@ from hil_tests.faults.row import Row, Try
 from hil_tests.faults.slow_policy import write_full, write_mean, write_slow, write_steady
 from hil_tests.faults.table import ROWS
 from hil_tests.faults.timeline import longest_gap_s, spread_ms, unsafe_commands
+from hil_tests.options import trusting
 
 POLICY = Path("results/policies/left_turn.onnx")
 PUBLIC_KEY = POLICY.with_name("policy.pub")
@@ -49,6 +50,7 @@ def run_faults(
     policy: Path | None = None,
     on_progress: OnProgress = lambda row, done, total: None,
     jobs: int = 2,
+    public_key: str | None = None,
 ) -> dict[str, Any]:
     """Do every row ``tries`` times (fewer where the row says so); a report for JSON.
 
@@ -58,13 +60,15 @@ def run_faults(
         policy: an exported policy; None for the repository's own left turn.
         on_progress: called after every try.
         jobs: rigs at once; rows that need the machine for themselves run after the others.
+        public_key: what the policy is verified with.
 
     Raises:
         UserError: a row that the table does not hold, or no policy.
     """
     chosen = _choose(rows)
     with tempfile.TemporaryDirectory(prefix="phil-faults-") as work:
-        campaign = _Campaign(Path(work), policy, tries, chosen, on_progress)
+        trust = _trusted(policy, public_key)
+        campaign = _Campaign(Path(work), trust, tries, chosen, on_progress)
         with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
             futures = {row.name: pool.submit(campaign.run, row) for row in chosen if not row.alone}
             outcomes = {name: future.result() for name, future in futures.items()}
@@ -83,7 +87,7 @@ class _Campaign:
     def __init__(
         self,
         work: Path,
-        policy: Path | None,
+        trust: Sequence[str],
         tries: int,
         rows: Sequence[Row],
         on_progress: OnProgress,
@@ -91,14 +95,14 @@ class _Campaign:
         self._work, self._tries, self._on_progress = work, tries, on_progress
         self._done, self._total = 0, sum(self._tries_of(row) for row in rows)
         self._lock = threading.Lock()
-        self._policies = {"given": _trusted(policy)}
+        self._policies = {"given": trust}
         makers = {
             "slow": write_slow, "steady": write_steady, "full": write_full, "mean": write_mean,
         }  # fmt: skip
         for kind in {row.policy for row in rows} & set(makers):
             path = work / f"{kind}.onnx"
             makers[kind](path)
-            self._policies[kind] = ["--policy", str(path), "--allow-unsigned"]
+            self._policies[kind] = trusting(path, None)
 
     def run(self, row: Row) -> Outcome:
         """All tries of a row; a rig in which a try came to no end is replaced."""
@@ -172,10 +176,10 @@ def _choose(names: Sequence[str] | None) -> list[Row]:
     return [row for row in ROWS if any(fnmatch.fnmatch(row.name, name) for name in names)]
 
 
-def _trusted(policy: Path | None) -> list[str]:
+def _trusted(policy: Path | None, public_key: str | None) -> tuple[str, ...]:
     if policy is None:
-        return ["--policy", str(POLICY), "--public-key", str(PUBLIC_KEY)]
-    return ["--policy", str(policy), "--allow-unsigned"]
+        return ("--policy", str(POLICY), "--public-key", public_key or str(PUBLIC_KEY))
+    return trusting(policy, public_key)
 
 
 def _report_row(row: Row, outcome: Outcome) -> dict[str, Any]:

@@ -5,6 +5,7 @@ speed 0 and stays so; the vehicle stands (by the mock's own truth, whatever it r
 the mock would drive on by itself when the fault is over; feedback names the fault in words; only a
 re-arm lets it move. When the edge can know:
 - silent, bus off, late: at the last frame that came in time, for the next ones were due;
+- frozen: the same, and STATUS_SILENCE_S later, for it goes on sending;
 - the others: at the first frame on the bus that shows it;
 - stuck: at the first set-point that the vehicle should follow and does not (it may lag FOLLOWS_S).
 """
@@ -18,6 +19,7 @@ from functools import partial
 from typing import NamedTuple
 
 from edge_runtime.safety import Event
+from edge_runtime.vehicles.hunter.reports import STATUS_SILENCE_S
 from edge_runtime.vehicles.hunter.set_point import DEVIATES_S, FOLLOWS_S
 from edge_runtime.wire import DRIVE
 from hil_tests.faults.can_ears import CanEars, Heard
@@ -40,8 +42,8 @@ _SAID_BEFORE_S = 0.1
 _FAST_MPS = 0.9 * MODELS[MODEL].max_speed_mps
 _IMPOSSIBLE_MPS = 1.2 * MODELS[MODEL].max_speed_mps
 _DIFFERS_MPS = 0.15
-_NO_FRAME_TO_SHOW_IT = ("silent", "bus_off", "late")
-_REFUSED = ("silent", "bus_off", "remote", "estop")
+_NO_FRAME_TO_SHOW_IT = ("silent", "frozen", "bus_off", "late")
+_REFUSED = ("silent", "frozen", "bus_off", "remote", "estop")
 """While these last, the runtime refuses to be re-armed: it would be in vain."""
 
 
@@ -187,6 +189,7 @@ def _status(test: Callable[[bytes], bool]) -> Callable[[Heard], bool]:
 
 _EXPECTS = (
     Expect("silent", "sends no 0x2"),
+    Expect("frozen", "stands still"),
     Expect("bus_off", "sends no 0x2"),
     Expect("late", "sends no 0x2"),
     Expect(
@@ -201,6 +204,7 @@ _EXPECTS = (
 _EXPECT = "set-point 0 on the bus, vehicle_fault; stands until re-armed"
 _RIG = {"vehicle": "hunter", "model": MODEL}
 _STUCK_LIMIT_S = FOLLOWS_S + DEVIATES_S + REACTION_LIMIT_S
+_LIMITS_S = {"frozen": STATUS_SILENCE_S + REACTION_LIMIT_S}
 
 ROWS = (
     *(
@@ -212,6 +216,7 @@ ROWS = (
             if expect.name in _NO_FRAME_TO_SHOW_IT
             else "first frame on the bus that shows it to set-point 0",
             partial(at_fault, expect),
+            reaction_limit_s=_LIMITS_S.get(expect.name, REACTION_LIMIT_S),
             rig=_RIG,
             policy="full",
             flows=True,

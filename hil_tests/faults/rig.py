@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ class Rig:
 
     def __init__(
         self,
-        policy: list[str],
+        policy: Sequence[str],
         directory: Path,
         between: str = "",
         vehicle: str = "none",

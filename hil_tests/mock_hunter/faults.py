@@ -48,6 +48,7 @@ BITS: dict[str, Bit] = {
 
 BEHAVIOURS: dict[str, str] = {
     "silent": "it sends nothing, and obeys",
+    "frozen": "it repeats its last frames, and obeys",
     "stuck": "its motors stay as they are, whatever is asked; its brake works",
     "lying": "it reports a speed that cannot be",
     "late": "all that it sends comes late",

@@ -47,6 +47,7 @@ class MockHunter:
         self._under_way: deque[tuple[float, Setpoint]] = deque()
         self._setpoint = Setpoint()
         self._tick = 0
+        self._reported: Reported | None = None  # the newest
         self._outgoing: deque[tuple[float, Wire]] = deque()
 
     def describe(self) -> str:
@@ -139,13 +140,14 @@ class MockHunter:
         return advance(self.body, self._setpoint, step_s, self._parameters)
 
     def _report(self, now_s: float) -> None:
-        reported = Reported(
-            self.chassis, self.body, self.battery.volts, self.battery.amperes,
-            self._tick // SLOW_EVERY, "lying" in self.faults,
-        )  # fmt: skip
-        frames = fast_frames(reported, self._parameters)
+        if self._reported is None or "frozen" not in self.faults:
+            self._reported = Reported(
+                self.chassis, self.body, self.battery.volts, self.battery.amperes,
+                self._tick // SLOW_EVERY, "lying" in self.faults,
+            )  # fmt: skip
+        frames = fast_frames(self._reported, self._parameters)
         if self._tick % SLOW_EVERY == 0:
-            frames += slow_frames(reported, self._parameters, self._profile)
+            frames += slow_frames(self._reported, self._parameters, self._profile)
         if self.faults & {"silent", "bus_off"}:
             return
         release_s = now_s + (LATE_S if "late" in self.faults else 0.0)

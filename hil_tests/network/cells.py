@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_json
 from edge_runtime.latency.model import LatencySpec
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand
@@ -50,7 +49,7 @@ def run_cell(drive: Drive, cell: Cell) -> dict[str, Any]:
     """
     out = drive.folder / f"{cell.row}-{cell.transport}.json"
     TRANSPORTS[cell.transport](drive, cell, out)
-    return summary(json.loads(read_bytes(out, "report")))
+    return summary(read_json(out, "report"))
 
 
 def summary(report: dict[str, Any]) -> dict[str, Any]:

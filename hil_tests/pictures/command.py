@@ -10,9 +10,8 @@ from pathlib import Path
 
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable
+from edge_runtime.files import check_writable, make_directory
 from hil_tests.pictures import curves, loop, rerun_view, scenes
-from trainer.files import make_directory
 
 PICTURES: dict[str, Callable[[Path, Path], None]] = {
     "left_turn.png": scenes.left_turn,

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_json
 from hil_tests.campaign.figures import write_figures
 from hil_tests.commands import run_command
 
@@ -22,6 +21,6 @@ def learning_curve(out: Path, _work: Path) -> None:
 
 def success_against_latency(out: Path, work: Path) -> None:
     """The shipped policy behind worse and worse networks."""
-    report = json.loads(read_bytes(LATENCY, "latency report"))
+    report = read_json(LATENCY, "latency report")
     names = write_figures(work / LATENCY.name, report["latency"], {})
     shutil.copyfile(work / names["success"], out)

@@ -15,8 +15,9 @@ from trainer.scenarios import SCENARIOS
 
 LEFT_TURN_MOMENT = ("--seed", "8", "--time", "3.4")
 CONGESTION_MOMENT = ("--seed", "3", "--time", "5")
-FILM_SEED = "29"
-"""A drive of 6 s in which an untrained policy would meet a car, once."""
+FILM_POLICY, FILM_SEED = "constant:0.3", "40"
+"""Always the same throttle, and a drive in which it would meet a car, once: the guide brakes, hands
+the wheel back when the car stands, and the next gap is wide enough."""
 SEEN_MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}
 """Scenario -> seed and time, s."""
 SCALE, MARGIN, TITLE_PIXELS = 5, 16, 26
@@ -48,13 +49,10 @@ def policy_sees(out: Path, _work: Path) -> None:
     write_atomic(out, buffer.getvalue())
 
 
-def take_over(out: Path, work: Path) -> None:
-    """A policy that has learned nothing yet drives, and the scripted expert takes over."""
-    run_dir = work / "untrained"
-    nothing = ("--episodes", "1", "--set", "evaluate_every_steps=0", "--set", "warmup_steps=100000")
-    run_command("trainer", "train", *nothing, "--out", str(run_dir))
+def take_over(out: Path, _work: Path) -> None:
+    """The same throttle throughout, and the scripted expert brakes for a car."""
     words = ("--human", "expert", "--seed", FILM_SEED, "--time", "15")
-    run_command("trainer", "picture", str(run_dir), *words, "--out", str(out))
+    run_command("trainer", "picture", FILM_POLICY, *words, "--out", str(out))
 
 
 def cockpit(out: Path, _work: Path) -> None:

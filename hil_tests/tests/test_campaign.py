@@ -146,6 +146,12 @@ def test_one_episode_has_no_interval_that_a_report_could_hold(tmp_path, capsys):
     assert "2 or more have an interval" in capsys.readouterr().err
 
 
+def test_a_key_that_is_not_there_is_said_before_anything_is_driven(tmp_path, capsys):
+    options = ["--only", "latency", "--public-key", "nothing.pub"]
+    assert run_cli(main, ["campaign", "--out", str(tmp_path / "r.json"), *options]) == 2
+    assert "public key nothing.pub does not exist" in capsys.readouterr().err
+
+
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
     few = Axis("delay", "delay", "ms", (0, 100), "delay={}ms", "none", "{} of delay")
     monkeypatch.setattr(command, "AXES", (few,))

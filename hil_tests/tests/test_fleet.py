@@ -127,7 +127,7 @@ def test_a_routers_file_names_the_vehicles_of_both_options(router_folder, tmp_pa
         (["--tls", "viewer"], "certificate of viewer"),
         (["--vehicle-id", "a/b"], "not valid"),
         (["--vehicles", "nowhere.txt"], "does not exist"),
-        (["--out", "nowhere/r.json5"], "does not exist"),
+        (["--out", "/dev/null/r.json5"], "Not a directory"),
     ],
 )
 def test_a_routers_file_is_refused_where_it_would_not_hold(router_folder, tmp_path, change, says):

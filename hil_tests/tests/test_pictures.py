@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from bridge.scene import Scene
 from bridge.tests.commands import make_command
@@ -16,7 +16,10 @@ from hil_tests.__main__ import main
 from hil_tests.pictures import command, headless
 from hil_tests.pictures.curves import success_against_latency
 from hil_tests.pictures.loop import Trips
-from hil_tests.pictures.scenes import policy_sees
+from hil_tests.pictures.scenes import FILM_POLICY, FILM_SEED, policy_sees
+from trainer.animation import drive_moments
+from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
+from trainer.human.guide import HumanGuide
 
 DOCS = Path(__file__).parents[2] / "docs"
 MS = 10**6
@@ -32,6 +35,23 @@ def test_the_table_of_pictures_is_that_of_the_command():
 def test_every_picture_is_small():
     heavy = [path.name for path in DOCS.glob("*.*") if path.stat().st_size > 2_000_000]
     assert heavy == []
+
+
+def test_the_guide_in_the_film_brakes_for_the_crash_and_hands_the_wheel_back():
+    env = make_environment("left_turn")
+    driver, expert = (load_driver(name, env)[0] for name in (FILM_POLICY, "expert"))
+    guide = HumanGuide(expert, TRIGGERS["left_turn"](EXPERTS["left_turn"](env)))
+    moments = list(drive_moments(env, driver, guide, int(FILM_SEED), 15.0))
+    taken = [number for number, each in enumerate(moments) if each.intervention]
+    first = moments[taken[0]]
+    assert first.intervention is not None
+    assert (first.intervention.reason, first.action) == ("collision", -1.0)
+    assert all(moments[number].action < 0.0 < moments[number].policy_action for number in taken)
+    assert taken == list(range(taken[0], taken[-1] + 1))
+    assert taken[-1] < len(moments) - 10
+    assert env.distance_m > 20.0
+    with Image.open(DOCS / "take_over.gif") as film:
+        assert len(list(ImageSequence.Iterator(film))) == len(moments)
 
 
 def test_a_round_trip_is_drawn_in_its_parts_and_a_lost_state_as_lost():
@@ -89,7 +109,8 @@ def test_one_that_cannot_be_made_does_not_keep_the_others_from_it(monkeypatch, t
 
 
 @pytest.mark.parametrize(
-    ("words", "part"), [(["x.png"], "no picture 'x.png'"), (["--out", "/none"], "does not exist")]
+    ("words", "part"),
+    [(["x.png"], "no picture 'x.png'"), (["--out", "/dev/null"], "Not a directory")],
 )
 def test_bad_input_is_one_line(words, part, capsys):
     assert run_cli(main, ["pictures", *words]) == 2

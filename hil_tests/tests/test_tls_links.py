@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from deploy.certs import CLOCK_SLACK, issue, read_authority
 from edge_runtime import wire
 from edge_runtime.access import rules_for_edge, rules_for_listener
 from edge_runtime.errors import UserError
+from edge_runtime.link_probe import why_no_link
 from edge_runtime.tests.harness import EdgeProcess, make_state, run_command, wait_until
 from edge_runtime.tests.policies import write_policy
 from edge_runtime.tls import load_tls
@@ -88,6 +90,22 @@ def test_our_own_line_says_why(parties, endpoint, mode):
     if mode == "client":
         with pytest.raises(UserError, match="wants --tls"):
             open_session(connect=endpoint.replace("tls/", "tcp/"), mode=mode)
+
+
+def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, policy_flags):
+    plain = endpoint.replace("tls/", "tcp/")
+    with EdgeProcess(*policy_flags, "--connect", plain) as edge:
+        assert edge.process.stderr is not None
+        line = next(line for line in edge.process.stderr if " waiting " in line)
+        assert f"{plain} listens with TLS and wants --tls" in line
+        assert edge.end() == 0
+    place, files = free_endpoint("tls"), load_tls(parties / "edge-hunter01")
+    simulator = open_session(listen=place.replace("tls/", "tcp/"), mode="router")
+    said = why_no_link(place, files)
+    simulator.close()
+    assert re.match(f"{place} (does not speak TLS|answers, but not with TLS)", said)
+    assert "connection refused" in why_no_link(place, files)
+    assert why_no_link(endpoint, files) == ""
 
 
 def test_a_viewers_certificate_is_no_servers(parties):

@@ -12,7 +12,7 @@ from bridge.tests.processes import SLOW_TOY, BridgeProcess, make_policy, read, w
 from edge_runtime.access import rules_for_edge, rules_for_listener
 from edge_runtime.errors import UserError
 from edge_runtime.operator_commands import ask
-from edge_runtime.tests.harness import EdgeProcess
+from edge_runtime.tests.harness import EdgeProcess, run_command
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint
 from hil_tests.tests.tls_parties import SETTLE_S, Intruder, listener, make_certificates, session
@@ -127,3 +127,44 @@ def test_an_edge_takes_no_states_from_another_vehicles_simulator(parties, who, i
         time.sleep(SETTLE_S)
         subscriber.undeclare()
     assert len(states) == int(is_believed)
+
+
+@pytest.mark.parametrize("is_there_first", [True, False])
+def test_another_vehicles_simulator_ends_no_edge_by_a_forged_token(
+    parties, tmp_path, is_there_first
+):
+    """Posing as the server, it claims that an elder runtime has this vehicle's id."""
+    endpoint, anything_goes = free_endpoint("tls"), {"enabled": False}
+    policy = make_policy(tmp_path, "constant", 0.1)
+    flags = ["--policy", str(policy), "--allow-unsigned", "--connect", endpoint]
+    flags += ["--tls", str(parties / "edge-hunter01")]
+    with contextlib.ExitStack() as opened:
+        edge = None if is_there_first else opened.enter_context(EdgeProcess(*flags))
+        posing = listener(endpoint, parties / "simulator-hunter02", anything_goes)
+        liveliness = opened.enter_context(posing).liveliness()
+        tokens = [
+            liveliness.declare_token(f"phil/hunter01/alive{claim}") for claim in ("", "/0-elder")
+        ]
+        edge = edge or opened.enter_context(EdgeProcess(*flags))
+        assert edge.ready_line.startswith("ready ")
+        time.sleep(4 * SETTLE_S)  # it looks twice within a second of the link
+        assert edge.end() == 0
+        for token in tokens:
+            token.undeclare()
+    assert "another" not in edge.log
+
+
+@pytest.mark.parametrize("who", ["simulator-hunter01", "router"])
+def test_a_second_runtime_is_still_refused_over_tls(parties, tmp_path, who):
+    """What the test above must not have broken."""
+    endpoint, policy = free_endpoint("tls"), make_policy(tmp_path, "constant", 0.1)
+    flags = ["--policy", str(policy), "--allow-unsigned", "--connect", endpoint]
+    flags += ["--tls", str(parties / "edge-hunter01")]
+    with (
+        listener(endpoint, parties / who, rules_for_listener(["hunter01"])),
+        EdgeProcess(*flags) as edge,
+    ):
+        second = run_command("run", *flags)
+        assert second.returncode == 2
+        assert "another edge runtime is connected" in second.stderr
+        assert edge.end() == 0

@@ -196,6 +196,7 @@ def test_the_sweep_as_a_command(tmp_path):
         (["--set", "dead_time_s"], "use NAME=VALUE"),
         (["--set", "colour=1"], "no parameter 'colour'"),
         (["--policy", "nothing.onnx"], "nothing.onnx"),
+        (["--public-key", "nothing.pub"], "public key nothing.pub does not exist"),
     ],
 )
 def test_bad_input_is_one_line(options, words, tmp_path, capsys):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.cli import ArgumentParser, add_public_key, examples
 from edge_runtime.errors import UserError
 from edge_runtime.option_types import not_negative, positive, share
 from edge_runtime.policy import load_policy
@@ -47,6 +47,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="P.onnx",
         help="policy file (default: results/policies/SCENARIO.onnx)",
     )
+    add_public_key(parser)
     add_scenario(parser)
     parser.add_argument(
         "--condition", choices=("nominal", "variant"), default="nominal", help="scene"
@@ -93,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_report(out)
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
     # The edge runtime checks signatures where it matters; here the loop is measured.
-    policy_id = load_policy(str(policy), allow_unsigned=True).policy_id
+    policy_id = load_policy(str(policy), arguments.public_key, allow_unsigned=True).policy_id
     changes = read_changes(arguments.set)
     make_parameters(MODEL, changes)  # refuses what the mock does not know, before anything runs
     lags = _lags(arguments.lags)
@@ -121,7 +122,7 @@ def _compare(
 ) -> dict[str, Any]:
     drive = Drive(
         policy, arguments.scenario, arguments.condition, VEHICLE, arguments.seed, arguments.runs,
-        changes,
+        changes, arguments.public_key,
     )  # fmt: skip
     count = 2 * math.ceil(arguments.runs / PART_EPISODES)
     with ProgressBar("drives", count) as bar:
@@ -145,7 +146,7 @@ def _sweep(
 ) -> dict[str, Any]:
     task = SweepTask(
         str(policy), arguments.scenario, arguments.condition, arguments.seed, arguments.runs,
-        changes,
+        changes, arguments.public_key,
     )  # fmt: skip
     out = Path(arguments.out)
     kept = kept_points(out.with_name(f"{out.stem}_rows"), task, policy_id)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import tempfile
 from collections.abc import Mapping
@@ -10,11 +9,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_json
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand
 from hil_tests.faults.chassis import free_bus
 from hil_tests.operator import Operator
+from hil_tests.options import trusting
 
 VEHICLE_ID = "rig01"
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
@@ -32,6 +32,7 @@ class Drive(NamedTuple):
     first_seed: int
     episodes: int
     changes: Mapping[str, float]
+    public_key: str | None = None
 
 
 def run_rig(drive: Drive) -> dict[str, Any]:
@@ -46,7 +47,7 @@ def run_rig(drive: Drive) -> dict[str, Any]:
         edge = _start_vehicle(drive, directory, stack) if drive.loop == VEHICLE else ()
         stack.enter_context(
             BackgroundCommand(
-                "edge_runtime", "run", "--policy", str(drive.policy), "--allow-unsigned",
+                "edge_runtime", "run", *trusting(drive.policy, drive.public_key),
                 "--connect", endpoint, "--vehicle-id", VEHICLE_ID, *edge, ready="ready", quiet=True,
             )
         )  # fmt: skip
@@ -78,5 +79,5 @@ def _simulate(drive: Drive, endpoint: str, out: Path) -> dict[str, Any]:
     here = ("--listen", endpoint, "--vehicle-id", VEHICLE_ID, "--out", str(out))
     with BackgroundCommand(*arguments, *here, quiet=True) as simulator:
         simulator.wait(LONGEST_EPISODE_S * (1 + drive.episodes))
-    report: dict[str, Any] = json.loads(read_bytes(out, "report"))
+    report: dict[str, Any] = read_json(out, "report")
     return {**report, "command": f"python -m {shlex.join(arguments)}"}

@@ -39,11 +39,13 @@ class SweepTask(NamedTuple):
     first_seed: int
     runs: int
     changes: Mapping[str, float]
+    public_key: str | None = None
 
 
 def kept_points(directory: Path, task: SweepTask, policy_id: str) -> KeptResults:
     """Where the points of a task are kept, whatever its policy's file is called."""
-    deciding = {name: value for name, value in task._asdict().items() if name != "policy"}
+    files = ("policy", "public_key")
+    deciding = {name: value for name, value in task._asdict().items() if name not in files}
     deciding |= {"format": FORMAT, "policy_id": policy_id}
     return KeptResults(directory, task.scenario, task.condition, deciding)
 
@@ -128,7 +130,7 @@ def lag_budget(rows: Sequence[Mapping[str, Any]], target: float) -> dict[str, An
 
 def drive_point(task: SweepTask, lag: Lag) -> dict[str, Any]:
     """Drive the episodes of one point; its row."""
-    env, driver = _cockpit(task.policy, task.scenario, task.condition)
+    env, driver = _cockpit(task.policy, task.scenario, task.condition, task.public_key)
     drive = VirtualDrive(env, driver, make_parameters(MODEL, {**task.changes, **lag.changes()}))
     driven = [drive.episode(task.first_seed + number) for number in range(task.runs)]
     return make_row(lag, driven, drive.tracking.report(drive.action_names))
@@ -177,5 +179,7 @@ def _watch_the_parent() -> None:
 
 
 @cache
-def _cockpit(policy: str, scenario: str, condition: str) -> tuple[Any, OnnxDriver]:
-    return make_environment(scenario, condition), OnnxDriver(Path(policy))
+def _cockpit(
+    policy: str, scenario: str, condition: str, public_key: str | None
+) -> tuple[Any, OnnxDriver]:
+    return make_environment(scenario, condition), OnnxDriver(Path(policy), public_key)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from edge_runtime.cli import examples
+from edge_runtime.cli import add_public_key, examples
 from edge_runtime.errors import UserError
 from edge_runtime.option_types import not_negative, positive
 from edge_runtime.words import counted
@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="POLICY",
         help="who drives until you take over: see `trainer evaluate` (default: you drive alone)",
     )
+    add_public_key(parser)
     goal = parser.add_mutually_exclusive_group()
     goal.add_argument(
         "--out",
@@ -71,7 +72,9 @@ def run(arguments: argparse.Namespace) -> int:
         return _calibrate(arguments)
     set_threads(arguments.threads)
     env = make_environment(arguments.scenario)
-    policy = None if arguments.policy is None else load_driver(arguments.policy, env)[0]
+    policy = None
+    if arguments.policy is not None:
+        policy, _ = load_driver(arguments.policy, env, arguments.public_key)
     person = HUMANS[arguments.human](person_options(arguments))
     try:
         recorder = Recorder(Path(arguments.out))

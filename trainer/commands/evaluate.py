@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from edge_runtime.cli import examples, write_json_out
+from edge_runtime.cli import add_public_key, examples, write_json_out
 from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
 from edge_runtime.files import check_writable
 from edge_runtime.latency.model import parse_spec
@@ -32,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="an .onnx file, a RUN_DIR, a HUMAN_DIR, the word expert, or constant:ACTION for one "
         "action from -1 to 1 throughout",
     )
+    add_public_key(parser)
     add_scenario(parser)
     parser.add_argument(
         "--condition",
@@ -66,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         check_writable(arguments.out)
     latency = parse_spec(arguments.latency)
     env = make_environment(arguments.scenario, arguments.condition)
-    driver, policy_id = load_driver(arguments.policy, env)
+    driver, policy_id = load_driver(arguments.policy, env, arguments.public_key)
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     jobs = min(arguments.jobs or choose_jobs(arguments.runs), arguments.runs)
     goals = 0
@@ -89,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
                 arguments.condition,
                 on_episode,
                 latency,
+                arguments.public_key,
             )
     report = summarise(results, arguments.scenario, arguments.condition, policy_id, arguments.seed)
     report["latency_spec"] = str(latency)

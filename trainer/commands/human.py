@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -83,12 +84,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="imitate a person: recordings of `trainer drive` or of `trainer train` with a person, "
         "their directories, or such a training run (default: the scripted expert)",
     )
+    parser.add_argument(
+        "--leave-out",
+        nargs="+",
+        type=_place,
+        metavar="SITTING[:EPISODE]",
+        help="of --from: what is not to be imitated, as 3 (sitting-0003.mcap) or 3:7 (its episode "
+        "7, as the window shows it); an episode discarded at the wheel is left out anyway",
+    )
     add_time_limit(
         parser,
         "begin no episode after this time; those refining steps are taken that the episodes driven "
         "are worth",
     )
     add_threads(parser)
+
+
+def _place(word: str) -> str:
+    """A sitting's number, or that and an episode's."""
+    if not re.fullmatch(r"[0-9]+(:[0-9]+)?", word):
+        raise argparse.ArgumentTypeError(f"{word!r} is no SITTING or SITTING:EPISODE, as 3 or 3:7")
+    return ":".join(str(int(number)) for number in word.split(":"))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -100,6 +116,8 @@ def run(arguments: argparse.Namespace) -> int:
             "--label-every-step and --unaided-share ask the scripted expert; "
             "a recording holds no more"
         )
+    if scripted and arguments.leave_out:
+        raise UserError("--leave-out names recorded episodes: it goes with --from")
     config = HumanModelConfig(
         frames=arguments.frames,
         episodes=arguments.episodes,
@@ -167,7 +185,7 @@ def _from_person(
     """
     recordings = find_recordings([Path(place) for place in arguments.recordings])
     model = HumanModel(config, arguments.seed)
-    interventions = demonstrate(model, recordings, arguments.scenario)
+    interventions = demonstrate(model, recordings, arguments.scenario, arguments.leave_out or ())
     with ProgressBar("human model", config.episodes) as bar:
         for _ in until(end_s, range(config.episodes)):
             loss = model.learn(config.updates_per_episode)

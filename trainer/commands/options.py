@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
+from edge_runtime import files
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
 from edge_runtime.latency.model import GRAMMAR
 from edge_runtime.option_types import whole_number
 from trainer.scenarios import SCENARIOS
@@ -71,10 +70,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     Raises:
         UserError: no file, or something else in it.
     """
-    try:
-        value = json.loads(read_bytes(path, what))
-    except ValueError as error:
-        raise UserError(f"{what} {path} is not JSON: {error}") from error
+    value = files.read_json(path, what)
     if not isinstance(value, dict):
         raise UserError(f"{what} {path} holds no JSON object")
     return value

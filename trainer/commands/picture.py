@@ -8,7 +8,7 @@ from typing import Any
 
 from PIL import Image
 
-from edge_runtime.cli import examples
+from edge_runtime.cli import add_public_key, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.option_types import not_negative, positive_number
@@ -27,6 +27,7 @@ EXAMPLE = examples(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("policy", help="who drives: see `trainer evaluate`")
+    add_public_key(parser)
     add_scenario(parser)
     parser.add_argument("--seed", type=not_negative, default=0, help="of the episode")
     parser.add_argument(
@@ -57,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError("--human takes over in a film: --out F.gif")
     check_writable(arguments.out)
     env = make_environment(arguments.scenario)
-    driver, _ = load_driver(arguments.policy, env)
+    driver, _ = load_driver(arguments.policy, env, arguments.public_key)
     if is_film:
         data = _film(arguments, env, driver)
     else:

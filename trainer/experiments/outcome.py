@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
+from edge_runtime.files import read_json
 from trainer.experiments.plan import FULL_PATH_M
 from trainer.experiments.store import TESTS_FILE, UNIT_FILE
 from trainer.experiments.units import Unit
@@ -81,7 +81,7 @@ def read_outcome(unit: Unit, directory: Path) -> Outcome:
         UserError: the files are not what this project writes, or parts of them are missing.
     """
     try:
-        about = json.loads((directory / UNIT_FILE).read_bytes())
+        about = read_json(directory / UNIT_FILE, "result")
         tests = _tests(directory / TESTS_FILE, about["test_runs"])
         metrics = {}
         if unit.trained:
@@ -93,7 +93,7 @@ def read_outcome(unit: Unit, directory: Path) -> Outcome:
 
 
 def _tests(path: Path, runs: int) -> dict[str, Drives]:
-    conditions = json.loads(path.read_bytes())
+    conditions = read_json(path, "tests")
     for condition, columns in _mapping(conditions, path).items():
         _check_columns(_mapping(columns, path), KEPT_TESTS, path)
         for name, values in columns.items():

@@ -16,13 +16,12 @@ from typing import Any
 import torch
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.files import make_directory, read_bytes, write_atomic
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.experiments.runner import FAILED, Tally, episodes_of, say
 from trainer.experiments.store import Store
 from trainer.experiments.units import Unit, human_file
 from trainer.experiments.work import BUSY, FINISHED, PATIENCE_S, STOPPED, Task, advance
-from trainer.files import make_directory
 from trainer.progress import ProgressBar
 from trainer.training.metrics import METRICS_FILE
 

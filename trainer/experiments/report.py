@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from edge_runtime.files import make_directory
 from trainer.experiments import timing
 from trainer.experiments.catalogue import EXPERIMENTS, NAMES, TIME
 from trainer.experiments.figures.style import write_figure
@@ -17,7 +18,6 @@ from trainer.experiments.gathered import Gathered, gather
 from trainer.experiments.store import BEGUN, DONE, IMPOSSIBLE, MISSING, RUNNING, Store
 from trainer.experiments.units import Unit, obstacle
 from trainer.experiments.verdict import Verdict, verdict_of, write_verdict
-from trainer.files import make_directory
 
 STATES = (DONE, RUNNING, BEGUN, MISSING, IMPOSSIBLE)
 TIME_TITLE = "training time of the algorithms"

@@ -17,9 +17,8 @@ from multiprocessing.context import SpawnProcess
 import torch
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import write_atomic
+from edge_runtime.files import make_directory, write_atomic
 from trainer.experiments.work import BUSY, FINISHED, STOPPED, OnEpisode, Task, compute
-from trainer.files import make_directory
 from trainer.parallel import die_with_parent, interrupts_blocked
 from trainer.progress import ProgressBar
 

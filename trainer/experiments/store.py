@@ -16,11 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import write_atomic
+from edge_runtime.files import make_directory, write_atomic
 from trainer.evaluation import CONDITIONS
 from trainer.experiments.plan import Plan
 from trainer.experiments.units import Unit, obstacle, unit_id
-from trainer.files import make_directory
 from trainer.locks import held, holder
 from trainer.training.metrics import METRICS_FILE
 
@@ -75,7 +74,7 @@ class Store:
             tests = json.loads(path.read_bytes())
         except (FileNotFoundError, NotADirectoryError):
             return False
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise UserError(f"{path} is broken: {error}") from error
         if not isinstance(tests, dict):
             raise UserError(f"{path} is broken: it names no conditions")

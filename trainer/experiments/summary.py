@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.files import read_json, write_atomic
 from trainer.experiments.catalogue import OURS
 from trainer.experiments.statistics import Holds
 from trainer.experiments.verdict import BAR, VERDICT_FILE, decisive_text
@@ -143,7 +142,7 @@ def _read(path: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        verdict = json.loads(read_bytes(path, "verdict"))
+        verdict = read_json(path, "verdict")
         for one in verdict["claims"]:
             _ = (
                 decisive_text(one),

@@ -6,7 +6,6 @@ a machine that slows down for a while slows all of them down.
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Mapping
@@ -20,14 +19,13 @@ import torch
 from matplotlib.figure import Figure
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes, write_json
+from edge_runtime.files import make_directory, read_json, write_json
 from trainer.benches.machine import about
 from trainer.experiments.figures.style import colour, label, new_figure, note_missing
 from trainer.experiments.plan import NORMAL, Plan
 from trainer.experiments.statistics import CONFIDENCE, RESAMPLES, Estimate, Holds
 from trainer.experiments.units import Unit, obstacle, run_config, unit_id
 from trainer.experiments.verdict import BAR, Claim, claim
-from trainer.files import make_directory
 from trainer.progress import ProgressBar
 from trainer.training.run import TrainingRun
 
@@ -141,7 +139,7 @@ def load_or_measure(
         make_directory(directory)
         write_json(path, measure(plan, humans, device))
     try:
-        measured = json.loads(read_bytes(path, "measurement"))
+        measured = read_json(path, "measurement")
         turns = measured["turns"]
         # The first measurement does not say what it was of.
         ids = _ids(plan, humans)

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 
 from edge_runtime.episode_report import EpisodeResult
+from edge_runtime.files import make_directory
 from trainer.benches.machine import processor_model
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver, make_environment
 from trainer.evaluation import CONDITIONS, drive_episodes
 from trainer.experiments.store import TESTS_FILE, UNIT_FILE, Store
 from trainer.experiments.units import Unit, deciding, run_config
-from trainer.files import make_directory
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.precision import multiplies_bfloat16
 from trainer.revision import source_revision

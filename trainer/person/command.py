@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from edge_runtime.files import make_directory
 from edge_runtime.words import counted
-from trainer.files import make_directory
 from trainer.person.options import person_options
 from trainer.person.registry import HUMANS
 from trainer.person.run import PersonRun, check_settings
@@ -43,8 +43,9 @@ def summary(training: PersonRun) -> str:
     sitting = training.sitting
     if not sitting.recorder.index:
         return "nothing was driven, and nothing recorded"
+    discarded = f"{counted(sitting.discarded, 'episode')} discarded, " * bool(sitting.discarded)
     return (
-        f"{counted(sitting.episodes, 'episode')}, "
+        f"{counted(sitting.episodes, 'episode')}, {discarded}"
         f"{counted(sitting.interventions, 'intervention')}, "
         f"{counted(sitting.human_steps, 'step')} yours; "
         f"{counted(sitting.pacer.late, 'control period')} late, "

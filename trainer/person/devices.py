@@ -24,15 +24,19 @@ from trainer.person.window import Window
 WISH_KEYS: dict[int, Wish] = {
     pygame.K_p: "pause",
     pygame.K_r: "restart",
+    pygame.K_BACKSPACE: "discard",
     pygame.K_ESCAPE: "quit",
     pygame.K_q: "quit",
 }
-WISH_HELP = "P: pause    R: restart the episode    Q / Esc: quit, all is kept"
+WISH_HELP = (
+    "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
+    "    Q / Esc: quit, all is kept"
+)
 SHIPPED_PROFILES = {"gamepad": SHIPPED / "gamepad.toml", "wheel": SHIPPED / "g29.toml"}
 
 
 class WindowDevice:
-    """Hands, and the keys of the window: pause, restart, quit, which closing it is, too.
+    """Hands, and the keys of the window: pause, restart, discard, quit, which closing it is, too.
 
     Args:
         hands: the device proper.

@@ -34,10 +34,10 @@ def drive(
             outcome = _episode(env, sitting, policy, seed)
         except SittingOver:
             break
+        outcome = sitting.rest(outcome)
         outcomes[outcome] += 1
         env.episode += 1
         sitting.progress = ", ".join(f"{count} {word}" for word, count in outcomes.items())
-        sitting.rest(outcome)
     return outcomes
 
 

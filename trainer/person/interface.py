@@ -13,10 +13,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Wish = Literal["pause", "restart", "quit"]
-"""``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``quit`` ends the
-sitting. None of them loses data."""
-WISHES: tuple[Wish, ...] = ("pause", "restart", "quit")
+Wish = Literal["pause", "restart", "discard", "quit"]
+"""``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard``
+does so and throws it away: it stays in the recording, marked, and nothing learns from it; ``quit``
+ends the sitting."""
+WISHES: tuple[Wish, ...] = ("pause", "restart", "discard", "quit")
 Control = Literal["policy", "human", "returning"]
 """Who decides the applied action; ``returning``: the person has let go and the action is on its way
 back to the policy's, which still counts as the person's."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_toml
 from trainer.person.interface import Moving
 
 SHIPPED = Path(__file__).parent / "profiles"
@@ -71,6 +70,7 @@ class Buttons(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hold: tuple[Number, ...] = ()
     pause: tuple[Number, ...] = ()
     restart: tuple[Number, ...] = ()
+    discard: tuple[Number, ...] = ()
     quit: tuple[Number, ...] = ()
 
 
@@ -119,10 +119,7 @@ def read_profile(path: Path) -> Profile:
     Raises:
         UserError: no such file, no TOML, or no profile; one line says where.
     """
-    try:
-        values = tomllib.loads(read_bytes(path, "profile").decode())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UserError(f"profile {path} is no TOML: {error}") from None
+    values = read_toml(path, "profile")
     try:
         return msgspec.convert(values, Profile)
     except msgspec.ValidationError as error:

@@ -2,31 +2,30 @@
 
 One MCAP file a sitting, ``sitting-0001.mcap`` and so on, whose messages are whole transitions
 (``Step``) in MessagePack. Each step is a chunk of its own and handed to the operating system at
-once, so whatever ends the process, at most the step that was being taken is lost; 30 minutes are
-about 12 MB. Nothing is ever overwritten: sittings add up.
+once, so whatever ends the process, at most one step is lost, the one that was being taken or an
+episode's last, which says whether the person discarded it; 30 minutes are about 12 MB. Nothing is
+ever overwritten: sittings add up.
 """
 
 from __future__ import annotations
 
 import re
-import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import IO
 
 import msgspec
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, McapRecord, Message
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Channel, Message
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from numpy.typing import NDArray
-from zstandard import ZstdError
 
+from bridge.recording.records import Records
 from edge_runtime import __version__
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import hold
-from trainer.files import make_directory
+from edge_runtime.files import make_directory, open_regular
 from trainer.person.interface import Control
 
 TOPIC = "person/step"
@@ -34,15 +33,10 @@ WIRE = ("phil/", "view/")
 """How the topics of the wire's recordings begin, and those of their copies for viewers."""
 DIRECTORY = "sittings"
 """Where a training run keeps its recordings."""
+DISCARDED = "discarded"
+"""Outcome of an episode that the person threw away: it is shown, and nothing learns from it."""
 FRAME_SHAPE = (45, 80)
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
-TORN = (
-    McapError, struct.error, ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
-    MemoryError,
-)  # fmt: skip
-"""What the libraries raise for a file that was cut off."""
-MAX_RECORD_BYTES = 64 << 20
-"""A torn length must not ask for more memory than any chunk of ours needs."""
 
 
 class Step(msgspec.Struct, frozen=True):
@@ -113,7 +107,7 @@ class Recorder:
         except OSError as error:
             raise UserError(f"cannot write {self.path}: {error.strerror}") from None
         hold(self._file.fileno())  # `bridge repair` keeps away meanwhile.
-        self._mcap = Writer(self._file, compression=CompressionType.ZSTD)
+        self._mcap = Writer(self._file, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._mcap.start(profile="", library=f"phil-hil {__version__}")
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)
         self._flush()
@@ -180,34 +174,34 @@ def read_steps(path: Path) -> Iterator[Step]:
         UserError: no such file, or not one of ours.
     """
     try:
-        stream = path.open("rb")
+        with open_regular(path) as stream:
+            if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                raise UserError(f"{path} is no recording of a sitting")
+            for message in _messages(Records(stream, path.stat().st_size), path):
+                yield msgspec.msgpack.decode(message.data, type=Step)
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
-    with stream:
-        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise UserError(f"{path} is no recording of a sitting")
-        stream.seek(0)
-        try:
-            for message in _messages(stream, path):
-                yield msgspec.msgpack.decode(message.data, type=Step)
-        # Of a chunk whose checksum is right: no kill does that.
-        except msgspec.DecodeError as error:
-            raise UserError(f"{path} was recorded by another version: {error}") from None
-        except TORN:
+    # Of a chunk whose checksum is right: no kill does that.
+    except msgspec.DecodeError as error:
+        raise UserError(f"{path} was recorded by another version: {error}") from None
+
+
+def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
+    """Recorded steps by the episode, without the episodes that the person discarded."""
+    for _, drive in groupby(steps, key=lambda step: (step.sitting, step.index - step.step)):
+        episode = list(drive)
+        if episode[-1].outcome != DISCARDED:
+            yield episode
+
+
+def _messages(records: Records, path: Path) -> Iterator[Message]:
+    for record in records.walk():
+        if records.damaged_places:
             return
-
-
-def _messages(stream: IO[bytes], path: Path) -> Iterator[Message]:
-    reader = StreamReader(stream, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
-    for record in reader.records:
-        parts: Sequence[McapRecord] = (
-            breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
-        )
-        for part in parts:
-            if isinstance(part, Channel) and part.topic != TOPIC and isinstance(record, Chunk):
-                raise UserError(_foreign(path, part.topic))
-            if isinstance(part, Message):
-                yield part
+        if isinstance(record, Channel) and record.topic != TOPIC:
+            raise UserError(_foreign(path, record.topic))
+        if isinstance(record, Message):
+            yield record
 
 
 def _foreign(path: Path, topic: str) -> str:

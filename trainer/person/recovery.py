@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import groupby
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 
-from trainer.human.guide import Intervention
-from trainer.person.recording import Step, read_steps, sittings
-from trainer.training.learning import Action, Observation
+from trainer.human.guide import Action, Intervention
+from trainer.person.recording import Step, read_episodes, read_steps, sittings
+from trainer.training.wheel import Store
 
 Position = tuple[int, int]
 """Sitting and index of a recorded step."""
@@ -19,16 +17,6 @@ Shape = Callable[[float, Intervention | None], float]
 """The reward to store (eq. 17), from the environment's and what the person did."""
 Penalises = Callable[[Intervention | None], bool]
 """Whether what the person did costs the policy the penalty."""
-
-
-class Store(Protocol):
-    """The part of a learner that is needed here."""
-
-    def start_episode(self, observation: Observation) -> None:
-        """Take an episode's first observation."""
-
-    def add(self, *transition: Any, **guidance: Any) -> None:
-        """Store a transition; arguments as ``ReplayBuffer.add``."""
 
 
 def steps_since(directory: Path, position: Position) -> Iterator[Step]:
@@ -46,6 +34,8 @@ def store_again(
 ) -> tuple[int, int]:
     """Put recorded steps into the replay buffer as the run had put them there.
 
+    Episodes that the person discarded are left out.
+
     Args:
         store: the learner, or its buffer.
         steps: in their order.
@@ -58,8 +48,7 @@ def store_again(
         How many steps were stored, and how many of them are the person's.
     """
     stored = human = 0
-    for _, drive in groupby(steps, key=lambda step: (step.sitting, step.index - step.step)):
-        episode = list(drive)
+    for episode in read_episodes(steps):
         for known, step in zip(episode, episode[ticks_late:], strict=False):
             if step is episode[ticks_late]:
                 store.start_episode(known.observation)

@@ -13,9 +13,10 @@ from edge_runtime.errors import UserError
 from edge_runtime.words import counted
 from trainer.human.guide import Guide
 from trainer.learner.algorithms import ALGORITHMS
+from trainer.person.episode import KeptBack
 from trainer.person.guide import PersonGuide
 from trainer.person.interface import Person
-from trainer.person.recording import DIRECTORY, Recorder
+from trainer.person.recording import DIRECTORY, DISCARDED, Recorder
 from trainer.person.recovery import steps_since, store_again
 from trainer.person.sitting import Sitting, SittingOver
 from trainer.person.unhurried import UnhurriedLearning
@@ -25,11 +26,11 @@ from trainer.training.divergence import divergence_said
 from trainer.training.learning import Learning, LearningThread
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
-from trainer.training.wheel import ticks_late
+from trainer.training.wheel import make_wheel, ticks_late
 
 
 class PersonRun(TrainingRun):
-    """``TrainingRun`` in a sitting.
+    """``TrainingRun`` in a sitting; what an episode has shown is stored at its end.
 
     Args:
         config: what to train; ``human`` is ``options.PERSON``.
@@ -60,6 +61,8 @@ class PersonRun(TrainingRun):
         recorder = Recorder(run_dir / DIRECTORY)
         self.sitting = Sitting(person, recorder, self.env, speed=speed)
         self.guide = PersonGuide(self.sitting)
+        self.kept_back = KeptBack(self.learning)
+        self.wheel = make_wheel(self.kept_back, self.env, self.network)
         self.watched = self.env = WatchedEnv(self.env, self.sitting)
 
     def train(
@@ -85,11 +88,13 @@ class PersonRun(TrainingRun):
         """Train one episode, and rest."""
         self.watched.episode = self.episode
         metrics = super().advance()
-        self.sitting.rest(metrics.outcome)
+        metrics.outcome = self.sitting.rest(metrics.outcome)
+        self.kept_back.release(discarded=metrics.outcome == DISCARDED)
+        metrics.total_steps = self.learning.added
         self.sitting.progress = (
             f"{counted(self.learning.added, 'step')} stored, {self.sitting.human_steps} yours in "
             f"{counted(self.sitting.interventions, 'intervention')} of this sitting; "
-            f"critic loss {metrics.critic_loss:.3f}, return {metrics.episode_return:.1f}"
+            f"{self._learned(metrics.critic_loss)}, return {metrics.episode_return:.1f}"
         )
         return metrics
 
@@ -100,6 +105,13 @@ class PersonRun(TrainingRun):
         with divergence_said(self.episode):  # The update under way may be the one.
             super().save()
         self.longest_save_s = max(self.longest_save_s, time.perf_counter() - began_s)
+
+    def _learned(self, critic_loss: float) -> str:
+        """What the learner did in an episode: nothing before its warm-up is over."""
+        warmup = self.config.learner.warmup_steps
+        if self.learning.added < warmup:
+            return f"not learning yet ({self.learning.added} of {warmup} steps)"
+        return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
 
     def _around(self, learning: LearningThread) -> Learning:
         return UnhurriedLearning(learning)

@@ -10,18 +10,19 @@ import time
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from trainer.person.interface import LET_GO, Person, View
 from trainer.person.pacing import Pacer
-from trainer.person.recording import Recorder, Step
+from trainer.person.recording import DISCARDED, Recorder, Step
 from trainer.person.takeover import Applied, Intent, TakeOver
 
 Observation = NDArray[np.uint8]
 REST_S = 1.0
 """Between two episodes: time to see how it ended, and to take the hands to rest."""
 STOPPED, RESTARTED = "stopped", "restarted"
-"""Outcomes of an episode that the person ended."""
+"""Outcomes of an episode that the person ended; or ``recording.DISCARDED``."""
 
 
 class SittingOver(Exception):  # noqa: N818 (no error: it was asked for)
@@ -47,7 +48,10 @@ class Sitting:
         self.stop = False
         """The sitting is to end: asked for by the person, or by a signal."""
         self.progress = ""
-        self.episodes = self.interventions = self.human_steps = 0
+        self.episodes = self.interventions = self.human_steps = self.discarded = 0
+        """The last counts what the others leave out."""
+        self._last_step: Step | None = None
+        """Of an episode that has ended, until it is known whether the person discards it."""
         self._take_over, self._intent = TakeOver(), Intent(person.moving)
         self._paused = False
         self.closed = False
@@ -69,7 +73,7 @@ class Sitting:
             self._idle("waiting for the person's device")
         if self.stop:
             raise SittingOver
-        self._restart = False
+        self._restart = self._discard = False
         self.pacer.restart()
 
     def decide(self, observation: Observation, policy_action: float | None) -> Applied:
@@ -108,20 +112,37 @@ class Sitting:
         Returns:
             ``truncated`` and ``outcome``, as the person has them who may end the episode here.
         """
-        if not (terminated or truncated) and (self.stop or self._restart):
+        if not (terminated or truncated) and (self.stop or self._restart or self._discard):
             outcome, truncated = STOPPED if self.stop else RESTARTED, True
-        self.recorder.write(self._step(next_observation, reward, terminated, truncated, outcome))
-        self.human_steps += self._applied.human
-        self.interventions += self._applied.first
+        step = self._step(next_observation, reward, terminated, truncated, outcome)
+        if terminated or truncated:
+            self._last_step = step
+        else:
+            self.recorder.write(step)
+        self._human_steps += self._applied.human
+        self._interventions += self._applied.first
         self._number += 1
         return truncated, outcome
 
-    def rest(self, outcome: str) -> None:
-        """Show for a moment how the episode ended."""
-        self.episodes += 1
+    def rest(self, outcome: str) -> str:
+        """Show for a moment how the episode ended; the person may still discard it.
+
+        Returns:
+            How it ended, now that it is known.
+        """
         end_s = time.monotonic() + REST_S * self.pacer.period_s / self.env.config.control_period_s
         while not self.stop and time.monotonic() < end_s:
-            self._idle(f"episode ended: {outcome}")
+            self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
+            if self._discard:
+                self._write_last_step()  # At once: no kill shall take that back.
+        self._write_last_step()
+        if self._discard:
+            self.discarded += 1
+            return DISCARDED
+        self.episodes += 1
+        self.human_steps += self._human_steps
+        self.interventions += self._interventions
+        return outcome
 
     def announce(self, message: str) -> None:
         """Show a line before something that takes a moment."""
@@ -136,7 +157,15 @@ class Sitting:
         """Close the person's devices and the recording; twice is once."""
         self.closed = True
         self.person.close()
+        self._write_last_step()
         self.recorder.close()
+
+    def _write_last_step(self) -> None:
+        """Record an episode's last step, which says whether it was discarded."""
+        step, self._last_step = self._last_step, None
+        if step is not None:
+            outcome = DISCARDED if self._discard else step.outcome
+            self.recorder.write(structs.replace(step, outcome=outcome))
 
     def _forget(self, episode: int, seed: int) -> None:
         """Nothing of an episode has happened yet."""
@@ -146,7 +175,8 @@ class Sitting:
         self._reading, self._read_ns = LET_GO, 0
         self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
         self._policy_action = None
-        self._restart = False
+        self._human_steps = self._interventions = 0
+        self._restart = self._discard = False
 
     def _weigh(self, policy_action: float | None) -> Applied:
         if policy_action is None:
@@ -168,11 +198,12 @@ class Sitting:
         wishes = self._reading.wishes
         self.stop = self.stop or "quit" in wishes
         self._restart = self._restart or "restart" in wishes
+        self._discard = self._discard or "discard" in wishes
         self._paused = self._paused != ("pause" in wishes)
 
     def _pause(self) -> None:
         """Stand still until the person goes on, quits or begins anew."""
-        while self._paused and not self.stop and not self._restart:
+        while self._paused and not (self.stop or self._restart or self._discard):
             self._idle("")
         self._paused = False
         self.pacer.restart()

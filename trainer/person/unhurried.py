@@ -1,9 +1,8 @@
 """A learner that nobody waits for: the person's clock goes on whatever an update takes.
 
 The policy acts in the loop's thread, from a copy of the actor as of the last finished update. The
-next update is begun in the first control period after the last one's end. What is stored while one
-is under way is kept back until it is done, so that the learner itself sees the order it always
-does: an update is begun, finished, and only then follow the steps.
+next update is begun in the first control period after the last one's end. Steps are stored between
+episodes (``episode.py``), when no update is under way.
 
 A run with a person is not repeatable anyway; all others learn as before.
 """
@@ -15,8 +14,6 @@ import os
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -31,7 +28,7 @@ LOOK_S = 0.002
 
 
 class UnhurriedLearning:
-    """``Learning`` whose ``act``, ``begin``, ``add`` and ``finish`` never wait for an update.
+    """``Learning`` whose ``act``, ``begin`` and ``finish`` never wait for an update.
 
     Args:
         inner: where it learns.
@@ -39,15 +36,13 @@ class UnhurriedLearning:
 
     def __init__(self, inner: LearningThread) -> None:
         self._inner = inner
-        self._kept_back: deque[Callable[[], None]] = deque()
-        self._kept_back_steps = 0
         self._actor = copy.deepcopy(inner.learner.actor).eval()
         inner.in_thread(_step_aside)
 
     @property
     def added(self) -> int:
-        """Transitions stored since the run began, what is kept back included."""
-        return self._inner.added + self._kept_back_steps
+        """Transitions stored since the run began."""
+        return self._inner.added
 
     @property
     def learner(self) -> TD3Learner:
@@ -71,18 +66,14 @@ class UnhurriedLearning:
         return self._inner.act_together(observations, averaged)
 
     def start_episode(self, observation: Observation) -> None:
-        """Take an episode's first observation."""
-        self._later(lambda: self._inner.start_episode(observation))
+        """Take an episode's first observation. Waits for the update."""
+        self.settle()
+        self._inner.start_episode(observation)
 
     def add(self, *transition: Any, **guidance: Any) -> None:
-        """Store a transition, now or when the update is done; arguments as ``Learning.add``."""
-        self._kept_back_steps += 1
-
-        def store() -> None:
-            self._kept_back_steps -= 1
-            self._inner.add(*transition, **guidance)
-
-        self._later(store)
+        """Store a transition; arguments as ``Learning.add``. Waits for the update."""
+        self.settle()
+        self._inner.add(*transition, **guidance)
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored, unless the last one is still under way."""
@@ -114,24 +105,18 @@ class UnhurriedLearning:
         self._inner.close()
 
     def settle(self) -> None:
-        """Wait for the update that is under way, and store what was kept back."""
+        """Wait for the update that is under way."""
         # In short waits: a signal that another thread took does not wake the main thread.
         while not self._tidy():
             time.sleep(LOOK_S)
 
-    def _later(self, store: Callable[[], None]) -> None:
-        self._kept_back.append(store)
-        self._tidy()
-
     def _tidy(self) -> bool:
-        """Finish an update that is done and store what was kept back; False where one is not."""
+        """Finish an update that is done; False where one is not."""
         if self._inner.updating:
             return False
         if self._inner.begun:
             self._inner.finish()
             self._copy_actor()
-        while self._kept_back:
-            self._kept_back.popleft()()
         return True
 
     def _copy_actor(self) -> None:

@@ -13,8 +13,12 @@ from edge_runtime.errors import UserError
 from trainer.person.interface import View
 from trainer.person.quiet import quiet_stderr
 from trainer.scenarios.scene import draw_scene
+from viewing.colours import BY_NAME
 
 SIZE = (1040, 680)
+"""Of what is drawn; the window shows it larger or smaller."""
+SCREEN_SHARE = 0.9
+"""Of a small screen, as the window's frame and the desktop's bars take some."""
 SCENE_WIDTH = 736
 FRAME_SCALE = 3
 MARGIN = 16
@@ -23,10 +27,7 @@ COLOURS = {
     "panel": (36, 41, 48),
     "text": (232, 234, 237),
     "dim": (150, 157, 166),
-    "policy": (120, 190, 255),
-    "human": (255, 176, 80),
-    "returning": (200, 140, 255),
-    "applied": (130, 220, 150),
+    **BY_NAME,
     "warning": (255, 110, 100),
 }
 UNSEEN = ("offscreen", "dummy", "evdev")
@@ -39,6 +40,12 @@ def _check_visible() -> None:
     driver = pygame.display.get_driver()
     if driver in UNSEEN and "SDL_VIDEODRIVER" not in os.environ:
         raise pygame.error(f"SDL would draw {driver}")
+
+
+def _fitted(room: tuple[float, float]) -> tuple[int, int]:
+    """The largest size of the picture's shape that fits."""
+    scale = min(room[0] / SIZE[0], room[1] / SIZE[1])
+    return max(int(SIZE[0] * scale), 1), max(int(SIZE[1] * scale), 1)
 
 
 class Window:
@@ -55,7 +62,9 @@ class Window:
                 _check_visible()
                 pygame.joystick.init()
                 pygame.font.init()
-                self._screen = pygame.display.set_mode(SIZE)
+                screen = [SCREEN_SHARE * length for length in pygame.display.get_desktop_sizes()[0]]
+                size = _fitted((min(screen[0], SIZE[0]), min(screen[1], SIZE[1])))
+                self._window = pygame.display.set_mode(size, pygame.RESIZABLE)
         except pygame.error as error:
             pygame.quit()
             raise UserError(
@@ -63,6 +72,7 @@ class Window:
                 "name it; --human web needs none"
             ) from None
         pygame.display.set_caption(title)
+        self._screen = pygame.Surface(SIZE)
         self._fonts = {size: pygame.font.Font(None, size) for size in (20, 24, 38)}
 
     def show(self, view: View) -> None:
@@ -70,11 +80,18 @@ class Window:
         if not pygame.display.get_init():
             return
         self._screen.fill(COLOURS["background"])
-        self._blit(draw_scene(view.scene), (0, 0))
+        self._blit(draw_scene(view.scene, ego=COLOURS[view.control]), (0, 0))
         self._frames(view)
         self._state(view)
         self._bars(view)
         self._lines(view)
+        size = _fitted(self._window.get_size())
+        left, top = ((a - b) // 2 for a, b in zip(self._window.get_size(), size, strict=True))
+        self._window.fill(COLOURS["background"])
+        drawn = self._screen
+        if size != SIZE:
+            drawn = pygame.transform.smoothscale(drawn, size)
+        self._window.blit(drawn, (left, top))
         pygame.display.flip()
 
     def close(self) -> None:

@@ -38,6 +38,7 @@ class CongestionEnv(DrivingEnv):
     """
 
     scenario = "congestion"
+    action_names = ("steering",)
     config: CongestionConfig
 
     def __init__(

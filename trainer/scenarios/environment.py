@@ -67,6 +67,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's form)
     scenario: str
+    action_names: tuple[str, ...]
     config: ScenarioConfig
     ego: EgoVehicle
     traffic: list[TrafficVehicle]

@@ -98,6 +98,7 @@ class LeftTurnEnv(DrivingEnv):
     """The left turn as a gymnasium environment; the action is the pedal aperture (eq. 30)."""
 
     scenario = "left_turn"
+    action_names = ("pedal",)
     config: LeftTurnConfig
     brake_action = np.array([-1.0], dtype=np.float32)
     """The action that stops the car: what a simulator applies when commands stop."""

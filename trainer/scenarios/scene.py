@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from trainer.scenarios.geometry import Rectangle, corners
+from viewing.colours import POLICY, Colour
 
 PIXELS_PER_METRE = 16
 WIDTH_M, HEIGHT_M = 46.0, 25.0
@@ -22,7 +23,7 @@ COLOURS = {
     "marking": (235, 235, 235),
     "path": (120, 190, 255),
     "goal": (84, 200, 120),
-    "ego": (40, 120, 230),
+    "ego": POLICY,
     "traffic": (235, 140, 40),
     "glass": (30, 34, 40),
     "text": (30, 34, 40),
@@ -30,9 +31,14 @@ COLOURS = {
 
 
 def draw_scene(
-    scene: dict[str, Any], frames: NDArray[np.uint8] | None = None, caption: str = ""
+    scene: dict[str, Any],
+    frames: NDArray[np.uint8] | None = None,
+    caption: str = "",
+    ego: Colour = POLICY,
 ) -> NDArray[np.uint8]:
     """Draw ``scene`` (see ``DrivingEnv.scene``) and, inset, the two frames of the policy.
+
+    ``ego`` is the ego car's colour: of whoever drives it.
 
     Returns:
         uint8 [height, width, 3].
@@ -45,7 +51,7 @@ def draw_scene(
     x, y = scene["goal"]
     pen.line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], "goal", 8)
     for vehicle in scene["vehicles"]:
-        _draw_vehicle(pen, vehicle)
+        _draw_vehicle(pen, vehicle, ego if vehicle["ego"] else COLOURS["traffic"])
     if frames is not None:
         _inset_frames(image, frames)
     ImageDraw.Draw(image).multiline_text(
@@ -83,11 +89,9 @@ class _GroundPen:
     def line(self, points: Iterable[Sequence[float]], colour: str, width_pixels: int) -> None:
         self._pen.line(self._pixels(points), fill=COLOURS[colour], width=width_pixels)
 
-    def area(self, shape: Rectangle, colour: str, outlined: bool = False) -> None:
+    def area(self, shape: Rectangle, colour: Colour, outlined: bool = False) -> None:
         outline = COLOURS["glass"] if outlined else None
-        self._pen.polygon(
-            self._pixels(corners(shape)), fill=COLOURS[colour], outline=outline, width=2
-        )
+        self._pen.polygon(self._pixels(corners(shape)), fill=colour, outline=outline, width=2)
 
     def _pixels(self, points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
         scale = PIXELS_PER_METRE
@@ -118,7 +122,7 @@ def _draw_dashes(pen: _GroundPen, road: list[list[float]], skip_m: float) -> Non
             pen.line([end.tolist() for end in ends], "marking", 2)
 
 
-def _draw_vehicle(pen: _GroundPen, vehicle: dict[str, Any]) -> None:
+def _draw_vehicle(pen: _GroundPen, vehicle: dict[str, Any], colour: Colour) -> None:
     body = Rectangle(
         vehicle["x"],
         vehicle["y"],
@@ -126,12 +130,12 @@ def _draw_vehicle(pen: _GroundPen, vehicle: dict[str, Any]) -> None:
         vehicle["length_m"],
         vehicle["width_m"],
     )
-    pen.area(body, "ego" if vehicle["ego"] else "traffic", outlined=True)
+    pen.area(body, colour, outlined=True)
     ahead = 0.18 * body.length * np.array([np.cos(body.heading), np.sin(body.heading)])
     glass = Rectangle(
         body.x + ahead[0], body.y + ahead[1], body.heading, 0.16 * body.length, 0.8 * body.width
     )
-    pen.area(glass, "glass")
+    pen.area(glass, COLOURS["glass"])
 
 
 def _inset_frames(image: Image.Image, frames: NDArray[np.uint8]) -> None:

@@ -1,15 +1,21 @@
 """The command line as a user meets it, mistakes included."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from edge_runtime.errors import UserError
 from edge_runtime.tests.commands import exit_status
+from edge_runtime.tests.policies import public_pem
 from trainer.__main__ import main
 from trainer.commands.settings import with_setting
 from trainer.files import save_torch
 from trainer.training.config import RunConfig
+
+POLICY = str(Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx")
 
 
 def call(capsys, *arguments: str) -> tuple[int, str, str]:
@@ -41,7 +47,7 @@ WRONG = [
     ("evaluate", "{tmp}/file"),
     ("evaluate", "expert", "--runs", "-1"),
     ("evaluate", "expert", "--condition", "rain"),
-    ("evaluate", "expert", "--out", "{tmp}/no/such/r.json"),
+    ("evaluate", "expert", "--out", "/dev/null/r.json"),
     ("export", "{tmp}/nothing", "--out", "{tmp}/p.onnx"),
     ("export", "{tmp}", "--out", "{tmp}/p.onnx"),
     ("export", "{tmp}", "--out", "{tmp}/p.onnx", "--key", "{tmp}/no.key"),
@@ -49,7 +55,7 @@ WRONG = [
     ("picture", "expert", "--time", "-1", "--out", "{tmp}/p.png"),
     ("picture", "expert", "--out", "{tmp}/p.jpg"),
     ("plot", "{tmp}"),
-    ("picture", "expert", "--out", "{tmp}/no/such/p.png"),
+    ("picture", "expert", "--out", "/dev/null/p.png"),
     ("picture", "{tmp}/nobody", "--out", "{tmp}/p.png"),
     ("human", "--out", "{tmp}/file"),
     ("bench", "--threads", "-1"),
@@ -67,7 +73,7 @@ WRONG = [
     ("view", "{tmp}", "--save", ""),
     ("bench", "--out", ""),
     ("experiment", "status", "--results", ""),
-    ("bench", "--out", "{tmp}/no/such/b.json"),
+    ("bench", "--out", "/dev/null/b.json"),
     (),
 ]
 
@@ -98,6 +104,38 @@ def test_evaluate_reports_what_the_contract_asks_for(capsys, tmp_path):
     }  # fmt: skip
     assert keys <= set(report)
     assert set(report["surviving_distance_m"]) == {"mean", "std"}
+
+
+@pytest.fixture
+def workshop(tmp_path, monkeypatch):
+    """Where somebody has made keys of their own, as the README's `deploy keys` does."""
+    monkeypatch.chdir(tmp_path)
+    Path("keys").mkdir()
+    Path("keys/policy.pub").write_bytes(public_pem(Ed25519PrivateKey.generate()))
+
+
+def test_a_shipped_policy_is_verified_with_the_key_beside_it(workshop, capsys):
+    """Not with another one's, which lies in the working directory."""
+    for command in (["evaluate", POLICY, "--runs", "1"], ["picture", POLICY, "--out", "a.png"]):
+        status, _, err = call(capsys, *command)
+        assert status == 0, err
+    drive = ["drive", "--human", "keyboard", "--policy", POLICY, "--public-key", "none.pub"]
+    status, _, err = call(capsys, *drive)
+    assert (status, "public key none.pub does not exist" in err) == (2, True)
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_named_key_decides_in_every_process(jobs, workshop, capsys):
+    for end in ("", ".sig"):
+        shutil.copy(POLICY + end, f"p.onnx{end}")
+    evaluate = ["evaluate", "p.onnx", "--runs", "2", "--jobs", jobs]
+    status, _, err = call(capsys, *evaluate)
+    assert status == 2
+    assert "public key keys/policy.pub: " in err
+    assert "--public-key" in err
+    key = str(Path(POLICY).with_name("policy.pub"))
+    status, _, err = call(capsys, *evaluate, "--public-key", key)
+    assert status == 0, err
 
 
 def test_noise_disturbs_and_is_reproducible(capsys, tmp_path):

@@ -50,8 +50,10 @@ def test_without_the_human_model_it_can_still_be_drawn(measured, humans, tmp_pat
     assert load(measured, TINY, tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize("text", ["", "[]", "3", '{"turns": {}}', '{"turns": {"phil_td3": 1}}'])
+@pytest.mark.parametrize(
+    "text", ["", "[" * 9999, "[]", "3", '{"turns": {}}', '{"turns": {"phil_td3": 1}}']
+)
 def test_what_is_no_measurement_is_refused(measured, humans, text):
     (measured / timing.MEASURED_FILE).write_text(text)
-    with pytest.raises(UserError, match="no measurement of this project"):
+    with pytest.raises(UserError, match=r"no measurement of this project|is not JSON"):
         load(measured, TINY, humans)

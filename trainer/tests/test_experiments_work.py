@@ -80,6 +80,8 @@ def _cut(text: str) -> str:
         ("metrics.csv", lambda text: text.replace("distance_m", "way_m"), "lacks distance_m"),
         ("metrics.csv", lambda text: text.replace(",", "\0,", 1), "cannot be read"),
         ("tests.json", lambda text: "3", "names no conditions"),
+        ("tests.json", lambda text: "[" * 100_000, "is broken"),
+        ("config.json", lambda text: "[" * 100_000, "is not JSON"),
         ("tests.json", lambda text: '["nominal", "noise", "variant"]', "names no conditions"),
         ("tests.json", lambda text: '{"nominal": 1, "noise": 2, "variant": 3}', "in place of"),
         ("tests.json", lambda text: text.replace('"seed": [0, 1]', '"seed": [0]'), "2 values of"),

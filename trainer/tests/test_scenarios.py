@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from trainer.actions import ACTIONS
 from trainer.drivers import make_environment
 from trainer.scenarios import SCENARIOS
 
@@ -53,6 +54,12 @@ def test_the_same_seed_gives_the_same_episode_in_any_process(scenario):
     ]
     assert len(runs[0].strip()) == hashlib.sha256().digest_size * 2
     assert runs[0] == runs[1]
+
+
+@every_scenario
+def test_a_policy_and_its_environment_name_the_same_actions(scenario):
+    """What the bridge compares when a policy comes to drive."""
+    assert make_environment(scenario).action_names == (ACTIONS[scenario].name,)
 
 
 @every_scenario

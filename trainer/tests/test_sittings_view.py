@@ -110,7 +110,7 @@ def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):
     [
         (["none", "--save", "a.rrd"], "no recording in none"),
         (["drives"], "no display for a window here"),
-        (["drives", "--save", "/none/a.rrd"], "does not exist"),
+        (["drives", "--save", "/dev/null/a.rrd"], "Not a directory"),
     ],
 )
 def test_bad_input_is_one_line(words, part, capsys, tmp_path, monkeypatch):

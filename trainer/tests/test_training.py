@@ -1,5 +1,6 @@
 import csv
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -282,3 +283,9 @@ def test_what_is_kept_is_the_network_that_was_validated(averaged, name, tmp_path
             (tmp_path / BEST_FILE).unlink()
         kept = load_actor(tmp_path)[0].state_dict()
         assert all(torch.equal(kept[key], wanted[key]) for key in wanted)
+
+
+def test_a_checkpoint_that_is_a_pipe_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / CHECKPOINT_FILE)
+    with pytest.raises(UserError, match="no regular file"):
+        load_torch(tmp_path / CHECKPOINT_FILE)

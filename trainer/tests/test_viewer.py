@@ -5,9 +5,10 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import cast, get_args
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ import torch
 
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
-from trainer.human.guide import Intervention
+from trainer.human.guide import Intervention, Reason
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Critic
+from trainer.plots import CURVE_FILE
 from trainer.tests.drawn import values_in
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
@@ -25,10 +27,14 @@ from trainer.training.run import TrainingRun
 from trainer.training.seen import Seen
 from trainer.viewer.advantage import q_advantage
 from trainer.viewer.background import MOST_WAITING, Background
+from trainer.viewer.blueprint import LINES
 from trainer.viewer.command import watched
 from trainer.viewer.entries import Correction, Entry, Episode, Steps
+from trainer.viewer.training_log import DRIVERS, TrainingLog
 from trainer.viewer.watcher import CORRECTIONS, STEPS_TOGETHER, Watcher
+from viewing.colours import APPLIED, HUMAN, POLICY
 from viewing.sinks import Sink
+from viewing.tests.viewers import in_place
 
 ROOT = Path(__file__).parents[2]
 TINY = RunConfig(
@@ -121,6 +127,11 @@ def test_interventions_are_on_the_time_line_with_their_reasons(shown):
     assert all(human[step] for step in corrected)
 
 
+def test_on_the_time_line_policy_and_human_have_their_colours_of_every_view():
+    assert {"policy": POLICY, **dict.fromkeys(get_args(Reason), HUMAN)} == DRIVERS
+    assert (LINES["action/policy"], LINES["action/applied"]) == (POLICY, APPLIED)
+
+
 def test_the_q_advantage_is_the_critics():
     torch.manual_seed(1)
     critic = Critic()
@@ -203,7 +214,7 @@ def test_a_slow_view_holds_nobody_up():
         go_on.wait(10.0)
         drawn.append(entry)
 
-    background = Background(draw)
+    background = Background(lambda: nullcontext(draw))
     entries = [Steps([], None) for _ in range(MOST_WAITING + 100)]
     for entry in entries:
         background.put(entry)
@@ -223,12 +234,38 @@ def test_a_view_that_fails_does_not_end_the_run(capsys, error):
     def draw(_entry):
         raise error
 
-    background = Background(draw)
+    background = Background(lambda: nullcontext(draw))
     for _ in range(3):
         background.put(Steps([], None))
     background.close()
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == "the view ends, the training goes on: disk full"
+    assert line == "viewer gone; the run is unharmed: disk full"
+
+
+@pytest.mark.parametrize("word", ["spawn", "serve"])
+@pytest.mark.parametrize("kind", ["ends at once", "is killed", "never listens"])
+def test_a_training_outlives_its_viewer(kind, word, tmp_path, capfd, monkeypatch, one_thread):
+    drawn = TrainingLog._draw_episode
+
+    def draw_late(self, episode):
+        time.sleep(1.5)  # By then it is gone.
+        drawn(self, episode)
+
+    monkeypatch.setattr(TrainingLog, "_draw_episode", draw_late)
+    out = tmp_path / "run"
+    with in_place(kind, tmp_path, monkeypatch):
+        assert run_cli(main, ["train", "--rerun", word, "--out", str(out), *QUICK]) == 0
+    said = capfd.readouterr().err
+    assert said.count("viewer gone; the run is unharmed: ") == 1
+    assert "Traceback" not in said
+    assert (out / CURVE_FILE).exists()
+
+
+def test_a_training_is_not_held_up_by_a_viewer_that_hangs(tmp_path, monkeypatch, one_thread):
+    out = tmp_path / "run"
+    with in_place("hangs", tmp_path, monkeypatch):
+        assert main(["train", "--rerun", "serve", "--out", str(out), *QUICK]) == 0
+    assert (out / CURVE_FILE).exists()
 
 
 @pytest.mark.parametrize(

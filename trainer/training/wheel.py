@@ -22,7 +22,25 @@ from edge_runtime.latency.command_hold import COMMAND_WINDOW_S, ROUNDING_S
 from edge_runtime.latency.model import LatencySpec
 from edge_runtime.wire import CONTROL_PERIOD_S
 from trainer.remote.vehicle_end import Action, Observation, Policy, VehicleEnd
-from trainer.training.learning import Learning
+
+
+class Store(Protocol):
+    """The part of a learner that a wheel needs."""
+
+    def start_episode(self, observation: Observation) -> None:
+        """Take an episode's first observation."""
+
+    def add(
+        self,
+        action: Action,
+        reward: float,
+        observation: Observation,
+        terminal: bool,
+        human: bool,
+        overruled: Action | None = None,
+        penalised: bool = False,
+    ) -> None:
+        """Store a transition that led to ``observation``; arguments as ``ReplayBuffer.add``."""
 
 
 class Wheel(Protocol):
@@ -54,7 +72,7 @@ class Wheel(Protocol):
 class DirectWheel:
     """No network: the policy acts on what is there."""
 
-    def __init__(self, learning: Learning) -> None:
+    def __init__(self, learning: Store) -> None:
         self._learning = learning
 
     def start(self, observation: Observation, seed: int) -> None:
@@ -78,7 +96,7 @@ class DirectWheel:
 class RemoteWheel:
     """The policy behind a network, in virtual time."""
 
-    def __init__(self, learning: Learning, env: Any, spec: LatencySpec) -> None:
+    def __init__(self, learning: Store, env: Any, spec: LatencySpec) -> None:
         self._learning, self._env, self._spec = learning, env, spec
         self._known: deque[Observation] = deque(maxlen=ticks_late(spec) + 1)
         """Observations of the ticks n - d to n."""
@@ -118,6 +136,6 @@ def ticks_late(spec: LatencySpec) -> int:
     return math.ceil(beyond_window_s / CONTROL_PERIOD_S)
 
 
-def make_wheel(learning: Learning, env: Any, spec: LatencySpec) -> Wheel:
+def make_wheel(learning: Store, env: Any, spec: LatencySpec) -> Wheel:
     """The wheel for a network; ``none`` is no network."""
     return DirectWheel(learning) if spec == LatencySpec() else RemoteWheel(learning, env, spec)

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
+from viewing.colours import APPLIED, HUMAN, POLICY
 from viewing.layout import frames_view, full_blueprint, road_view
 from viewing.scene import Scene
-from viewing.series import ALL_OF_IT, BLUE, GREEN, GREY, ORANGE, PURPLE, Plot, plot_view
+from viewing.series import ALL_OF_IT, BLUE, GREY, ORANGE, PURPLE, Plot, plot_view
 
 APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
 TIMELINE = "step"
@@ -30,22 +31,21 @@ RECENT = (
     Plot("speed", "Speed, m/s, the last 20 s"),
 )
 LINES = {
-    # Blue is the policy's and green the human's, in every view.
     "return/episode": GREY,
     "return/mean_of_20": BLUE,
     "success/mean_of_20": BLUE,
     "success/validation": ORANGE,
     "loss/critic": PURPLE,
-    "loss/policy": BLUE,
-    "loss/cloning": GREEN,
-    "priority/human": GREEN,
-    "priority/policy": BLUE,
-    "human/share": GREEN,
-    "action/policy": BLUE,
-    "action/applied": ORANGE,
+    "loss/policy": POLICY,
+    "loss/cloning": HUMAN,
+    "priority/human": HUMAN,
+    "priority/policy": POLICY,
+    "human/share": HUMAN,
+    "action/policy": POLICY,
+    "action/applied": APPLIED,
     "speed/ego": BLUE,
 }
-POINTS = {"advantage/of_the_human": GREEN}
+POINTS = {"advantage/of_the_human": HUMAN}
 
 ROAD = "Road from above (blue: the policy drives, green: the human)"
 

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from edge_runtime.signals import sigterm_as_interrupt
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
-from trainer.viewer.background import Background
+from trainer.viewer.background import Background, Draw
 from trainer.viewer.blueprint import (
     APPLICATION,
     EPISODES,
@@ -21,6 +22,7 @@ from trainer.viewer.sittings import Shown
 from trainer.viewer.training_log import TrainingLog
 from trainer.viewer.watcher import Watcher
 from viewing.sinks import Sink, check_sink, open_sink, read_sink
+from viewing.viewer import flush
 
 OnEpisode = Callable[[EpisodeMetrics], None]
 
@@ -35,8 +37,15 @@ def check_word(word: str) -> Sink:
 @contextmanager
 def watched(run: TrainingRun, sink: Sink) -> Iterator[OnEpisode]:
     """Show a run for as long as it lasts; what it yields is to be called after each episode."""
-    with open_sink(sink, APPLICATION, make_blueprint(None, EPISODES)) as recording:
-        background = Background(TrainingLog(recording, EPISODES).draw)
+
+    @contextmanager
+    def opened() -> Iterator[Draw]:
+        with open_sink(sink, APPLICATION, make_blueprint(None, EPISODES)) as recording:
+            yield TrainingLog(recording, EPISODES).draw
+
+    # Here, as signals are the main thread's.
+    with sigterm_as_interrupt():
+        background = Background(opened)
         watcher = Watcher(run, background.put)
         run.on_step = watcher.on_step
         try:
@@ -57,5 +66,5 @@ def show_sittings(paths: Iterable[Path], sink: Sink) -> Iterator[Shown]:
         log = TrainingLog(recording, SITTINGS)
         for entry in shown.entries(paths):
             log.draw(entry)
-        recording.flush()
+        flush(recording)
         yield shown

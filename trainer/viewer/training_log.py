@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import rerun as rr
@@ -13,36 +13,20 @@ from numpy.typing import NDArray
 
 from edge_runtime.episode_report import GOAL
 from edge_runtime.words import counted
+from trainer.human.guide import Reason
 from trainer.training.metrics import EpisodeMetrics
 from trainer.viewer.advantage import q_advantage
 from trainer.viewer.blueprint import LINES, POINTS, TIMELINE, make_blueprint
 from trainer.viewer.entries import Entry, Episode, Picture, StepEntry, Steps
+from viewing.colours import HUMAN, POLICY
 from viewing.road import draw_cars, draw_ground
 from viewing.scene import SeenScene, read_scene
-from viewing.series import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    RED,
-    Plot,
-    style_lines,
-    style_points,
-)
+from viewing.series import Plot, style_lines, style_points
+from viewing.viewer import flush
 
-POLICY = "policy"
-DRIVERS = {
-    POLICY: BLUE,
-    "collision": RED,
-    "lane": RED,
-    "stuck": ORANGE,
-    "heading": PURPLE,
-    "offset": PURPLE,
-    "person": GREEN,
-}
+BY_POLICY = "policy"
+DRIVERS = {BY_POLICY: POLICY, **dict.fromkeys(get_args(Reason), HUMAN)}
 """Who drives: the policy, or the human for one of these reasons; their colours on the time line."""
-HUMAN_EGO = GREEN
-"""The ego car's colour while the human drives it, whyever."""
 WINDOW = 20
 """Episodes of the moving means."""
 
@@ -94,7 +78,7 @@ class TrainingLog:
 
     def _tell_driver(self, entry: StepEntry) -> None:
         """Draw who drives where that changes."""
-        driver = POLICY if entry.reason is None else entry.reason
+        driver = BY_POLICY if entry.reason is None else entry.reason
         if driver == self._driver:
             return
         self._driver = driver
@@ -115,7 +99,7 @@ class TrainingLog:
             self._ground = ground
             self._recording.send_blueprint(make_blueprint(scene, self._episodes))
             draw_ground(self._recording, scene)
-        draw_cars(self._recording, scene, BLUE if self._driver == POLICY else HUMAN_EGO)
+        draw_cars(self._recording, scene, DRIVERS[self._driver or BY_POLICY])
 
     def _draw_episode(self, episode: Episode) -> None:
         metrics = episode.metrics
@@ -132,6 +116,7 @@ class TrainingLog:
             steps = np.array([correction.step for correction in episode.corrections])
             values = [q_advantage(episode.critic, each) for each in episode.corrections]
             self._columns("advantage/of_the_human", steps, np.array(values))
+        flush(self._recording)  # A viewer that is gone takes everything without a word.
 
     def _numbers(self, metrics: EpisodeMetrics) -> dict[str, float]:
         return {

@@ -16,7 +16,7 @@ from edge_runtime.errors import UserError
 from viewing.pace import Pace
 from viewing.scene import SeenCar, SeenScene, read_scene
 from viewing.shapes import outline, view_bounds
-from viewing.sinks import Sink, open_sink, read_sink
+from viewing.sinks import Sink, check_sink, open_sink, read_sink
 from viewing.timeline import Timeline
 
 
@@ -105,6 +105,15 @@ def test_a_link_to_a_file_stays_and_the_file_is_written(tmp_path):
         pass
     assert link.is_symlink()
     assert target.stat().st_size > 0
+
+
+def test_the_folder_of_a_file_is_made(tmp_path):
+    path = tmp_path / "runs" / "today" / "drive.rrd"
+    check_sink(Sink("save", str(path)))
+    assert not path.parent.exists()
+    with open_sink(Sink("save", str(path)), "test", rrb.Blueprint()):
+        pass
+    assert path.stat().st_size > 0
 
 
 def test_a_command_with_another_use_for_sigterm_keeps_it(tmp_path):

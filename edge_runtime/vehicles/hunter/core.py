@@ -55,7 +55,7 @@ class HunterCore(Core):
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """The newest command; forgotten where it may not drive. ValueError: not finite."""
+        """The newest command; forgotten where it may not drive. ValueError: see `wish_of`."""
         wish = wish_of(action, scenario_speed_mps)
         if self.state is State.ENABLED:
             self._wish, self._wished_s = wish, now_s

@@ -15,6 +15,7 @@ from edge_runtime.wire import CONTROL_PERIOD_S
 
 MOTION_SILENCE_S = 2 * CONTROL_PERIOD_S  # ten frames of 0x221
 STATUS_SILENCE_S = 3 * CONTROL_PERIOD_S  # three frames of 0x211
+COUNTERS = 256  # byte 7 of 0x211 runs over
 
 REMOTE_WORDS = "the remote control drives"
 ESTOP_WORDS = "the emergency stop is pressed"
@@ -33,7 +34,8 @@ class Reports:
     def __init__(self, spec: HunterSpec, profile: str) -> None:
         self.status: Optional[SystemStatus] = None
         self.motion: Optional[MotionStatus] = None
-        self.status_s = self.motion_s = -math.inf
+        self.status_s = self.motion_s = -math.inf  # of 0x211: when its counter last went on
+        self._counter, self._last_status_s = 0, -math.inf
         self._spec, self._profile = spec, profile
         self._motor_faults: Dict[int, List[str]] = {}
         self._speeds = Speeds()
@@ -45,7 +47,8 @@ class Reports:
             return
         message = decoded.message
         if isinstance(message, SystemStatus):
-            self.status, self.status_s = message, now_s
+            self.status = message
+            self._count(message.counter, now_s)
         elif isinstance(message, MotionStatus):
             self.motion, self.motion_s = message, now_s
             self._speeds.note(message.speed_mps, now_s)
@@ -90,12 +93,12 @@ class Reports:
 
     def silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         """SILENT where feedback is missing that was due since `since_s`."""
-        for heard_s, patience_s, name in (
-            (self.motion_s, MOTION_SILENCE_S, "0x221"),
-            (self.status_s, STATUS_SILENCE_S, "0x211"),
-        ):
-            if now_s - max(heard_s, since_s) > patience_s:
-                return Finding(Event.SILENT, f"the chassis sends no {name}")
+        if now_s - max(self.motion_s, since_s) > MOTION_SILENCE_S:
+            return Finding(Event.SILENT, "the chassis sends no 0x221")
+        if now_s - max(self.status_s, since_s) > STATUS_SILENCE_S:
+            repeats = now_s - self._last_status_s <= STATUS_SILENCE_S
+            words = "repeats itself: the counter of 0x211 stands still"
+            return Finding(Event.SILENT, f"the chassis {words if repeats else 'sends no 0x211'}")
         return None
 
     def commander(self) -> Optional[Finding]:
@@ -125,6 +128,16 @@ class Reports:
         if status.brake:
             return Finding(Event.LOCKED, "the chassis has locked its brake")
         return None
+
+    def _count(self, counter: int, now_s: float) -> None:
+        """A status is a sign of life where its counter is ahead of all before, or it was silent.
+
+        Half of the circle is ahead: frames that go round and round are behind their newest one.
+        """
+        was_silent = now_s - self._last_status_s > STATUS_SILENCE_S
+        if was_silent or 0 < (counter - self._counter) % COUNTERS < COUNTERS // 2:
+            self._counter, self.status_s = counter, now_s
+        self._last_status_s = now_s
 
     def lie(self) -> Optional[Finding]:
         """LYING where it reports what the model cannot do."""

@@ -13,8 +13,8 @@ from edge_runtime.vehicles.similarity import Similarity
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 _LONGEST_STEP_S = CONTROL_PERIOD_S  # after a pause of the process the pedal was not held for it
-# A pedal is integrated to a speed, so that any leap of it is a ramp: 2.0 in T = 0.1 s.
-_PEDAL_SLEW_PER_S = 20.0
+# A pedal is integrated to a speed, so that any leap of it is a ramp.
+_PEDAL_SLEW_PER_S = math.inf
 
 FOLLOWS_S = 10 * CONTROL_PERIOD_S  # a drive may still follow a set-point of this age
 DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
@@ -30,10 +30,15 @@ class Wish(NamedTuple):
 
 
 def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wish:
-    """The command of an action, within -1 to 1. Raises ValueError for what is not finite."""
+    """The command of an action, within -1 to 1.
+
+    Raises ValueError for what is not finite, and for what leaves out how fast to drive.
+    """
     wish = Wish(action.get("pedal"), scenario_speed_mps, action.get("steering"))
     if not all(math.isfinite(value) for value in wish if value is not None):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
+    if not action or (wish.pedal is None and scenario_speed_mps is None):
+        raise ValueError(f"a command that lacks an action: {action}, {scenario_speed_mps} m/s")
     return Wish(_within(wish.pedal), scenario_speed_mps, _within(wish.steering))
 
 

@@ -20,13 +20,17 @@ _LONGEST_GAP_S = 10.0
 
 
 class MockParameters(NamedTuple):
-    """The actuators and the body of the mock. Rates are in full pedal or steering per second."""
+    """The actuators and the body of the mock. Rates are in full pedal or steering per second.
+
+    The body's numbers are the car's of this repository's scenarios (similarity.CARS).
+    """
 
     dead_time_s: float = 0.02
     time_constant_s: float = 0.05
     slew_per_s: float = 40.0
-    acceleration_mps2: float = 5.0  # at full pedal, the same for the brake
-    max_speed_mps: float = 15.0
+    throttle_mps2: float = 3.0  # at full pedal
+    brake_mps2: float = 4.0
+    max_speed_mps: float = 6.0
 
 
 class MockState(NamedTuple):
@@ -42,7 +46,8 @@ def advance(
 ) -> MockState:
     """One integration step towards the targets `pedal` and `steering`."""
     position = _follow(state.pedal, pedal, step_s, parameters)
-    speed_mps = state.speed_mps + position * parameters.acceleration_mps2 * step_s
+    full_mps2 = parameters.throttle_mps2 if position > 0.0 else parameters.brake_mps2
+    speed_mps = state.speed_mps + position * full_mps2 * step_s
     return MockState(
         pedal=position,
         steering=_follow(state.steering, steering, step_s, parameters),
@@ -61,11 +66,11 @@ class MockVehicle(Vehicle):
     """Takes pedal and steering; brakes by itself when no command came for 2 T."""
 
     name: ClassVar[str] = "mock"
-    # A full swing within one control period: 20 / s is 2.0 in T = 0.1 s, so that every action
-    # of a policy goes through unchanged. What the body does with it is the lag's business.
+    # Every action of a policy goes through unchanged, in lock-step, too, where states follow one
+    # another faster than its time. What the body does with it is the lag's business.
     limits: Dict[str, ActionLimit] = {  # noqa: RUF012
-        "pedal": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
-        "steering": ActionLimit(-1.0, 1.0, slew_per_s=20.0),
+        "pedal": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
+        "steering": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
     }
 
     def __init__(self, parameters: Optional[MockParameters] = None) -> None:
@@ -85,7 +90,9 @@ class MockVehicle(Vehicle):
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
     ) -> None:
-        """An action that a policy leaves out is zero: no pedal, wheels straight."""
+        """An action that a policy does not have is zero: no pedal, wheels straight."""
+        if not action:
+            raise ValueError("a command that lacks an action")
         self._integrate(now_s)
         if self._latched:
             return

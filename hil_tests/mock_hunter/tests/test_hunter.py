@@ -294,7 +294,7 @@ def test_late_its_reports_are_old_and_in_order():
 
 
 def test_every_fault_has_a_test_here_and_others_are_refused():
-    behaviours = {"silent", "stuck", "lying", "late", "bus_off", "remote", "estop"}
+    behaviours = {"silent", "frozen", "stuck", "lying", "late", "bus_off", "remote", "estop"}
     assert set(FAULTS) == behaviours | set(FAULT_BITS)
     with pytest.raises(UserError, match="no fault 'meteor'"):
         Bench().switch("meteor")

@@ -21,6 +21,7 @@ SPEC = SPECS["2.0"]
 TICK_S = 0.02
 WORDS = {
     "silent": "sends no 0x2",
+    "frozen": "the counter of 0x211 stands still",
     "bus_off": "sends no 0x2",
     "late": "sends no 0x2",
     "lying": "the chassis reports",
@@ -29,7 +30,7 @@ WORDS = {
     "estop": "the emergency stop is pressed",
     **{name: bit.words for name, bit in BITS.items()},
 }
-STANDING = ("silent", "bus_off", "remote", "estop")
+STANDING = ("silent", "frozen", "bus_off", "remote", "estop")
 # 2 T and 50 ms after the driver could know: 0x211 tells within 100 ms, silence tells itself.
 STOPS_WITHIN_S = {"stuck": FOLLOWS_S + DEVIATES_S + 0.35}
 STANDS_WITHIN_S = 1.5  # from 1.5 m/s at the mock's 2 to 3 m/s2, or by the brake after 1 s

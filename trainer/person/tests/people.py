@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from trainer.drivers import make_environment
-from trainer.person.interface import LET_GO, Person, Reading, View
+from trainer.person.interface import LET_GO, Person, Reading, View, Wish
 from trainer.person.recording import Recorder
 from trainer.person.sitting import Sitting
 
@@ -28,6 +28,28 @@ class Hands:
 
     def close(self) -> None:
         self.closed = True
+
+
+class Discarding:
+    """Hands that hold full brake, and throw these episodes away: in the rest after their end."""
+
+    help, present = ("a test",), True
+
+    def __init__(self, eyes: Eyes, discarded: Iterable[int], episodes: int) -> None:
+        self._eyes, self._discarded, self._episodes = eyes, set(discarded), episodes
+
+    def poll(self, now_s: float) -> Reading:
+        seen = self._eyes.views[-1]
+        ended = seen.message.startswith("episode")
+        wishes: set[Wish] = set()
+        if ended and seen.episode + 1 == self._episodes:
+            wishes.add("quit")
+        if ended and seen.episode in self._discarded:
+            wishes.add("discard")
+        return Reading(-1.0, engaged=True, wishes=frozenset(wishes))
+
+    def close(self) -> None:
+        """Nothing to close."""
 
 
 class Eyes:

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trainer.drivers import load_driver, make_environment
+from trainer.drivers import CHECKPOINT_FILE, load_driver, make_environment
+from trainer.files import load_torch
 from trainer.person.interface import LET_GO, Person
-from trainer.person.recording import Recorder
+from trainer.person.recording import Recorder, find_recordings, read_steps
 from trainer.person.registry import HUMANS
 from trainer.person.sitting import STOPPED
-from trainer.person.tests.people import QUIT, Eyes, Hands
+from trainer.person.tests.people import QUIT, Discarding, Eyes, Hands
 from trainer.person.tests.steps import recorded_step
 from trainer.tests.test_commands import call
 from trainer.training.metrics import read_metrics
@@ -42,7 +43,7 @@ WRONG = [
     (DRIVE, ("--calibrate", "{tmp}/p.toml"), "not allowed with argument --out"),
     (("drive", "--calibrate", "{tmp}/p.toml"), (), "--calibrate asks a --human gamepad or wheel"),
     (("drive", "--calibrate", "{tmp}/p.toml"), ("--human", "wheel"), "no wheel is plugged in"),
-    (("drive", "--calibrate", "{tmp}/no/p.toml"), ("--human", "wheel"), "cannot write"),
+    (("drive", "--calibrate", "{tmp}/file/p.toml"), ("--human", "wheel"), "cannot write"),
     (TRAIN, ("--human", "keyboard", "--algorithm", "per_td3"), "takes no guidance"),
     (TRAIN, ("--human", "keyboard", "--set", "guided_share=3"), "watches every episode"),
     (TRAIN, ("--human", "keyboard", "--set", "poor_guidance_share=0.3"), "not replaced"),
@@ -165,6 +166,78 @@ def test_a_human_model_learns_what_the_hands_did(capsys, tmp_path, one_thread):
     driver, _ = load_driver(str(tmp_path / "me"), make_environment("left_turn"))
     assert driver.act(np.full((2, 45, 80), 200, np.uint8))[0] > 0.3
     assert driver.act(np.full((2, 45, 80), 20, np.uint8))[0] < -0.3
+
+
+def episodes_of_two_steps(directory):
+    """Sitting 1: episodes 0 to 2, all the person's; the last was thrown away."""
+    record(
+        directory,
+        [
+            recorded_step(
+                1,
+                index,
+                episode=index // 2,
+                step=index % 2,
+                control="human",
+                human=True,
+                first=index % 2 == 0,
+                outcome="discarded" if index == 5 else "",
+            )
+            for index in range(6)
+        ],
+    )
+
+
+@pytest.mark.parametrize(
+    ("left_out", "steps"), [((), 4), (("1:0",), 2), (("1:1", "1:01"), 2), (("1:0", "1:1"), 0)]
+)
+def test_what_was_thrown_away_or_is_left_out_is_not_imitated(
+    capsys, tmp_path, one_thread, left_out, steps
+):
+    episodes_of_two_steps(tmp_path / "rec")
+    command = ["human", "--from", str(tmp_path / "rec"), "--episodes", "1"]
+    more = ["--leave-out", *left_out] if left_out else []
+    status, out, errors = call(capsys, *command, "--out", str(tmp_path / "me"), *more)
+    if steps:
+        assert (status, f"from {steps} demonstrated steps" in out) == (0, True)
+    else:
+        assert (status, "nobody took over" in errors) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "complaint"),
+    [("1:9", "no such episode"), ("2", "no such episode"), ("1:2:3", "no SITTING"), ("-1", "")],
+)
+def test_leaving_out_what_is_not_there_is_one_line(capsys, tmp_path, left_out, complaint):
+    episodes_of_two_steps(tmp_path / "rec")
+    command = ["human", "--from", str(tmp_path / "rec"), "--out", str(tmp_path / "me")]
+    status, _, errors = call(capsys, *command, "--leave-out", left_out)
+    assert (status, complaint in errors, errors.count("\n")) == (2, True, 1)
+    assert not (tmp_path / "me" / "human.pt").exists()
+
+
+def test_a_person_is_not_imitated_in_what_they_threw_away(
+    capsys, tmp_path, monkeypatch, one_thread
+):
+    """Three episodes, the second thrown away after its end: neither stored nor brought back."""
+    eyes, run_dir = Eyes(), tmp_path / "run"
+    hands = Discarding(eyes, discarded={1}, episodes=3)
+    monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, eyes))
+    command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
+    quick = ["--threads", "1", "--set", "evaluate_every=0", "--set", "warmup_steps=8"]
+    status, out, errors = call(capsys, *command, *quick)
+    assert status == 0, errors
+    assert "2 episodes, 1 episode discarded" in errors
+    rows = read_metrics(run_dir)
+    assert [row["outcome"] == "discarded" for row in rows] == [False, True, False]
+    lengths = [int(row["steps"]) for row in rows]
+    kept = lengths[0] + lengths[2]
+    assert [int(row["total_steps"]) for row in rows] == [lengths[0], lengths[0], kept]
+    assert f"{kept} steps" in out
+    replay = load_torch(run_dir / CHECKPOINT_FILE)["learning"]["replay"]
+    assert int(replay["human"].sum()) == sum(int(rows[n]["human_steps"]) for n in (0, 2))
+    (recording,) = find_recordings([run_dir])
+    assert len(list(read_steps(recording))) == sum(lengths), "all of it is recorded"
 
 
 def test_recordings_that_teach_nothing_are_refused(capsys, tmp_path):

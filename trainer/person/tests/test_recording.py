@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 from typing import cast
 
@@ -9,6 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from bridge.recording import records
+from bridge.tests.test_recording_damage import MIB, crafted, zeros
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import try_to_hold
 from trainer.person.recording import Recorder, Step, find_recordings, read_steps, sittings
@@ -112,6 +115,16 @@ def test_another_file_is_refused(tmp_path, data):
         list(read_steps(path))
     with pytest.raises(UserError, match="cannot be read"):
         list(read_steps(tmp_path / "none.mcap"))
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match="no regular file"):
+        list(read_steps(tmp_path / "pipe"))
+
+
+def test_a_file_made_to_keep_its_reader_busy_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(records, "MAX_CHUNK_BYTES", MIB)
+    path = crafted(tmp_path / "sitting-0001.mcap", *[(zeros(1), MIB)] * 40)
+    with pytest.raises(UserError, match="is refused"):
+        list(read_steps(path))
 
 
 def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from trainer.learner.replay import ReplayBuffer
-from trainer.person.recording import Recorder
+from trainer.person.recording import DISCARDED, Recorder
 from trainer.person.recovery import steps_since, store_again
 from trainer.person.tests.steps import recorded_step
 
@@ -52,6 +53,14 @@ def test_steps_come_back_with_mask_action_reward_and_pictures():
     for row, index in enumerate(batch.indices):
         np.testing.assert_array_equal(batch.frames[row], steps[index].observation)
         np.testing.assert_array_equal(batch.next_frames[row], steps[index].next_observation)
+
+
+def test_an_episode_that_was_thrown_away_does_not_come_back():
+    steps = [*episode(1, 0, 4, range(1, 3)), *episode(1, 4, 3, range(0))]
+    steps[3] = replace(steps[3], outcome=DISCARDED)
+    buffer = ReplayBuffer(100)
+    assert store_again(buffer, steps, shape, penalises) == (3, 0)
+    assert buffer.state_dict()["rewards"].tolist() == [4.0, 5.0, 6.0]
 
 
 def test_behind_a_network_the_action_answers_an_older_picture():

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from trainer.person.drive import drive
-from trainer.person.interface import LET_GO
-from trainer.person.recording import read_steps
+from trainer.person.interface import LET_GO, Person
+from trainer.person.recording import DISCARDED, read_episodes, read_steps
 from trainer.person.sitting import RESTARTED, STOPPED
 from trainer.person.takeover import MAX_SLEW
-from trainer.person.tests.people import QUIT, Hands, hold, make_sitting, wish
+from trainer.person.tests.people import QUIT, Discarding, Hands, hold, make_sitting, wish
 
 
 class Steady:
@@ -100,6 +100,46 @@ def test_restarting_begins_another_episode(tmp_path):
     assert [s.step for s in steps if s.episode == 0] == [0, 1, 2]
     assert steps[3].episode == 1
     assert steps[3].seed != steps[0].seed
+
+
+def test_an_episode_that_is_thrown_away_ends_and_is_marked(tmp_path):
+    readings = [hold(1.0), hold(1.0), wish("discard"), *[LET_GO] * 4]
+    sitting, _ = make_sitting(tmp_path, readings)
+    outcomes = drive(sitting, Steady(0.5), 0, None)
+    sitting.close()
+    steps = list(read_steps(sitting.recorder.path))
+    assert dict(outcomes) == {DISCARDED: 1, STOPPED: 1}
+    assert [step.outcome for step in steps if step.episode == 0] == ["", "", DISCARDED]
+    assert steps[2].truncated
+    assert [step.episode for step in steps[3:]] == [1] * (len(steps) - 3)
+    assert [episode[0].episode for episode in read_episodes(steps)] == [1]
+    assert (sitting.discarded, sitting.episodes, sitting.human_steps) == (1, 1, 0)
+
+
+def test_what_has_just_ended_can_still_be_thrown_away(tmp_path):
+    sitting, eyes = make_sitting(tmp_path, [])
+    sitting.person = Person(Discarding(eyes, discarded={0}, episodes=2), eyes)
+    outcomes = drive(sitting, Steady(1.0), 0, None)
+    sitting.close()
+    first, second = (
+        [step for step in read_steps(sitting.recorder.path) if step.episode == number]
+        for number in (0, 1)
+    )
+    assert outcomes[DISCARDED] == 1
+    assert (first[-1].outcome, first[-1].terminated or first[-1].truncated) == (DISCARDED, True)
+    assert DISCARDED not in {step.outcome for step in (*first[:-1], *second)}
+    assert [step.index for step in (*first, *second)] == list(range(len(first) + len(second)))
+
+
+def test_out_of_a_pause_an_episode_can_be_thrown_away(tmp_path):
+    readings = [LET_GO, wish("pause"), LET_GO, wish("discard"), *[LET_GO] * 3]
+    assert drive_and_read(tmp_path, readings)[0][DISCARDED] == 1
+
+
+def test_a_wish_from_before_an_episode_throws_nothing_away(tmp_path, monkeypatch):
+    sitting, _ = make_sitting(tmp_path, [wish("discard"), *[LET_GO] * 4])
+    who_is_there(monkeypatch, False)
+    assert dict(drive(sitting, Steady(0.0), 0, None)) == {STOPPED: 1}
 
 
 def test_a_pause_holds_the_car_still_and_goes_on_where_it_was(tmp_path):

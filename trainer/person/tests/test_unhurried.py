@@ -10,6 +10,7 @@ import pytest
 
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.learner.config import LearnerConfig
+from trainer.person.episode import KeptBack
 from trainer.person.unhurried import UnhurriedLearning
 from trainer.training.learning import LearningThread
 
@@ -53,32 +54,35 @@ def test_while_an_update_hangs_everything_goes_on(learning, monkeypatch):
     gate = Gate(inner, monkeypatch)
     before = unhurried.act(frames(7))
     unhurried.begin(0.0)
-    for value in range(3, 8):
+    for _ in range(5):
         np.testing.assert_array_equal(unhurried.act(frames(7)), before)
         unhurried.begin(0.0)
         assert unhurried.finish() == 0.0
-        unhurried.add(ACTION, float(value), frames(value + 1), False, value == 5)
-    assert (unhurried.added, inner.added) == (8, 3)
     assert not unhurried.idle
     assert gate.begun <= 1
     gate.open.set()
     unhurried.settle()
-    assert unhurried.added == inner.added == 8
     assert np.any(unhurried.act(frames(7)) != before)
 
 
-def test_what_was_kept_back_is_stored_in_its_order_with_its_mask(learning, monkeypatch):
+def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(learning, monkeypatch):
     inner, unhurried = learning
-    gate = Gate(inner, monkeypatch)
+    gate, episode = Gate(inner, monkeypatch), KeptBack(unhurried)
     unhurried.begin(0.0)
-    unhurried.add(ACTION, 3.0, frames(4), True, True)
-    unhurried.start_episode(frames(10))
-    unhurried.add(-ACTION, 4.0, frames(11), False, False)
-    gate.open.set()
+    for discarded, reward in ((True, 9.0), (False, 3.0)):
+        episode.start_episode(frames(10))
+        episode.add(ACTION, reward, frames(11), False, True)
+        episode.add(-ACTION, reward + 1.0, frames(12), True, False)
+        assert unhurried.added == 3
+        if discarded:
+            episode.release(discarded)
+    threading.Timer(0.05, gate.open.set).start()
+    episode.release(discarded=False)
+    episode.release(discarded=False)
     state = unhurried.state_dict()["replay"]
     assert state["rewards"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert state["human"].tolist() == [False, False, False, True, False]
-    assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 1.0, 0.0]
+    assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 
 def test_the_next_update_begins_when_the_last_is_done(learning, monkeypatch):

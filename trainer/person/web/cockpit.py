@@ -19,17 +19,19 @@ from aiohttp.http_exceptions import HttpProcessingError
 from edge_runtime.errors import UserError
 from trainer.person.interface import KEY_HELP, Person, Reading, View
 from trainer.person.web.seat import Seat
-from trainer.person.web.server import CLOSING_S, Server
+from trainer.person.web.server import CLOSING_S, LOOPBACK, Server
 
 if TYPE_CHECKING:
     from trainer.person.registry import PersonOptions
 
 TOKEN_BYTES = 16
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
+KEEP_ALIVE_S = 10.0
+"""How long a connection stays open for another request."""
 HELP = (
     "Space: take over without driving",
     "or slide on the pad, or use a gamepad or wheel",
     "P: pause    R: restart the episode    Q: quit",
+    "Backspace: discard the episode, or the one that has just ended",
 )
 
 
@@ -64,8 +66,10 @@ class Cockpit:
         self._listener = _listen(host, port)
         self.port: int = self._listener.getsockname()[1]
         token = secrets.token_urlsafe(TOKEN_BYTES)
-        self.url = f"http://{_in_url(host)}:{self.port}/{token}/"
-        self._server = Server(token, self.seat)
+        name = _name(host)
+        shown = f"[{name}]" if ":" in name else name
+        self.url = f"http://{shown}:{self.port}/{token}/"
+        self._server = Server(token, self.seat, (host, name))
         self._shown = 0
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
@@ -110,10 +114,16 @@ class Cockpit:
             logger=LOGGER,
             handle_signals=False,
             shutdown_timeout=CLOSING_S,
+            keepalive_timeout=KEEP_ALIVE_S,
         )
         await runner.setup()
-        await web.SockSite(runner, self._listener).start()
-        await self._closing.wait()
+        assert runner.server is not None
+        with self._listener:
+            accepting = asyncio.create_task(self._server.door.let_in(self._listener, runner.server))
+            await self._closing.wait()
+            accepting.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await accepting
         await self._server.close()
         await runner.cleanup()
 
@@ -143,6 +153,7 @@ def _listen(host: str, port: int) -> socket.socket:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(address)
             listener.listen()
+            listener.setblocking(False)
         except OSError:
             listener.close()
             raise
@@ -155,7 +166,6 @@ def _listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _in_url(host: str) -> str:
-    if host in ("0.0.0.0", "::"):
-        host = socket.gethostname()
-    return f"[{host}]" if ":" in host else host
+def _name(host: str) -> str:
+    """By what name a browser elsewhere finds the cockpit."""
+    return socket.gethostname() if host in ("0.0.0.0", "::") else host

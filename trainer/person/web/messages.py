@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from trainer.person.interface import View, Wish
+from trainer.person.interface import WISHES, View, Wish
 from trainer.scenarios.scene import HEIGHT_M, VIEW, WIDTH_M
 
 MAX_INPUT_BYTES = 1024
@@ -24,7 +24,7 @@ class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     engaged: bool
     by_moving: bool = False
     """Whether moving ``action`` takes over, too: a steering wheel."""
-    wishes: Annotated[tuple[Wish, ...], msgspec.Meta(max_length=3)] = ()
+    wishes: Annotated[tuple[Wish, ...], msgspec.Meta(max_length=len(WISHES))] = ()
     seen: Annotated[int, msgspec.Meta(ge=0)] = 0
     """Number of the newest view that was drawn."""
 

@@ -14,14 +14,18 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from importlib.resources import files
 from types import MappingProxyType
+from urllib.parse import urlsplit
 
 import msgspec
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from trainer.person.interface import View
+from trainer.person.web.door import Door
 from trainer.person.web.messages import END, MAX_INPUT_BYTES, decode_input, encode_echo, encode_view
 from trainer.person.web.seat import Seat
+from viewing.colours import BY_NAME
 
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
 GONE_S = 2.0
 """A page that is not heard for this long is shown out, and the next one may drive."""
 CLOSING_S = 0.5
@@ -37,6 +41,7 @@ HEADERS = {
 }
 """The address holds the token: it shall not be kept, passed on, or framed."""
 NO_TOKEN = "This address holds no token, or an old one: open the one that the trainer printed.\n"
+NO_NAME = "The cockpit has another name: open the address that the trainer printed.\n"
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -60,10 +65,13 @@ class Server:
     Args:
         token: what the address must hold.
         seat: who drives.
+        names: hosts by which it is asked for, besides loopback's.
     """
 
-    def __init__(self, token: str, seat: Seat) -> None:
+    def __init__(self, token: str, seat: Seat, names: tuple[str, ...] = ()) -> None:
         self._token, self._seat = token.encode(), seat
+        self._names = {*LOOPBACK, *(name.lower() for name in names)}
+        self.door = Door()
         self._pages: dict[int, Page] = {}
         self._numbers = itertools.count(1)
         self._files = _page_files()
@@ -72,7 +80,7 @@ class Server:
 
     def application(self) -> web.Application:
         """What aiohttp is to run."""
-        app = web.Application(middlewares=[self._check_token])
+        app = web.Application(middlewares=[self._check])
         app.router.add_get("/{token}", _with_slash)
         app.router.add_get("/{token}/socket", self._talk)
         app.router.add_get("/{token}/{file:[a-z.]*}", self._file)
@@ -90,11 +98,26 @@ class Server:
         await asyncio.gather(*(_say_goodbye(page.socket) for page in pages), return_exceptions=True)
 
     @web.middleware
-    async def _check_token(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         given = request.path.partition("/")[2].partition("/")[0]
+        if not self._is_asked_by_name(request):
+            return _refusal(421, NO_NAME)
         if not hmac.compare_digest(given.encode(), self._token):
-            return web.Response(status=403, text=NO_TOKEN, headers=HEADERS)
+            return _refusal(403, NO_TOKEN)
+        self.door.has_token(request.transport)
         return await handler(request)
+
+    def _is_asked_by_name(self, request: web.Request) -> bool:
+        """Whether the request names this machine. Another site's name may resolve to it, too: a
+        page from there would be of the same origin (DNS rebinding).
+        """
+        try:
+            host = urlsplit(f"//{request.headers.get('Host', '')}").hostname
+        except ValueError:
+            return False
+        # With --host 0.0.0.0 the address at which the request arrived.
+        arrived_at = request.get_extra_info("sockname", ("",))[0].removeprefix("::ffff:")
+        return host is not None and host in {*self._names, arrived_at}
 
     async def _file(self, request: web.Request) -> web.Response:
         name = request.match_info["file"] or "index.html"
@@ -175,6 +198,13 @@ class Server:
         return self._encoded[1]
 
 
+def _refusal(status: int, text: str) -> web.Response:
+    """An answer after which the connection is closed."""
+    response = web.Response(status=status, text=text, headers=HEADERS)
+    response.force_close()
+    return response
+
+
 async def _with_slash(request: web.Request) -> web.Response:
     """The page's own files stand beside it only behind the slash."""
     raise web.HTTPFound(request.path + "/", headers=HEADERS)
@@ -187,4 +217,6 @@ async def _say_goodbye(socket: web.WebSocketResponse) -> None:
 
 def _page_files() -> dict[str, bytes]:
     folder = files("trainer.person.web") / "page"
-    return {entry.name: entry.read_bytes() for entry in folder.iterdir() if "." in entry.name}
+    found = {entry.name: entry.read_bytes() for entry in folder.iterdir() if "." in entry.name}
+    colours = "".join(f"--{name}: rgb{colour}; " for name, colour in BY_NAME.items())
+    return {**found, "colours.css": f":root {{ {colours}}}".encode()}

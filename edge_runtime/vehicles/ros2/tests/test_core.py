@@ -154,10 +154,12 @@ def test_odometry_without_stamps_is_believed_by_its_arrival():
     assert core.state is State.ENABLED
 
 
-def test_a_command_that_is_not_finite_is_refused():
+def test_a_command_that_is_not_finite_or_lacks_an_action_is_refused():
     drive = Drive().start()
     with pytest.raises(ValueError, match="not finite"):
         drive.core.command({"pedal": math.nan}, drive.now_s)
+    with pytest.raises(ValueError, match="lacks an action"):
+        drive.core.command({}, drive.now_s, 6.0)
 
 
 @pytest.mark.parametrize("angular", [YAW_RATE, STEERING])

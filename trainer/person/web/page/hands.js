@@ -8,7 +8,7 @@ const KEYS = {
 const FIRST_S = 0.1; // what a press is worth at once
 const HOLD = "Space";
 const DRIVING = new Set([HOLD, ...Object.values(KEYS).flatMap((keys) => [...keys.plus, ...keys.minus])]);
-const WISHES = { KeyP: "pause", KeyR: "restart", KeyQ: "quit" };
+const WISHES = { KeyP: "pause", KeyR: "restart", Backspace: "discard", KeyQ: "quit" };
 
 const clip = (value) => Math.min(Math.max(value, -1), 1);
 

@@ -9,10 +9,9 @@ const COLOURS = {
   line: "#e6e6e6",
   traffic: "#eb8c28",
   glass: "rgba(10, 12, 15, 0.75)",
-  policy: "#4d9bff",
-  human: "#3fd07c",
-  returning: "#b98cff",
 };
+// Of who decides: the same in every view, and given with the page.
+const colour = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`);
 const GOAL_HALF_M = 2.0;
 const HISTORY_STEPS = 100;
 
@@ -74,7 +73,7 @@ function drawCar(pen, car, control) {
   pen.rotate(car.heading_rad);
   pen.shadowColor = "rgba(0, 0, 0, 0.5)";
   pen.shadowBlur = 6;
-  pen.fillStyle = car.ego ? COLOURS[control] : COLOURS.traffic;
+  pen.fillStyle = car.ego ? colour(control) : COLOURS.traffic;
   pen.beginPath();
   pen.roundRect(-length / 2, -width / 2, length, width, 0.45);
   pen.fill();
@@ -119,9 +118,11 @@ export class History {
     const y = (action) => height / 2 - action * (height / 2 - 3);
     this.steps.forEach(([, , control], i) => {
       if (control === "policy") return;
-      pen.fillStyle = control === "human" ? "rgba(63, 208, 124, 0.22)" : "rgba(185, 140, 255, 0.22)";
+      pen.fillStyle = colour(control);
+      pen.globalAlpha = 0.22;
       const [from, to] = [Math.round(left + i * dx), Math.round(left + (i + 1) * dx)];
       pen.fillRect(from, 0, to - from, height);
+      pen.globalAlpha = 1;
     });
     line(pen, [[0, height / 2], [width, height / 2]], "#3a424d", 1);
     const trace = (index, colour, wide) => {
@@ -129,7 +130,7 @@ export class History {
       const points = known.filter(([, action]) => action !== null);
       line(pen, points.map(([x, action]) => [x, y(action)]), colour, wide);
     };
-    trace(0, COLOURS.policy, 1.2);
-    trace(1, "#f2f5f8", 2);
+    trace(0, colour("policy"), 1.2);
+    trace(1, colour("applied"), 2);
   }
 }

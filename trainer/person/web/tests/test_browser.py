@@ -10,6 +10,7 @@ from trainer.person.web.tests.pages import page
 from trainer.person.web.tests.readings import LIVE, READY, TWO_HEARTBEATS, WHY, YOU, poll, reads
 from trainer.person.web.tests.tunnel import Tunnel
 from trainer.person.web.tests.views import first_view
+from viewing.colours import BY_NAME
 
 pytestmark = pytest.mark.usefixtures("opened")
 
@@ -104,6 +105,50 @@ def test_a_finger_on_the_pad_drives(runner, browser, cockpit):
     runner.run(slide())
 
 
+TOUCHED = [(844, 390), (667, 375), (932, 430), (390, 844), (360, 640), (1024, 768), (768, 1024)]
+"""Phones and tablets, either way up."""
+
+
+@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
+@pytest.mark.parametrize("size", TOUCHED, ids=str)
+def test_a_thumb_finds_pad_and_buttons_beside_the_road(runner, browser, cockpit, size, scenario):
+    width, height = size
+
+    async def hold():
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": True}
+        await browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+        await browser.call("Emulation.setTouchEmulationEnabled", enabled=True)
+        await browser.open(cockpit.url)
+        cockpit.show(first_view(scenario))
+        await browser.until(READY)
+        boxes = await browser.value(
+            "Object.fromEntries(['pad', 'scene', 'control', 'buttons'].map((id) => "
+            "[id, document.getElementById(id).getBoundingClientRect().toJSON()]))"
+        )
+        for box in boxes.values():
+            assert box["left"] >= 0
+            assert box["right"] <= width
+            assert box["bottom"] <= height
+        assert boxes["pad"]["width"] >= 240
+        assert boxes["pad"]["height"] >= 190
+        assert boxes["scene"]["width"] >= 0.55 * width
+        pad, road = boxes["pad"], boxes["scene"]
+        assert pad["left"] >= road["right"] or pad["top"] >= road["bottom"]
+
+    try:
+        runner.run(hold())
+    finally:
+        desktop = {"width": 1280, "height": 740, "deviceScaleFactor": 1, "mobile": False}
+        runner.run(browser.call("Emulation.setDeviceMetricsOverride", **desktop))
+        runner.run(browser.call("Emulation.setTouchEmulationEnabled", enabled=False))
+
+
+@pytest.mark.parametrize("name", ["policy", "human", "applied"])
+def test_colours_are_those_of_every_view(runner, browser, name):
+    shown = f"getComputedStyle(document.querySelector('.bar.{name} u')).backgroundColor"
+    assert runner.run(browser.value(shown)) == f"rgb{BY_NAME[name]}"
+
+
 def test_a_gamepads_triggers_drive_while_its_button_is_held(runner, browser, cockpit):
     async def press():
         buttons = [0.0] * 17
@@ -147,6 +192,10 @@ def test_buttons_and_keys_wish_once_and_quitting_asks_again(runner, browser, coc
         await reads(cockpit, lambda r: r.wishes == {"pause"})
         await browser.tap("KeyR")
         await reads(cockpit, lambda r: r.wishes == {"restart"})
+        await browser.value("document.querySelector('[data-wish=discard]').click()")
+        await reads(cockpit, lambda r: r.wishes == {"discard"})
+        await browser.value("dispatchEvent(new KeyboardEvent('keydown', {code: 'Backspace'}))")
+        await reads(cockpit, lambda r: r.wishes == {"discard"})
         await browser.tap("KeyQ")
         await browser.until("document.querySelector('[data-wish=quit]').textContent[0] === 'R'")
         assert not poll(cockpit).wishes

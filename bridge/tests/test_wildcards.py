@@ -1,0 +1,62 @@
+"""What is put to many vehicles at once is nobody's own: neither end takes it, nor a listener."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from bridge.feed import ANY_VEHICLE, open_feed
+from bridge.port import SimulatorPort
+from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.wire import TOPICS
+
+HEARS_S = 0.3
+WILD = ("phil/*/{}", "phil/**", "phil/v$*/{}", "*/v1/{}", "**/{}")
+
+
+@pytest.fixture
+def sessions():
+    """The simulator's router, and somebody else's client."""
+    endpoint = free_endpoint()
+    router = open_session(listen=endpoint, mode="router")
+    client = open_session(connect=endpoint, mode="client")
+    yield endpoint, router, client
+    client.close()
+    router.close()
+
+
+def put_wildly(session, topic):
+    for pattern in WILD:
+        session.put(pattern.format(topic), b"wild")
+    session.put(f"phil/v1/{topic}", b"own")
+
+
+def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
+    _, router, client = sessions
+    port = SimulatorPort(router, "v1")
+    heard: list[bytes] = []
+    port.on_command(heard.append)
+    port.on_feedback(heard.append)
+    time.sleep(HEARS_S)
+    for topic in ("command", "feedback", "health"):
+        put_wildly(client, topic)
+    time.sleep(HEARS_S)
+    port.close()
+    assert heard == [b"own"] * 2
+    assert port.edge_counts.policy_id == ""
+
+
+@pytest.mark.parametrize("vehicle_id", ["v1", ANY_VEHICLE])
+def test_a_listener_hears_what_was_put_to_one_vehicle(sessions, vehicle_id):
+    endpoint, router, client = sessions
+    port = SimulatorPort(router, "v1")
+    with open_feed(endpoint, vehicle_id, 5.0) as feed:
+        for topic in ("state", "command", "feedback", "health"):
+            put_wildly(client, topic)
+        time.sleep(HEARS_S)
+        heard = iter(lambda: feed.next(0.1), None)
+        found = {(one.key, one.payload) for one in heard if one.topic in TOPICS}
+    topics = ("state", "command", "feedback", "health")
+    assert found == {(f"phil/v1/{topic}", b"own") for topic in topics}
+    port.close()
