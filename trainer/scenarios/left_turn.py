@@ -23,7 +23,7 @@ from trainer.scenarios.environment import (
     Step,
     start_speed_mps,
 )
-from trainer.scenarios.geometry import overlap
+from trainer.scenarios.geometry import Rectangle, overlap
 from trainer.scenarios.path import LeftTurnPath
 from trainer.scenarios.rasteriser import Rasteriser
 from trainer.scenarios.roads import LANE_REACH_M, NEAR_LANE, road_areas, t_intersection
@@ -200,13 +200,11 @@ class LeftTurnEnv(DrivingEnv):
         equip(cars, types)
         return cars
 
-    def _frame(self) -> NDArray[np.uint8]:
-        cars = [car.footprint for car in self.traffic]
-        return self.rasteriser.frame(self._background, cars, self.ego.footprint)
+    def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
+        return self.rasteriser.frame(self._background, cars, ego)
 
-    def _outcome(self) -> str | None:
-        ego = self.ego.footprint
-        if any(overlap(ego, car.footprint) for car in self.traffic):
+    def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
+        if any(overlap(ego, car) for car in cars):
             return "collision"
         if self.distance_m >= self.config.goal_m:
             return "goal"
