@@ -19,8 +19,9 @@ Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
 Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 Range = tuple[float, float]
-Scene = Literal["nominal", "variant"]
-"""The trained scene, or one with more vehicles and other types of them (section VII-D)."""
+Scene = Literal["nominal", "variant", "dense"]
+"""The trained scene; one with more vehicles and other types of them (section VII-D); one whose
+traffic stands closer and leaves less to do right."""
 FAILURES = ("collision", "off_road")
 
 

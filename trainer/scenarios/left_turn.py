@@ -87,11 +87,22 @@ class LeftTurnConfig:
 
     @staticmethod
     def of(scene: Scene) -> LeftTurnConfig:
-        """The numbers of a scene; the variant has more vehicles, and not only cars."""
+        """The numbers of a scene.
+
+        The variant has more vehicles, and not only cars. Dense is a longer queue whose gaps are
+        neither clearly long nor clearly short: all come from one range. The scripted expert takes
+        no gap of less than 16 m and each one of more than 25 m; between them the two cars' speeds
+        decide, and a policy that only ever met gaps up to 16 m and from 32 m on has to have learned
+        more than to tell these apart. Half of the range is such near-ties, a third cannot be used.
+        """
         if scene == "nominal":
             return LeftTurnConfig()
-        # Five vehicles may take longer than 20 s to pass; who rightly waits shall not time out.
-        return LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300)
+        # More vehicles may take longer than 20 s to pass; who rightly waits shall not time out.
+        if scene == "variant":
+            return LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300)
+        return LeftTurnConfig(
+            traffic_cars=6, long_gap_m=(12.0, 28.0), long_gap_share=1.0, max_steps=400
+        )
 
 
 class LeftTurnEnv(DrivingEnv):

@@ -31,6 +31,8 @@ GOLDEN = {
     "congestion, random": "b446e260c41008d3a8301dd86dd874fff1637293bbbca9a8b7756923a44a6a6d",
     "congestion, expert": "4654583381419aa3977888a96dd3b299046bcfe12ced469540f95450dc1349b2",
     "congestion, variant": "9ced478a7e3e511b952c8fafa6d4d3640ddbbd929e905537c8cbf60cad3a0624",
+    "dense": "321961c59e49aa7b9a1d5297b0b76f68d7f4a7a2a780e4eb72125ffefd7fa807",
+    "congestion, dense": "bcf266123c56af45803adca97ff663f89797362bff04884a73e207fc0a51df39",
 }
 
 
@@ -71,6 +73,8 @@ EPISODES: dict[str, tuple[Any, Callable[[], Any], int]] = {
     "congestion, random": (random_driver, partial(make_environment, "congestion"), 6),
     "congestion, expert": (expert_driver, partial(make_environment, "congestion"), 2),
     "congestion, variant": (expert_driver, partial(make_environment, "congestion", "variant"), 2),
+    "dense": (expert_driver, partial(make_environment, "left_turn", "dense"), 4),
+    "congestion, dense": (expert_driver, partial(make_environment, "congestion", "dense"), 2),
 }
 """Name -> who drives, in which environment, how many episodes."""
 
