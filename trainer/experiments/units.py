@@ -38,7 +38,7 @@ NEUTRAL: dict[str, Any] = {
     "left_turn_tests": "b1b2df6847a6",
     "congestion_tests": "082f423f4a49",
     "left_turn_dense": "8a0bc00c4c0a",
-    "congestion_dense": "12bde1663f9c",
+    "congestion_dense": "e2980480c2ca",
     "motion": "d975daa0e3e2",
     "code": 1,
 }

@@ -50,11 +50,10 @@ class CongestionEnv(DrivingEnv):
         self.config = c = config or CongestionConfig.of(scene)
         self.road_width_m = LANES * c.lane_width_m
         self.network = straight_road(c.lane_width_m, c.goal_m)
-        self.rasteriser = Rasteriser(
-            -c.view_behind_m, -0.5 * ROWS * c.metres_per_pixel, c.metres_per_pixel
-        )
         road = Rectangle(0.0, 0.0, 0.0, 4.0 * c.goal_m, self.road_width_m)
-        self._background = self.rasteriser.background([road])
+        self.rasteriser = Rasteriser(
+            -c.view_behind_m, -0.5 * ROWS * c.metres_per_pixel, c.metres_per_pixel, [road]
+        )
         self._steering = self._last_steering = 0.0
         self._braking = False
 
@@ -156,7 +155,7 @@ class CongestionEnv(DrivingEnv):
 
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
         seen = [_seen_from(ego.x, shape) for shape in cars]
-        return self.rasteriser.frame(self._background, seen, _seen_from(ego.x, ego))
+        return self.rasteriser.frame(seen, _seen_from(ego.x, ego))
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
         if any(overlap(ego, car) for car in cars):

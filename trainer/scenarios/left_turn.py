@@ -126,9 +126,9 @@ class LeftTurnEnv(DrivingEnv):
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
         start = (half, c.straight_m + c.lane_width_m)
         self.path = LeftTurnPath(start, c.straight_m, c.turn_radius_m)
-        self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel)
-        self.road_areas = road_areas(c.lane_width_m)
-        self._background = self.rasteriser.background(self.road_areas)
+        self.rasteriser = Rasteriser(
+            c.view_left_m, c.view_top_m, c.metres_per_pixel, road_areas(c.lane_width_m)
+        )
         self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
         self._offset_m = 0.0
 
@@ -212,7 +212,7 @@ class LeftTurnEnv(DrivingEnv):
         return cars
 
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
-        return self.rasteriser.frame(self._background, cars, ego)
+        return self.rasteriser.frame(cars, ego)
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
         if any(overlap(ego, car) for car in cars):

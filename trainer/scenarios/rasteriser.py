@@ -7,6 +7,7 @@ tenth of a pixel changes the picture, so two frames show speed (eq. 28 stacks tw
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +26,12 @@ class Rasteriser:
         left_m: x of the picture's left edge.
         top_m: y of the picture's upper edge (y grows downwards).
         metres_per_pixel: side of a pixel.
+        roads: the paved ground.
     """
 
-    def __init__(self, left_m: float, top_m: float, metres_per_pixel: float) -> None:
+    def __init__(
+        self, left_m: float, top_m: float, metres_per_pixel: float, roads: Sequence[Rectangle] = ()
+    ) -> None:
         self.left_m, self.top_m = left_m, top_m
         self.metres_per_pixel = metres_per_pixel
         steps_m = (np.arange(COLUMNS) + 0.5) * metres_per_pixel
@@ -35,25 +39,21 @@ class Rasteriser:
         """Where the middles of columns and rows are; of the rows more than there are, so that both
         fit into one array."""
         self._column_x, self._row_y = self._centres[0], self._centres[1, :ROWS]
-
-    def background(self, roads: list[Rectangle]) -> NDArray[np.float32]:
+        self.background = np.full((ROWS, COLUMNS), GROUND, dtype=np.float32)
         """The still part of the picture, grey values [45, 80]."""
-        picture = np.full((ROWS, COLUMNS), GROUND, dtype=np.float32)
         for road in roads:
-            self.draw(picture, road, ROAD)
-        return picture
+            self.draw(self.background, road, ROAD)
+        # In the type of the sums that they are used in.
+        self._still = self.background.astype(np.float64)
+        self._up_to_traffic = (TRAFFIC - self.background).astype(np.float64)
 
-    def frame(
-        self, background: NDArray[np.float32], traffic: list[Rectangle], ego: Rectangle
-    ) -> NDArray[np.uint8]:
+    def frame(self, traffic: list[Rectangle], ego: Rectangle) -> NDArray[np.uint8]:
         """One frame of the observation, uint8 [45, 80]; the ego car on top."""
-        picture = self._with_traffic(background, traffic)
+        picture = self._with_traffic(traffic)
         self.draw(picture, ego, EGO)
         return (picture + 0.5).astype(np.uint8)
 
-    def _with_traffic(
-        self, background: NDArray[np.float32], cars: list[Rectangle]
-    ) -> NDArray[np.float32]:
+    def _with_traffic(self, cars: list[Rectangle]) -> NDArray[np.float32]:
         """The background with the cars on it, float32 [45, 80].
 
         What a car parallel to the rows covers is a row of shares times a column of them. Where no
@@ -64,9 +64,9 @@ class Rasteriser:
             shapes = np.array(cars)[:, :, None]
             covered = self._covered(self._centres - shapes[:, :2], shapes[:, 3:])
             if _product(np.ceil(covered)).max() <= 1.0:
-                mixed = _product(covered) * (TRAFFIC - background) + background
+                mixed = self._still + _product(covered) * self._up_to_traffic
                 return mixed.astype(np.float32)
-        picture = background.copy()
+        picture = self.background.copy()
         for car in cars:
             self.draw(picture, car, TRAFFIC)
         return picture

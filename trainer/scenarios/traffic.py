@@ -73,9 +73,9 @@ class TrafficVehicle(IDMVehicle):
         closing_mps = self.speed - leader.speed * math.cos(leader.heading)
         approach_m = self.speed * closing_mps / (2.0 * math.sqrt(-a * self.COMFORT_ACC_MIN))
         gap_m = self.DISTANCE_WANTED + self.speed * self.TIME_WANTED + approach_m
-        # Along the lane from its start.
-        distance_m = (leader.position[0] - self._start_m) - (self.position[0] - self._start_m)
-        share = gap_m / not_zero(float(distance_m))
+        # Along the lane, each from its start.
+        x, ahead_x = self.position.item(0), leader.position.item(0)
+        share = gap_m / not_zero((ahead_x - self._start_m) - (x - self._start_m))
         return wanted - a * (share * share)
 
     def step(self, dt: float) -> None:

@@ -81,7 +81,7 @@ def test_the_jam_is_closer_and_less_even():
         nearest[condition] = min(m for m in room if m > 0.0) - 0.5 * env.ego.WIDTH
     assert spread["dense"] > 2.0 * spread["nominal"]
     assert nearest["nominal"] == pytest.approx(1.25, abs=0.1)
-    assert nearest["dense"] == pytest.approx(0.55, abs=0.1)
+    assert nearest["dense"] == pytest.approx(0.5, abs=0.1)
 
 
 def test_every_scene_can_be_served():

@@ -32,7 +32,7 @@ GOLDEN = {
     "congestion, expert": "4654583381419aa3977888a96dd3b299046bcfe12ced469540f95450dc1349b2",
     "congestion, variant": "9ced478a7e3e511b952c8fafa6d4d3640ddbbd929e905537c8cbf60cad3a0624",
     "dense": "321961c59e49aa7b9a1d5297b0b76f68d7f4a7a2a780e4eb72125ffefd7fa807",
-    "congestion, dense": "bcf266123c56af45803adca97ff663f89797362bff04884a73e207fc0a51df39",
+    "congestion, dense": "26ec6b10e5023e4eb244fcd3f4ea19fedf8e2e3e3dd006d20b5ca484f4a2cdc8",
 }
 
 
