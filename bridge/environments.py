@@ -25,8 +25,12 @@ SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"
 _REGISTERED_BY = {"phil": "trainer.scenarios"}
 """Namespace of a gymnasium id -> the module that registers it."""
 NOMINAL = "nominal"
-CONDITIONS = (NOMINAL, "variant")
-"""Scenes that can be served: the one that was trained in, and one with other traffic."""
+CONDITIONS = {
+    NOMINAL: "the scene that is trained in",
+    "variant": "more vehicles, and other types of them",
+    "dense": "closer and less even traffic",
+}
+"""Scenes that can be served, with what they are."""
 
 PLUGIN_GROUP, ROOT = "gymnasium.envs", "__root__"
 

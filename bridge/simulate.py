@@ -80,7 +80,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--condition",
         choices=CONDITIONS,
         default=NOMINAL,
-        help="the scene as trained in, or its variant with more vehicles and other types of them",
+        help="scene; " + "; ".join(f"{name}: {meaning}" for name, meaning in CONDITIONS.items()),
     )
     parser.add_argument(
         "--episodes", metavar="N", type=positive, default=1, help="episodes to drive"

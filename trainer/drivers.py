@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
 from trainer.actions import ACTIONS
+from trainer.conditions import CONDITIONS
 from trainer.files import load_torch
 from trainer.human.congestion_expert import CongestionExpert
 from trainer.human.congestion_trigger import CongestionTrigger
@@ -107,8 +108,7 @@ def make_environment(
     """
     if scenario not in SCENARIOS:
         raise UserError(f"unknown scenario {scenario!r}; there is {', '.join(SCENARIOS)}")
-    # Noise disturbs the command, not the scene: evaluation.py adds it.
-    scene = "variant" if condition == "variant" else "nominal"
+    scene = CONDITIONS[condition].scene
     env: Any = gymnasium.make(SCENARIOS[scenario], scene=scene).unwrapped
     if printed_reward:
         env.config = env.config.with_printed_reward()

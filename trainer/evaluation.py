@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.latency.model import LatencySpec
+from trainer.conditions import CONDITIONS
 from trainer.human.guide import Action, Driver
 from trainer.remote.vehicle_end import RemoteDriver
 
-COMMAND_NOISE = 0.05 * 2.0
-"""Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
-CONDITIONS = ("nominal", "noise", "variant")
 NO_NETWORK = LatencySpec()
 ActTogether = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 
@@ -100,7 +98,7 @@ def drive_together(
         seeds: of the episodes.
         condition: one of ``CONDITIONS``.
     """
-    noise_std = COMMAND_NOISE if condition == "noise" else 0.0
+    noise_std = CONDITIONS[condition].noise_std
     results: dict[int, EpisodeResult] = {}
     waiting, free = deque(seeds), deque(envs)
     under_way: list[Drive] = []
@@ -127,9 +125,9 @@ def drive_episodes(
 ) -> list[EpisodeResult]:
     """Drive one episode for each seed under a condition.
 
-    The variant condition is the environment's own: see ``drivers.make_environment``.
+    Its noise is added here; its scene is the environment's own (``drivers.make_environment``).
     """
-    noise_std = COMMAND_NOISE if condition == "noise" else 0.0
+    noise_std = CONDITIONS[condition].noise_std
     results = []
     for seed in seeds:
         results.append(drive_episode(env, driver, seed, noise_std, latency))

@@ -57,7 +57,7 @@ def drive_episodes_in_parallel(
         scenario: what is driven.
         seeds: of the episodes.
         jobs: number of processes.
-        condition: one of `trainer.evaluation.CONDITIONS`.
+        condition: one of `trainer.conditions.CONDITIONS`.
         on_episode: called with each result, in the order of the seeds.
         latency: the network between driver and vehicle, in virtual time.
         public_key: what an .onnx file is verified with.

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from bridge.environments import CONDITIONS, NOMINAL
 from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, add_public_key, examples
 from edge_runtime.errors import UserError
@@ -47,9 +48,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_public_key(parser)
     add_scenario(parser)
-    parser.add_argument(
-        "--condition", choices=("nominal", "variant"), default="nominal", help="scene"
-    )
+    parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
     parser.add_argument("--only", choices=PARTS, help="one part (default: both)")
     parser.add_argument(
         "--rows",

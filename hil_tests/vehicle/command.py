@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from bridge.environments import CONDITIONS, NOMINAL
 from bridge.signals import sigterm_as_interrupt
 from edge_runtime.cli import ArgumentParser, add_public_key, examples
 from edge_runtime.errors import UserError
@@ -49,9 +50,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_public_key(parser)
     add_scenario(parser)
-    parser.add_argument(
-        "--condition", choices=("nominal", "variant"), default="nominal", help="scene"
-    )
+    parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
     parser.add_argument("--only", choices=PARTS, help="one part (default: both)")
     parser.add_argument(
         "--runs", type=several, default=50, help="episodes of each loop and of each lag"

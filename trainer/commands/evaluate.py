@@ -12,8 +12,9 @@ from edge_runtime.latency.model import parse_spec
 from edge_runtime.option_types import not_negative, positive
 from edge_runtime.words import counted
 from trainer.commands.options import add_latency, add_scenario, set_threads
+from trainer.conditions import CONDITIONS
 from trainer.drivers import load_driver, make_environment
-from trainer.evaluation import CONDITIONS, drive_episodes
+from trainer.evaluation import drive_episodes
 from trainer.parallel import WORTH_STARTING, choose_jobs, drive_episodes_in_parallel
 from trainer.progress import ProgressBar
 
@@ -38,8 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--condition",
         choices=CONDITIONS,
         default="nominal",
-        help="nominal; Gaussian noise of 5 %% of the control domain on the command; or the variant "
-        "scene with more vehicles and other types of them",
+        help="; ".join(f"{name}: {what.meaning}" for name, what in CONDITIONS.items()).replace(
+            "%", "%%"
+        ),
     )
     add_latency(parser, "network between policy and vehicle")
     parser.add_argument("--runs", type=positive, default=50, help="episodes")

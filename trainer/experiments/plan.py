@@ -64,7 +64,7 @@ SETTINGS: Mapping[str, Setting] = {
 
 
 class Scene(NamedTuple):
-    """One of the six test scenes of section VII-D."""
+    """A test scene."""
 
     scenario: str
     condition: str
@@ -81,6 +81,12 @@ SCENES = (
     Scene("congestion", "noise", "C-N", "congestion, noise"),
     Scene("congestion", "variant", "C-V", "congestion, variant"),
 )
+"""The six of section VII-D, which the paper's figures and claims are about."""
+DENSE_SCENES = (
+    Scene("left_turn", "dense", "L-D", "left turn, dense"),
+    Scene("congestion", "dense", "C-D", "congestion, dense"),
+)
+"""Beside the paper's six: scenes that leave room above a good policy."""
 SCENARIO_TITLES = {"left_turn": "left turn", "congestion": "congestion"}
 FULL_PATH_M = {"left_turn": 21.0, "congestion": 80.0}
 """Distance from start to goal."""

@@ -9,32 +9,36 @@ from trainer.experiments.claims.scenes import DISTANCE, SUCCESS, shown_of
 from trainer.experiments.figures.curves import Line
 from trainer.experiments.gathered import Gathered, gather
 from trainer.experiments.outcome import Outcome
-from trainer.experiments.plan import NETWORK, SCENARIO_TITLES, SCENES
+from trainer.experiments.plan import DENSE_SCENES, NETWORK, SCENARIO_TITLES, SCENES, Scene
 from trainer.experiments.store import Store
 from trainer.experiments.summary import row
 
-HEADER = ("units", "seeds", "nominal", "noise", "variant", "validated: best → last")
 REMARKS = {NETWORK: " (tested without it)"}
 """What a setting's name would let one believe."""
 
 
 def unit_lines(store: Store, seeds: int) -> list[str]:
-    """One row an algorithm and setting of which there is a unit: success and distance a scene, and
-    the success without help that chose the tested actor, beside that of the last one.
+    """One row an algorithm and setting of which there is a unit: success and distance a scene in
+    which any was tested, and the success without help that chose the tested actor, beside that of
+    the last one.
     """
     gathered = gather(store, units_of(NAMES, seeds), seeds)
     kinds = dict.fromkeys((u.scenario, Line(u.algorithm, u.setting)) for u in gathered.found)
-    lines = [row(HEADER), row(["---"] * len(HEADER))]
+    tested = {condition for outcome in gathered.found.values() for condition in outcome.tests}
+    scenes = [scene for scene in (*SCENES, *DENSE_SCENES) if scene.condition in tested]
+    conditions = dict.fromkeys(scene.condition for scene in scenes)
+    header = ("units", "seeds", *conditions, "validated: best → last")
+    lines = [row(header), row(["---"] * len(header))]
     for scenario in SCENARIO_TITLES:
-        lines += [_line(gathered, scenario, line) for place, line in kinds if place == scenario]
+        there = [scene for scene in scenes if scene.scenario == scenario]
+        lines += [_line(gathered, scenario, there, line) for s, line in kinds if s == scenario]
     return lines
 
 
-def _line(gathered: Gathered, scenario: str, line: Line) -> str:
+def _line(gathered: Gathered, scenario: str, scenes: Sequence[Scene], line: Line) -> str:
     tests = [
         f"{shown_of(gathered, scene, line, SUCCESS)}, {shown_of(gathered, scene, line, DISTANCE)} m"
-        for scene in SCENES
-        if scene.scenario == scenario
+        for scene in scenes
     ]
     outcomes = gathered.of(scenario, line.algorithm, line.setting)
     name = f"{SCENARIO_TITLES[scenario]}, {line.label}{REMARKS.get(line.setting, '')}"

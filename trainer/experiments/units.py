@@ -11,8 +11,8 @@ from typing import Any
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
+from trainer.conditions import COMMAND_NOISE
 from trainer.drivers import EXPERTS, TRIGGERS, make_environment
-from trainer.evaluation import COMMAND_NOISE
 from trainer.experiments.plan import HUMAN_MODEL, SETTINGS, Plan
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
@@ -37,6 +37,8 @@ NEUTRAL: dict[str, Any] = {
     "printed_reward": False,
     "left_turn_tests": "b1b2df6847a6",
     "congestion_tests": "082f423f4a49",
+    "left_turn_dense": "8a0bc00c4c0a",
+    "congestion_dense": "e2980480c2ca",
     "motion": "d975daa0e3e2",
     "code": 1,
 }
@@ -125,6 +127,7 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
         "test_runs": plan.test_runs,
         "scenario": _numbers_of(unit.scenario),
         f"{unit.scenario}_tests": _tests_of(unit.scenario),
+        f"{unit.scenario}_dense": digest(_numbers_of(unit.scenario, "dense")),
         "motion": digest({kind.__name__: _constants_of(kind) for kind in MOTION}),
         "code": CODE,
     }
@@ -170,7 +173,7 @@ def _numbers_of(scenario: str, condition: str = "nominal") -> dict[str, Any]:
 
 
 def _tests_of(scenario: str) -> str:
-    """What decides the tests beside the nominal scene."""
+    """What decides the paper's tests beside the nominal scene."""
     return digest({"noise": COMMAND_NOISE, "variant": _numbers_of(scenario, "variant")})
 
 

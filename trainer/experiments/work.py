@@ -17,8 +17,9 @@ import torch
 from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.files import make_directory
 from trainer.benches.machine import processor_model
+from trainer.conditions import CONDITIONS
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor, load_driver, make_environment
-from trainer.evaluation import CONDITIONS, drive_episodes
+from trainer.evaluation import drive_episodes
 from trainer.experiments.store import TESTS_FILE, UNIT_FILE, Store
 from trainer.experiments.units import Unit, deciding, run_config
 from trainer.learner.kernel import load as load_kernel

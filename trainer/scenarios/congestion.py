@@ -51,11 +51,10 @@ class CongestionEnv(DrivingEnv):
         self.config = c = config or CongestionConfig.of(scene)
         self.road_width_m = LANES * c.lane_width_m
         self.network = straight_road(c.lane_width_m, c.goal_m)
-        self.rasteriser = Rasteriser(
-            -c.view_behind_m, -0.5 * ROWS * c.metres_per_pixel, c.metres_per_pixel
-        )
         road = Rectangle(0.0, 0.0, 0.0, 4.0 * c.goal_m, self.road_width_m)
-        self._background = self.rasteriser.background([road])
+        self.rasteriser = Rasteriser(
+            -c.view_behind_m, -0.5 * ROWS * c.metres_per_pixel, c.metres_per_pixel, [road]
+        )
         self._steering = self._last_steering = 0.0
         self._braking = False
 
@@ -155,14 +154,12 @@ class CongestionEnv(DrivingEnv):
         ]
         return min(ahead, key=lambda car: float(car.position[0]), default=None)
 
-    def _frame(self) -> NDArray[np.uint8]:
-        x = float(self.ego.position[0])
-        cars = [_seen_from(x, car.footprint) for car in self.traffic]
-        return self.rasteriser.frame(self._background, cars, _seen_from(x, self.ego.footprint))
+    def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
+        seen = [_seen_from(ego.x, shape) for shape in cars]
+        return self.rasteriser.frame(seen, _seen_from(ego.x, ego))
 
-    def _outcome(self) -> str | None:
-        ego = self.ego.footprint
-        if any(overlap(ego, car.footprint) for car in self.traffic):
+    def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
+        if any(overlap(ego, car) for car in cars):
             return "collision"
         reach_m = 0.5 * (
             ego.length * abs(math.sin(ego.heading)) + ego.width * abs(math.cos(ego.heading))
@@ -181,4 +178,4 @@ class CongestionEnv(DrivingEnv):
 
 def _seen_from(x: float, shape: Rectangle) -> Rectangle:
     """A rectangle as the picture has it, which moves along the road with the ego car."""
-    return shape._replace(x=shape.x - x)
+    return Rectangle(shape.x - x, *shape[1:])

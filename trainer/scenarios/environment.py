@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from trainer.scenarios.ego import EgoVehicle
+from trainer.scenarios.geometry import Rectangle
 from trainer.scenarios.rasteriser import COLUMNS, ROWS, Rasteriser
 from trainer.scenarios.scene import draw_scene, vehicle_entry
 from trainer.scenarios.traffic import TrafficVehicle
@@ -18,8 +19,9 @@ Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
 Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 Range = tuple[float, float]
-Scene = Literal["nominal", "variant"]
-"""The trained scene, or one with more vehicles and other types of them (section VII-D)."""
+Scene = Literal["nominal", "variant", "dense"]
+"""The trained scene; one with more vehicles and other types of them (section VII-D); one whose
+traffic stands closer and leaves less to do right."""
 FAILURES = ("collision", "off_road")
 
 
@@ -94,12 +96,12 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         """What a viewer needs to draw the scene; plain lists and numbers."""
         raise NotImplementedError
 
-    def _frame(self) -> NDArray[np.uint8]:
-        """What the policy sees now, uint8 [45, 80]."""
+    def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
+        """What the policy sees now, uint8 [45, 80]: from the footprints of ego car and traffic."""
         raise NotImplementedError
 
-    def _outcome(self) -> str | None:
-        """How the episode has ended, or None."""
+    def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
+        """How the episode has ended, or None; from the same footprints."""
         raise NotImplementedError
 
     def _reward(self, outcome: str | None) -> float:
@@ -108,17 +110,22 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
 
     def _first_report(self) -> tuple[Observation, dict[str, Any]]:
         """What ``reset`` returns: the same frame twice."""
-        self.frames[:] = self._frame()
+        self.frames[:] = self._frame(*self._footprints())
         return self.frames.copy(), self._info(None)
 
     def _report(self) -> Step:
         """What ``step`` returns, after the vehicles have moved."""
+        ego, cars = self._footprints()
         self.frames[0] = self.frames[1]
-        self.frames[1] = self._frame()
-        outcome = self._outcome()
+        self.frames[1] = self._frame(ego, cars)
+        outcome = self._outcome(ego, cars)
         terminated = outcome == "goal" or outcome in FAILURES
         info = self._info(outcome)
         return self.frames.copy(), self._reward(outcome), terminated, outcome == "timeout", info
+
+    def _footprints(self) -> tuple[Rectangle, list[Rectangle]]:
+        """Of the ego car and of each car of the traffic."""
+        return self.ego.footprint, [car.footprint for car in self.traffic]
 
     def _ending_reward(self, outcome: str | None) -> float:
         """Goal and failure: the first two terms of eq. 31 and 32."""

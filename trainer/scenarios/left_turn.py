@@ -23,7 +23,7 @@ from trainer.scenarios.environment import (
     Step,
     start_speed_mps,
 )
-from trainer.scenarios.geometry import overlap
+from trainer.scenarios.geometry import Rectangle, overlap
 from trainer.scenarios.path import LeftTurnPath
 from trainer.scenarios.rasteriser import Rasteriser
 from trainer.scenarios.roads import LANE_REACH_M, NEAR_LANE, road_areas, t_intersection
@@ -87,11 +87,22 @@ class LeftTurnConfig:
 
     @staticmethod
     def of(scene: Scene) -> LeftTurnConfig:
-        """The numbers of a scene; the variant has more vehicles, and not only cars."""
+        """The numbers of a scene.
+
+        The variant has more vehicles, and not only cars. Dense is a longer queue whose gaps are
+        neither clearly long nor clearly short: all come from one range. The scripted expert takes
+        no gap of less than 16 m and each one of more than 25 m; between them the two cars' speeds
+        decide, and a policy that only ever met gaps up to 16 m and from 32 m on has to have learned
+        more than to tell these apart. Half of the range is such near-ties, a third cannot be used.
+        """
         if scene == "nominal":
             return LeftTurnConfig()
-        # Five vehicles may take longer than 20 s to pass; who rightly waits shall not time out.
-        return LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300)
+        # More vehicles may take longer than 20 s to pass; who rightly waits shall not time out.
+        if scene == "variant":
+            return LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300)
+        return LeftTurnConfig(
+            traffic_cars=6, long_gap_m=(12.0, 28.0), long_gap_share=1.0, max_steps=400
+        )
 
 
 class LeftTurnEnv(DrivingEnv):
@@ -116,9 +127,9 @@ class LeftTurnEnv(DrivingEnv):
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
         start = (half, c.straight_m + c.lane_width_m)
         self.path = LeftTurnPath(start, c.straight_m, c.turn_radius_m)
-        self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel)
-        self.road_areas = road_areas(c.lane_width_m)
-        self._background = self.rasteriser.background(self.road_areas)
+        self.rasteriser = Rasteriser(
+            c.view_left_m, c.view_top_m, c.metres_per_pixel, road_areas(c.lane_width_m)
+        )
         self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
         self._offset_m = 0.0
 
@@ -201,13 +212,11 @@ class LeftTurnEnv(DrivingEnv):
         equip(cars, types)
         return cars
 
-    def _frame(self) -> NDArray[np.uint8]:
-        cars = [car.footprint for car in self.traffic]
-        return self.rasteriser.frame(self._background, cars, self.ego.footprint)
+    def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
+        return self.rasteriser.frame(cars, ego)
 
-    def _outcome(self) -> str | None:
-        ego = self.ego.footprint
-        if any(overlap(ego, car.footprint) for car in self.traffic):
+    def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
+        if any(overlap(ego, car) for car in cars):
             return "collision"
         if self.distance_m >= self.config.goal_m:
             return "goal"

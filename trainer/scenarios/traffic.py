@@ -7,8 +7,11 @@ bumpers.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from highway_env.road.road import LaneIndex, Road
+from highway_env.utils import not_zero
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
@@ -21,7 +24,7 @@ class TrafficVehicle(IDMVehicle):
 
     Only the longitudinal half of ``IDMVehicle`` is used: a car in a straight lane needs no lane
     choice, and its leader never changes. That takes the neighbour search, most of the cost of a
-    step, out of the loop.
+    step, out of the loop. All lanes with traffic lead along x, so that a place is one number.
     """
 
     DISTANCE_WANTED = 7.0
@@ -51,18 +54,35 @@ class TrafficVehicle(IDMVehicle):
         )
         self.road, self.lane, self.lane_index = road, lane, lane_index
         self._direction = super().direction
+        self._start_m = float(lane.start[0])
         self.leader = leader
 
     def act(self, action: dict | str | None = None) -> None:
         """Choose the acceleration by the intelligent driver model; the wheels stay straight."""
-        acceleration = self.acceleration(ego_vehicle=self, front_vehicle=self.leader)
-        acceleration = float(min(max(acceleration, -self.ACC_MAX), self.ACC_MAX))
-        Vehicle.act(self, {"steering": 0.0, "acceleration": acceleration})
+        acceleration = min(max(self._wanted_mps2(), -self.ACC_MAX), self.ACC_MAX)
+        self.action = {"steering": 0.0, "acceleration": acceleration}
+
+    def _wanted_mps2(self) -> float:
+        """``IDMVehicle.acceleration`` to the bit, on plain numbers: several times as fast."""
+        a, speed = self.COMFORT_ACC_MAX, max(self.speed, 0.0)
+        # numpy's power, as there: Python's differs in the last bit.
+        wanted = a * (1.0 - float(np.power(speed / abs(not_zero(self.target_speed)), self.DELTA)))
+        if self.leader is None:
+            return wanted
+        leader = self.leader
+        closing_mps = self.speed - leader.speed * math.cos(leader.heading)
+        approach_m = self.speed * closing_mps / (2.0 * math.sqrt(-a * self.COMFORT_ACC_MIN))
+        gap_m = self.DISTANCE_WANTED + self.speed * self.TIME_WANTED + approach_m
+        # Along the lane, each from its start.
+        x, ahead_x = self.position.item(0), leader.position.item(0)
+        share = gap_m / not_zero((ahead_x - self._start_m) - (x - self._start_m))
+        return wanted - a * (share * share)
 
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds. Who has braked to a stop stands: nobody reverses."""
-        self.action["acceleration"] = max(self.action["acceleration"], -self.speed / dt)
-        super().step(dt)
+        acceleration = max(self.action["acceleration"], -self.speed / dt)
+        self.position[0] += self.speed * dt
+        self.speed += acceleration * dt
 
     def on_state_update(self) -> None:
         """Keep the lane: nothing to look up."""

@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from edge_runtime.errors import UserError
-from trainer.evaluation import CONDITIONS
+from trainer.conditions import CONDITIONS
 from trainer.experiments import store as store_module
 from trainer.experiments.store import BEGUN, DONE, IMPOSSIBLE, MISSING, RUNNING
 from trainer.experiments.work import BUSY, Task, compute
@@ -64,7 +64,7 @@ def test_a_result_is_found_by_another_store_on_the_same_directory(tmp_path):
 
 def test_a_result_without_a_condition_that_came_later_is_replaced_as_a_whole(tmp_path):
     store = store_in(tmp_path)
-    first = CONDITIONS[0]
+    first, *_ = CONDITIONS
     store.put(UNIT, {**FILES, "tests.json": json.dumps({first: {}}).encode()})
     assert not store.done(UNIT)
     store.put(UNIT, FILES)
@@ -72,6 +72,13 @@ def test_a_result_without_a_condition_that_came_later_is_replaced_as_a_whole(tmp
     assert [p.name for p in store.result_dir(UNIT).parent.iterdir()] == [
         store.result_dir(UNIT).name
     ]
+
+
+def test_a_result_from_before_the_dense_scene_stays_valid(tmp_path):
+    store = store_in(tmp_path)
+    tests = {condition: {} for condition in ("nominal", "noise", "variant")}
+    store.put(UNIT, {**FILES, "tests.json": json.dumps(tests).encode()})
+    assert store.done(UNIT)
 
 
 def die_while_writing(store, after: int) -> None:

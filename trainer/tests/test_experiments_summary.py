@@ -109,6 +109,24 @@ def test_the_table_of_units_has_a_row_a_kind_with_each_seed(tmp_path, monkeypatc
     assert rows[-1].endswith(" | – |")
 
 
+def test_the_table_of_units_shows_the_dense_scene_where_any_was_tested_in_it(tmp_path, monkeypatch):
+    first, later = (
+        Unit("left_turn", "phil_td3", "normal", 1),
+        Unit("congestion", "ia_td3", "normal", 1),
+    )
+    tested = {
+        first: outcome(first),
+        later: outcome(later, conditions=("nominal", "noise", "variant", "dense")),
+    }
+    made = Gathered(tested, tested, 3)
+    monkeypatch.setattr(unit_table, "gather", lambda store, wanted, seeds: made)
+    header, _, before, now = unit_table.unit_lines(store_in(tmp_path), 3)
+    place = header.split(" | ").index("dense")
+    assert before.split(" | ")[place] == "–, – m"
+    assert now.split(" | ")[place].endswith(" m")
+    assert header.count("|") == before.count("|") == now.count("|")
+
+
 def test_a_policy_that_unlearns_shows_it(tmp_path, monkeypatch):
     unit = Unit("congestion", "per_td3", "normal", 1)
     shares = np.full(100, np.nan)

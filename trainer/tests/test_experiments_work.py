@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from edge_runtime.errors import UserError
+from trainer.conditions import CONDITIONS
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
-from trainer.evaluation import CONDITIONS
 from trainer.experiments.gathered import gather
 from trainer.experiments.plan import HUMAN_MODEL
 from trainer.experiments.store import BEGUN, DONE
