@@ -8,6 +8,7 @@ from pathlib import Path
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
+from edge_runtime.files import write_json
 from edge_runtime.option_types import not_negative, whole_number
 from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.experiments import run as running
@@ -21,7 +22,10 @@ from trainer.experiments.plan import (
     obstacle,
     units_of,
 )
+from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, say
+from trainer.experiments.timing import TIME_FILE, measure
+from trainer.files import make_directory
 from trainer.parallel import cores
 
 EXAMPLE = examples(
@@ -94,7 +98,16 @@ def run(arguments: argparse.Namespace) -> int:
     if names == [STATUS]:
         print("\n".join(running.status_lines(store, arguments.seeds)))
         return 0
-    return _compute(arguments, store, [name for name in names if name != TIME])
+    if names == [REPORT]:
+        print(f"wrote {write_report(store, arguments.seeds)}")
+        return 0
+    status = 0
+    if set(names) != {TIME}:
+        status = _compute(arguments, store, [name for name in names if name != TIME])
+    if TIME in names:
+        make_directory(store.results)
+        write_json(store.results / TIME_FILE, measure(store))
+    return status
 
 
 def _store(arguments: argparse.Namespace) -> Store:

@@ -61,6 +61,22 @@ SETTINGS: Mapping[str, Setting] = {
     PRINTED: Setting("every number and equation as the paper prints it", preset="printed"),
 }
 
+LABELS = {
+    "phil_td3": "PHIL-TD3",
+    "ia_td3": "IA-TD3",
+    "hi_td3": "HI-TD3",
+    "per_td3": "vanilla TD3",
+    "phil_td_only": "TD error alone",
+    "phil_q_advantage_only": "Q advantage alone",
+    "phil_advantage_0.1": "weight 0.1",
+    "phil_advantage_100": "weight 100",
+    "rd2_td3": "RD2-TD3",
+    "rd2_phil": "RD2-PHIL",
+    "phil_without_cloning": "without cloning",
+    "phil_without_shaping": "without shaping",
+    HUMAN_MODEL: "human model",
+    CONSTANT: "best constant action",
+}
 FOUR = ("phil_td3", "ia_td3", "hi_td3", "per_td3")
 """What the paper compares throughout."""
 GUIDED = FOUR[:3]

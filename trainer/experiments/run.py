@@ -16,7 +16,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -402,7 +402,7 @@ def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
     drives = [seeds.episode_seed(0, seeds.VALIDATION, run) for run in range(plan.search_runs)]
     worth: dict[float, tuple[float, float]] = {}
 
-    def search(grid: Sequence[float]) -> float:
+    def search(grid: Iterable[float]) -> float:
         for action in (round(float(value), 3) for value in grid):
             if action not in worth:
                 results = drive_together(envs, constantly(action), drives)

@@ -1,0 +1,114 @@
+"""Means, intervals, tests and the words of a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Numbers = NDArray[np.float64]
+Holds = Literal["yes", "no", "undecided"]
+CONFIDENCE = 0.95
+TAIL = 0.5 * (1.0 - CONFIDENCE)
+"""Outside each end of an interval."""
+RESAMPLES = 2000
+
+
+class Estimate(NamedTuple):
+    """A number with its interval; the interval is infinite where there is too little to say."""
+
+    value: float
+    low: float
+    high: float
+    size: int
+    """Values behind it."""
+
+    def times(self, factor: float) -> Estimate:
+        """The number and its interval multiplied."""
+        low, high = sorted((factor * self.low, factor * self.high))
+        return Estimate(factor * self.value, low, high, self.size)
+
+    def text(self, digits: int = 2, unit: str = "") -> str:
+        """As in "0.97 [0.93, 0.99]"; a dash for nothing."""
+        if not self.size:
+            return "–"
+        shown = f"{self.value:.{digits}f}{unit}"
+        if np.isinf([self.low, self.high]).all():
+            return shown
+        low, high = (f"{end:.{digits}f}".replace("inf", "∞") for end in (self.low, self.high))
+        return f"{shown} [{low}, {high}]"
+
+
+NOTHING = Estimate(float("nan"), float("-inf"), float("inf"), 0)
+
+
+def mean_estimate(values: Iterable[float]) -> Estimate:
+    """Mean and Student's 95 % interval; no interval for fewer than two values."""
+    numbers = np.fromiter(values, float)
+    numbers = numbers[~np.isnan(numbers)]
+    if len(numbers) == 0:
+        return NOTHING
+    mean = float(numbers.mean())
+    if len(numbers) == 1:
+        return Estimate(mean, float("-inf"), float("inf"), 1)
+    error = float(numbers.std(ddof=1)) / len(numbers) ** 0.5
+    reach = float(stats.t.ppf(1.0 - TAIL, len(numbers) - 1)) * error
+    return Estimate(mean, mean - reach, mean + reach, len(numbers))
+
+
+def above(difference: Estimate, least: float = 0.0) -> Holds:
+    """Whether a number is above ``least``: decided where the interval lies on one side."""
+    if difference.low > least:
+        return "yes"
+    return "no" if difference.high < least else "undecided"
+
+
+def within(difference: Estimate, reach: float) -> Holds:
+    """Whether a difference is at most ``reach`` either way."""
+    if -reach <= difference.low and difference.high <= reach:
+        return "yes"
+    return "no" if difference.low > reach or difference.high < -reach else "undecided"
+
+
+def all_of(answers: Sequence[Holds]) -> Holds:
+    """Yes where all are, no where one is not."""
+    if "no" in answers:
+        return "no"
+    return "yes" if answers and set(answers) == {"yes"} else "undecided"
+
+
+def decisive(found: Mapping[str, Estimate], answers: Mapping[str, Holds], sign: float = 1.0) -> str:
+    """Which of several comparisons decides: the worst of those that answer as all together do.
+
+    Empty where there is none.
+    """
+    holds = all_of(list(answers.values()))
+    candidates = [name for name in found if answers[name] == holds and found[name].size]
+    return min(candidates, key=lambda name: sign * found[name].value, default="")
+
+
+def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
+    """A number with the 95 % interval of its resampled values, some of which may be infinite."""
+    if size < 2:
+        return Estimate(point, float("-inf"), float("inf"), size)
+    ends = np.quantile(values, (TAIL, 1.0 - TAIL), method="inverted_cdf")
+    return Estimate(point, float(ends[0]), float(ends[1]), size)
+
+
+def paired_t(first: Numbers, second: Numbers) -> float:
+    """P value of the paired t-test (two-sided); 1 where the pairs do not differ or are too few."""
+    difference = first - second
+    if len(difference) < 2 or np.all(difference == 0.0):
+        return 1.0
+    if np.all(difference == difference[0]):
+        return 0.0  # scipy divides by a spread of zero
+    return float(stats.ttest_rel(first, second).pvalue)
+
+
+def stars(p_value: float) -> str:
+    """The usual marks of significance."""
+    marks = ((0.001, "***"), (0.01, "**"), (0.05, "*"))
+    return next((mark for limit, mark in marks if p_value < limit), "n.s.")
