@@ -22,6 +22,7 @@ from trainer.experiments.plan import (
     obstacle,
     units_of,
 )
+from trainer.experiments.ray_runner import run_on_ray
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, say
 from trainer.experiments.timing import TIME_FILE, measure
@@ -64,6 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--scenario", choices=SCENARIOS, help="compute in this one only (default: in both)"
+    )
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="compute on a Ray cluster instead of this machine: HOST:PORT, auto or local",
     )
     add_time_limit(
         parser,
@@ -129,7 +135,10 @@ def _compute(arguments: argparse.Namespace, store: Store, names: list[str]) -> i
     stop_at_s = deadline_s(arguments, time.time)
     states = store.states(possible)
     left = [Task(unit, store, stop_at_s) for unit in possible if states[unit] != running.DONE]
-    ends = running.run_units(left, arguments.jobs or cores())
+    if left and arguments.ray:
+        ends = run_on_ray(left, arguments.ray)
+    else:
+        ends = running.run_units(left, arguments.jobs or cores())
     said = ", ".join(f"{count} {end}" for end, count in ends.items())
     print(
         f"{len(possible) - len(left)} of {len(wanted)} units were done{f', {said}' if said else ''}"

@@ -222,7 +222,7 @@ BARS: tuple[tuple[str, Judge], ...] = (
         for line, place in product((PER, HI), SCENARIOS)
     ),
     *(
-        (f"PHIL-TD3, {scene.label}: success at least {least:.0%}",
+        (f"PHIL-TD3, {scene.label}: success at least {100 * least:.0f} %",
          partial(success_bar, scene=scene, line=PHIL, least=least))
         for scene, least in zip(PAPER_SCENES, (0.99, 0.98, 0.96) * 2, strict=True)
     ),

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from edge_runtime.files import write_atomic
 from trainer.experiments.data import (
@@ -138,7 +139,9 @@ def draw_settings(results: Results, algorithms: Sequence[str], other: str) -> Fi
                 panel.bar(place + side, means[-1], 0.38, yerr=np.std(ends), capsize=3,
                           color=colour(line), **look)  # fmt: skip
             if len(means) == 2 and means[0] > 0.0 and metric != REWARD:
-                panel.text(place, max(means), f"{means[1] / means[0]:.2f}", ha="center", fontsize=9)
+                panel.text(
+                    place + 0.2, means[1], f"{means[1] / means[0]:.2f}\n", ha="center", fontsize=8
+                )
         _finish(panel, [name_of(Line(name)) for name in algorithms])
     figure.supxlabel(
         f"plain: normal; hatched: {other.replace('_', ' ')}; number: ratio; "
@@ -171,8 +174,9 @@ def draw_tests(results: Results, algorithms: Sequence[str]) -> Figure:
             if not len(values):
                 continue
             x = group + (place - 0.5 * (len(lines) - 1)) * width
+            named = None if group else name_of(line)
             panel.bar(x, values.mean(), width, yerr=values.std(), capsize=2, error_kw={"lw": 0.8},
-                      color=colour(line, place), label=None if group else name_of(line))  # fmt: skip
+                      color=colour(line, place), label=named)  # fmt: skip
             mark = _stars(results, scene, lines[0], line, DISTANCE) if place else ""
             panel.text(x, 1.2 * FULL_PATH_M[scenario], mark, ha="center", fontsize=8, rotation=90)
         panel.set_ylim(0.0, 1.35 * FULL_PATH_M[scenario])
@@ -222,10 +226,12 @@ def draw_boxes(results: Results, algorithms: Sequence[str]) -> Figure:
                                   flierprops={"ms": 2}, medianprops={"color": "black"})  # fmt: skip
             boxes["boxes"][0].set(facecolor=colour(line), alpha=0.7)
             mark = _stars(results, scene, lines[0], line, quantity) if place else ""
-            panel.text(x, 1.0, mark, transform=panel.get_xaxis_transform(), ha="center", fontsize=8)
-        for line in lines:
-            panel.bar(0.0, 0.0, color=colour(line), label=_counted(results, scenario, line))
-        panel.legend(fontsize=8)
+            panel.text(
+                x, 0.96, mark, transform=panel.get_xaxis_transform(), ha="center", fontsize=8
+            )
+        named = [Patch(fc=colour(line), label=_counted(results, scenario, line)) for line in lines]
+        panel.legend(handles=named, fontsize=8, loc="lower left")
+        panel.margins(y=0.12)
         _finish(panel, [scene.label for scene in scenes])
     figure.supxlabel(
         f"{SCENE_KEY}; drives that arrive; stars: paired t-test against PHIL-TD3 where both arrive",
@@ -306,15 +312,17 @@ def _finish(panel: Any, names: Sequence[str] = ()) -> None:
 
 
 def _curves_of(name: str) -> Callable[[Results], Figure]:
-    _, algorithms, settings, _ = EXPERIMENTS[name]
-    lines = [Line(algorithm, setting) for setting in settings for algorithm in algorithms]
+    one = EXPERIMENTS[name]
+    lines = [
+        Line(algorithm, setting) for setting, algorithm in product(one.settings, one.algorithms)
+    ]
     return partial(draw_curves, lines=lines)
 
 
 FIGURES: Mapping[str, Callable[[Results], Figure]] = {
     "fig7": _curves_of("fig7"),
     "fig8": partial(draw_settings, algorithms=FOUR, other=ONE_FRAME),
-    "fig9": partial(draw_tests, algorithms=EXPERIMENTS["fig9"][1]),
+    "fig9": partial(draw_tests, algorithms=EXPERIMENTS["fig9"].algorithms),
     "fig10": partial(draw_boxes, algorithms=FOUR),
     "fig11": _curves_of("fig11"),
     "fig12": _curves_of("fig12"),

@@ -42,7 +42,6 @@ from trainer.experiments.statistics import (
     above,
     all_of,
     bootstrap,
-    decisive,
     mean_estimate,
     within,
 )
@@ -63,6 +62,7 @@ UNITS = {
     LONGITUDINAL: (1.0, 3, " m/s²"),
 }
 """Quantity -> factor, digits and unit as it is shown."""
+WORDS = {DISTANCE: "distance", REWARD: "reward", SUCCESS: "success"}
 PHIL, IA, HI, PER = map(Line, FOUR)
 
 
@@ -71,7 +71,7 @@ class Finding(NamedTuple):
 
     holds: Holds
     ours: str
-    decisive: Estimate = NOTHING
+    estimate: Estimate = NOTHING
     """The comparison that decides."""
 
 
@@ -93,15 +93,19 @@ def _decided(
     found: Mapping[str, Estimate],
     answers: Mapping[str, Holds],
     complete: bool,
+    show: Callable[[Estimate, str], str],
     sign: float = 1.0,
-    show: Callable[[Estimate, str], str] = lambda one, name: f"{one.text()}: {name}",
 ) -> Finding:
-    """All comparisons together; undecided wherever trainings are missing."""
-    holds = all_of(list(answers.values())) if complete else "undecided"
-    name = decisive(found, answers, sign)
-    if not name:
-        return Finding(holds, "not measured")
-    return Finding(holds, show(found[name], name), found[name])
+    """All comparisons together, shown by the worst one of those that decide.
+
+    Undecided wherever trainings are missing. With sign 0 the largest difference is the worst.
+    """
+    holds = all_of(list(answers.values()))
+    candidates = [name for name in found if answers[name] == holds and found[name].size]
+    if not candidates:
+        return Finding("undecided", "not measured")
+    worst = min(candidates, key=lambda name: sign * found[name].value or -abs(found[name].value))
+    return Finding(holds if complete else "undecided", show(found[worst], worst), found[worst])
 
 
 def _complete(results: Results, places: Sequence[Place], lines: Sequence[Line]) -> bool:
@@ -113,17 +117,14 @@ def difference(first: BySeed, second: BySeed) -> Estimate:
     return mean_estimate(first[seed] - second[seed] for seed in first if seed in second)
 
 
-def _compare(
-    results: Results, place: Place, first: Line, second: Line, quantity: str, kind: str
-) -> Estimate:
-    if isinstance(place, Scene):
-        return mean_estimate(results.differences(place, first, second, quantity).values())
-    return difference(*(results.ends(place, line, kind, quantity) for line in (first, second)))
+def in_units(one: Estimate, quantity: str) -> str:
+    """A difference of a quantity in words."""
+    factor, digits, unit = UNITS[quantity]
+    return one.times(factor).text(digits) + unit
 
 
-def _shown(names: Mapping[str, str], one: Estimate, name: str) -> str:
-    factor, digits, unit = UNITS[names[name]]
-    return f"{one.times(factor).text(digits)}{unit}: {name}"
+def _percent(one: Estimate, name: str) -> str:
+    return f"{one.times(100.0).text(1)} %: {name}"
 
 
 def ahead(
@@ -135,44 +136,31 @@ def ahead(
     quantities: Sequence[str] = (DISTANCE,),
     sign: float = 1.0,
 ) -> Finding:
-    """Whether each of ours is above (sign -1: below) each of the others in every place."""
-    found, names = {}, {}
-    for place, quantity in product(places, quantities):
-        for first, second in product(ours, others):
-            name = f"{name_of(first)} over {name_of(second)}, {_place(place)}"
-            name += f", {quantity}" if len(quantities) > 1 else ""
-            names[name] = quantity
-            found[name] = _compare(results, place, first, second, quantity, kind)
-    answers = {name: above(one.times(sign)) for name, one in found.items()}
-    complete = _complete(results, places, [*ours, *others])
-    return _decided(found, answers, complete, sign, partial(_shown, names))
-
-
-def level(
-    results: Results,
-    kind: str,
-    places: Sequence[Place],
-    ours: Sequence[Line],
-    others: Sequence[Line],
-    quantities: Sequence[str] = (DISTANCE,),
-) -> Finding:
-    """Whether each of ours is on one level with each of the others."""
+    """Whether each of ours is above (sign -1: below) each of the others in every place; with sign
+    0, whether it is on their level.
+    """
     found, answers, names = {}, {}, {}
     for place, quantity, first, second in product(places, quantities, ours, others):
-        name = f"{name_of(first)} over {name_of(second)}, {_place(place)}, {quantity}"
+        name = f"{name_of(first)} over {name_of(second)}, {_place(place)}"
+        name += f", {WORDS.get(quantity, quantity)}" if len(quantities) > 1 else ""
         names[name] = quantity
-        found[name] = _compare(results, place, first, second, quantity, kind)
-        reach = SAME_LEVEL
-        if quantity != SUCCESS:
-            ends = (
-                results.tested(place, first, quantity)
-                if isinstance(place, Scene)
-                else results.ends(place, first, kind, quantity)
-            )
-            reach *= abs(mean_estimate(ends.values()).value)
-        answers[name] = within(found[name], reach)
+        if isinstance(place, Scene):
+            own = results.tested(place, first, quantity)
+            one = mean_estimate(results.differences(place, first, second, quantity).values())
+        else:
+            own = results.ends(place, first, kind, quantity)
+            one = difference(own, results.ends(place, second, kind, quantity))
+        scale = 1.0 if quantity == SUCCESS else abs(mean_estimate(own.values()).value)
+        found[name] = one
+        answers[name] = above(one.times(sign)) if sign else within(one, SAME_LEVEL * scale)
+
     complete = _complete(results, places, [*ours, *others])
-    return _decided(found, answers, complete, 1.0, partial(_shown, names))
+    return _decided(
+        found, answers, complete, lambda one, name: f"{in_units(one, names[name])}: {name}", sign
+    )
+
+
+level = partial(ahead, sign=0.0)
 
 
 def first_reached(grid: Numbers, curve: Numbers, least: float) -> float:
@@ -214,8 +202,8 @@ def sooner_by(
         common: the level is the lower end of the two, so that both can reach it.
         least: the level, where it is given.
 
-    Who never gets there counts as if at the budget's end, as the other one, and has the ratio 0, as
-    the one. The interval is a bootstrap over the seeds of both.
+    Who never gets there does so somewhere beyond the budget, so that the ratio has bounds, and its
+    interval, a bootstrap over the seeds of both, reaches from the lower bounds to the upper ones.
     """
     if not own or not other:
         return NOTHING, ""
@@ -234,18 +222,18 @@ def sooner_by(
         )
         return first, second
 
-    def ratio(first: float, second: float) -> float:
-        return 0.0 if np.isinf(first) else min(second, float(grid[-1])) / first
-
-    random = np.random.default_rng(0)
+    budget, random = float(grid[-1]), np.random.default_rng(0)
     counts = [len(curve) for curve in curves]
-    ratios = [
-        ratio(*reached([random.integers(count, size=count) for count in counts]))
-        for _ in range(RESAMPLES)
+    drawn = [
+        reached([random.integers(count, size=count) for count in counts]) for _ in range(RESAMPLES)
     ]
-    both = reached([np.arange(count) for count in counts])
-    said = [f"{steps:,.0f}" if np.isfinite(steps) else "never" for steps in both]
-    return bootstrap(ratios, ratio(*both), min(counts)), f"{said[0]} against {said[1]} steps"
+    least_ratios = [min(second, budget) / first for first, second in drawn]
+    most_ratios = [second / min(first, budget) for first, second in drawn]
+    first, second = reached([np.arange(count) for count in counts])
+    said = [f"{steps:,.0f}" if np.isfinite(steps) else "never" for steps in (first, second)]
+    found = bootstrap(least_ratios, min(second, budget) / first, min(counts))
+    found = found._replace(high=bootstrap(most_ratios, 0.0, min(counts)).high)
+    return found, f"{said[0]} against {said[1]} steps"
 
 
 def best_of(results: Results, place: str, lines: Sequence[Line], kind: str, quantity: str) -> Line:
@@ -269,7 +257,7 @@ def sooner(
 ) -> Finding:
     """Whether each of ours is so many times as soon as each of the others, or as the best of them.
 
-    With ``by_mean`` the ratio itself decides, not its interval.
+    With ``by_mean`` the ratio itself decides, not its interval; a lower bound of it only says yes.
     """
     found, answers, said = {}, {}, {}
     for place, quantity in product(places, quantities):
@@ -278,14 +266,17 @@ def sooner(
             rivals = [best_of(results, place, others, kind, quantity)]
         for first, second in product(ours, rivals):
             name = f"{name_of(first)} before {name_of(second)}, {_place(place)}"
+            name += f", {WORDS[quantity]}" if len(quantities) > 1 else ""
             own, other = results.of(place, first), results.of(place, second)
             one, said[name] = sooner_by(own, other, kind, quantity, common, least)
             found[name], answers[name] = one, above(one, times)
             if by_mean and one.size:
-                answers[name] = "yes" if one.value >= times else "no"
+                bound: Holds = "undecided" if said[name].endswith("never steps") else "no"
+                answers[name] = "yes" if one.value >= times else bound
     complete = _complete(results, places, [*ours, *others])
-    return _decided(found, answers, complete, 1.0,
-                    lambda one, name: f"{one.text(1)} times, {said[name]}: {name}")  # fmt: skip
+    return _decided(
+        found, answers, complete, lambda one, name: f"{one.text(1)} times, {said[name]}: {name}"
+    )
 
 
 def kept_shares(results: Results, scenario: str, line: Line, kind: str) -> BySeed:
@@ -329,8 +320,7 @@ def kept(
     complete = _complete(
         results, places, [*lines, *(Line(line.algorithm, ONE_FRAME) for line in lines)]
     )
-    return _decided(found, answers, complete, 1.0,
-                    lambda one, name: f"{one.times(100.0).text(1)} %: {name}")  # fmt: skip
+    return _decided(found, answers, complete, _percent)
 
 
 def same_ranking(
@@ -379,8 +369,7 @@ def dropped(results: Results, kind: str, places: Sequence[str], ours: Sequence[L
         )
         found[f"lost by {name_of(line)}, {_place(place)}"] = difference(nominal, variant)
     answers = {name: above(one) for name, one in found.items()}
-    return _decided(found, answers, _complete(results, places, ours), 1.0,
-                    lambda one, name: f"{one.times(100.0).text(1)} points: {name}")  # fmt: skip
+    return _decided(found, answers, _complete(results, places, ours), _percent)
 
 
 def changes(
@@ -419,8 +408,7 @@ def changed(
     lines = [line, *([than] if than else [])]
     poor = [Line(one.algorithm, RANDOM) for one in lines]
     answers = {name: judged(one) for name, one in found.items()}
-    return _decided(found, answers, _complete(results, SCENARIOS, [*lines, *poor]), 1.0,
-                    lambda one, name: f"{one.times(100.0).text(1)} %: {name}")  # fmt: skip
+    return _decided(found, answers, _complete(results, SCENARIOS, [*lines, *poor]), _percent)
 
 
 def success_bar(results: Results, kind: str, scene: Scene, line: Line, least: float) -> Finding:
@@ -448,7 +436,7 @@ def ahead_in(results: Results, kind: str, least: int) -> Finding:
         for quantity in (SUCCESS, DISTANCE):
             found = mean_estimate(results.differences(scene, PHIL, HUMAN, quantity).values())
             if above(found) == "yes":
-                said.append(f"{scene.label} {_shown({quantity: quantity}, found, quantity)}")
+                said.append(f"{scene.label} {in_units(found, quantity)}")
                 break
     complete = _complete(results, SCENARIOS, [PHIL, HUMAN])
     holds: Holds = "yes" if len(said) >= least else "no"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,6 +81,11 @@ LABELS = {
 FOUR = ("phil_td3", "ia_td3", "hi_td3", "per_td3")
 """What the paper compares throughout."""
 GUIDED = FOUR[:3]
+PARTS = ("phil_without_cloning", "phil_without_shaping")
+PRIORITIES = ("phil_td_only", "phil_q_advantage_only")
+BUFFERS = ("rd2_phil", "rd2_td3")
+WEIGHTS = ("phil_advantage_0.1", "phil_advantage_100")
+LEFT, JAM = ("left_turn",), ("congestion",)
 LINES: tuple[tuple[int, str, tuple[str, ...]], ...] = (
     (0, NORMAL, TESTED_ONLY),
     (1, NORMAL, FOUR),
@@ -87,56 +93,41 @@ LINES: tuple[tuple[int, str, tuple[str, ...]], ...] = (
     (3, PRINTED, FOUR),
     (4, ONE_FRAME, FOUR),
     (5, RANDOM, GUIDED),
-    (6, NORMAL, ("phil_without_cloning", "phil_without_shaping")),
-    (7, NORMAL, ("phil_td_only", "phil_q_advantage_only", "rd2_phil", "rd2_td3")),
-    (8, NORMAL, ("phil_advantage_0.1", "phil_advantage_100")),
+    (6, NORMAL, PARTS),
+    (7, NORMAL, (*PRIORITIES, *BUFFERS)),
+    (8, NORMAL, WEIGHTS),
 )
 """Everything that is computed: priority (what comes first), setting, algorithms."""
 DEFAULT_SEEDS = 5
 
+
+class Experiment(NamedTuple):
+    """A figure or table of the paper, and the units it needs."""
+
+    title: str
+    algorithms: tuple[str, ...]
+    settings: tuple[str, ...] = (NORMAL,)
+    scenarios: tuple[str, ...] = SCENARIOS
+
+
 TIME = "time"
-EXPERIMENTS: Mapping[str, tuple[str, tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
-    "fig7": ("learning curves", FOUR, (NORMAL,), SCENARIOS),
-    "fig8": ("normal and tough setting", FOUR, (NORMAL, ONE_FRAME), SCENARIOS),
-    "fig9": ("success and surviving distance", (*FOUR, *TESTED_ONLY), (NORMAL,), SCENARIOS),
-    "fig10": ("time and smoothness", FOUR, (NORMAL,), SCENARIOS),
-    "fig11": (
-        "what the priority is made of",
-        ("phil_td3", "phil_td_only", "phil_q_advantage_only"),
-        (NORMAL,),
-        SCENARIOS,
-    ),
-    "fig12": (
-        "weight of the Q advantage",
-        ("phil_td3", "phil_advantage_0.1", "phil_advantage_100"),
-        (NORMAL,),
-        SCENARIOS,
-    ),
-    "fig13": (
-        "one replay buffer or two",
-        ("phil_td3", "rd2_phil", "rd2_td3"),
-        (NORMAL,),
-        SCENARIOS,
-    ),
-    "fig14": (
-        "surviving distance after poor guidance",
-        GUIDED,
-        (NORMAL, RANDOM, BIASED),
-        SCENARIOS,
-    ),
-    "fig15": ("smoothness after poor guidance", GUIDED, (NORMAL, RANDOM, BIASED), SCENARIOS),
-    "table1": ("beside the human, left turn", (*GUIDED, HUMAN_MODEL), (NORMAL,), ("left_turn",)),
-    "table2": ("beside the human, congestion", (*GUIDED, HUMAN_MODEL), (NORMAL,), ("congestion",)),
-    "ablation": (
-        "PHIL-TD3 without each of its parts",
-        ("phil_td3", "phil_without_cloning", "ia_td3", "phil_without_shaping"),
-        (NORMAL,),
-        SCENARIOS,
-    ),
-    "printed": ("the settings as the paper prints them", FOUR, (NORMAL, PRINTED), SCENARIOS),
-    "floor": ("the best constant action", (CONSTANT,), (NORMAL,), SCENARIOS),
+EXPERIMENTS: Mapping[str, Experiment] = {
+    "fig7": Experiment("learning curves", FOUR),
+    "fig8": Experiment("normal and tough setting", FOUR, (NORMAL, ONE_FRAME)),
+    "fig9": Experiment("success and surviving distance", (*FOUR, *TESTED_ONLY)),
+    "fig10": Experiment("time and smoothness", FOUR),
+    "fig11": Experiment("what the priority is made of", ("phil_td3", *PRIORITIES)),
+    "fig12": Experiment("weight of the Q advantage", ("phil_td3", *WEIGHTS)),
+    "fig13": Experiment("one replay buffer or two", ("phil_td3", *BUFFERS)),
+    "fig14": Experiment("surviving distance after poor guidance", GUIDED, (NORMAL, RANDOM, BIASED)),
+    "fig15": Experiment("smoothness after poor guidance", GUIDED, (NORMAL, RANDOM)),
+    "table1": Experiment("beside the human, left turn", (*GUIDED, HUMAN_MODEL), scenarios=LEFT),
+    "table2": Experiment("beside the human, congestion", (*GUIDED, HUMAN_MODEL), scenarios=JAM),
+    "ablation": Experiment("PHIL-TD3 without each of its parts", ("phil_td3", "ia_td3", *PARTS)),
+    "printed": Experiment("the settings as the paper prints them", FOUR, (NORMAL, PRINTED)),
+    "floor": Experiment("the best constant action", (CONSTANT,)),
 }
-"""Name on the command line -> title, algorithms, settings, scenarios."""
+"""Name on the command line -> what it is."""
 
 
 @dataclass(frozen=True)
@@ -207,26 +198,26 @@ class Unit(NamedTuple):
         return self.algorithm == HUMAN_MODEL or (self.trained and ALGORITHMS[self.algorithm].guided)
 
 
-def units_of(names: Iterable[str], seeds: int, scenario: str | None = None) -> list[Unit]:
+def units_of(names: Collection[str], seeds: int, scenario: str | None = None) -> list[Unit]:
     """The units of some experiments, or of ``all``, each once, in the order of work.
 
     Seed by seed within a priority, so that work that stops early leaves balanced results.
     """
-    wanted = set()
-    for name in names:
-        everything = EXPERIMENTS.values() if name == "all" else [EXPERIMENTS[name]]
-        for _, algorithms, settings, scenarios in everything:
-            wanted |= {(s, a, e) for s in scenarios for a in algorithms for e in settings}
+    chosen = EXPERIMENTS.values() if "all" in names else [EXPERIMENTS[name] for name in names]
+    wanted = {
+        line
+        for one in chosen
+        for line in product(one.scenarios, one.algorithms, one.settings)
+        if scenario in (None, line[0])
+    }
     units = []
     for priority, setting, algorithms in LINES:
         for place, algorithm in enumerate(algorithms):
-            for where in SCENARIOS:
-                if (where, algorithm, setting) not in wanted or scenario not in (None, where):
-                    continue
-                numbers = [0] if algorithm in TESTED_ONLY else range(1, seeds + 1)
-                for seed in numbers:
-                    key = (priority, seed, SCENARIOS.index(where), place)
-                    units.append((key, Unit(where, algorithm, setting, seed)))
+            numbers = [0] if algorithm in TESTED_ONLY else range(1, seeds + 1)
+            for (turn, where), seed in product(enumerate(SCENARIOS), numbers):
+                if (where, algorithm, setting) in wanted:
+                    order = (priority, seed, turn, place)
+                    units.append((order, Unit(where, algorithm, setting, seed)))
     return [unit for _, unit in sorted(units)]
 
 

@@ -102,8 +102,8 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         yield from _paper_table(results, name, scenario)
     yield from _costs(results)
     for name in FIGURES:
-        yield from _section(f"{name}: {EXPERIMENTS[name][0]}", f"{COMMAND} {name}")
-        yield from (f"![{EXPERIMENTS[name][0]}]({name}.png)", "")
+        yield from _section(f"{name}: {EXPERIMENTS[name].title}", f"{COMMAND} {name}")
+        yield from (f"![{EXPERIMENTS[name].title}]({name}.png)", "")
 
 
 def _introduction(
@@ -154,7 +154,7 @@ def _claim_row(one: Judged) -> tuple[str, ...]:
 
 def _anchor(source: str) -> str:
     """Of the section of an experiment, as GitHub makes it."""
-    title = f"{source} {EXPERIMENTS[source][0]}".lower().replace(",", "")
+    title = f"{source} {EXPERIMENTS[source].title}".lower().replace(",", "")
     return title.replace(" ", "-")
 
 
@@ -173,7 +173,8 @@ def _time_lines(path: Path) -> Iterator[str]:
         ),
     )
     found = ratio(turns["phil_td3"], turns["ia_td3"])
-    holds = within(Estimate(*(each - 1.0 for each in found[:3]), found.size), SAME_LEVEL)
+    value, low, high = (each - 1.0 for each in found[:3])
+    holds = within(Estimate(value, low, high, found.size), SAME_LEVEL)
     yield from (
         f'"Similar", says the paper of PHIL-TD3 and IA-TD3 (1.03 times): {found.text(3)} times, '
         f"so within 5 %: {holds}.",
@@ -214,11 +215,14 @@ def _tests(results: Results) -> Iterator[str]:
 
 def _paper_table(results: Results, name: str, scenario: str) -> Iterator[str]:
     """A table of the paper with our numbers beside its own."""
-    title = EXPERIMENTS[name][0]
+    title = EXPERIMENTS[name].title
     yield from _section(f"{name}: {title}", f"{COMMAND} {name}")
-    yield from (f"Surviving distance, m, mean and standard deviation over the paper's {PAPER_TESTS} "
-                "seeds and all trainings: ours (the paper's). Distances end at the goal, at "
-                "21 and 80 m; the paper counts what was driven beyond it.", "")  # fmt: skip
+    yield from (
+        "Surviving distance, m, mean and standard deviation over the drives with the paper's "
+        f"{PAPER_TESTS} seeds, of all trainings: ours (the paper's). Distances end at the goal, at "
+        "21 and 80 m; the paper counts what was driven beyond it.",
+        "",
+    )
     scenes = [scene for scene in PAPER_SCENES if scene.scenario == scenario]
     rows = []
     for algorithm, numbers in PAPER_TABLES[name].items():
@@ -263,9 +267,10 @@ def _costs(results: Results) -> Iterator[str]:
         for result in results.of(scenario, Line(CONSTANT))
     ]
     for scenario, result in floors:
+        tried = len(result.record["success_of"])
         yield from (
             f"Best constant action in the {scenario.replace('_', ' ')}: "
-            f"{result.record['action']:g}, the best of {len(result.record['success_of'])} on validation drives.", ""
+            f"{result.record['action']:g}, the best of {tried} on validation drives.", ""
         )  # fmt: skip
 
 

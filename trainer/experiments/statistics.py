@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -78,16 +78,6 @@ def all_of(answers: Sequence[Holds]) -> Holds:
     if "no" in answers:
         return "no"
     return "yes" if answers and set(answers) == {"yes"} else "undecided"
-
-
-def decisive(found: Mapping[str, Estimate], answers: Mapping[str, Holds], sign: float = 1.0) -> str:
-    """Which of several comparisons decides: the worst of those that answer as all together do.
-
-    Empty where there is none.
-    """
-    holds = all_of(list(answers.values()))
-    candidates = [name for name in found if answers[name] == holds and found[name].size]
-    return min(candidates, key=lambda name: sign * found[name].value, default="")
 
 
 def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:

@@ -42,6 +42,21 @@ def write_human(store: Store, scenario: str = "left_turn", seed: int = 1) -> Pat
     return directory / MODEL_FILE
 
 
+class Soon(float):
+    """A time that is still to come when it is first looked at, and over ever after."""
+
+    looked = False
+
+    def __lt__(self, other: float) -> bool:
+        looked, self.looked = self.looked, True
+        return looked
+
+
+def without_times(record: dict[str, Any]) -> dict[str, Any]:
+    """What must be the same however often a unit was stopped."""
+    return {name: value for name, value in record.items() if name != "computed"}
+
+
 def synthetic(unit: Unit, runs: int = 60) -> dict[str, Any]:
     """The record of a unit that learns to its skill, the more skilled the sooner."""
     skill = SKILLS[unit.algorithm] * FACTORS[unit.setting]
