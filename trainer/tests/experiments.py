@@ -52,8 +52,10 @@ class Soon(float):
         return looked
 
 
-def without_times(record: dict[str, Any]) -> dict[str, Any]:
-    """What must be the same however often a unit was stopped."""
+def without_times(store: Store, unit: Unit) -> dict[str, Any]:
+    """What must be the same in a unit's record however often it was stopped."""
+    record = store.record(unit)
+    assert record is not None
     return {name: value for name, value in record.items() if name != "computed"}
 
 

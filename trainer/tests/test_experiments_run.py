@@ -76,7 +76,7 @@ def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
     assert ends == [STOPPED, STOPPED]
     assert store.states([UNIT])[UNIT] == running.BEGUN
     assert compute(Task(UNIT, store)) == FINISHED
-    assert without_times(store.record(UNIT)) == without_times(straight.record(UNIT))
+    assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
 def test_a_killed_command_goes_on_to_the_same_record(straight, tmp_path):
@@ -97,7 +97,7 @@ def test_a_killed_command_goes_on_to_the_same_record(straight, tmp_path):
     process.wait()
     assert not store.records("left_turn")
     assert compute(Task(UNIT, store)) == FINISHED
-    assert without_times(store.record(UNIT)) == without_times(straight.record(UNIT))
+    assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
 def test_two_processes_share_one_file_of_records(tmp_path):
@@ -149,7 +149,7 @@ def test_the_floor_is_searched_and_driven(tmp_path):
     store = store_in(tmp_path)
     unit = Unit("left_turn", CONSTANT, NORMAL, 0)
     assert compute(Task(unit, store)) == FINISHED
-    record = store.record(unit)
+    record = store.records("left_turn")[unit]
     assert record["success_of"][f"{record['action']:g}"] == max(record["success_of"].values())
 
 
