@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from pathlib import Path
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from edge_runtime.files import write_json
+from edge_runtime.files import write_atomic
 from edge_runtime.option_types import not_negative, whole_number
 from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.experiments import run as running
@@ -112,7 +113,8 @@ def run(arguments: argparse.Namespace) -> int:
         status = _compute(arguments, store, [name for name in names if name != TIME])
     if TIME in names:
         make_directory(store.results)
-        write_json(store.results / TIME_FILE, measure(store))
+        measured = json.dumps(measure(store))
+        write_atomic(store.results / TIME_FILE, f"{measured}\n".encode())
     return status
 
 

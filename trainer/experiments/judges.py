@@ -6,10 +6,10 @@ holds, or does not, where a 95 % interval lies on one side; else it is undecided
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial, wraps
 from itertools import pairwise, permutations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,8 +71,35 @@ class Finding(NamedTuple):
 
     holds: Holds
     ours: str
-    estimate: Estimate = NOTHING
-    """The comparison that decides."""
+    """The worst of the comparisons that decide, in words."""
+
+
+class Comparison(NamedTuple):
+    """One of those that a claim makes: it holds where all of them do."""
+
+    text: str
+    holds: Holds
+    margin: float
+    """How far on the good side it is; nan where nothing is measured."""
+    needs: Sequence[tuple[str, Line]]
+    """Scenarios and lines whose trainings must all be there."""
+
+
+def decided(judge: Callable[..., Iterator[Comparison]]) -> Callable[..., Finding]:
+    """A judge that takes all of the comparisons together; undecided where trainings are missing."""
+
+    @wraps(judge)
+    def finding(results: Results, kind: str, **arguments: Any) -> Finding:
+        made = list(judge(results, kind, **arguments))
+        holds = all_of([one.holds for one in made])
+        measured = [one for one in made if one.holds == holds and not np.isnan(one.margin)]
+        if not measured:
+            return Finding("undecided", "not measured")
+        complete = all(results.complete(*need) for one in made for need in one.needs)
+        worst = min(measured, key=lambda one: one.margin)
+        return Finding(holds if complete else "undecided", worst.text)
+
+    return finding
 
 
 def name_of(line: Line) -> str:
@@ -81,35 +108,12 @@ def name_of(line: Line) -> str:
     return LABELS[line.algorithm] + setting
 
 
-def _scenario(place: Place) -> str:
-    return place if isinstance(place, str) else place.scenario
-
-
-def _place(place: Place) -> str:
+def _words(place: Place) -> str:
     return place.replace("_", " ") if isinstance(place, str) else place.label
 
 
-def _decided(
-    found: Mapping[str, Estimate],
-    answers: Mapping[str, Holds],
-    complete: bool,
-    show: Callable[[Estimate, str], str],
-    sign: float = 1.0,
-) -> Finding:
-    """All comparisons together, shown by the worst one of those that decide.
-
-    Undecided wherever trainings are missing. With sign 0 the largest difference is the worst.
-    """
-    holds = all_of(list(answers.values()))
-    candidates = [name for name in found if answers[name] == holds and found[name].size]
-    if not candidates:
-        return Finding("undecided", "not measured")
-    worst = min(candidates, key=lambda name: sign * found[name].value or -abs(found[name].value))
-    return Finding(holds if complete else "undecided", show(found[worst], worst), found[worst])
-
-
-def _complete(results: Results, places: Sequence[Place], lines: Sequence[Line]) -> bool:
-    return all(results.complete(_scenario(place), line) for place in places for line in lines)
+def _one_frame(line: Line) -> Line:
+    return Line(line.algorithm, ONE_FRAME)
 
 
 def difference(first: BySeed, second: BySeed) -> Estimate:
@@ -123,10 +127,11 @@ def in_units(one: Estimate, quantity: str) -> str:
     return one.times(factor).text(digits) + unit
 
 
-def _percent(one: Estimate, name: str) -> str:
-    return f"{one.times(100.0).text(1)} %: {name}"
+def _percent(one: Estimate) -> str:
+    return f"{one.times(100.0).text(1)} %"
 
 
+@decided
 def ahead(
     results: Results,
     kind: str,
@@ -135,29 +140,25 @@ def ahead(
     others: Sequence[Line],
     quantities: Sequence[str] = (DISTANCE,),
     sign: float = 1.0,
-) -> Finding:
+) -> Iterator[Comparison]:
     """Whether each of ours is above (sign -1: below) each of the others in every place; with sign
     0, whether it is on their level.
     """
-    found, answers, names = {}, {}, {}
     for place, quantity, first, second in product(places, quantities, ours, others):
-        name = f"{name_of(first)} over {name_of(second)}, {_place(place)}"
-        name += f", {WORDS.get(quantity, quantity)}" if len(quantities) > 1 else ""
-        names[name] = quantity
         if isinstance(place, Scene):
-            own = results.tested(place, first, quantity)
+            own, scenario = results.tested(place, first, quantity), place.scenario
             one = mean_estimate(results.differences(place, first, second, quantity).values())
         else:
-            own = results.ends(place, first, kind, quantity)
+            own, scenario = results.ends(place, first, kind, quantity), place
             one = difference(own, results.ends(place, second, kind, quantity))
         scale = 1.0 if quantity == SUCCESS else abs(mean_estimate(own.values()).value)
-        found[name] = one
-        answers[name] = above(one.times(sign)) if sign else within(one, SAME_LEVEL * scale)
-
-    complete = _complete(results, places, [*ours, *others])
-    return _decided(
-        found, answers, complete, lambda one, name: f"{in_units(one, names[name])}: {name}", sign
-    )
+        text = (
+            f"{in_units(one, quantity)}: {name_of(first)} over {name_of(second)}, {_words(place)}"
+        )
+        text += f", {WORDS.get(quantity, quantity)}" if len(quantities) > 1 else ""
+        holds = above(one.times(sign)) if sign else within(one, SAME_LEVEL * scale)
+        margin = sign * one.value if sign else -abs(one.value)
+        yield Comparison(text, holds, margin, [(scenario, first), (scenario, second)])
 
 
 level = partial(ahead, sign=0.0)
@@ -242,6 +243,7 @@ def best_of(results: Results, place: str, lines: Sequence[Line], kind: str, quan
     return max(lines, key=lambda line: np.mean([*ends[line]]) if ends[line] else -np.inf)
 
 
+@decided
 def sooner(
     results: Results,
     kind: str,
@@ -254,29 +256,25 @@ def sooner(
     least: float | None = None,
     best: bool = False,
     by_mean: bool = False,
-) -> Finding:
+) -> Iterator[Comparison]:
     """Whether each of ours is so many times as soon as each of the others, or as the best of them.
 
     With ``by_mean`` the ratio itself decides, not its interval; a lower bound of it only says yes.
     """
-    found, answers, said = {}, {}, {}
     for place, quantity in product(places, quantities):
-        rivals = others
-        if best:
-            rivals = [best_of(results, place, others, kind, quantity)]
+        rivals = [best_of(results, place, others, kind, quantity)] if best else others
         for first, second in product(ours, rivals):
-            name = f"{name_of(first)} before {name_of(second)}, {_place(place)}"
-            name += f", {WORDS[quantity]}" if len(quantities) > 1 else ""
             own, other = results.of(place, first), results.of(place, second)
-            one, said[name] = sooner_by(own, other, kind, quantity, common, least)
-            found[name], answers[name] = one, above(one, times)
+            one, steps = sooner_by(own, other, kind, quantity, common, least)
+            text = f"{one.text(1)} times, {steps}: {name_of(first)} before {name_of(second)}"
+            text += f", {_words(place)}"
+            text += f", {WORDS[quantity]}" if len(quantities) > 1 else ""
+            holds = above(one, times)
             if by_mean and one.size:
-                bound: Holds = "undecided" if said[name].endswith("never steps") else "no"
-                answers[name] = "yes" if one.value >= times else bound
-    complete = _complete(results, places, [*ours, *others])
-    return _decided(
-        found, answers, complete, lambda one, name: f"{one.text(1)} times, {said[name]}: {name}"
-    )
+                bound: Holds = "undecided" if steps.endswith("never steps") else "no"
+                holds = "yes" if one.value >= times else bound
+            needs = [(place, line) for line in (first, *others)]
+            yield Comparison(text, holds, one.value - times, needs)
 
 
 def kept_shares(results: Results, scenario: str, line: Line, kind: str) -> BySeed:
@@ -286,7 +284,7 @@ def kept_shares(results: Results, scenario: str, line: Line, kind: str) -> BySee
     mean of the seeds' own ratios would be ruled by whichever learned next to nothing with two.
     """
     two = results.ends(scenario, line, kind, DISTANCE)
-    one = results.ends(scenario, Line(line.algorithm, ONE_FRAME), kind, DISTANCE)
+    one = results.ends(scenario, _one_frame(line), kind, DISTANCE)
     seeds = sorted(two.keys() & one.keys())
     mean = float(np.mean([two[seed] for seed in seeds])) if seeds else 0.0
     if not mean:
@@ -295,152 +293,135 @@ def kept_shares(results: Results, scenario: str, line: Line, kind: str) -> BySee
     return {seed: ratio + (one[seed] - ratio * two[seed]) / mean for seed in seeds}
 
 
+@decided
 def kept(
-    results: Results,
-    kind: str,
-    places: Sequence[str],
-    ours: Sequence[Line],
-    others: Sequence[Line] = (),
-) -> Finding:
-    """Whether each of ours keeps more of its distance with one frame than each of the others, or,
-    without others, whether each of ours loses some.
-    """
-    found = {}
-    for place in places:
-        shares = {line: kept_shares(results, place, line, kind) for line in (*ours, *others)}
-        for first in ours:
-            if not others:
-                lost = mean_estimate(1.0 - share for share in shares[first].values())
-                found[f"lost by {name_of(first)}, {_place(place)}"] = lost
-            for second in others:
-                name = f"{name_of(first)} over {name_of(second)}, {_place(place)}"
-                found[name] = difference(shares[first], shares[second])
-    answers = {name: above(one) for name, one in found.items()}
-    lines = [*ours, *others]
-    complete = _complete(
-        results, places, [*lines, *(Line(line.algorithm, ONE_FRAME) for line in lines)]
-    )
-    return _decided(found, answers, complete, _percent)
+    results: Results, kind: str, places: Sequence[str], ours: Sequence[Line], others: Sequence[Line]
+) -> Iterator[Comparison]:
+    """Whether each of ours keeps a larger share of its distance with one frame than the others."""
+    for place, first, second in product(places, ours, others):
+        one = difference(*(kept_shares(results, place, line, kind) for line in (first, second)))
+        text = f"{_percent(one)}: {name_of(first)} over {name_of(second)}, {_words(place)}"
+        lines = (first, second, _one_frame(first), _one_frame(second))
+        yield Comparison(text, above(one), one.value, [(place, line) for line in lines])
 
 
+@decided
+def lost(
+    results: Results, kind: str, places: Sequence[str], ours: Sequence[Line]
+) -> Iterator[Comparison]:
+    """Whether one frame instead of two costs each of ours a share of its distance."""
+    for place, line in product(places, ours):
+        shares = kept_shares(results, place, line, kind)
+        one = mean_estimate(1.0 - share for share in shares.values())
+        text = f"{_percent(one)} lost: {name_of(line)}, {_words(place)}"
+        yield Comparison(text, above(one), one.value, [(place, line), (place, _one_frame(line))])
+
+
+@decided
+def dropped(
+    results: Results, kind: str, places: Sequence[str], ours: Sequence[Line]
+) -> Iterator[Comparison]:
+    """Whether the variant scene costs each of ours success."""
+    for place, line in product(places, ours):
+        scenes = (Scene(place, condition) for condition in ("nominal", "variant"))
+        one = difference(*(results.tested(scene, line, SUCCESS) for scene in scenes))
+        text = f"{in_units(one, SUCCESS)} lost: {name_of(line)}, {_words(place)}"
+        yield Comparison(text, above(one), one.value, [(place, line)])
+
+
+@decided
 def same_ranking(
     results: Results, kind: str, places: Sequence[str], lines: Sequence[Line]
-) -> Finding:
+) -> Iterator[Comparison]:
     """Whether the lines end in one order with two frames and with one.
 
     Yes where every neighbour is ahead in both, no where two have changed places for sure.
     """
-    answers: list[Holds] = []
-    said = []
+    numbers = range(len(lines))
     for place in places:
-        both = []
-        for setting in (NORMAL, ONE_FRAME):
-            chosen = [Line(line.algorithm, setting) for line in lines]
-            both.append([results.ends(place, line, kind, DISTANCE) for line in chosen])
+        settings = (lines, [_one_frame(line) for line in lines])
+        both = [[results.ends(place, line, kind, DISTANCE) for line in each] for each in settings]
         means = [[mean_estimate(end.values()).value for end in ends] for ends in both]
-        orders = [sorted(range(len(lines)), key=lambda i: -each[i]) for each in means]
+        orders = [list(np.argsort(np.negative(each), kind="stable")) for each in means]
         swapped = any(
             above(difference(both[0][i], both[0][j])) == "yes"
             and above(difference(both[1][i], both[1][j])) == "no"
-            for i, j in permutations(range(len(lines)), 2)
+            for i, j in permutations(numbers, 2)
         )
         apart = all(
             above(difference(ends[i], ends[j])) == "yes"
             for ends, order in zip(both, orders, strict=True)
             for i, j in pairwise(order)
         )
-        same = apart and orders[0] == orders[1]
-        answers.append("no" if swapped else "yes" if same else "undecided")
         shown = [" > ".join(name_of(lines[i]) for i in order) for order in orders]
-        said.append(f"{_place(place)}: two frames {shown[0]}, one {shown[1]}")
-    settings = [Line(line.algorithm, setting) for line in lines for setting in (NORMAL, ONE_FRAME)]
-    complete = _complete(results, places, settings)
-    return Finding(all_of(answers) if complete else "undecided",
-                   "; ".join(said) if complete else "not measured")  # fmt: skip
+        same: Holds = "yes" if apart and orders[0] == orders[1] else "undecided"
+        text = f"{_words(place)}: two frames {shown[0]}, one {shown[1]}"
+        needs = [(place, line) for each in settings for line in each]
+        yield Comparison(text, "no" if swapped else same, float(np.sum(means)), needs)
 
 
-def dropped(results: Results, kind: str, places: Sequence[str], ours: Sequence[Line]) -> Finding:
-    """Whether the variant scene costs each of ours success."""
-    found = {}
-    for place, line in product(places, ours):
-        nominal, variant = (
-            results.tested(Scene(place, condition), line, SUCCESS)
-            for condition in ("nominal", "variant")
-        )
-        found[f"lost by {name_of(line)}, {_place(place)}"] = difference(nominal, variant)
-    answers = {name: above(one) for name, one in found.items()}
-    return _decided(found, answers, _complete(results, places, ours), _percent)
-
-
-def changes(
-    results: Results, line: Line, setting: str, scenes: Sequence[Scene] = PAPER_SCENES
-) -> BySeed:
-    """Seed -> relative change of the surviving distance under poor guidance, over the scenes."""
+def changes(results: Results, line: Line, scenes: Sequence[Scene]) -> BySeed:
+    """Seed -> relative change of the surviving distance by random poor guidance, over scenes."""
     by_seed: dict[int, list[float]] = {}
     for scene in scenes:
         good = results.tested(scene, line, DISTANCE)
-        poor = results.tested(scene, Line(line.algorithm, setting), DISTANCE)
+        poor = results.tested(scene, Line(line.algorithm, RANDOM), DISTANCE)
         for seed in good.keys() & poor.keys():
             by_seed.setdefault(seed, []).append(poor[seed] / good[seed] - 1.0)
     return {seed: float(np.mean(values)) for seed, values in by_seed.items()}
 
 
+@decided
 def changed(
     results: Results,
     kind: str,
     line: Line,
     judged: Callable[[Estimate], Holds],
     than: Line | None = None,
-    each_scene: bool = False,
-) -> Finding:
-    """How random poor guidance changes a line's surviving distance, or more than another's."""
-    groups = [(scene,) for scene in PAPER_SCENES] if each_scene else [PAPER_SCENES]
-    found = {}
-    for scenes in groups:
-        own = changes(results, line, RANDOM, scenes)
-        name = name_of(line) + (f" against {name_of(than)}" if than else "")
-        name += f", {scenes[0].label}" if each_scene else ""
-        found[name] = (
-            difference(own, changes(results, than, RANDOM, scenes))
-            if than
-            else mean_estimate(own.values())
-        )
-    lines = [line, *([than] if than else [])]
+    groups: Sequence[Sequence[Scene]] = (PAPER_SCENES,),
+) -> Iterator[Comparison]:
+    """How random poor guidance changes a line's distance, or how much more than another's."""
+    lines = [line, than] if than else [line]
     poor = [Line(one.algorithm, RANDOM) for one in lines]
-    answers = {name: judged(one) for name, one in found.items()}
-    return _decided(found, answers, _complete(results, SCENARIOS, [*lines, *poor]), _percent)
+    for scenes in groups:
+        found = [changes(results, one, scenes) for one in lines]
+        one = difference(*found) if than else mean_estimate(found[0].values())
+        where = scenes[0].label if len(scenes) == 1 else "mean of the scenes"
+        text = f"{_percent(one)}: {' against '.join(map(name_of, lines))}, {where}"
+        yield Comparison(
+            text, judged(one), -abs(one.value), list(product(SCENARIOS, [*lines, *poor]))
+        )
 
 
-def success_bar(results: Results, kind: str, scene: Scene, line: Line, least: float) -> Finding:
+@decided
+def success_bar(
+    results: Results, kind: str, scene: Scene, line: Line, least: float
+) -> Iterator[Comparison]:
     """Whether the mean of the seeds' success is at least so much."""
-    by_seed = results.tested(scene, line, SUCCESS)
-    found = mean_estimate(by_seed.values())
-    if not found.size:
-        return Finding("undecided", "not measured")
-    drives = [r.reached(scene.condition) for r in results.of(scene.scenario, line)]
-    paper, others = (
-        [float(one.mean()) for one in part if len(one)]
-        for part in ([d[:PAPER_TESTS] for d in drives], [d[PAPER_TESTS:] for d in drives])
-    )
-    shown = f"{found.times(100.0).text(1)} %; the paper's seeds {100 * np.mean(paper):.1f} %"
-    shown += f", others {100 * np.mean(others):.1f} %" if others else ""
-    holds: Holds = "yes" if found.value >= least - 1e-9 else "no"
-    complete = results.complete(scene.scenario, line)
-    return Finding(holds if complete else "undecided", shown, found)
+    one = mean_estimate(results.tested(scene, line, SUCCESS).values())
+    found = results.of(scene.scenario, line)
+    text = _percent(one)
+    for words, part in ((f"the paper's {PAPER_TESTS} seeds", slice(PAPER_TESTS)),
+                        ("others", slice(PAPER_TESTS, None))):  # fmt: skip
+        drives = [result.drives(scene.condition, SUCCESS)[part] for result in found]
+        text += f"; {words} {100 * np.mean(drives):.1f} %" if np.size(drives) else ""
+    holds: Holds = "yes" if one.value >= least - 1e-9 else "no"
+    yield Comparison(text, holds, one.value, [(scene.scenario, line)])
 
 
-def ahead_in(results: Results, kind: str, least: int) -> Finding:
+@decided
+def ahead_in(results: Results, kind: str, least: int) -> Iterator[Comparison]:
     """Whether PHIL-TD3 is ahead of its human in success or distance in so many scenes."""
     said = []
     for scene in PAPER_SCENES:
         for quantity in (SUCCESS, DISTANCE):
-            found = mean_estimate(results.differences(scene, PHIL, HUMAN, quantity).values())
-            if above(found) == "yes":
-                said.append(f"{scene.label} {in_units(found, quantity)}")
+            one = mean_estimate(results.differences(scene, PHIL, HUMAN, quantity).values())
+            if above(one) == "yes":
+                said.append(f"{scene.label} {in_units(one, quantity)}")
                 break
-    complete = _complete(results, SCENARIOS, [PHIL, HUMAN])
     holds: Holds = "yes" if len(said) >= least else "no"
-    return Finding(holds if complete else "undecided", f"{len(said)} of 6: {', '.join(said)}")
+    needs = list(product(SCENARIOS, [PHIL, HUMAN]))
+    yield Comparison(f"{len(said)} of 6: {', '.join(said)}", holds, len(said), needs)
 
 
 UNLEARNED = 0.02
@@ -448,26 +429,22 @@ LATE = 3
 """Validations whose mean counts: a single one of 50 drives is off by some points."""
 
 
-def unlearned(results: Results, kind: str, place: str, line: Line) -> Finding:
+@decided
+def unlearned(results: Results, kind: str, place: str, line: Line) -> Iterator[Comparison]:
     """Whether the policy alone ends at most 2 points below its best, as a mean of the seeds."""
-    lost = {}
+    below = []
     for result in results.of(place, line):
-        values = np.asarray(result.record["validation"][SUCCESS], float)
+        _, values = result.points(ALONE, SUCCESS)
         width = min(LATE, len(values))
         means = np.convolve(values, np.full(width, 1.0 / width), "valid")
-        lost[result.unit.seed] = float(means.max() - means[-1])
-    found = mean_estimate(lost.values())
-    holds: Holds = "yes" if found.value <= UNLEARNED else "no"
-    complete = results.complete(place, line)
-    shown = f"{found.times(100.0).text(1)} points"
-    return Finding(holds if complete else "undecided", shown, found)
+        below.append(float(means.max() - means[-1]))
+    one = mean_estimate(below)
+    holds: Holds = "yes" if one.value <= UNLEARNED else "no"
+    yield Comparison(in_units(one, SUCCESS), holds, -one.value, [(place, line)])
 
 
-def either(results: Results, kind: str, judges: Sequence[Callable[..., Finding]]) -> Finding:
+def either(results: Results, kind: str, judges: Sequence[Judge]) -> Finding:
     """Whether one of several claims holds, and the one that says most for it."""
     findings = [judge(results, kind) for judge in judges]
-    for holds in ("yes", "undecided"):
-        for finding in findings:
-            if finding.holds == holds:
-                return finding
-    return findings[0]
+    order = ("yes", "undecided", "no")
+    return min(findings, key=lambda finding: order.index(finding.holds))

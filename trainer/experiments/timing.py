@@ -55,12 +55,13 @@ def measure(store: Store) -> dict[str, Any]:
             for name in names:
                 began_s = time.perf_counter()
                 driven = runs[name].advance().steps
-                turns[name].append((driven, time.perf_counter() - began_s))
+                turns[name].append((driven, round(time.perf_counter() - began_s, 4)))
                 bar.advance({"last": name}, min(driven, max(wanted - steps[name], 0)))
                 steps[name] += driven
             names = names[1:] + names[:1]
+        machine = about()
     ids = {unit.algorithm: training_id(unit, store.plan, store.humans) for unit in units}
-    return {**about(), "trainings": ids, "turns": turns}
+    return {**machine, "trainings": ids, "turns": turns}
 
 
 def seconds(turns: Turns) -> float:

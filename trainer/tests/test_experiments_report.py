@@ -137,7 +137,12 @@ class TestJudges:
         found, said = sooner_by(own, other, ALONE, SUCCESS, least=0.9)
         assert found.value == pytest.approx(6_000 / 1_800), "a lower bound"
         assert said == "1,800 against never steps"
-        rest: Any = {"places": ["left_turn"], "quantities": [SUCCESS], "least": 0.9, "by_mean": True}
+        rest: Any = {
+            "places": ["left_turn"],
+            "quantities": [SUCCESS],
+            "least": 0.9,
+            "by_mean": True,
+        }
         bar = sooner(results, ALONE, ours=[PHIL], others=[PER], times=4.0, **rest)
         assert bar.holds == "undecided"
         assert sooner(results, ALONE, ours=[PHIL], others=[PER], times=3.0, **rest).holds == "yes"
