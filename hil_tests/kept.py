@@ -11,7 +11,7 @@ from typing import Any
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes, write_json
 from trainer.drivers import make_environment
-from trainer.experiments.units import digest
+from trainer.experiments.plan import digest
 from trainer.files import make_directory
 
 

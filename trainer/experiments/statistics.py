@@ -59,6 +59,14 @@ def mean_estimate(values: Iterable[float]) -> Estimate:
     return Estimate(mean, mean - reach, mean + reach, len(numbers))
 
 
+def success_estimate(successes: int, count: int) -> Estimate:
+    """Share of successes and Wilson's 95 % interval."""
+    if count == 0:
+        return NOTHING
+    interval = stats.binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
+    return Estimate(successes / count, float(interval.low), float(interval.high), count)
+
+
 def above(difference: Estimate, least: float = 0.0) -> Holds:
     """Whether a number is above ``least``: decided where the interval lies on one side."""
     if difference.low > least:
