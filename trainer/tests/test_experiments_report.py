@@ -15,7 +15,17 @@ from trainer.__main__ import main
 from trainer.experiments import judges
 from trainer.experiments.claims import BARS, CLAIMS, judge, judge_bars
 from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, load
-from trainer.experiments.judges import HI, IA, PER, PHIL, ahead, level, sooner, sooner_by
+from trainer.experiments.judges import (
+    HI,
+    IA,
+    PER,
+    PHIL,
+    ahead,
+    first_reached,
+    level,
+    sooner,
+    sooner_by,
+)
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import table, write_report
 from trainer.experiments.statistics import (
@@ -147,6 +157,17 @@ class TestJudges:
         assert bar.holds == "undecided"
         assert sooner(results, ALONE, ours=[PHIL], others=[PER], times=3.0, **rest).holds == "yes"
         assert sooner(results, ALONE, ours=[PER], others=[PHIL], times=1.0, **rest).holds == "no"
+
+    @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12), st.floats(0.0, 1.0))
+    def test_a_level_is_reached_where_the_curve_crosses_it(self, values, least):
+        grid, curve = 500.0 * np.arange(1, len(values) + 1), np.array(values)
+        steps = first_reached(grid, curve, least)
+        if np.isinf(steps):
+            assert curve.max() < least
+        else:
+            assert np.interp(steps, grid, curve) == pytest.approx(least, abs=1e-6) or steps == 500.0
+            assert (curve[grid < steps] <= least).all()
+            assert steps <= first_reached(grid, curve, min(least + 0.1, 1.0))
 
     def test_every_claim_and_bar_is_judged(self, everything):
         judged, bars = list(judge(everything)), list(judge_bars(everything))
