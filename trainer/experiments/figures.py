@@ -230,7 +230,9 @@ def draw_boxes(results: Results, algorithms: Sequence[str]) -> Figure:
                 x, 0.96, mark, transform=panel.get_xaxis_transform(), ha="center", fontsize=8
             )
         named = [Patch(fc=colour(line), label=_counted(results, scenario, line)) for line in lines]
-        panel.legend(handles=named, fontsize=8, loc="lower left")
+        panel.legend(
+            handles=named, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.06)
+        )
         panel.margins(y=0.12)
         _finish(panel, [scene.label for scene in scenes])
     figure.supxlabel(

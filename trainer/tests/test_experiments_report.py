@@ -14,7 +14,7 @@ from edge_runtime.errors import UserError
 from trainer.__main__ import main
 from trainer.experiments import judges
 from trainer.experiments.claims import BARS, CLAIMS, judge, judge_bars
-from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, load
+from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, grid_of, load
 from trainer.experiments.judges import (
     HI,
     IA,
@@ -160,7 +160,7 @@ class TestJudges:
 
     @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12), st.floats(0.0, 1.0))
     def test_a_level_is_reached_where_the_curve_crosses_it(self, values, least):
-        grid, curve = 500.0 * np.arange(1, len(values) + 1), np.array(values)
+        grid, curve = grid_of(500 * len(values)), np.array(values)
         steps = first_reached(grid, curve, least)
         if np.isinf(steps):
             assert curve.max() < least
