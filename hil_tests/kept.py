@@ -10,7 +10,7 @@ from typing import Any
 from edge_runtime.errors import UserError
 from edge_runtime.files import make_directory, read_json, write_json
 from trainer.drivers import make_environment
-from trainer.experiments.units import digest
+from trainer.experiments.plan import digest
 
 
 class KeptResults:

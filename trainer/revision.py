@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 HERE = Path(__file__).parent
-WRITTEN = ("results/units", "results/experiments", "results/README.md")
+WRITTEN = ("results/paper",)
 """What the experiments write themselves. Human models, which decide trainings, count as source."""
 
 

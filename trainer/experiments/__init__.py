@@ -1,1 +1,1 @@
-"""The paper's experiments: training runs, where they are kept, how they are drawn and judged."""
+"""The paper's experiments: what is trained, the kept records, its claims, figures and report."""

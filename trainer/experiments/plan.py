@@ -1,13 +1,35 @@
-"""How much is trained and tested for the paper's experiments: one table of numbers."""
+"""What the paper's experiments train and test: lines, settings and budgets, and a unit's id."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import hashlib
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from itertools import product
+from pathlib import Path
 from typing import Any, NamedTuple
 
-HUMAN_MODEL = "human_model"
-"""Stands in an algorithm's place where the human model itself is tested: nothing is trained."""
+import numpy as np
+
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes
+from trainer.drivers import EXPERTS, TRIGGERS, make_environment
+from trainer.evaluation import COMMAND_NOISE, CONDITIONS
+from trainer.human.guide import HumanGuide
+from trainer.human.model import MODEL_FILE
+from trainer.learner.algorithms import ALGORITHMS
+from trainer.training.config import BIASED as BIASED_GUIDANCE
+from trainer.training.config import PRESETS, RunConfig
+
+FULL_PATH_M = {"left_turn": 21.0, "congestion": 80.0}
+"""Scenario -> distance from start to goal."""
+SCENARIOS = tuple(FULL_PATH_M)
+HUMAN_MODEL, CONSTANT = "human_model", "constant"
+"""In an algorithm's place: the human model alone, and the best constant action. Both are tested
+only, once in each scenario."""
+TESTED_ONLY = (HUMAN_MODEL, CONSTANT)
 
 
 @dataclass(frozen=True)
@@ -15,114 +37,293 @@ class Setting:
     """How the runs of a setting differ from the normal ones."""
 
     meaning: str
+    preset: str = "ours"
+    """Where its settings start from."""
     run: Mapping[str, Any] = field(default_factory=dict)
     """Fields of the run's config that it changes."""
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters that it changes."""
 
 
-NORMAL, TOUGH, POOR, REMEDY = "normal", "tough", "poor", "remedy"
-EXACT_LOSSES, IMPORTANCE, WEAK_CLONING = "exact_losses", "importance", "weak_cloning"
-PRINTED_RATES, PRINTED_REWARD, LAST_ACTOR = "printed_rates", "printed_reward", "last_actor"
-NETWORK = "network"
+NORMAL, ONE_FRAME, RANDOM, BIASED, PRINTED = "normal", "one_frame", "random", "biased", "printed"
+POOR_SHARE = 1.0 / 3.0
+"""Share of the human's actions that poor guidance replaces (section VII-E)."""
 SETTINGS: Mapping[str, Setting] = {
-    NORMAL: Setting("section VI's definition"),
-    TOUGH: Setting("one frame instead of two", learner={"frames": 1}),
-    POOR: Setting(
-        "one third of the demonstrations replaced by random actions (section VII-E)",
-        run={"poor_guidance_share": 1.0 / 3.0},
+    NORMAL: Setting("two frames, good guidance"),
+    ONE_FRAME: Setting("one frame, the paper's tough setting", learner={"frames": 1}),
+    RANDOM: Setting(
+        "one third of the human's actions replaced by random ones, the paper's poor guidance",
+        run={"poor_guidance_share": POOR_SHARE},
     ),
-    # Not in the paper; the weight was measured on one run of a prototype.
-    REMEDY: Setting(
-        "a price on the action before tanh, for algorithms whose policy saturates",
-        learner={"saturation_weight": 0.1},
+    BIASED: Setting(
+        "one third of the human's actions replaced by one wrong action, always the same",
+        run={"poor_guidance_share": POOR_SHARE, "poor_guidance": BIASED_GUIDANCE},
     ),
-    EXACT_LOSSES: Setting("losses as eq. 22 and 23 are printed", learner={"split_loss": True}),
-    IMPORTANCE: Setting(
-        "the importance weights that the paper calls optional",
-        learner={"importance_sampling": True},
-    ),
-    WEAK_CLONING: Setting(
-        "a tenth of the weight on behaviour cloning, for which the paper gives no value",
-        learner={"cloning_weight": 1.0},
-    ),
-    PRINTED_RATES: Setting(
-        "table A5's learning rates, which the authors' code has the other way round",
-        learner={"actor_learning_rate": 5e-4, "critic_learning_rate": 2e-4},
-    ),
-    PRINTED_REWARD: Setting(
-        "weight 1 on the reward's term of speed or steering", run={"printed_reward": True}
-    ),
-    LAST_ACTOR: Setting(
-        "the actor as it stands judged, not its average", run={"averaged_actor": False}
-    ),
-    NETWORK: Setting(
-        "training behind a network, as with `trainer train --latency`",
-        run={"latency": "delay=100ms,jitter=20ms,loss=2%"},
-    ),
+    PRINTED: Setting("every number and equation as the paper prints it", preset="printed"),
 }
 
+LABELS = {
+    "phil_td3": "PHIL-TD3",
+    "ia_td3": "IA-TD3",
+    "hi_td3": "HI-TD3",
+    "per_td3": "vanilla TD3",
+    "phil_td_only": "TD error alone",
+    "phil_q_advantage_only": "Q advantage alone",
+    "phil_advantage_0.1": "weight 0.1",
+    "phil_advantage_100": "weight 100",
+    "rd2_td3": "RD2-TD3",
+    "rd2_phil": "RD2-PHIL",
+    "phil_without_cloning": "without cloning",
+    "phil_without_shaping": "without shaping",
+    HUMAN_MODEL: "human model",
+    CONSTANT: "best constant action",
+}
+FOUR = ("phil_td3", "ia_td3", "hi_td3", "per_td3")
+"""What the paper compares throughout."""
+GUIDED = FOUR[:3]
+PARTS = ("phil_without_cloning", "phil_without_shaping")
+PRIORITIES = ("phil_td_only", "phil_q_advantage_only")
+BUFFERS = ("rd2_phil", "rd2_td3")
+WEIGHTS = ("phil_advantage_0.1", "phil_advantage_100")
+LEFT, JAM = ("left_turn",), ("congestion",)
+LINES: tuple[tuple[int, str, tuple[str, ...]], ...] = (
+    (0, NORMAL, TESTED_ONLY),
+    (1, NORMAL, FOUR),
+    (2, BIASED, GUIDED),
+    (3, PRINTED, FOUR),
+    (4, ONE_FRAME, FOUR),
+    (5, RANDOM, GUIDED),
+    (6, NORMAL, PARTS),
+    (7, NORMAL, (*PRIORITIES, *BUFFERS)),
+    (8, NORMAL, WEIGHTS),
+)
+"""Everything that is computed: priority (what comes first), setting, algorithms."""
+DEFAULT_SEEDS = 5
 
-class Scene(NamedTuple):
-    """A test scene."""
 
-    scenario: str
-    condition: str
-    label: str
-    """As in the paper's fig. 9."""
+class Experiment(NamedTuple):
+    """A figure or table of the paper, and the units it needs."""
+
     title: str
+    algorithms: tuple[str, ...]
+    settings: tuple[str, ...] = (NORMAL,)
+    scenarios: tuple[str, ...] = SCENARIOS
 
 
-SCENES = (
-    Scene("left_turn", "nominal", "L", "left turn"),
-    Scene("left_turn", "noise", "L-N", "left turn, noise"),
-    Scene("left_turn", "variant", "L-V", "left turn, variant"),
-    Scene("congestion", "nominal", "C", "congestion"),
-    Scene("congestion", "noise", "C-N", "congestion, noise"),
-    Scene("congestion", "variant", "C-V", "congestion, variant"),
-)
-"""The six of section VII-D, which the paper's figures and claims are about."""
-DENSE_SCENES = (
-    Scene("left_turn", "dense", "L-D", "left turn, dense"),
-    Scene("congestion", "dense", "C-D", "congestion, dense"),
-)
-"""Beside the paper's six: scenes that leave room above a good policy."""
-SCENARIO_TITLES = {"left_turn": "left turn", "congestion": "congestion"}
-FULL_PATH_M = {"left_turn": 21.0, "congestion": 80.0}
-"""Distance from start to goal."""
+TIME = "time"
+EXPERIMENTS: Mapping[str, Experiment] = {
+    "fig7": Experiment("learning curves", FOUR),
+    "fig8": Experiment("normal and tough setting", FOUR, (NORMAL, ONE_FRAME)),
+    "fig9": Experiment("success and surviving distance", (*FOUR, *TESTED_ONLY)),
+    "fig10": Experiment("time and smoothness", FOUR),
+    "fig11": Experiment("what the priority is made of", ("phil_td3", *PRIORITIES)),
+    "fig12": Experiment("weight of the Q advantage", ("phil_td3", *WEIGHTS)),
+    "fig13": Experiment("one replay buffer or two", ("phil_td3", *BUFFERS)),
+    "fig14": Experiment("surviving distance after poor guidance", GUIDED, (NORMAL, RANDOM, BIASED)),
+    "fig15": Experiment("smoothness after poor guidance", GUIDED, (NORMAL, RANDOM)),
+    "table1": Experiment("beside the human, left turn", (*GUIDED, HUMAN_MODEL), scenarios=LEFT),
+    "table2": Experiment("beside the human, congestion", (*GUIDED, HUMAN_MODEL), scenarios=JAM),
+    "ablation": Experiment("PHIL-TD3 without each of its parts", ("phil_td3", "ia_td3", *PARTS)),
+    "printed": Experiment("the settings as the paper prints them", FOUR, (NORMAL, PRINTED)),
+    "floor": Experiment("the best constant action", (CONSTANT,)),
+}
+"""Name on the command line -> what it is."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What every training run of the experiments has in common."""
+    """What every unit has in common."""
 
-    episodes: Mapping[str, int]
-    """Scenario -> episodes of a run."""
-    evaluate_every_steps: int = 10
-    """Episodes between two validations; the best validated actor is the one that is tested."""
-    evaluation_runs: int = 100
-    """Episodes of a validation."""
-    test_runs: int = 50
-    """Test episodes in each scene, with the seeds 0, 1, ... for every policy (section VII-D)."""
+    steps: Mapping[str, int]
+    """Scenario -> environment steps of a training, the same for every algorithm."""
+    evaluate_every_steps: int = 500
+    """Environment steps between two validations; the best validated actor is tested."""
+    evaluation_runs: int = 50
+    """Drives of a validation."""
+    test_runs: int = 250
+    """Test drives in each scene, with the seeds 0, 1, ...: the paper's 50 first, then others."""
+    together: int = 50
+    """Test drives side by side."""
     checkpoint_every: int = 5
-    """Episodes between two checkpoints; it decides what a kill costs, not what a run gives."""
-    learner: Mapping[str, Any] = field(default_factory=dict)
-    """Hyper-parameters that differ from the defaults, for every algorithm alike."""
+    """Episodes between two checkpoints: what a kill costs, not what a run gives."""
+    search_runs: int = 100
+    """Validation drives of each constant action in the search for the best one."""
+    search_points: int = 21
+    """Actions on each of the two grids of that search."""
     timed_steps: int = 10_000
-    """Training steps of each algorithm that are timed (the paper's table of time efficiency)."""
-    turn_steps: int = 100
-    """Least steps of an algorithm before the next one has its turn."""
+    """Training steps of each algorithm whose time is taken."""
+    learner: Mapping[str, Any] = field(default_factory=dict)
+    """Hyper-parameters changed for every algorithm alike."""
 
 
-PLAN = Plan(episodes={"left_turn": 200, "congestion": 100})
+PLAN = Plan(steps={"left_turn": 6_000, "congestion": 8_000})
 QUICK = Plan(
-    episodes={"left_turn": 3, "congestion": 3},
-    evaluate_every_steps=2,
-    evaluation_runs=1,
+    steps={"left_turn": 250, "congestion": 250},
+    evaluate_every_steps=100,
+    evaluation_runs=2,
     test_runs=3,
+    together=3,
     checkpoint_every=1,
+    search_runs=2,
+    search_points=3,
+    timed_steps=200,
     learner={"batch_size": 4, "warmup_steps": 16},
-    timed_steps=40,
-    turn_steps=10,
 )
-"""A look at the whole way in a minute or two; its figures mean nothing."""
+"""A look at everything in a minute or two; its numbers mean nothing."""
+UNLIMITED_EPISODES = 10**6
+"""So many that steps decide."""
+PAPER_TESTS = 50
+"""Of the test drives in a scene, the first so many have the paper's seeds (section VII-D)."""
+
+
+class Unit(NamedTuple):
+    """One training with its tests, or tests alone."""
+
+    scenario: str
+    algorithm: str
+    setting: str
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.scenario} {self.algorithm} {self.setting} seed {self.seed}"
+
+    @property
+    def trained(self) -> bool:
+        """Whether anything is trained for it."""
+        return self.algorithm not in TESTED_ONLY
+
+    @property
+    def needs_human(self) -> bool:
+        """Whether a human model decides its result."""
+        return self.algorithm == HUMAN_MODEL or (self.trained and ALGORITHMS[self.algorithm].guided)
+
+
+def units_of(names: Collection[str], seeds: int, scenario: str | None = None) -> list[Unit]:
+    """The units of some experiments, or of ``all``, each once, in the order of work.
+
+    Seed by seed within a priority, so that work that stops early leaves balanced results.
+    """
+    chosen = EXPERIMENTS.values() if "all" in names else [EXPERIMENTS[name] for name in names]
+    wanted = {
+        line
+        for one in chosen
+        for line in product(one.scenarios, one.algorithms, one.settings)
+        if scenario in (None, line[0])
+    }
+    units = []
+    for priority, setting, algorithms in LINES:
+        for place, algorithm in enumerate(algorithms):
+            numbers = [0] if algorithm in TESTED_ONLY else range(1, seeds + 1)
+            for (turn, where), seed in product(enumerate(SCENARIOS), numbers):
+                if (where, algorithm, setting) in wanted:
+                    order = (priority, seed, turn, place)
+                    units.append((order, Unit(where, algorithm, setting, seed)))
+    return [unit for _, unit in sorted(units)]
+
+
+def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:
+    """The settings of a unit's training."""
+    setting = SETTINGS[unit.setting]
+    start = PRESETS[setting.preset]
+    return replace(
+        start,
+        scenario=unit.scenario,
+        algorithm=unit.algorithm,
+        seed=unit.seed,
+        episodes=UNLIMITED_EPISODES,
+        steps=plan.steps[unit.scenario],
+        human=str(humans / unit.scenario) if unit.needs_human else "expert",
+        evaluate_every_steps=plan.evaluate_every_steps,
+        evaluation_runs=plan.evaluation_runs,
+        checkpoint_every=plan.checkpoint_every,
+        threads=1,
+        learner=replace(start.learner, **{**plan.learner, **setting.learner}),
+        **setting.run,
+    )
+
+
+NOT_DECIDING = ("device", "threads", "checkpoint_every", "human")
+"""Fields of a run's config that do not decide its result: the human does, but by the model's
+contents and not by where it lies."""
+
+
+def obstacle(unit: Unit, humans: Path) -> str | None:
+    """Why a unit cannot be computed, in a few words; None where it can."""
+    if unit.needs_human and not (humans / unit.scenario / MODEL_FILE).is_file():
+        return f"there is no human model in {humans / unit.scenario}"
+    return None
+
+
+def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
+    """What decides a unit's training, as plain values."""
+    reason = obstacle(unit, humans)
+    if reason:
+        raise UserError(f"{unit}: {reason}; see `python -m trainer human --help`")
+    values: dict[str, Any] = {"unit": unit._asdict(), "human": None}
+    if unit.needs_human:
+        model = read_bytes(humans / unit.scenario / MODEL_FILE, "human model")
+        values["human"] = hashlib.sha256(model).hexdigest()[:ID_LENGTH]
+    if unit.trained:
+        config = run_config(unit, plan, humans)
+        kept = {k: v for k, v in config.as_dict().items() if k not in NOT_DECIDING}
+        values["config"] = kept
+        values["switches"] = asdict(ALGORITHMS[unit.algorithm])
+        values["scene"] = behaviour(unit.scenario, "nominal", config.printed_reward)
+    if unit.algorithm == CONSTANT:
+        values["search"] = [plan.search_runs, plan.search_points]
+        values["scene"] = behaviour(unit.scenario, "nominal")
+    return values
+
+
+def testing(unit: Unit, plan: Plan) -> dict[str, Any]:
+    """What decides a unit's tests beside its training."""
+    scenes = {name: behaviour(unit.scenario, name) for name in CONDITIONS}
+    return {"runs": plan.test_runs, "noise_std": COMMAND_NOISE, "scenes": scenes}
+
+
+ID_LENGTH = 12
+
+
+def training_id(unit: Unit, plan: Plan, humans: Path) -> str:
+    """Names the directory in which a unit is trained: tests that change do not touch it."""
+    return digest(deciding(unit, plan, humans))
+
+
+def unit_id(unit: Unit, plan: Plan, humans: Path) -> str:
+    """Names a unit's record: a short hash of all that decides it."""
+    return digest({**deciding(unit, plan, humans), "testing": testing(unit, plan)})
+
+
+def digest(values: Mapping[str, Any]) -> str:
+    """Hash of plain values, whatever the order in which they stand."""
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:ID_LENGTH]
+
+
+@cache
+def behaviour(scenario: str, condition: str, printed_reward: bool = False) -> str:
+    """Hash of what a scene does: pictures, rewards and the human's take-overs in three drives.
+
+    It sees what a list of numbers from configs would miss, a changed line of code, and leaves
+    alone what changes nothing. Numbers are rounded, since libraries differ in their last bits.
+    """
+    env = make_environment(scenario, condition, printed_reward)
+    expert = EXPERTS[scenario](env)
+    guide = HumanGuide(expert, TRIGGERS[scenario](expert))
+    seen = hashlib.sha256()
+    for seed in range(3):
+        observation, info = env.reset(seed=seed)
+        guide.reset()
+        random, ended = np.random.default_rng(seed), False
+        while not ended:
+            policy = random.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+            intervention = guide.watch(observation, policy)
+            action = policy if intervention is None else intervention.action
+            observation, reward, terminated, truncated, info = env.step(action)
+            ended = terminated or truncated
+            seen.update(observation.tobytes())
+            numbers = [reward, info["distance_m"], *map(float, action)]
+            why = None if intervention is None else (intervention.reason, intervention.first)
+            seen.update(repr(([round(number, 6) + 0.0 for number in numbers], why)).encode())
+        seen.update(str(info["outcome"]).encode())
+    return seen.hexdigest()[:ID_LENGTH]

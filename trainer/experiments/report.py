@@ -1,100 +1,287 @@
-"""From the store to figures, verdicts and the table of what is done."""
+"""One page that holds the results against the paper: claims, bars, tables and figures."""
 
 from __future__ import annotations
 
-import sys
+import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from rich.console import Console
-from rich.table import Table
+import numpy as np
 
-from edge_runtime.files import make_directory
-from trainer.experiments import timing
-from trainer.experiments.catalogue import EXPERIMENTS, NAMES, TIME
-from trainer.experiments.figures.style import write_figure
-from trainer.experiments.gathered import Gathered, gather
-from trainer.experiments.store import BEGUN, DONE, IMPOSSIBLE, MISSING, RUNNING, Store
-from trainer.experiments.units import Unit, obstacle
-from trainer.experiments.verdict import Verdict, verdict_of, write_verdict
+from edge_runtime.errors import UserError
+from edge_runtime.files import read_bytes, write_atomic
+from trainer.experiments.claims import Judged, judge, judge_bars
+from trainer.experiments.data import (
+    ALONE,
+    DISTANCE,
+    PAPER_SCENES,
+    SCENES,
+    SUCCESS,
+    Line,
+    Results,
+    load,
+)
+from trainer.experiments.figures import FIGURES, write_figure
+from trainer.experiments.judges import SAME_LEVEL, Finding, name_of, steps_to
+from trainer.experiments.plan import (
+    CONSTANT,
+    EXPERIMENTS,
+    HUMAN_MODEL,
+    LINES,
+    PAPER_TESTS,
+    SCENARIOS,
+    SETTINGS,
+    TIME,
+    units_of,
+)
+from trainer.experiments.run import Store
+from trainer.experiments.statistics import Estimate, mean_estimate, within
+from trainer.experiments.timing import PAPER_S, TIME_FILE, Turns, ratio, seconds
 
-STATES = (DONE, RUNNING, BEGUN, MISSING, IMPOSSIBLE)
-TIME_TITLE = "training time of the algorithms"
-
-
-def directory_of(store: Store, name: str) -> Path:
-    """Where an experiment's figure and verdict are."""
-    return store.results / "experiments" / name
-
-
-def draw_experiment(
-    store: Store, name: str, seeds: int, device: str = "cpu", draw_only: bool = True
-) -> Verdict:
-    """Draw and judge an experiment from what the store has, however little that is."""
-    directory = directory_of(store, name)
-    make_directory(directory)
-    figure_file = f"{name}.png"
-    if name == TIME:
-        turns = timing.load_or_measure(directory, store.plan, store.humans, device, draw_only)
-        gathered = Gathered([], {}, seeds)
-        figure, claims, title = timing.draw(turns), timing.judge(turns), TIME_TITLE
-    else:
-        experiment = EXPERIMENTS[name]
-        gathered = gather(store, experiment.units(seeds), seeds)
-        figure, claims = experiment.draw(gathered), experiment.judge(gathered)
-        title = experiment.title
-    write_figure(figure, directory / figure_file)
-    verdict = verdict_of(name, title, claims, gathered, figure_file)
-    write_verdict(verdict, directory)
-    return verdict
-
-
-def outcome_line(verdict: Verdict, directory: Path) -> str:
-    """What an experiment came to, in one line."""
-    holds = Counter(one.holds for one in verdict.claims)
-    said = ", ".join(f"{holds[word]} {word}" for word in ("yes", "no", "undecided") if holds[word])
-    units = ""
-    if verdict.wanted:
-        units = f"{verdict.wanted - len(verdict.missing)} of {verdict.wanted} units; "
-    return f"{verdict.name}: {units}claims: {said}: {directory}"
+COMMAND = "python -m trainer experiment"
+PAPER_TABLES: dict[str, dict[str, tuple[str, ...]]] = {
+    "table1": {
+        "phil_td3": ("21.28±0.02", "21.27±0.02", "21.29±0.02"),
+        "ia_td3": ("20.37±2.58", "19.75±3.05", "19.46±3.03"),
+        "hi_td3": ("20.87±1.76", "20.63±1.74", "19.90±2.65"),
+        HUMAN_MODEL: ("20.70±1.82", "20.88±1.32", "20.90±1.21"),
+    },
+    "table2": {
+        "phil_td3": ("80.15±0.08", "79.26±4.30", "77.29±11.55"),
+        "ia_td3": ("79.26±5.90", "78.64±6.11", "78.39±7.66"),
+        "hi_td3": ("76.27±16.00", "76.02±13.72", "73.57±18.49"),
+        HUMAN_MODEL: ("80.11±0.07", "77.66±12.27", "75.15±15.20"),
+    },
+}
+"""Tables I and II of the paper: surviving distance, m, by scene."""
 
 
-def warn_of_obstacles(store: Store, units: Iterable[Unit]) -> list[Unit]:
-    """The units that this version can compute; each reason why others cannot is said once."""
-    possible, reasons = [], Counter[str]()
-    for unit in units:
-        reason = obstacle(unit, store.humans)
-        if reason is None:
-            possible.append(unit)
-        else:
-            reasons[reason] += 1
-    for reason, count in reasons.items():
-        print(f"left out: {count} units, since {reason}", file=sys.stderr)
-    return possible
+def write_report(store: Store, seeds: int) -> Path:
+    """Draw all figures and write the page beside the records; returns its path.
+
+    Raises:
+        UserError: there are no records at all.
+    """
+    results = load(store, seeds)
+    if not results.found:
+        raise UserError(f"there are no results to report in {store.results}")
+    for name, draw in FIGURES.items():
+        write_figure(draw(results), store.results / f"{name}.png")
+    path = store.results / "README.md"
+    write_atomic(path, ("\n".join(_page(results, store)) + "\n").encode())
+    return path
 
 
-def print_status(store: Store, names: Sequence[str], seeds: int) -> None:
-    """A table on stdout: how many units of each experiment are in which state."""
-    table = Table("experiment", *STATES, title=f"units with {seeds} seeds")
-    states: dict[Unit, str] = {}
-    for name in (name for name in NAMES if name in names and name != TIME):
-        units = EXPERIMENTS[name].units(seeds)
-        for unit in units:
-            if unit not in states:
-                states[unit] = store.state(unit)
-        table.add_row(name, *_counts(states[unit] for unit in units))
-    table.add_section()
-    table.add_row("all, each once", *_counts(states.values()))
-    if TIME in names:
-        measured = (directory_of(store, TIME) / timing.MEASURED_FILE).is_file()
-        table.add_row(TIME, "measured" if measured else "-", "", "", "" if measured else "1", "")
-    Console().print(table)
-    for unit in (unit for unit in states if states[unit] == RUNNING):
-        print(f"running: {unit}, {store.holder(unit)}")
-    warn_of_obstacles(store, states)
+def _page(results: Results, store: Store) -> Iterator[str]:
+    judged, bars = list(judge(results)), list(judge_bars(results))
+    yield from _introduction(results, judged, bars)
+    yield from _section("The paper's claims", f"{COMMAND} report")
+    yield from (
+        "A verdict is yes or no where a 95 % interval of the difference, paired by training seed, "
+        "lies on one side of the bar; else it is undecided. What decides is the worst of the "
+        "comparisons that a claim makes. Learning curves are judged twice: as the paper does, on "
+        "training episodes in which the human helps, and by the policy alone on validation drives.",
+        "",
+    )
+    yield from table(
+        ("", "claim", "the paper", "what decides", "holds", "policy alone", "holds"),
+        (_claim_row(one) for one in judged),
+    )
+    yield from _time_lines(store.results / TIME_FILE)
+    yield from _section("This project's bars", f"{COMMAND} report")
+    yield from (
+        "Of the policy alone: means of the seeds decide about shares and steps, 95 % intervals "
+        "about who is ahead.",
+        "",
+    )
+    yield from table(("bar", "measured", "met"), ((t, f.ours, f.holds) for t, f in bars))
+    yield from _tests(results)
+    for name, scenario in zip(PAPER_TABLES, SCENARIOS, strict=True):
+        yield from _paper_table(results, name, scenario)
+    yield from _costs(results)
+    for name in FIGURES:
+        yield from _section(f"{name}: {EXPERIMENTS[name].title}", f"{COMMAND} {name}")
+        yield from (f"![{EXPERIMENTS[name].title}]({name}.png)", "")
 
 
-def _counts(states: Iterable[str]) -> list[str]:
-    found = Counter(states)
-    return [str(found[state] or "-") for state in STATES]
+def _introduction(
+    results: Results, judged: Sequence[Judged], bars: Sequence[tuple[str, Finding]]
+) -> Iterator[str]:
+    wanted = units_of(["all"], results.seeds)
+    holds, met = Counter(one.found.holds for one in judged), Counter(f.holds for _, f in bars)
+    budgets = " and ".join(
+        f"{results.budget(scenario):,} in the {scenario.replace('_', ' ')}"
+        for scenario in SCENARIOS
+    )
+    yield from (
+        "# The paper's experiments, run again",
+        "",
+        f"`{COMMAND} all --seeds {results.seeds}` computes what is missing, `{COMMAND} report` "
+        "writes this page and its figures from `left_turn.jsonl` and `congestion.jsonl`, one line "
+        f"a training. {len(results.found)} of {len(wanted)} trainings and tests are there.",
+        "",
+        f"Every algorithm has the same budget of environment steps: {budgets}. The policy is "
+        "validated alone every 500 steps; the best validated actor drives 250 test drives in each "
+        f"scene, of which the first {PAPER_TESTS} have the paper's seeds.",
+        "",
+        f"Of the paper's {len(judged)} claims {holds['yes']} hold, {holds['no']} do not, and "
+        f"{holds['undecided']} are undecided. Of this project's {len(bars)} bars {met['yes']} are "
+        f"met, {met['no']} are not, {met['undecided']} are undecided.",
+        "",
+    )
+    if results.stale:
+        yield from (
+            f"{len(results.stale)} records are of other settings than today's and left out.", ""
+        )  # fmt: skip
+    yield from table(
+        ("setting", "meaning", "algorithms"),
+        (
+            (name, SETTINGS[name].meaning, ", ".join(name_of(Line(a)) for a in algorithms))
+            for _, name, algorithms in LINES
+            if HUMAN_MODEL not in algorithms
+        ),
+    )
+
+
+def _claim_row(one: Judged) -> tuple[str, ...]:
+    claim, found, alone = one
+    link = f"[{claim.source}](#{_anchor(claim.source)})"
+    alone_cells = (alone.ours, alone.holds) if alone else ("", "")
+    return (link, claim.text, claim.paper, found.ours, found.holds, *alone_cells)
+
+
+def _anchor(source: str) -> str:
+    """Of the section of an experiment, as GitHub makes it."""
+    title = f"{source} {EXPERIMENTS[source].title}".lower().replace(",", "")
+    return title.replace(" ", "-")
+
+
+def _time_lines(path: Path) -> Iterator[str]:
+    """The paper's table of time efficiency beside ours, and what it says of them."""
+    yield from _section("Training time", f"{COMMAND} {TIME}")
+    if not path.is_file():
+        yield from ("Not measured.", "")
+        return
+    turns = _turns(path)
+    yield from table(
+        ("seconds for 10,000 steps", *(name_of(Line(name)) for name in PAPER_S)),
+        (
+            ("the paper", *(f"{each:.0f}" for each in PAPER_S.values())),
+            ("ours", *(f"{seconds(turns[name]):.0f}" for name in PAPER_S)),
+        ),
+    )
+    found = ratio(turns["phil_td3"], turns["ia_td3"])
+    value, low, high = (each - 1.0 for each in found[:3])
+    holds = within(Estimate(value, low, high, found.size), SAME_LEVEL)
+    yield from (
+        f'"Similar", says the paper of PHIL-TD3 and IA-TD3 (1.03 times): {found.text(3)} times, '
+        f"so within 5 %: {holds}.",
+        "",
+    )
+
+
+def _turns(path: Path) -> dict[str, Turns]:
+    try:
+        measured = json.loads(read_bytes(path, "measurement"))["turns"]
+        return {name: [(int(n), float(s)) for n, s in measured[name]] for name in PAPER_S}
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{path} is no measurement of this project") from None
+
+
+def _tests(results: Results) -> Iterator[str]:
+    """Success of every policy in every scene."""
+    yield from _section("Test drives", f"{COMMAND} fig9 fig14 printed floor")
+    yield from ("Success in %, mean of the seeds, with its 95 % interval; in brackets that of the "
+                f"paper's {PAPER_TESTS} seeds alone.", "")  # fmt: skip
+    rows = []
+    for _, setting, algorithms in LINES:
+        for line in (Line(algorithm, setting) for algorithm in algorithms):
+            cells = []
+            for scene in SCENES:
+                found = mean_estimate(results.tested(scene, line, SUCCESS).values())
+                paper = results.pooled(scene, line, SUCCESS, paper=True)
+                shown = (
+                    f"{found.times(100.0).text(1)} ({100 * paper.mean():.0f})"
+                    if len(paper)
+                    else "–"
+                )
+                cells.append(shown)
+            if set(cells) != {"–"}:
+                rows.append((name_of(line), *cells))
+    yield from table(("", *(scene.label for scene in SCENES)), rows)
+
+
+def _paper_table(results: Results, name: str, scenario: str) -> Iterator[str]:
+    """A table of the paper with our numbers beside its own."""
+    title = EXPERIMENTS[name].title
+    yield from _section(f"{name}: {title}", f"{COMMAND} {name}")
+    yield from (
+        "Surviving distance, m, mean and standard deviation over the drives with the paper's "
+        f"{PAPER_TESTS} seeds, of all trainings: ours (the paper's). Distances end at the goal, at "
+        "21 and 80 m; the paper counts what was driven beyond it.",
+        "",
+    )
+    scenes = [scene for scene in PAPER_SCENES if scene.scenario == scenario]
+    rows = []
+    for algorithm, numbers in PAPER_TABLES[name].items():
+        cells = []
+        for scene, number in zip(scenes, numbers, strict=True):
+            ours = results.pooled(scene, Line(algorithm), DISTANCE, paper=True)
+            shown = f"{ours.mean():.2f}±{ours.std():.2f}" if len(ours) else "–"
+            cells.append(f"{shown} ({number})")
+        rows.append((name_of(Line(algorithm)), *cells))
+    yield from table(("", *(scene.label for scene in scenes)), rows)
+
+
+def _costs(results: Results) -> Iterator[str]:
+    """What each training cost, and where the policy alone ends."""
+    yield from _section("What the trainings cost", f"{COMMAND} all")
+    yield from ("Means of the seeds. Alone: validation drives of the policy without help.", "")
+    rows = []
+    for scenario in SCENARIOS:
+        for _, setting, algorithms in LINES:
+            for line in (Line(algorithm, setting) for algorithm in algorithms):
+                found = results.of(scenario, line)
+                if not found or not found[0].unit.trained:
+                    continue
+                totals = [result.record["totals"] for result in found]
+                ends = results.ends(scenario, line, ALONE, SUCCESS)
+                best = [each["validation"]["best"] for each in totals]
+                reached = steps_to(found, 0.9)
+                rows.append((
+                    scenario.replace("_", " "), name_of(line), str(len(found)),
+                    *(f"{np.mean([each[key] for each in totals]):,.0f}"
+                      for key in ("episodes", "steps", "updates", "human_steps", "takeovers")),
+                    f"{np.mean([sum(each['failures'].values()) for each in totals]):.0f}",
+                    f"{reached:,.0f}" if np.isfinite(reached) else "never",
+                    f"{100 * np.mean(best):.0f} %", f"{100 * np.mean(list(ends.values())):.0f} %",
+                ))  # fmt: skip
+    yield from table(
+        ("", "", "seeds", "episodes", "steps", "updates", "human steps", "take-overs", "failures",
+         "steps to 90 % alone", "best alone", "end alone"), rows)  # fmt: skip
+    floors = [
+        (scenario, result)
+        for scenario in SCENARIOS
+        for result in results.of(scenario, Line(CONSTANT))
+    ]
+    for scenario, result in floors:
+        tried = len(result.record["success_of"])
+        yield from (
+            f"Best constant action in the {scenario.replace('_', ' ')}: "
+            f"{result.record['action']:g}, the best of {tried} on validation drives.", ""
+        )  # fmt: skip
+
+
+def _section(title: str, command: str) -> Iterator[str]:
+    yield from (f"## {title}", "", f"`{command}`", "")
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterator[str]:
+    """A Markdown table and an empty line."""
+    yield f"| {' | '.join(head)} |"
+    yield "|---" * len(head) + "|"
+    for row in rows:
+        yield f"| {' | '.join(str(cell).replace('|', '/') for cell in row)} |"
+    yield ""

@@ -1,21 +1,19 @@
-"""Means, intervals and tests."""
+"""Means, intervals, tests and the words of a verdict."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from trainer.plots import moving_average
-
 Numbers = NDArray[np.float64]
 Holds = Literal["yes", "no", "undecided"]
 CONFIDENCE = 0.95
-WINDOW = 20
-"""Episodes over which curves are smoothed, and final averages taken."""
+TAIL = 0.5 * (1.0 - CONFIDENCE)
+"""Outside each end of an interval."""
 RESAMPLES = 2000
 
 
@@ -47,16 +45,17 @@ class Estimate(NamedTuple):
 NOTHING = Estimate(float("nan"), float("-inf"), float("inf"), 0)
 
 
-def mean_estimate(values: Sequence[float] | Numbers) -> Estimate:
+def mean_estimate(values: Iterable[float]) -> Estimate:
     """Mean and Student's 95 % interval; no interval for fewer than two values."""
-    numbers = np.asarray(values, dtype=float)
+    numbers = np.fromiter(values, float)
+    numbers = numbers[~np.isnan(numbers)]
     if len(numbers) == 0:
         return NOTHING
     mean = float(numbers.mean())
     if len(numbers) == 1:
         return Estimate(mean, float("-inf"), float("inf"), 1)
     error = float(numbers.std(ddof=1)) / len(numbers) ** 0.5
-    reach = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, len(numbers) - 1)) * error
+    reach = float(stats.t.ppf(1.0 - TAIL, len(numbers) - 1)) * error
     return Estimate(mean, mean - reach, mean + reach, len(numbers))
 
 
@@ -84,46 +83,22 @@ def within(difference: Estimate, reach: float) -> Holds:
 
 def all_of(answers: Sequence[Holds]) -> Holds:
     """Yes where all are, no where one is not."""
-    if "no" in answers or not answers:
-        return "no" if answers else "undecided"
-    return "yes" if set(answers) == {"yes"} else "undecided"
+    if "no" in answers:
+        return "no"
+    return "yes" if answers and set(answers) == {"yes"} else "undecided"
 
 
-class Judged(NamedTuple):
-    """Whether all of some differences are above a number."""
-
-    holds: Holds
-    size: int
-    """Values behind the one that decides, or the fewest behind any where all count."""
-    decisive: Estimate | None
-    """The one that says no; of those that leave it open the lowest; the lowest end of those that
-    say yes."""
-    rival: str
-    """Its name; empty where none decides."""
-
-
-def judge_all(differences: Mapping[str, Estimate], sign: float = 1.0, least: float = 0.0) -> Judged:
-    """Judge whether all differences, or with sign -1 their opposites, are above ``least``."""
-    signed = {name: each.times(sign) for name, each in differences.items()}
-    holds = all_of([above(each, least) for each in signed.values()])
-    if holds == "no":
-        rival = min(signed, key=lambda name: signed[name].high)
-        return Judged(holds, signed[rival].size, differences[rival], rival)
-    size = min((each.size for each in signed.values()), default=0)
-    candidates = {
-        name: each.low if holds == "yes" else each.value
-        for name, each in signed.items()
-        if each.size and above(each, least) == holds
-    }
-    if not candidates:
-        return Judged(holds, size, None, "")
-    rival = min(candidates, key=candidates.__getitem__)
-    return Judged(holds, size, differences[rival], rival)
+def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
+    """A number with the 95 % interval of its resampled values, some of which may be infinite."""
+    if size < 2:
+        return Estimate(point, float("-inf"), float("inf"), size)
+    ends = np.quantile(values, (TAIL, 1.0 - TAIL), method="inverted_cdf")
+    return Estimate(point, float(ends[0]), float(ends[1]), size)
 
 
 def paired_t(first: Numbers, second: Numbers) -> float:
     """P value of the paired t-test (two-sided); 1 where the pairs do not differ or are too few."""
-    difference = np.asarray(first, dtype=float) - np.asarray(second, dtype=float)
+    difference = first - second
     if len(difference) < 2 or np.all(difference == 0.0):
         return 1.0
     if np.all(difference == difference[0]):
@@ -135,8 +110,3 @@ def stars(p_value: float) -> str:
     """The usual marks of significance."""
     marks = ((0.001, "***"), (0.01, "**"), (0.05, "*"))
     return next((mark for limit, mark in marks if p_value < limit), "n.s.")
-
-
-def smoothed(curves: Numbers) -> Numbers:
-    """Curves of several seeds, float [seeds, episodes], each as a moving average."""
-    return np.stack([moving_average(curve, WINDOW) for curve in curves])

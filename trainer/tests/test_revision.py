@@ -14,7 +14,8 @@ def git(directory, *arguments: str) -> str:
 
 def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
     code, human = tmp_path / "trainer" / "code.py", tmp_path / "results" / "humans" / "human.pt"
-    table, unit = tmp_path / "results" / "README.md", tmp_path / "results" / "units" / "a.json"
+    paper = tmp_path / "results" / "paper"
+    table, unit = paper / "README.md", paper / "left_turn.jsonl"
     for path in (code, human, table, unit):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("as committed")
@@ -24,7 +25,7 @@ def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
     commit = git(tmp_path, "rev-parse", "HEAD")
     table.write_text("a run has written")
     unit.write_text("another one")
-    (unit.parent / "b.json").write_text("new")
+    (unit.parent / "fig7.png").write_text("new")
     assert revision_of(code.parent) == commit
     for path in (human, code):
         path.write_text("changed")

@@ -1,1 +1,0 @@
-"""What the paper says about each figure and table, held against what was gathered."""

@@ -1,0 +1,256 @@
+"""The kept records as arrays: what was trained, how it drives, one number a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_runtime.episode_report import GOAL
+from edge_runtime.errors import UserError
+from trainer.evaluation import CONDITIONS
+from trainer.experiments.plan import (
+    FULL_PATH_M,
+    HUMAN_MODEL,
+    NORMAL,
+    PAPER_TESTS,
+    SCENARIOS,
+    TESTED_ONLY,
+    Unit,
+    units_of,
+)
+from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
+
+Numbers = NDArray[np.float64]
+BySeed = dict[int, float]
+"""Training seed -> a number of that training."""
+GRID_STEPS = 500
+"""Curves are drawn and compared at multiples of it: the distance between two validations."""
+END_STEPS = 1_500
+"""What ended within so many steps of the last one is the end of a training."""
+SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
+TIME_S, LATERAL, LONGITUDINAL = "time_s", *TEST_COLUMNS[-2:]
+ARRIVED_ONLY = (TIME_S, LATERAL, LONGITUDINAL)
+"""Compared over drives that reach the goal only: who crashes at once was quick and smooth."""
+SPREAD = "spread_m"
+"""Standard deviation of the surviving distance from drive to drive."""
+TRAINING, ALONE = "in training", "alone"
+"""A curve of the training episodes, in which the human helps (the paper's), or of the policy alone,
+on validation seeds."""
+
+
+class Line(NamedTuple):
+    """An algorithm in a setting."""
+
+    algorithm: str
+    setting: str = NORMAL
+
+
+class Scene(NamedTuple):
+    """A scenario under a test condition."""
+
+    scenario: str
+    condition: str
+
+    @property
+    def label(self) -> str:
+        """As in the paper's figure 9: L, L-N, L-V, C, ..."""
+        letter = self.scenario[0].upper()
+        return letter if self.condition == "nominal" else f"{letter}-{self.condition[0].upper()}"
+
+
+SCENES = tuple(Scene(scenario, condition) for scenario in SCENARIOS for condition in CONDITIONS)
+PAPER_SCENES = tuple(s for s in SCENES if s.condition in ("nominal", "noise", "variant"))
+
+
+@dataclass(frozen=True)
+class Result:
+    """A unit's record."""
+
+    unit: Unit
+    record: Mapping[str, Any]
+
+    @cached_property
+    def budget(self) -> int:
+        """Environment steps that were to be trained."""
+        return int(self.record["config"]["steps"])
+
+    def points(self, kind: str, metric: str) -> tuple[Numbers, Numbers]:
+        """At which steps a metric was measured, and its values; in training once an episode."""
+        if kind == ALONE:
+            columns = self.record["validation"]
+            return np.asarray(columns["at_step"], float), np.asarray(columns[metric], float)
+        columns = self.record["training"]
+        if metric == SUCCESS:
+            values = np.array([outcome == GOAL for outcome in columns["outcome"]], float)
+        else:
+            values = np.asarray(columns["return" if metric == REWARD else metric], float)
+        values = self._cut(values) if metric == DISTANCE else values
+        return np.asarray(columns["end_step"], float), values
+
+    def curve(self, kind: str, metric: str) -> Numbers:
+        """A metric at each multiple of ``GRID_STEPS`` up to the budget.
+
+        In training it is the mean of the episodes since the multiple before, or of the next one
+        where none ended there.
+        """
+        steps, values = self.points(kind, metric)
+        grid = grid_of(self.budget)
+        if kind == ALONE:
+            return np.interp(grid, steps, values)
+        means = []
+        for end in grid:
+            inside = (steps > end - GRID_STEPS) & (steps <= end)
+            next_one = min(int(np.searchsorted(steps, end)), len(values) - 1)
+            means.append(values[inside].mean() if inside.any() else values[next_one])
+        return np.array(means)
+
+    def end(self, kind: str, metric: str) -> float:
+        """Mean of what was measured in the last ``END_STEPS`` steps."""
+        steps, values = self.points(kind, metric)
+        return float(values[steps > steps[-1] - END_STEPS].mean())
+
+    def reached(self, condition: str) -> NDArray[np.bool_]:
+        """Which test drives reached the goal, by seed."""
+        return np.array([outcome == GOAL for outcome in self.record["tests"][condition]["outcome"]])
+
+    def drives(self, condition: str, quantity: str) -> Numbers:
+        """A quantity of each test drive; distances without what lies beyond the goal, which is at
+        most one step and a matter of the speed there.
+        """
+        if quantity == SUCCESS:
+            return self.reached(condition).astype(float)
+        values = np.asarray(self.record["tests"][condition][quantity], float)
+        return self._cut(values) if quantity == DISTANCE else values
+
+    def _cut(self, distances_m: Numbers) -> Numbers:
+        return np.minimum(distances_m, FULL_PATH_M[self.unit.scenario])
+
+
+def grid_of(budget: int) -> Numbers:
+    """The multiples of ``GRID_STEPS`` up to a budget, or the budget alone."""
+    return (
+        np.arange(GRID_STEPS, budget + 1, GRID_STEPS, dtype=float)
+        if (budget >= GRID_STEPS)
+        else np.array([float(budget)])
+    )
+
+
+class Results:
+    """The results of a plan, of so many seeds.
+
+    Args:
+        found: unit -> its result.
+        seeds: how many seeds are wanted.
+        stale: units whose record is of other settings, and left out.
+    """
+
+    def __init__(
+        self, found: Mapping[Unit, Result], seeds: int, stale: Iterable[Unit] = ()
+    ) -> None:
+        self.found, self.seeds, self.stale = dict(found), seeds, tuple(stale)
+
+    def of(self, scenario: str, line: Line) -> list[Result]:
+        """What there is of a line in a scenario, by seed."""
+        numbers = [0] if line.algorithm in TESTED_ONLY else range(1, self.seeds + 1)
+        units = [Unit(scenario, *line, seed) for seed in numbers]
+        return [self.found[unit] for unit in units if unit in self.found]
+
+    def complete(self, scenario: str, line: Line) -> bool:
+        """Whether no seed is missing."""
+        wanted = 1 if line.algorithm in TESTED_ONLY else self.seeds
+        return len(self.of(scenario, line)) == wanted
+
+    def budget(self, scenario: str) -> int:
+        """The longest training in a scenario; 0 without any."""
+        trained = (r for r in self.found.values() if r.unit.trained)
+        return max((r.budget for r in trained if r.unit.scenario == scenario), default=0)
+
+    def ends(self, scenario: str, line: Line, kind: str, metric: str) -> BySeed:
+        """Where the trainings of a line end."""
+        return {r.unit.seed: r.end(kind, metric) for r in self.of(scenario, line)}
+
+    def tested(self, scene: Scene, line: Line, quantity: str) -> BySeed:
+        """Mean of a quantity over each seed's test drives."""
+        return {
+            result.unit.seed: _amount(result, scene.condition, quantity)
+            for result in self.of(scene.scenario, line)
+        }
+
+    def pooled(self, scene: Scene, line: Line, quantity: str, paper: bool = False) -> Numbers:
+        """A quantity of all drives of all seeds; of those with the paper's seeds alone."""
+        count = PAPER_TESTS if paper else None
+        parts = [r.drives(scene.condition, quantity)[:count] for r in self.of(scene.scenario, line)]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def differences(self, scene: Scene, first: Line, second: Line, quantity: str) -> BySeed:
+        """First minus second in the test drives, paired by training seed.
+
+        What is compared of arrivals only is the mean over the drives in which both arrive.
+        """
+        theirs = {r.unit.seed: r for r in self.of(scene.scenario, second)}
+        found = {}
+        for result in self.of(scene.scenario, first):
+            other = theirs.get(0 if second.algorithm in TESTED_ONLY else result.unit.seed)
+            if other is None:
+                continue
+            if quantity not in ARRIVED_ONLY:
+                value = _amount(result, scene.condition, quantity)
+                found[result.unit.seed] = value - _amount(other, scene.condition, quantity)
+                continue
+            both = result.reached(scene.condition) & other.reached(scene.condition)
+            if both.any():
+                own, its = (r.drives(scene.condition, quantity)[both] for r in (result, other))
+                found[result.unit.seed] = float((own - its).mean())
+        return found
+
+
+def _amount(result: Result, condition: str, quantity: str) -> float:
+    if quantity == SPREAD:
+        return float(result.drives(condition, DISTANCE).std())
+    values = result.drives(condition, quantity)
+    if quantity in ARRIVED_ONLY:
+        values = values[result.reached(condition)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def load(store: Store, seeds: int) -> Results:
+    """What there is of the whole plan.
+
+    Raises:
+        UserError: a record lacks what this project writes.
+    """
+    records = {scenario: store.records(scenario) for scenario in SCENARIOS}
+    found, stale = {}, []
+    for unit in units_of(["all"], seeds):
+        record = records[unit.scenario].get(unit)
+        if record is None:
+            continue
+        if record["id"] != store.id(unit):
+            stale.append(unit)
+            continue
+        found[unit] = Result(unit, _checked(record, store.records_file(unit.scenario)))
+    return Results(found, seeds, stale)
+
+
+def _checked(record: Mapping[str, Any], path: Any) -> Mapping[str, Any]:
+    """The record, whose columns are there and of one length."""
+    unit = Unit(**record["unit"])
+    tables: dict[str, tuple[Any, tuple[str, ...]]]
+    tables = {name: (record["tests"].get(name), TEST_COLUMNS) for name in CONDITIONS}
+    if unit.trained:
+        tables["training"] = record.get("training"), tuple(TRAINING_COLUMNS)
+        tables["validation"] = record.get("validation"), tuple(VALIDATION_COLUMNS)
+    for name, (columns, wanted) in tables.items():
+        if not isinstance(columns, dict) or not set(wanted) <= set(columns):
+            raise UserError(f"{path}: the record of {unit} lacks columns of {name}")
+        if len({len(columns[column]) for column in wanted}) != 1 or not columns[wanted[0]]:
+            raise UserError(f"{path}: the record of {unit} is cut off in {name}")
+    return record
+
+
+HUMAN = Line(HUMAN_MODEL)

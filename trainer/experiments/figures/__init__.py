@@ -1,1 +1,0 @@
-"""How the experiments are drawn."""

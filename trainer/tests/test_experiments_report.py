@@ -1,0 +1,293 @@
+"""Records out of the air, judged, drawn and reported; and the command around it."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge_runtime.cli import run_cli
+from edge_runtime.errors import UserError
+from trainer.__main__ import main
+from trainer.experiments import judges
+from trainer.experiments.claims import BARS, CLAIMS, judge, judge_bars
+from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, grid_of, load
+from trainer.experiments.judges import (
+    HI,
+    IA,
+    PER,
+    PHIL,
+    ahead,
+    first_reached,
+    level,
+    sooner,
+    sooner_by,
+)
+from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
+from trainer.experiments.report import table, write_report
+from trainer.experiments.statistics import (
+    Estimate,
+    above,
+    all_of,
+    mean_estimate,
+    paired_t,
+    within,
+)
+from trainer.experiments.timing import ratio, seconds
+from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
+
+SEEDS = 3
+LEFT = Scene("left_turn", "nominal")
+
+
+@pytest.fixture(scope="module")
+def everything():
+    return results_of(units_of(["all"], SEEDS), SEEDS)
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    monkeypatch.setattr(judges, "RESAMPLES", 200)
+
+
+class TestStatistics:
+    def test_an_interval_as_in_the_tables(self):
+        found = mean_estimate([1.0, 2.0, 3.0])
+        assert found.value == 2.0
+        assert found.high - 2.0 == pytest.approx(4.302653 * 1.0 / 3**0.5)
+        assert mean_estimate([]).size == 0
+        assert np.isinf(mean_estimate([1.0]).high)
+
+    @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=9), st.floats(-1e3, 1e3))
+    def test_a_verdict_never_says_both(self, values, least):
+        found = mean_estimate(values)
+        assert (found.low <= found.value <= found.high) or len(set(values)) == 1
+        opposite = {"yes": "no", "no": "yes", "undecided": "undecided"}
+        assert above(found.times(-1.0), -least) == opposite[above(found, least)]
+
+    @pytest.mark.parametrize(
+        ("low", "high", "holds"),
+        [(-0.5, 0.5, "yes"), (-0.5, 1.5, "undecided"), (1.5, 2.0, "no"), (-3.0, -1.5, "no")],
+    )
+    def test_one_level(self, low, high, holds):
+        assert within(Estimate(0.5 * (low + high), low, high, 5), 1.0) == holds
+
+    def test_all_of_several(self):
+        assert all_of(["yes", "yes"]) == "yes"
+        assert all_of(["yes", "undecided"]) == "undecided"
+        assert all_of(["no", "undecided"]) == "no"
+        assert all_of([]) == "undecided"
+
+    def test_the_paired_t_test(self):
+        assert paired_t(np.zeros(3), np.zeros(3)) == 1.0
+        assert paired_t(np.ones(3), np.zeros(3)) == 0.0
+        first = np.array([1.0, 2.0, 4.0])
+        assert paired_t(first, np.zeros(3)) == pytest.approx(0.1181, abs=1e-4)
+
+
+class TestData:
+    def test_curves_lie_on_multiples_of_500_steps(self, everything):
+        (result,) = everything.of("left_turn", PHIL)[:1]
+        curve = result.curve(TRAINING, DISTANCE)
+        assert len(curve) == 12
+        steps, values = result.points(TRAINING, DISTANCE)
+        assert curve[1] == pytest.approx(values[(steps > 500) & (steps <= 1000)].mean())
+        assert result.end(TRAINING, DISTANCE) == pytest.approx(values[steps > 4500].mean())
+
+    def test_distances_end_at_the_goal(self, everything):
+        assert everything.pooled(LEFT, PHIL, DISTANCE).max() == 21.0
+
+    def test_the_papers_drives_are_the_first_ones(self, everything):
+        (result,) = everything.of("left_turn", Line("human_model"))
+        own = everything.pooled(LEFT, Line("human_model"), DISTANCE, paper=True)
+        assert own.tolist() == result.drives("nominal", DISTANCE)[:PAPER_TESTS].tolist()
+
+    def test_time_is_compared_where_both_arrive(self, everything):
+        found = everything.differences(LEFT, PHIL, IA, "time_s")
+        one, other = everything.of("left_turn", PHIL)[0], everything.of("left_turn", IA)[0]
+        both = one.reached("nominal") & other.reached("nominal")
+        assert 0 < both.sum() < len(both)
+        times = one.drives("nominal", "time_s") - other.drives("nominal", "time_s")
+        assert found[1] == pytest.approx(times[both].mean())
+
+
+class TestJudges:
+    def test_who_is_ahead_and_who_is_not(self, everything):
+        place: Any = {"places": ["left_turn"], "quantities": [SUCCESS]}
+        assert ahead(everything, ALONE, ours=[PHIL], others=[IA, HI, PER], **place).holds == "yes"
+        found = ahead(everything, ALONE, ours=[PER], others=[HI], **place)
+        assert found.holds == "no"
+        assert "vanilla TD3 over HI-TD3" in found.ours
+        assert level(everything, ALONE, ours=[PHIL], others=[PHIL], **place).holds == "yes"
+        assert level(everything, ALONE, ours=[PHIL], others=[PER], **place).holds == "no"
+
+    def test_missing_trainings_leave_it_open(self):
+        units = [unit for unit in units_of(["fig7"], SEEDS) if unit != UNIT]
+        results = results_of(units, SEEDS)
+        place: Any = {"places": ["left_turn"], "quantities": [SUCCESS]}
+        assert ahead(results, ALONE, ours=[PHIL], others=[PER], **place).holds == "undecided"
+        assert ahead(results, ALONE, ours=[PHIL], others=[IA], **place).holds == "yes"
+
+    def test_how_much_sooner(self):
+        """Straight lines, so that the steps can be worked out by hand."""
+        units = [Unit("left_turn", name, NORMAL, 1) for name in ("phil_td3", "per_td3")]
+        results = results_of(units, 1)
+        for unit, end in zip(units, (2_000, 6_000), strict=True):
+            columns = results.found[unit].record["validation"]
+            columns["at_step"] = list(range(500, 6_001, 500))
+            columns["success"] = [min(step / end, 1.0) for step in columns["at_step"]]
+        own, other = (results.of("left_turn", line) for line in (PHIL, PER))
+        found, said = sooner_by(own, other, ALONE, SUCCESS, least=0.9)
+        assert (found.value, said) == (pytest.approx(3.0), "1,800 against 5,400 steps")
+        for result in other:
+            result.record["validation"]["success"] = [0.0] * 12
+        found, said = sooner_by(own, other, ALONE, SUCCESS, least=0.9)
+        assert found.value == pytest.approx(6_000 / 1_800), "a lower bound"
+        assert said == "1,800 against never steps"
+        rest: Any = {
+            "places": ["left_turn"],
+            "quantities": [SUCCESS],
+            "least": 0.9,
+            "by_mean": True,
+        }
+        bar = sooner(results, ALONE, ours=[PHIL], others=[PER], times=4.0, **rest)
+        assert bar.holds == "undecided"
+        assert sooner(results, ALONE, ours=[PHIL], others=[PER], times=3.0, **rest).holds == "yes"
+        assert sooner(results, ALONE, ours=[PER], others=[PHIL], times=1.0, **rest).holds == "no"
+
+    @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12), st.floats(0.0, 1.0))
+    def test_a_level_is_reached_where_the_curve_crosses_it(self, values, least):
+        grid, curve = grid_of(500 * len(values)), np.array(values)
+        steps = first_reached(grid, curve, least)
+        if np.isinf(steps):
+            assert curve.max() < least
+        else:
+            assert np.interp(steps, grid, curve) == pytest.approx(least, abs=1e-6) or steps == 500.0
+            assert (curve[grid < steps] <= least).all()
+            assert steps <= first_reached(grid, curve, min(least + 0.1, 1.0))
+
+    def test_every_claim_and_bar_is_judged(self, everything):
+        judged, bars = list(judge(everything)), list(judge_bars(everything))
+        assert (len(judged), len(bars)) == (len(CLAIMS), len(BARS))
+        findings = [one.found for one in judged] + [one.alone for one in judged if one.alone]
+        for found in [*findings, *(bar for _, bar in bars)]:
+            assert found.holds in ("yes", "no", "undecided")
+            assert found.ours not in ("", "not measured")
+        assert {one.claim.source for one in judged} <= set(EXPERIMENTS)
+
+    def test_nothing_is_said_of_nothing(self):
+        results = results_of([], SEEDS)
+        assert {one.found.holds for one in judge(results)} == {"undecided"}
+        assert {found.holds for _, found in judge_bars(results)} == {"undecided"}
+
+
+@pytest.fixture
+def store(tmp_path):
+    """Records of the first four lines of the left turn, as the runs would have written them."""
+    store = store_in(tmp_path)
+    write_human(store)
+    for unit in units_of(["fig9", "fig7"], 2, "left_turn"):
+        store.put(unit, {**synthetic(unit), "id": store.id(unit)})
+    return store
+
+
+def test_the_report_is_made_of_the_records_alone(store):
+    page = write_report(store, 2).read_text()
+    for name in re.findall(r"\((\w+\.png)\)", page):
+        assert (store.results / name).stat().st_size > 1000
+    rows = [line for line in page.splitlines() if line.startswith("| [fig7]")]
+    assert len(rows) == sum(claim.source == "fig7" for claim in CLAIMS)
+    assert any("| yes |" in row for row in rows)
+    anchors = {f"#{re.sub('[^a-z0-9 -]', '', line[3:].lower()).replace(' ', '-')}"
+               for line in page.splitlines() if line.startswith("## ")}  # fmt: skip
+    assert set(re.findall(r"\((#[^)]*)\)", page)) <= anchors
+    assert "20.70±1.82" in page
+    assert str(store.results.parent) not in page
+
+
+def test_records_of_other_settings_are_left_out(store):
+    unit = Unit("left_turn", "ia_td3", NORMAL, 2)
+    store.put(unit, {**synthetic(unit), "id": "of another time"})
+    results = load(store, 2)
+    assert results.stale == (unit,)
+    assert not results.complete("left_turn", IA)
+
+
+def test_records_that_lack_something_are_refused(store):
+    unit = Unit("left_turn", "ia_td3", NORMAL, 2)
+    record = {**synthetic(unit), "id": store.id(unit)}
+    del record["validation"]["success"]
+    store.put(unit, record)
+    with pytest.raises(UserError, match="lacks columns of validation"):
+        load(store, 2)
+
+
+def test_a_table_keeps_its_columns():
+    lines = list(table(("a", "b"), [("x|y", 1)]))
+    assert {line.count("|") for line in lines[:-1]} == {3}
+
+
+def test_the_time_of_a_step():
+    slow, quick = [(10, 2.0), (20, 4.0)], [(10, 1.0), (20, 2.0)]
+    assert seconds(slow) == pytest.approx(2_000.0)
+    found = ratio(slow, quick)
+    assert (found.value, found.low, found.high) == pytest.approx((2.0, 2.0, 2.0))
+
+
+class TestCommand:
+    def said(self, capsys, *arguments):
+        status = run_cli(main, ["experiment", *map(str, arguments)])
+        return status, capsys.readouterr()
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (["fig99"], "invalid choice"),
+            (["fig7", "--seeds", "0"], "--seeds"),
+            (["report", "status"], "stand alone"),
+            (["table1", "--scenario", "congestion"], "nothing to compute"),
+            (["report", "--results", "nowhere"], "no results"),
+        ],
+    )
+    def test_bad_input_is_one_line(self, capsys, arguments, words):
+        try:
+            status, said = self.said(capsys, *arguments)
+        except SystemExit as ending:
+            status, said = ending.code, capsys.readouterr()
+        assert status == 2
+        assert words in said.err.splitlines()[-1]
+
+    def test_status_counts_the_units(self, capsys, store):
+        places = [
+            word
+            for name in ("results", "runs", "humans")
+            for word in (f"--{name}", getattr(store, name))
+        ]
+        status, said = self.said(capsys, "status", "--seeds", 2, *places)
+        assert status == 0
+        lines = said.out.splitlines()
+        # They are of another plan: done for it, and of other settings for the command's.
+        assert any("of other settings" in line for line in lines)
+        assert lines[-1].startswith("0 of ")
+
+    def test_without_its_human_a_unit_is_left_out(self, capsys, tmp_path):
+        status, said = self.said(
+            capsys, "table1", "--humans", tmp_path, "--results", tmp_path, "--runs", tmp_path
+        )
+        assert status == 0
+        assert "no human model" in said.err
+        assert "0 of 16 units were done" in said.out
+
+
+def test_stopping_soon_leaves_it_to_the_same_command(tmp_path, capsys):
+    store = store_in(tmp_path)
+    write_human(store)
+    arguments = ["experiment", "fig7", "--scenario", "left_turn", "--seeds", "1", "--quick",
+                 "--max-minutes", "0.0001", "--humans", str(store.humans),
+                 "--runs", str(store.runs)]  # fmt: skip
+    assert main(arguments) == 0
+    assert "the same command goes on" in capsys.readouterr().out
+    assert replace(store, runs=store.runs / "quick").records("left_turn") == {}
