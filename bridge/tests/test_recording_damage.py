@@ -14,7 +14,6 @@ from mcap.records import Chunk, Header, Message
 from mcap.writer import MCAP0_MAGIC
 
 from bridge.feed import Heard
-from bridge.recording import records
 from bridge.recording.reader import Recording
 from bridge.recording.writer import RecordingWriter
 from bridge.tests.commands import make_command
@@ -22,6 +21,7 @@ from bridge.tests.processes import bridge_status
 from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import encode
+from viewing import records
 
 OVERWRITTEN = 10
 
