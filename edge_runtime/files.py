@@ -10,8 +10,6 @@ import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO, Dict, Union
 
-import msgspec
-
 from edge_runtime.errors import UserError
 
 PathLike = Union[str, "os.PathLike[str]"]
@@ -75,6 +73,8 @@ def parse_json(data: bytes, what: str) -> Any:
 
 def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
     """The tables of a TOML file. Raises UserError where it is none, or nested too deep."""
+    import msgspec  # here: `hil_tests doctor` runs before anything is installed
+
     data = read_bytes(path, what)
     try:
         tables: Dict[str, Any] = msgspec.toml.decode(data)

@@ -2,7 +2,8 @@
 
 Besides `phil/<id>/alive` each runtime declares `phil/<id>/alive/<claim>`, because Zenoh shows
 equal tokens of two sessions as one. Of two runtimes with one vehicle id the younger claim gives
-way; a claim is as old as the connection to the router, so who was cut off is not the elder one.
+way; a claim is as old as the connection to the router, so a runtime that reconnects loses its
+seniority.
 """
 
 from __future__ import annotations

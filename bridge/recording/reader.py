@@ -10,9 +10,9 @@ from typing import IO, NamedTuple
 
 from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 
-from bridge.recording.records import Records
 from edge_runtime.errors import UserError
 from edge_runtime.words import counted
+from viewing.records import Records
 
 
 class Stored(NamedTuple):

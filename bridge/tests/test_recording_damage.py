@@ -10,11 +10,10 @@ import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk, Header
+from mcap.records import Chunk, Header, Message
 from mcap.writer import MCAP0_MAGIC
 
 from bridge.feed import Heard
-from bridge.recording import records
 from bridge.recording.reader import Recording
 from bridge.recording.writer import RecordingWriter
 from bridge.tests.commands import make_command
@@ -22,6 +21,7 @@ from bridge.tests.processes import bridge_status
 from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import encode
+from viewing import records
 
 OVERWRITTEN = 10
 
@@ -143,6 +143,17 @@ def test_chunks_that_unpack_to_too_much_together_are_refused(tmp_path, monkeypat
         assert "bomb.mcap is refused" in line
     assert counted.unpacked <= 4 * MIB
     assert [file.name for file in tmp_path.iterdir()] == ["bomb.mcap"]
+
+
+def test_empty_messages_count_though_they_hardly_have_bytes(tmp_path):
+    builder = RecordBuilder()
+    for _ in range(20_000):
+        Message(channel_id=0, log_time=0, data=b"", publish_time=0, sequence=0).write(builder)
+    data = builder.end()
+    packed = zstandard.compress(data)
+    path = crafted(tmp_path / "empty.mcap", *[(packed, len(data))] * 20)
+    with pytest.raises(UserError, match="takes more than 200 times"):
+        list(Recording(path).messages())
 
 
 class ReadCounting(io.BytesIO):

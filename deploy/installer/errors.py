@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 
-class UserError(Exception):
-    """Bad input. Its text is one line: what is wrong, and what would be right."""
-
+class _OneLineError(Exception):
     def __str__(self) -> str:
         """The text on one line, whatever a file name or the system put into it."""
         line = " ".join(super().__str__().split())
@@ -13,5 +11,9 @@ class UserError(Exception):
         return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
-class UnhealthyError(Exception):
+class UserError(_OneLineError):
+    """Bad input. Its text is one line: what is wrong, and what would be right."""
+
+
+class UnhealthyError(_OneLineError):
     """A release that may not run here. Its text says why, on one line."""

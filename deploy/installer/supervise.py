@@ -29,11 +29,15 @@ RESTART_PAUSE_S = 0.5
 MAX_STARTS, IN_S = 5, 60.0
 _START_LIMIT_S = 30.0
 _END_LIMIT_S = 5.0
-# Its own death kills the runtime (apart.py), and a vehicle in mid-drive is to be stopped instead.
-_ENDS = (
-    *(signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM),
-    *(signal.SIGABRT, signal.SIGALRM, signal.SIGUSR1, signal.SIGUSR2),
-)
+# Its own death kills the runtime (apart.py), and a vehicle in mid-drive is to be stopped instead:
+# so each signal that ends a process stops it first. Of those left out, the first six cannot be
+# caught, or would only be raised again; the others end nothing.
+_ENDS = signal.valid_signals() - {
+    *(signal.SIGKILL, signal.SIGSTOP),
+    *(signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL),
+    *(signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH),
+    *(signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU),
+}
 
 
 def supervise(layout: Layout) -> int:
@@ -53,7 +57,8 @@ class _Supervisor:
         self._starts: list[float] = []
         self._process: subprocess.Popen | None = None
         for number in _ENDS:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # SIGHUP under nohup
+            # SIGHUP under nohup is ignored, and SIGPIPE by Python itself.
+            if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._stop)
 
     def run(self) -> int:

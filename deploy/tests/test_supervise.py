@@ -17,7 +17,10 @@ while :; do sleep 0.05; done
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGTERM])
+ENDS = (signal.SIGHUP, signal.SIGQUIT, signal.SIGTERM, signal.SIGXCPU, signal.SIGRTMIN)
+
+
+@pytest.mark.parametrize("number", ENDS)
 def test_whatever_ends_it_the_runtime_is_stopped_and_not_killed(tmp_path, number):
     layout = Layout(str(tmp_path))
     told, ready = tmp_path / "told", tmp_path / "ready"

@@ -49,4 +49,4 @@ def test_a_training_that_does_not_begin_to_drive_is_ended(tmp_path, monkeypatch,
 def test_a_file_that_cannot_be_written_is_told_before_the_minutes_of_driving(bench, monkeypatch):
     monkeypatch.setattr(bench, "measure", None)
     with pytest.raises(UserError, match="cannot write"):
-        bench.main(["--out", "/none/figures.json"])
+        bench.main(["--out", "/dev/null/figures.json"])

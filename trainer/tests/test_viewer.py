@@ -270,7 +270,11 @@ def test_a_training_is_not_held_up_by_a_viewer_that_hangs(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize(
     ("word", "part"),
-    [("window", "neither spawn nor serve"), ("spawn", "no display"), ("/no/dir/a.rrd", "exist")],
+    [
+        ("window", "neither spawn nor serve"),
+        ("spawn", "no display"),
+        ("/dev/null/a.rrd", "/dev/null"),
+    ],
 )
 def test_a_wrong_word_is_one_line_before_anything_is_made(
     word, part, tmp_path, capsys, monkeypatch

@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from bridge.recording import records
 from bridge.tests.test_recording_damage import MIB, crafted, zeros
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import try_to_hold
 from trainer.person.recording import Recorder, Step, find_recordings, read_steps, sittings
 from trainer.person.tests.steps import recorded_step
+from viewing import records
 
 
 def record(directory, count: int) -> list[Step]:

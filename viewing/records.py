@@ -35,6 +35,8 @@ MAX_CHUNK_BYTES = 8 << 20
 MAX_WORK = 200
 """Bytes read and unpacked for each byte of the file, above one chunk. The recording of a car that
 stands still for an hour comes to 100: every picture in it is the same."""
+RECORD_BYTES = 256
+"""What a record counts besides its bytes: taking it apart costs as much, however empty it is."""
 TORN = (
     McapError, struct.error, zstandard.ZstdError, ValueError, KeyError, RuntimeError, OverflowError,
     MemoryError,
@@ -183,7 +185,9 @@ class Records:
         if size not in (-1, chunk.uncompressed_size) or chunk.uncompressed_size > MAX_CHUNK_BYTES:
             raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
         self._spend(chunk.uncompressed_size, end)
-        return breakup_chunk(chunk, validate_crc=True)
+        parts = breakup_chunk(chunk, validate_crc=True)
+        self._spend(RECORD_BYTES * len(parts), end)
+        return parts
 
     def _crc32(self, start: int, end: int) -> int:
         self._spend(max(0, end - start), end)
