@@ -9,7 +9,7 @@ from pathlib import Path
 
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from edge_runtime.files import write_atomic
+from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.option_types import not_negative, whole_number
 from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.experiments import run as running
@@ -27,7 +27,6 @@ from trainer.experiments.ray_runner import run_on_ray
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, say
 from trainer.experiments.timing import TIME_FILE, measure
-from trainer.files import make_directory
 from trainer.parallel import cores
 
 EXAMPLE = examples(

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 
 from edge_runtime.errors import UserError
-from edge_runtime.files import write_atomic
+from edge_runtime.files import make_directory, write_atomic
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.experiments.run import (
     BUSY,
@@ -29,7 +29,6 @@ from trainer.experiments.run import (
     make_record,
     say,
 )
-from trainer.files import make_directory
 from trainer.human.model import MODEL_FILE
 from trainer.training.metrics import METRICS_FILE
 

@@ -29,9 +29,10 @@ import torch
 
 from edge_runtime.episode_report import GOAL, EpisodeResult
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.files import make_directory, read_bytes, write_atomic
 from trainer import seeds
 from trainer.benches.machine import processor_model
+from trainer.conditions import CONDITIONS
 from trainer.drivers import (
     BEST_FILE,
     CHECKPOINT_FILE,
@@ -40,7 +41,7 @@ from trainer.drivers import (
     load_driver,
     make_environment,
 )
-from trainer.evaluation import CONDITIONS, ActTogether, drive_together
+from trainer.evaluation import ActTogether, drive_together
 from trainer.experiments.plan import (
     CONSTANT,
     DEFAULT_SEEDS,
@@ -55,7 +56,6 @@ from trainer.experiments.plan import (
     unit_id,
     units_of,
 )
-from trainer.files import make_directory
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.precision import multiplies_bfloat16
 from trainer.locks import held, holder

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from edge_runtime.files import make_directory
 from trainer.benches.machine import about
 from trainer.experiments.plan import FOUR, NORMAL, TIME, Unit, run_config, training_id
 from trainer.experiments.run import Store, one_thread
 from trainer.experiments.statistics import RESAMPLES, Estimate, bootstrap
-from trainer.files import make_directory
 from trainer.progress import ProgressBar
 from trainer.training.run import TrainingRun
 
