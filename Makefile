@@ -12,7 +12,7 @@ CONTAINER_STAMP := $(CONTAINER)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor pictures demo test test-ray test-network test-board lint format lint-container bench bench-quick bench-gpu \
+.PHONY: help install doctor pictures demo test test-ray test-network test-board lint format lint-container bench bench-quick \
 	bench-loop bench-view bench-can network vehicle board fleet recording mutate lock clean
 
 help:  ## this list
@@ -96,9 +96,6 @@ board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline,
 
 fleet: $(STAMP)  ## a router with 1, 5, 10 and 20 edge runtimes: processor, memory, bandwidth each
 	$(BIN)/python -m hil_tests fleet --out results/deploy/fleet.json
-
-bench-gpu: $(STAMP)  ## on a GPU: seconds for 10,000 training steps, one run and eight at once
-	$(BIN)/python -m trainer.benches.accelerator --runs 8 --out $(BENCH)/gpu.json
 
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
 	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json

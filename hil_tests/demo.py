@@ -159,7 +159,7 @@ class Demo:
             "trainer", "train", "--human", str(self.human_dir), "--out", str(self.run_dir),
             "--seed", seed, "--episodes", str(arguments.episodes),
             "--max-minutes", f"{arguments.minutes:g}", "--set", "batch_size=64",
-            "--set", "evaluate_every=10", "--set", "evaluation_runs=30", *resume,
+            "--set", "evaluate_every_steps=500", "--set", "evaluation_runs=30", *resume,
         )  # fmt: skip
         shutil.copy(self.run_dir / "learning_curve.png", self.directory / "learning_curve.png")
         heading("3  The actor becomes a signed policy file")

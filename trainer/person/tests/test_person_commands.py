@@ -224,7 +224,7 @@ def test_a_person_is_not_imitated_in_what_they_threw_away(
     hands = Discarding(eyes, discarded={1}, episodes=3)
     monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, eyes))
     command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
-    quick = ["--threads", "1", "--set", "evaluate_every=0", "--set", "warmup_steps=8"]
+    quick = ["--threads", "1", "--set", "evaluate_every_steps=0", "--set", "warmup_steps=8"]
     status, out, errors = call(capsys, *command, *quick)
     assert status == 0, errors
     assert "2 episodes, 1 episode discarded" in errors
