@@ -400,7 +400,7 @@ def success_bar(
     """Whether the mean of the seeds' success is at least so much."""
     one = mean_estimate(results.tested(scene, line, SUCCESS).values())
     found = results.of(scene.scenario, line)
-    text = _percent(one)
+    text = f"{one.as_share()} %"
     for words, part in ((f"the paper's {PAPER_TESTS} seeds", slice(PAPER_TESTS)),
                         ("others", slice(PAPER_TESTS, None))):  # fmt: skip
         drives = [result.drives(scene.condition, SUCCESS)[part] for result in found]

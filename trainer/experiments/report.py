@@ -202,11 +202,7 @@ def _tests(results: Results) -> Iterator[str]:
             for scene in SCENES:
                 found = mean_estimate(results.tested(scene, line, SUCCESS).values())
                 paper = results.pooled(scene, line, SUCCESS, paper=True)
-                shown = (
-                    f"{found.times(100.0).text(1)} ({100 * paper.mean():.0f})"
-                    if len(paper)
-                    else "–"
-                )
+                shown = f"{found.as_share()} ({100 * paper.mean():.0f})" if len(paper) else "–"
                 cells.append(shown)
             if set(cells) != {"–"}:
                 rows.append((name_of(line), *cells))

@@ -31,6 +31,13 @@ class Estimate(NamedTuple):
         low, high = sorted((factor * self.low, factor * self.high))
         return Estimate(factor * self.value, low, high, self.size)
 
+    def as_share(self) -> str:
+        """A share in percent, whose interval ends at 0 and 100."""
+        if self.size < 2:
+            return self.times(100.0).text(1)
+        held = self._replace(low=max(self.low, 0.0), high=min(self.high, 1.0))
+        return held.times(100.0).text(1)
+
     def text(self, digits: int = 2, unit: str = "") -> str:
         """As in "0.97 [0.93, 0.99]"; a dash for nothing."""
         if not self.size:
