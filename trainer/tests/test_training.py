@@ -35,7 +35,9 @@ TINY = RunConfig(
     evaluate_every_steps=250,  # after two and four episodes
     evaluation_runs=2,
     checkpoint_every=1,
-    learner=LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=100),
+    learner=LearnerConfig(
+        batch_size=4, replay_capacity=2000, warmup_steps=100, exploration_initial=1.0
+    ),
 )
 
 

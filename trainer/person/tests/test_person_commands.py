@@ -45,7 +45,7 @@ WRONG = [
     (("drive", "--calibrate", "{tmp}/p.toml"), ("--human", "wheel"), "no wheel is plugged in"),
     (("drive", "--calibrate", "{tmp}/file/p.toml"), ("--human", "wheel"), "cannot write"),
     (TRAIN, ("--human", "keyboard", "--algorithm", "per_td3"), "takes no guidance"),
-    (TRAIN, ("--human", "keyboard", "--set", "guided_share=3"), "watches every episode"),
+    (TRAIN, ("--human", "keyboard", "--set", "guided_share=0.5"), "watches every episode"),
     (TRAIN, ("--human", "keyboard", "--set", "poor_guidance_share=0.3"), "not replaced"),
     (TRAIN, ("--speed", "2"), "--speed means nothing with --human expert"),
     (TRAIN, ("--human", "keyboard", "--resume"), "no checkpoint"),
