@@ -176,6 +176,7 @@ class Demo:
         heading("4  Test episodes in process")
         run_command(
             "trainer", "evaluate", str(self.policy), "--runs", str(self.runs),
+            "--public-key", str(self.public_key),
             "--seed", str(FIRST_SEED), "--out", str(in_process),
         )  # fmt: skip
         heading("5  The same episodes through an edge runtime in a process of its own")
