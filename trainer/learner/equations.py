@@ -124,5 +124,5 @@ def behaviour_cloning_loss(actions: Tensor, human_actions: Tensor, human: Tensor
 
 
 def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    # No branch on the count: this must not wait for an accelerator to answer.
+    # No branch on the count: on a GPU it would wait for the answer.
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)

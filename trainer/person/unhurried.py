@@ -71,7 +71,7 @@ class UnhurriedLearning:
         self._inner.start_episode(observation)
 
     def add(self, *transition: Any, **guidance: Any) -> None:
-        """Store a transition; arguments as ``Learning.add``. Waits for the update."""
+        """Store a transition; arguments as ``Store.add``. Waits for the update."""
         self.settle()
         self._inner.add(*transition, **guidance)
 

@@ -24,12 +24,13 @@ from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner
+from trainer.training.wheel import Store
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
 
 
-class Learning(Protocol):
+class Learning(Store, Protocol):
     """What a training loop asks of a learner with its replay buffer, wherever they are."""
 
     @property
@@ -49,21 +50,6 @@ class Learning(Protocol):
     def act_together(self, observations: Observation, averaged: bool) -> Action:
         """The actor's actions, or the target actor's, [n, action size]; not while updating."""
         ...
-
-    def start_episode(self, observation: Observation) -> None:
-        """Take an episode's first observation."""
-
-    def add(
-        self,
-        action: Action,
-        reward: float,
-        observation: Observation,
-        terminal: bool,
-        human: bool,
-        overruled: Action | None = None,
-        penalised: bool = False,
-    ) -> None:
-        """Store a transition that led to ``observation``; arguments as ``ReplayBuffer.add``."""
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
@@ -214,7 +200,7 @@ class LearningThread:
         self.replay.start_episode(observation)
 
     def add(self, *transition: Any, **guidance: Any) -> None:
-        """Store a transition; arguments as ``Learning.add``."""
+        """Store a transition; arguments as ``Store.add``."""
         self.replay.add(*transition, **guidance)
 
     def begin(self, beta: float) -> None:
