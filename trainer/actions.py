@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from edge_runtime.manifest import Action
-from trainer.scenarios.congestion_config import CongestionConfig
+from trainer.scenarios.congestion import CongestionConfig
 
 ACTIONS = {
     "left_turn": Action(

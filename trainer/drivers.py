@@ -15,12 +15,10 @@ from edge_runtime.errors import UserError
 from trainer.actions import ACTIONS
 from trainer.conditions import CONDITIONS
 from trainer.files import load_torch
-from trainer.human.congestion_expert import CongestionExpert
-from trainer.human.congestion_trigger import CongestionTrigger
-from trainer.human.expert import LeftTurnExpert
+from trainer.human.congestion import CongestionExpert, CongestionTrigger
 from trainer.human.guide import Driver, Trigger
+from trainer.human.left_turn import LeftTurnExpert, LeftTurnTrigger
 from trainer.human.model import MODEL_FILE, load_human_model
-from trainer.human.trigger import LeftTurnTrigger
 from trainer.learner.networks import Actor
 from trainer.scenarios import SCENARIOS
 

@@ -13,7 +13,7 @@ from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.latency.model import LatencySpec
 from trainer.conditions import CONDITIONS
 from trainer.human.guide import Action, Driver
-from trainer.remote.vehicle_end import RemoteDriver
+from trainer.training.delayed import RemoteDriver
 
 NO_NETWORK = LatencySpec()
 ActTogether = Callable[[NDArray[np.uint8]], NDArray[np.float32]]

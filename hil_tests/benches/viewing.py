@@ -33,8 +33,7 @@ from trainer.commands.options import set_threads
 from trainer.revision import source_revision
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
-from trainer.training.run import TrainingRun
-from trainer.training.seen import Seen
+from trainer.training.run import Seen, TrainingRun
 from trainer.viewer.command import watched
 from viewing.sinks import Sink
 

@@ -11,7 +11,7 @@ import numpy as np
 from highway_env.envs.common.observation import GrayscaleObservation
 from numpy.typing import NDArray
 
-from trainer.scenarios.rasteriser import COLUMNS, ROWS
+from trainer.scenarios.picture import COLUMNS, ROWS
 
 WEIGHTS = [0.2989, 0.5870, 0.1140]
 """Red, green and blue in the grey value, as in highway-env's documentation."""

@@ -21,12 +21,11 @@ from trainer.benches.experience import Experience, fill, gather, save
 from trainer.benches.peer_process import PeerProcess
 from trainer.benches.turns import Contender, Rounds, Tick, compare, median, take_turns
 from trainer.benches.updates import Learner, Updates
-from trainer.learner.algorithms import PHIL
-from trainer.learner.config import LearnerConfig
-from trainer.learner.precision import multiplies_bfloat16
-from trainer.learner.reference import ReferenceLearner
+from trainer.learner.config import PHIL, LearnerConfig
+from trainer.learner.networks import multiplies_bfloat16
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import TD3Learner
+from trainer.tests.reference import ReferenceLearner
 
 TRANSITIONS = 1000
 OURS, FLOAT32, REFERENCE, SB3 = "ours", "ours_float32", "reference", "stable_baselines3"

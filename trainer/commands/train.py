@@ -25,7 +25,7 @@ from trainer.commands.options import add_latency, add_scenario, add_threads, set
 from trainer.commands.resuming import check_directory
 from trainer.commands.settings import DEFAULTS, settings, with_setting
 from trainer.commands.time_limit import add_time_limit, deadline_s
-from trainer.learner.algorithms import ALGORITHMS
+from trainer.learner.config import ALGORITHMS
 from trainer.locks import claimed
 from trainer.person.options import PERSON, add_person, check_no_person
 from trainer.person.registry import HUMANS

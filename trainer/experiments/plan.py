@@ -19,7 +19,7 @@ from trainer.conditions import COMMAND_NOISE, CONDITIONS
 from trainer.drivers import EXPERTS, TRIGGERS, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
-from trainer.learner.algorithms import ALGORITHMS
+from trainer.learner.config import ALGORITHMS
 from trainer.training.config import BIASED as BIASED_GUIDANCE
 from trainer.training.config import PRESETS, RunConfig
 

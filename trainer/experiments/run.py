@@ -57,7 +57,7 @@ from trainer.experiments.plan import (
     units_of,
 )
 from trainer.learner.kernel import load as load_kernel
-from trainer.learner.precision import multiplies_bfloat16
+from trainer.learner.networks import multiplies_bfloat16
 from trainer.locks import held, holder
 from trainer.parallel import die_with_parent, interrupts_blocked
 from trainer.progress import ProgressBar

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainer.learner import equations
-from trainer.learner.algorithms import Algorithm
-from trainer.learner.config import OVERRULED_ACTION, LearnerConfig
-from trainer.learner.networks import Actor, CriticPair
-from trainer.learner.precision import multiplies_bfloat16
+from trainer.learner.config import OVERRULED_ACTION, Algorithm, LearnerConfig
+from trainer.learner.networks import Actor, CriticPair, multiplies_bfloat16
 from trainer.learner.replay import Batch
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from trainer.training.delayed import Store
 from trainer.training.learning import Observation
-from trainer.training.wheel import Store
 
 
 class KeptBack:

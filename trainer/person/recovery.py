@@ -9,7 +9,7 @@ import numpy as np
 
 from trainer.human.guide import Action, Intervention
 from trainer.person.recording import Step, read_episodes, read_steps, sittings
-from trainer.training.wheel import Store
+from trainer.training.delayed import Store
 
 Position = tuple[int, int]
 """Sitting and index of a recorded step."""

@@ -12,7 +12,7 @@ from typing import Any
 from edge_runtime.errors import UserError
 from edge_runtime.words import counted
 from trainer.human.guide import Guide
-from trainer.learner.algorithms import ALGORITHMS
+from trainer.learner.config import ALGORITHMS
 from trainer.person.episode import KeptBack
 from trainer.person.guide import PersonGuide
 from trainer.person.interface import Person
@@ -22,11 +22,10 @@ from trainer.person.sitting import Sitting, SittingOver
 from trainer.person.unhurried import UnhurriedLearning
 from trainer.person.watched import WatchedEnv
 from trainer.training.config import RunConfig
-from trainer.training.divergence import divergence_said
+from trainer.training.delayed import make_wheel, ticks_late
 from trainer.training.learning import Learning, LearningThread
 from trainer.training.metrics import EpisodeMetrics
-from trainer.training.run import TrainingRun
-from trainer.training.wheel import make_wheel, ticks_late
+from trainer.training.run import TrainingRun, divergence_said
 
 
 class PersonRun(TrainingRun):

@@ -1,35 +1,217 @@
-"""``phil/Congestion-v0``: a car hemmed in by others in highway congestion (section VI).
-
-The learner has the steering wheel; the intelligent driver model has the pedals and follows
-whoever is ahead. The cars around cover the lane markings, and the one ahead is no guide: each
-keeps a place of its own within its lane.
-"""
+"""``phil/Congestion-v0``: a car hemmed in by others in highway congestion (section VI)."""
 
 from __future__ import annotations
 
+import itertools
 import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from highway_env.road.road import Road
+from highway_env.road.lane import LineType, StraightLane
+from highway_env.road.road import LaneIndex, Road, RoadNetwork
 from numpy.typing import NDArray
 
-from trainer.scenarios.congestion_config import CongestionConfig
 from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
     Observation,
+    Range,
     Scene,
     Step,
     start_speed_mps,
 )
-from trainer.scenarios.geometry import Rectangle, overlap
-from trainer.scenarios.idm import idm_acceleration
-from trainer.scenarios.jam import LANES, spawn_jam, straight_road
-from trainer.scenarios.rasteriser import ROWS, Rasteriser
-from trainer.scenarios.traffic import TrafficVehicle
-from trainer.scenarios.vehicle_types import CAR
+from trainer.scenarios.picture import ROWS, Rasteriser, Rectangle, overlap
+from trainer.scenarios.traffic import (
+    CAR,
+    CARS_ONLY,
+    MIXED,
+    Mix,
+    TrafficVehicle,
+    bodies_m,
+    draw_types,
+    equip,
+    idm_acceleration,
+    queue,
+)
+
+
+@dataclass(frozen=True)
+class CongestionConfig:
+    """One field a number, with its reason."""
+
+    control_period_s: float = 0.1
+    """Control interval of all vehicles (section VI-A)."""
+    max_steps: int = 300
+    """Steps until the episode is cut off as a timeout; at 4 m/s the goal takes 200."""
+    lane_width_m: float = 3.5
+    goal_m: float = 80.0
+    """Distance along the road from start to goal."""
+    lambda_rad: float = 0.15
+    """Front-wheel angle at full action: eq. 29's 5 lambda pi. With 5 pi rad of steering wheel for
+    the front wheels' 45 degrees, lambda is 0.19. At 5 m/s the heading then changes by at most
+    0.015 rad a step: enough to save a car 2 s before it touches its neighbour."""
+    start_offset_m: Range = (-0.3, 0.3)
+    """The ego car's place in its lane at the start."""
+    start_heading_rad: Range = (-0.05, 0.05)
+    """Its heading: at the edges of this range the wheels held straight lead 4 m aside."""
+    ego_speed_mps: Range = (4.0, 6.0)
+    """Initial speed of the ego car."""
+    desired_speed_mps: float = 6.0
+    """Target of the IDM on the ego car's pedals (section VI-A), and of the cars behind others."""
+    brake_mps2: float = 4.0
+    """Deceleration of the ego car at most; what the brake of a safe stop does."""
+    traffic_speed_mps: Range = (4.0, 6.0)
+    """Initial speeds of traffic (section VI-A)."""
+    jam_speed_mps: Range = (4.5, 5.5)
+    """Speed of the whole jam, and ..."""
+    lane_speed_mps: Range = (-0.5, 0.5)
+    """... what each lane's first car is faster. Lanes that drifted apart at 2 m/s would leave the
+    ego car alone before half of the way."""
+    side_cars: int = 3
+    """In each neighbouring lane; with those ahead and behind these are the eight within 20 m."""
+    cars_behind: int = 1
+    """In the ego car's lane. They follow it as one of them: traffic keeps lanes, so a car
+    elsewhere has nothing to react to."""
+    traffic_mix: Mix = CARS_ONLY
+    side_front_m: Range = (9.0, 13.0)
+    """How far each neighbouring lane's first car is ahead, centre to centre (of cars)."""
+    gap_m: Range = (3.5, 5.5)
+    """Between bumpers in a lane, at the start."""
+    ahead_gap_m: Range = (4.0, 9.0)
+    """From the ego car to the one ahead of it."""
+    time_gap_factor: float = 0.5
+    """Share of a vehicle's usual time gap that is kept in the jam."""
+    lane_offset_m: Range = (-0.2, 0.2)
+    """Where in its lane each car drives; the narrowest gap then leaves 1.3 m to each side of an
+    ego car in mid-lane, in the variant 1.1 m."""
+    goal_reward: float = 10.0
+    fail_reward: float = -10.0
+    steer_weight: float = 0.1
+    """Scale of the steering term: this times the change of the action, which costs (eq. 32 is
+    printed without the minus sign that its text demands). With gamma 0.95 and 10 Hz the horizon is
+    2 s. A correction (the action out, across and back, 2 in all) costs 0.2; the crash that it
+    avoids is worth -3.6 seen 20 steps ahead and -0.8 seen 50 ahead, so correcting early pays. With
+    weight 1 it would pay to wait for the last second; worse, trembling at random (2/3 a step) would
+    cost 13 in discounted sum, and an early crash, which is -10, would be the best policy of a
+    beginner. With 0.1 trembling costs 1.3: felt, and never worth a crash."""
+    metres_per_pixel: float = 0.375
+    view_behind_m: float = 12.0
+    """The picture shows 30 m x 16.9 m of ground, all three lanes. It moves along the road with the
+    ego car, and neither turns nor moves aside: place and heading show as they are, and other cars'
+    movement between the two frames is their speed relative to the ego car's."""
+
+    def with_printed_reward(self) -> CongestionConfig:
+        """The same with eq. 32 as it is printed, but for the sign."""
+        return replace(self, steer_weight=1.0)
+
+    @staticmethod
+    def of(scene: Scene) -> CongestionConfig:
+        """The numbers of a scene.
+
+        The variant has more vehicles, and not only cars. Dense is a jam in lanes as narrow as at
+        roadworks, in which cars keep to their lane's middle, and lanes to the jam's speed, about
+        half as well as usual. The narrowest gap leaves 0.5 m to each side of an ego car in mid-lane
+        instead of 1.25, and its walls move; were it narrower, cars of two lanes would touch. Gaps
+        along a lane are from 2 to 8 m, so that the walls have holes, too; a lane's queue is long
+        enough to be there until the goal.
+        """
+        if scene == "nominal":
+            return CongestionConfig()
+        if scene == "variant":
+            return CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=MIXED)
+        return CongestionConfig(
+            lane_width_m=2.9,
+            lane_offset_m=(-0.35, 0.35),
+            lane_speed_mps=(-1.0, 1.0),
+            side_cars=6,
+            side_front_m=(14.0, 22.0),
+            cars_behind=2,
+            gap_m=(2.0, 8.0),
+            ahead_gap_m=(2.5, 9.0),
+        )
+
+
+LANES = 3
+EGO_LANE = 1
+"""The middle one, y = 0; lane 0 is to its left."""
+REACH_M = 200.0
+"""How far the road goes on before start and goal."""
+
+
+def straight_road(lane_width_m: float, goal_m: float) -> RoadNetwork:
+    """Three lanes in the direction of x."""
+    network = RoadNetwork()
+    for lane in range(LANES):
+        y = (lane - EGO_LANE) * lane_width_m
+        ends = (-REACH_M, y), (goal_m + REACH_M, y)
+        lines = (LineType.CONTINUOUS if lane == 0 else LineType.NONE, LineType.CONTINUOUS)
+        # No speed limit: the cars' own desired speeds are what limits them.
+        road = StraightLane(*ends, lane_width_m, line_types=lines, speed_limit=None)
+        network.add_lane("start", "end", road)
+    return network
+
+
+def spawn_jam(
+    road: Road, ego: EgoVehicle, config: CongestionConfig, random: np.random.Generator
+) -> list[TrafficVehicle]:
+    """Surround the ego car: cars ahead of it, beside it, and in the variant behind it."""
+    jam_mps = float(random.uniform(*config.jam_speed_mps))
+    cars: list[TrafficVehicle] = []
+    for lane in range(LANES):
+        first_mps = jam_mps + float(random.uniform(*config.lane_speed_mps))
+        if lane == EGO_LANE:
+            own = _own_lane(road, ego, config, random)
+        else:
+            own = _side_lane(road, lane, config, random)
+        # The first of a lane goes with the jam, the others would go faster if they could.
+        own[0].speed = own[0].target_speed = first_mps
+        cars += own
+    for car in cars:
+        car.position[1] += float(random.uniform(*config.lane_offset_m))
+    return cars
+
+
+def _side_lane(
+    road: Road, lane: int, config: CongestionConfig, random: np.random.Generator
+) -> list[TrafficVehicle]:
+    types = draw_types(config.traffic_mix, config.side_cars, random)
+    x = [float(random.uniform(*config.side_front_m))]
+    for ahead, behind in itertools.pairwise(types):
+        x.append(x[-1] - bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
+    cars = _queue(road, lane, x, config, random)
+    equip(cars, types, config.time_gap_factor)
+    return cars
+
+
+def _own_lane(
+    road: Road, ego: EgoVehicle, config: CongestionConfig, random: np.random.Generator
+) -> list[TrafficVehicle]:
+    """One car ahead of the ego car; those behind follow the ego car as one of theirs."""
+    types = draw_types(config.traffic_mix, 1 + config.cars_behind, random)
+    nose_m = 0.5 * ego.LENGTH
+    x = [nose_m + float(random.uniform(*config.ahead_gap_m)) + 0.5 * types[0].length_m]
+    tail_m = -nose_m
+    for kind in types[1:]:
+        x.append(tail_m - float(random.uniform(*config.gap_m)) - 0.5 * kind.length_m)
+        tail_m = x[-1] - 0.5 * kind.length_m
+    cars = _queue(road, EGO_LANE, x, config, random)
+    if config.cars_behind:
+        cars[1].leader = ego
+    equip(cars, types, config.time_gap_factor)
+    return cars
+
+
+def _queue(
+    road: Road, lane: int, x: list[float], config: CongestionConfig, random: np.random.Generator
+) -> list[TrafficVehicle]:
+    index: LaneIndex = ("start", "end", lane)
+    speeds = [float(v) for v in random.uniform(*config.traffic_speed_mps, size=len(x))]
+    cars = queue(road, index, [REACH_M + place for place in x], speeds)
+    for car in cars:
+        car.target_speed = config.desired_speed_mps
+    return cars
 
 
 class CongestionEnv(DrivingEnv):

@@ -10,8 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from trainer.scenarios.ego import EgoVehicle
-from trainer.scenarios.geometry import Rectangle
-from trainer.scenarios.rasteriser import COLUMNS, ROWS, Rasteriser
+from trainer.scenarios.picture import COLUMNS, ROWS, Rasteriser, Rectangle
 from trainer.scenarios.scene import draw_scene, vehicle_entry
 from trainer.scenarios.traffic import TrafficVehicle
 

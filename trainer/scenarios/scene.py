@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from trainer.scenarios.geometry import Rectangle, corners
+from trainer.scenarios.picture import Rectangle, corners
 from viewing.colours import POLICY, Colour
 
 PIXELS_PER_METRE = 16

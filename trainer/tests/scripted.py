@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from trainer.human.guide import Intervention
-from trainer.human.trigger import Reason
+from trainer.human.left_turn import Reason
 from trainer.learner.config import LearnerConfig
 from trainer.learner.td3 import Losses
 from trainer.training.config import RunConfig

@@ -6,9 +6,8 @@ import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.drivers import make_environment
-from trainer.scenarios.congestion import CongestionEnv
-from trainer.scenarios.congestion_config import CongestionConfig
-from trainer.scenarios.geometry import corners, overlap
+from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
+from trainer.scenarios.picture import corners, overlap
 
 STRAIGHT, RIGHT, LEFT = (np.array([steering], np.float32) for steering in (0.0, 1.0, -1.0))
 CENTRED = CongestionConfig(

@@ -7,13 +7,11 @@ import pytest
 from trainer.benches.objections import objections
 from trainer.drivers import NetworkDriver
 from trainer.evaluation import drive_episodes
-from trainer.human.congestion_expert import CongestionExpert
-from trainer.human.congestion_trigger import CongestionTrigger
+from trainer.human.congestion import CongestionExpert, CongestionTrigger
 from trainer.human.dagger import HumanTraining
 from trainer.human.model import HumanModelConfig
-from trainer.scenarios.congestion import CongestionEnv
-from trainer.scenarios.congestion_config import CongestionConfig
-from trainer.scenarios.vehicle_types import CAR
+from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
+from trainer.scenarios.traffic import CAR
 from trainer.tests.test_congestion import CENTRED, LEFT, RIGHT, STRAIGHT
 
 ALONE = replace(CENTRED, side_cars=1, side_front_m=(60.0, 60.0))

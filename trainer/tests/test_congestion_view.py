@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trainer.scenarios.congestion import CongestionEnv
-from trainer.scenarios.geometry import corners
+from trainer.scenarios.picture import corners
 from trainer.tests.test_congestion import CENTRED, STRAIGHT
 
 

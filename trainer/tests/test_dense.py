@@ -9,8 +9,8 @@ from bridge.environments import CONDITIONS as SERVED
 from trainer.conditions import CONDITIONS
 from trainer.drivers import EXPERTS, make_environment
 from trainer.evaluation import drive_episodes
-from trainer.scenarios.geometry import overlap
-from trainer.scenarios.vehicle_types import CAR
+from trainer.scenarios.picture import overlap
+from trainer.scenarios.traffic import CAR
 
 every_scenario = pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 

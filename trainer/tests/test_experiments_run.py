@@ -32,8 +32,7 @@ from trainer.experiments.plan import (
     units_of,
 )
 from trainer.experiments.run import BUSY, FAILED, FINISHED, STOPPED, Task, compute, run_units
-from trainer.learner.algorithms import ALGORITHMS
-from trainer.learner.config import PRINTED_LEARNER
+from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
 from trainer.training.run import TrainingRun

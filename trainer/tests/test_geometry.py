@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trainer.scenarios.geometry import Rectangle, corners, overlap
-from trainer.scenarios.path import LeftTurnPath
+from trainer.scenarios.ego import LeftTurnPath
+from trainer.scenarios.picture import Rectangle, corners, overlap
 
 CAR = Rectangle(0.0, 0.0, 0.0, 5.0, 2.0)
 

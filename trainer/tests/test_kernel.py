@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from trainer.learner import kernel
-from trainer.learner.kernel import trunk
-from trainer.learner.kernel.trunk import trunk_features
-from trainer.learner.precision import multiplies_bfloat16
+from trainer.learner import kernel as trunk
+from trainer.learner.kernel import trunk_features
+from trainer.learner.networks import multiplies_bfloat16
 
 needs_kernel = pytest.mark.skipif(
     kernel.load("trunk") is None, reason="there is no compiler here, or PHIL_KERNEL=0"

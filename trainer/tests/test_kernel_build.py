@@ -15,7 +15,7 @@ from trainer.tests.test_kernel import needs_kernel
 _PROGRAM = """
 import torch
 from trainer.learner import kernel
-from trainer.learner.kernel.trunk import trunk_features
+from trainer.learner.kernel import trunk_features
 frames = torch.zeros(2, 1, 45, 80, dtype=torch.uint8)
 features = trunk_features(
     frames, torch.ones(6, 1, 6, 6), torch.ones(6), torch.ones(16, 6, 6, 6), torch.zeros(16)
@@ -69,7 +69,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path) -> None:
 _ON_ANOTHER_PROCESSOR = """
 import torch
 from trainer.learner import kernel
-from trainer.learner.kernel.trunk import _torch_features, trunk_features
+from trainer.learner.kernel import _torch_features, trunk_features
 frames = torch.randint(0, 256, (5, 2, 45, 80), dtype=torch.uint8)
 layers = torch.nn.Conv2d(2, 6, 6), torch.nn.Conv2d(6, 16, 6)
 parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trainer.learner.algorithms import PHIL
+from trainer.learner.config import PHIL
 from trainer.learner.td3 import Losses
 from trainer.tests.filled import SMALL, fill, observation
 from trainer.tests.scripted import CONFIG, ScriptedEnv, scripted_run

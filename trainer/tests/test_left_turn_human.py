@@ -7,10 +7,8 @@ import pytest
 
 from trainer.benches.objections import objections
 from trainer.evaluation import drive_episodes
-from trainer.human.crossing import Crossing, PedalPlan
-from trainer.human.expert import LeftTurnExpert
 from trainer.human.guide import HumanGuide
-from trainer.human.trigger import LeftTurnTrigger
+from trainer.human.left_turn import Crossing, LeftTurnExpert, LeftTurnTrigger, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes
 

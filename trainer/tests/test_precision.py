@@ -1,9 +1,8 @@
 import pytest
 import torch
 
-from trainer.learner import precision
-from trainer.learner.algorithms import PHIL
-from trainer.learner.config import LearnerConfig
+from trainer.learner import networks
+from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import Picture
 from trainer.learner.td3 import TD3Learner
 from trainer.tests.test_td3 import make_batch, weights_of
@@ -16,11 +15,11 @@ def processor(tmp_path, monkeypatch):
     def pretend(text: str) -> None:
         info = tmp_path / "cpuinfo"
         info.write_text(text)
-        monkeypatch.setattr(precision, "CPU_INFO", info)
-        precision.multiplies_bfloat16.cache_clear()
+        monkeypatch.setattr(networks, "CPU_INFO", info)
+        networks.multiplies_bfloat16.cache_clear()
 
     yield pretend
-    precision.multiplies_bfloat16.cache_clear()
+    networks.multiplies_bfloat16.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -35,13 +34,13 @@ def processor(tmp_path, monkeypatch):
 )
 def test_the_processors_flags_decide(processor, flags, multiplies):
     processor(flags)
-    assert precision.multiplies_bfloat16("cpu") == multiplies
+    assert networks.multiplies_bfloat16("cpu") == multiplies
 
 
 def test_without_a_list_of_flags_there_is_none(processor, monkeypatch, tmp_path):
     processor("")
-    monkeypatch.setattr(precision, "CPU_INFO", tmp_path / "none")
-    assert not precision.multiplies_bfloat16("cpu")
+    monkeypatch.setattr(networks, "CPU_INFO", tmp_path / "none")
+    assert not networks.multiplies_bfloat16("cpu")
 
 
 def updated(precisions: tuple[str, ...]) -> list[dict[str, torch.Tensor]]:
@@ -62,7 +61,7 @@ def test_a_processor_without_bfloat16_learns_in_float32(processor):
 
 
 @pytest.mark.skipif(
-    not precision.multiplies_bfloat16("cpu"), reason="this processor has no bfloat16"
+    not networks.multiplies_bfloat16("cpu"), reason="this processor has no bfloat16"
 )
 def test_a_processor_with_bfloat16_learns_in_it():
     single, reduced = updated(("float32", "bfloat16"))

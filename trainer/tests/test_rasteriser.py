@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.scenarios.geometry import Rectangle
-from trainer.scenarios.rasteriser import COLUMNS, EGO, GROUND, ROWS, TRAFFIC, Rasteriser
+from trainer.scenarios.picture import COLUMNS, EGO, GROUND, ROWS, TRAFFIC, Rasteriser, Rectangle
 
 view = Rasteriser(left_m=-20.0, top_m=-11.25, metres_per_pixel=0.5)
 roads = [Rectangle(0.0, 0.4, 0.0, 90.0, 7.3), Rectangle(3.0, 9.0, 1.5, 20.0, 8.0)]

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.learner.algorithms import ALGORITHMS, PHIL, Algorithm
-from trainer.learner.config import LearnerConfig
-from trainer.learner.reference import ReferenceLearner
+from trainer.learner.config import ALGORITHMS, PHIL, Algorithm, LearnerConfig
 from trainer.learner.td3 import TD3Learner
+from trainer.tests.reference import ReferenceLearner
 from trainer.tests.test_td3 import SMALL, make_batch, weights_of
 
 UPDATES = 3

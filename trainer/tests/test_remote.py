@@ -8,8 +8,14 @@ import pytest
 from edge_runtime.latency.model import LatencySpec, parse_spec
 from trainer.drivers import make_environment
 from trainer.evaluation import drive_episode
-from trainer.remote.vehicle_end import RemoteDriver, VehicleEnd
-from trainer.training.wheel import DirectWheel, RemoteWheel, make_wheel, ticks_late
+from trainer.training.delayed import (
+    DirectWheel,
+    RemoteDriver,
+    RemoteWheel,
+    VehicleEnd,
+    make_wheel,
+    ticks_late,
+)
 
 
 class Brightness:

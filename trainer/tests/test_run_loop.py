@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from edge_runtime.latency.model import parse_spec
 from trainer.learner import equations
 from trainer.tests.scripted import CONFIG, HUMAN, LEARNER, POLICY, scripted_run
+from trainer.training.delayed import make_wheel
 from trainer.training.run import WRONG_ACTIONS
-from trainer.training.wheel import make_wheel
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ from highway_env.vehicle.kinematics import Vehicle
 
 from edge_runtime.vehicles.similarity import CARS, similarity_to
 from trainer.scenarios import SCENARIOS
-from trainer.scenarios.congestion_config import CongestionConfig
+from trainer.scenarios.congestion import CongestionConfig
 from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.left_turn import LeftTurnConfig
-from trainer.scenarios.vehicle_types import CAR
+from trainer.scenarios.traffic import CAR
 
 
 def test_the_left_turns_car():

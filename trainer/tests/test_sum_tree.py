@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.learner.sum_tree import SumTree
+from trainer.learner.replay import SumTree
 
 weights_lists = st.lists(st.floats(0, 100), min_size=1, max_size=70)
 

@@ -5,12 +5,11 @@ import pytest
 import torch
 
 from trainer.learner import equations
-from trainer.learner.algorithms import ALGORITHMS, PHIL
-from trainer.learner.config import LearnerConfig
+from trainer.learner.config import ALGORITHMS, PHIL, LearnerConfig
 from trainer.learner.networks import FEATURES, Actor, Critic
-from trainer.learner.reference import ReferenceLearner
 from trainer.learner.replay import Batch
 from trainer.learner.td3 import TD3Learner
+from trainer.tests.reference import ReferenceLearner
 
 SMALL = LearnerConfig(batch_size=12, precision="float32", saturation_weight=0.0, tau=1e-3)
 

@@ -23,8 +23,7 @@ from trainer.plots import CURVE_FILE
 from trainer.tests.drawn import values_in
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
-from trainer.training.run import TrainingRun
-from trainer.training.seen import Seen
+from trainer.training.run import Seen, TrainingRun
 from trainer.viewer.advantage import q_advantage
 from trainer.viewer.background import MOST_WAITING, Background
 from trainer.viewer.blueprint import LINES

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,73 @@ from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, mak
 from trainer.files import load_torch, save_torch
 from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
-from trainer.learner.algorithms import ALGORITHMS
-from trainer.learner.config import HUMANS_ACTION
+from trainer.learner.config import ALGORITHMS, HUMANS_ACTION
+from trainer.learner.td3 import TD3Learner
 from trainer.revision import source_revision
 from trainer.training.config import BIASED, RunConfig
-from trainer.training.divergence import check_weights, divergence_said, finite_action
-from trainer.training.learning import Learning, LearningThread
+from trainer.training.delayed import make_wheel
+from trainer.training.learning import Action, Learning, LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
     MetricsWriter,
+    Tally,
     read_metrics,
     totals,
 )
-from trainer.training.seen import OnStep, Seen
-from trainer.training.tally import Tally
 from trainer.training.validation import Validation
-from trainer.training.wheel import make_wheel
+
+NETWORKS = ("actor", "critics", "target_actor", "target_critics")
+
+
+@contextmanager
+def divergence_said(episode: int) -> Iterator[None]:
+    """Turn the FloatingPointError of learning that diverged into a UserError.
+
+    Args:
+        episode: the one under way, from 0; people count from 1.
+    """
+    try:
+        yield
+    except FloatingPointError as error:
+        raise UserError(
+            f"the training diverged in episode {episode + 1}: {error}; a smaller "
+            "--set actor_learning_rate or critic_learning_rate may help"
+        ) from None
+
+
+def finite_action(action: Action) -> Action:
+    """The action; FloatingPointError where it is none: no car is to be driven by it."""
+    if not np.isfinite(action).all():
+        raise FloatingPointError("its actions are no longer finite")
+    return action
+
+
+def check_weights(learner: TD3Learner) -> None:
+    """Raise FloatingPointError unless every weight is finite: a checkpoint without is worthless."""
+    for name in NETWORKS:
+        for parameter in getattr(learner, name).parameters():
+            if not parameter.isfinite().all():
+                raise FloatingPointError("its weights are no longer finite")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the loop knows of it once it is stored; nothing in it changes afterwards."""
+
+    observation: NDArray[np.uint8]
+    """s, [2, 45, 80]."""
+    policy_action: NDArray[np.float32]
+    """With the exploration's noise, as the vehicle would have had it."""
+    intervention: Intervention | None
+    action: NDArray[np.float32]
+    """What was carried out."""
+    speed_mps: float
+    """After the step."""
+
+
+OnStep = Callable[[Seen], None]
+
 
 CONFIG_FILE = "config.json"
 WRONG_ACTIONS = {"left_turn": 1.0, "congestion": 0.5}

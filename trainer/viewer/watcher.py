@@ -12,8 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from trainer.training.metrics import EpisodeMetrics
-from trainer.training.run import TrainingRun
-from trainer.training.seen import Seen
+from trainer.training.run import Seen, TrainingRun
 from trainer.viewer.entries import Correction, Entry, Episode, Picture, StepEntry, Steps
 from viewing.pace import PICTURE_INTERVAL_S, Pace
 

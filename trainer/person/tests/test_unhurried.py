@@ -8,8 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from trainer.learner.algorithms import ALGORITHMS
-from trainer.learner.config import LearnerConfig
+from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.person.episode import KeptBack
 from trainer.person.unhurried import UnhurriedLearning
 from trainer.training.learning import LearningThread

@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
 from trainer.learner import equations
-from trainer.learner.algorithms import Algorithm
-from trainer.learner.config import OVERRULED_ACTION, LearnerConfig
+from trainer.learner.config import OVERRULED_ACTION, Algorithm, LearnerConfig
 from trainer.learner.networks import Actor, Critic, CriticPair, Picture
 from trainer.learner.replay import Batch
 from trainer.learner.td3 import Losses

@@ -1,0 +1,270 @@
+"""The human in the left turn: foresight, the scripted expert, and when a person would take over.
+
+All three know the true state. The activation conditions are those that section V leaves open.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trainer.human.guide import Reason
+from trainer.scenarios.ego import EgoVehicle
+from trainer.scenarios.left_turn import LeftTurnEnv, Observation
+from trainer.scenarios.picture import Rectangle, corners
+
+TABLE_STEP_M = 0.1
+
+
+@dataclass(frozen=True)
+class PedalPlan:
+    """What the ego car is supposed to do: a pedal for a while, then a speed."""
+
+    pedal: float = 1.0
+    hold_s: float = 0.0
+    then_mps: float | None = None
+    """Full throttle up to this speed; None keeps the speed that the pedal led to."""
+    then_brake: float = 0.0
+    """Instead of that: this share of the full brake, until the car stands."""
+
+
+class Crossing:
+    """Foresight for one left-turn environment.
+
+    Args:
+        env: the environment looked at.
+        side_clearance_m: room kept to the sides of a passing car.
+    """
+
+    def __init__(self, env: LeftTurnEnv, side_clearance_m: float) -> None:
+        self.env = env
+        config = env.config
+        lane_y, half_width_m = 0.5 * config.lane_width_m, 0.5 * EgoVehicle.WIDTH + side_clearance_m
+        stretch = [
+            _stretch_in_strip(self._footprint(s_m), lane_y - half_width_m, lane_y + half_width_m)
+            for s_m in np.arange(0.0, config.goal_m + 10.0, TABLE_STEP_M)
+        ]
+        self._covered_x = np.array(stretch)
+        self._first_cell = int(np.argmax(np.isfinite(self._covered_x[:, 0])))
+        """Where the ego car first reaches into the lane."""
+
+    def clear(self, horizon_s: float, margin_m: float, plan: PedalPlan) -> bool:
+        """Whether nothing comes within ``margin_m`` along the lane during ``horizon_s``."""
+        time_s, s_m, _ = self._ego_motion(horizon_s, plan)
+        cells = np.minimum((s_m / TABLE_STEP_M).astype(int), len(self._covered_x) - 1)
+        if cells[-1] < self._first_cell:
+            return True  # The ego car does not get as far as the lane.
+        rear_x, front_x = self._covered_x[cells].T
+        # All cars at once; the shape holds without any, too.
+        cars = [(car.position[0], car.speed, car.LENGTH) for car in self.env.traffic]
+        x, speed_mps, length_m = np.array(cars).reshape(-1, 3).T[:, :, None]
+        car_x, reach_m = x + speed_mps * time_s, 0.5 * length_m + margin_m
+        return not np.any((car_x + reach_m > rear_x) & (car_x - reach_m < front_x))
+
+    def state_after(self, horizon_s: float, plan: PedalPlan) -> tuple[float, float]:
+        """How far along the path the ego car is after ``horizon_s`` (m), and its speed (m/s)."""
+        _, s_m, speed_mps = self._ego_motion(horizon_s, plan)
+        return float(s_m[-1]), speed_mps
+
+    def in_lane(self, s_m: float) -> bool:
+        """Whether the ego car at this path length reaches into the traffic's way."""
+        cell = min(int(s_m / TABLE_STEP_M), len(self._covered_x) - 1)
+        return bool(np.isfinite(self._covered_x[cell, 0]))
+
+    def _ego_motion(
+        self, horizon_s: float, plan: PedalPlan
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Times ahead (s), arc lengths reached (m), an entry a control period; the last speed."""
+        c, dt_s = self.env.config, self.env.config.control_period_s
+        steps, held = round(horizon_s / dt_s), round(plan.hold_s / dt_s)
+        held_mps2 = plan.pedal * (c.throttle_mps2 if plan.pedal > 0 else c.brake_mps2)
+        speed_mps, s_m = self.env.ego.speed, self.env.distance_m
+        positions = [s_m]
+        for step in range(steps):
+            # As the car itself: the position takes the speed at the start of the interval.
+            s_m += speed_mps * dt_s
+            if step < held:
+                speed_mps = min(max(speed_mps + held_mps2 * dt_s, 0.0), c.max_speed_mps)
+            elif plan.then_brake:
+                speed_mps = max(speed_mps - plan.then_brake * c.brake_mps2 * dt_s, 0.0)
+            elif plan.then_mps is not None and speed_mps < plan.then_mps:
+                speed_mps = min(speed_mps + c.throttle_mps2 * dt_s, plan.then_mps)
+            positions.append(s_m)
+        return _instants(steps, dt_s), np.array(positions), speed_mps
+
+    def _footprint(self, s_m: float) -> Rectangle:
+        pose = self.env.path.pose(s_m)
+        length_m, width_m = EgoVehicle.LENGTH, EgoVehicle.WIDTH
+        # In the bend the tracked car points inwards by the slip angle.
+        slip_rad = math.asin(0.5 * length_m * self.env.path.curvature(s_m))
+        return Rectangle(pose.x, pose.y, pose.heading - slip_rad, length_m, width_m)
+
+
+@cache
+def _instants(steps: int, dt_s: float) -> NDArray[np.float64]:
+    return np.linspace(0.0, steps * dt_s, steps + 1)
+
+
+def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[float, float]:
+    """The x range that a rectangle covers between two y values; empty is (inf, -inf)."""
+    points = corners(shape)
+    xs: list[float] = []
+    for (x0, y0), (x1, y1) in zip(points, np.roll(points, -1, axis=0), strict=True):
+        if low_y <= y0 <= high_y:
+            xs.append(x0)
+        for level in (low_y, high_y):
+            if (y0 - level) * (y1 - level) < 0:
+                xs.append(x0 + (x1 - x0) * (level - y0) / (y1 - y0))
+    return (min(xs), max(xs)) if xs else (math.inf, -math.inf)
+
+
+class LeftTurnExpert:
+    """Waits at the stop line, picks a gap, and then commits.
+
+    A driver who changes their mind with the nose in the lane is hit; one who needs a wide gap to
+    start and a narrow one to go on is not, and is easier to imitate.
+    """
+
+    HORIZON_S = 6.0
+    START_MARGIN_M = 2.5
+    """Room to every car while turning. With 1.5 m the expert is as safe, but of its imitators, who
+    start some tenths of a second early or late, every tenth touches the car that just passed."""
+    KEEP_MARGIN_M = 0.3
+    POINT_OF_NO_RETURN_M = 8.0
+    """Path length at which the nose comes within 0.5 m of the cars of the near lane."""
+    APPROACH_MPS2 = 1.5
+    """Comfortable deceleration towards the stop line; full brake is kept for surprises."""
+    CRUISE_MPS = 5.2
+    SIDE_CLEARANCE_M = 0.3
+    """Room to the sides of a passing car."""
+    GO = PedalPlan(then_mps=CRUISE_MPS)
+
+    def __init__(self, env: LeftTurnEnv) -> None:
+        self.env = env
+        self.crossing = Crossing(env, self.SIDE_CLEARANCE_M)
+        self.going = False
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self.going = False
+
+    def would_go(self) -> bool:
+        """Whether a driver standing here would start now."""
+        return self.crossing.clear(self.HORIZON_S, self.START_MARGIN_M, self.GO)
+
+    def act(self, observation: Observation) -> NDArray[np.float32]:
+        """The expert's pedal, float32 [1]: from the true state, whatever the picture shows."""
+        if self._beyond_return():
+            self.going = True
+        else:
+            margin_m = self.KEEP_MARGIN_M if self.going else self.START_MARGIN_M
+            self.going = self.crossing.clear(self.HORIZON_S, margin_m, self.GO)
+        return np.array([self._go() if self.going else self._wait()], dtype=np.float32)
+
+    def _beyond_return(self) -> bool:
+        """Whether even full brake would leave the nose in the lane."""
+        env = self.env
+        stopping_m = env.ego.speed**2 / (2.0 * env.config.brake_mps2)
+        return env.distance_m + stopping_m > self.POINT_OF_NO_RETURN_M
+
+    def _go(self) -> float:
+        return min(max(2.0 * (self.CRUISE_MPS - self.env.ego.speed), -1.0), 1.0)
+
+    def _wait(self) -> float:
+        """Slow down on a speed that falls with the distance to the line, and stand there."""
+        to_line_m = self.env.config.stop_line_m - self.env.distance_m
+        wanted_mps = math.sqrt(2.0 * self.APPROACH_MPS2 * max(to_line_m - 0.5, 0.0))
+        if wanted_mps == 0.0:
+            return -1.0
+        return min(max(wanted_mps - self.env.ego.speed, -1.0), 0.3)
+
+
+class LeftTurnTrigger:
+    """Judges the policy's action before it is carried out.
+
+    A person lets an action pass that leaves a way out and does not stop in the lane. A judge that
+    asked only where the present pedal leads would object to each brisk approach to the stop line,
+    the expert's own, too; but theorem 1 holds only where no optimal policy goes where the human
+    takes over.
+
+    Args:
+        expert: knows the environment and what a driver would do in it.
+    """
+
+    HOLD_S = 0.5
+    """How long the judged pedal is taken to be held: a person's reaction time."""
+    RESCUE_BRAKE = 0.85
+    """Share of the full brake with which the car could then still be stopped in time; the rest is
+    room for a human who is a network."""
+    STOP_BY_M = LeftTurnExpert.POINT_OF_NO_RETURN_M - 0.5
+    """Path length by which it must then stand; past the point of no return a car can only be driven
+    on, and who creeps up to it has not waited."""
+    RESCUE_MARGIN_M = 1.0
+    """Room along the lane with which it could then still drive on, at full throttle."""
+    HESITATION_S = 1.0
+    """How long the judged pedal is taken to be held by who would then be in the lane."""
+    CRAWL_MPS = 1.5
+    """Who would then be slower than this within the lane is stopping there: nobody's plan, since
+    the traffic does not yield."""
+    STANDING_MPS = 0.3
+    STANDING_STEPS = 15
+    """Steps that a car stands before anybody thinks of it as stuck."""
+    OPEN_STEPS = 5
+    """Steps that the way must then have been free: a person's reaction time once more."""
+    START_PEDAL = 0.2
+    """Least throttle that counts as driving on by oneself."""
+
+    def __init__(self, expert: LeftTurnExpert) -> None:
+        self.expert = expert
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self.standing_steps = self.open_steps = 0
+
+    def judge(self, action: NDArray) -> Reason | None:
+        """Why a person would take over from ``action`` now, or None. Once a control period."""
+        pedal = float(action[0])
+        standing = self.expert.env.ego.speed < self.STANDING_MPS
+        self.standing_steps = self.standing_steps + 1 if standing else 0
+        waiting = self.standing_steps > self.STANDING_STEPS
+        self.open_steps = self.open_steps + 1 if waiting and self.expert.would_go() else 0
+        if not self._leaves_a_way_out(pedal):
+            return "collision"
+        if self._stops_in_the_lane(pedal):
+            return "lane"
+        return "stuck" if self.open_steps > self.OPEN_STEPS and pedal < self.START_PEDAL else None
+
+    def may_return(self) -> bool:
+        """Whether the wheel can be given back: nobody does while driving through the lane.
+
+        Who stands there gives up: a human who is a network might stand there for ever.
+        """
+        standing = self.expert.env.ego.speed < self.STANDING_MPS
+        return standing or not self.expert.crossing.in_lane(self.expert.env.distance_m)
+
+    def _stops_in_the_lane(self, pedal: float) -> bool:
+        """Whether after this pedal the car hardly moves, with its nose in the lane."""
+        if pedal >= self.START_PEDAL:
+            return False
+        held = PedalPlan(pedal, self.HESITATION_S)
+        at_m, speed_mps = self.expert.crossing.state_after(self.HESITATION_S, held)
+        return speed_mps < self.CRAWL_MPS and self.expert.crossing.in_lane(at_m)
+
+    def _leaves_a_way_out(self, pedal: float) -> bool:
+        """Whether after this pedal the car can still be stopped, or driven on, unharmed."""
+        expert, crossing = self.expert, self.expert.crossing
+        stop = PedalPlan(pedal, self.HOLD_S, then_brake=self.RESCUE_BRAKE)
+        if crossing.state_after(expert.HORIZON_S, stop)[0] <= self.STOP_BY_M or self._stays(pedal):
+            return True
+        go = PedalPlan(pedal, self.HOLD_S, then_mps=expert.CRUISE_MPS)
+        return crossing.clear(expert.HORIZON_S, self.RESCUE_MARGIN_M, go)
+
+    def _stays(self, pedal: float) -> bool:
+        """Whether the car stands outside of the lane, and goes on standing."""
+        ego_at_m, last_m = self.expert.env.distance_m, self.expert.POINT_OF_NO_RETURN_M
+        return pedal <= 0.0 and self.expert.env.ego.speed == 0.0 and ego_at_m <= last_m
