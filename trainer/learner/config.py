@@ -84,10 +84,15 @@ class LearnerConfig:
     """Standard deviation of the target policy smoothing (table A5: noise scale)."""
     target_noise_bound: float = 0.5
     """Bound of that noise; TD3's own value, the paper has none."""
-    exploration_initial: float = 0.5
+    exploration_initial: float = 0.3
     """Standard deviation of the exploration noise in the first episode (table A5: 1). More of it,
     and the human takes over for the noise's sake: the policy hardly drives, and the critic sees
-    hardly anything but the human's steps. Less, and the left turn learns more slowly."""
+    hardly anything but the human's steps."""
+    exploration_correlation: float = 0.9
+    """Correlation of the noise in two control periods in a row; the paper's is 0. A tenth of a
+    second of steering moves the car by nothing that a critic could see, a second of it does: noise
+    that lasts shows what an action is worth (Ornstein-Uhlenbeck, as in DDPG; Lillicrap et al.,
+    2016)."""
     exploration_final: float = 0.05
     """What it falls to (table A5)."""
     exploration_decay: float = 0.985
@@ -123,6 +128,10 @@ class LearnerConfig:
     """What it is charged to: ``overruled``, the policy's action that made the human take over,
     whose value it becomes; or ``human``, the reward of the human's own first action, as printed,
     which teaches the critic that rescuing is as bad as crashing."""
+    action_bound: float = 0.25
+    """Bound of the initial weights with which the action joins the picture in the critics' first
+    connected layer; 0: that of one more feature among 1,792 (0.02), as the paper's networks begin.
+    There the action hardly counts in the value at first, and the actor's gradient is noise."""
     warmup_steps: int = 256
     """Transitions stored before the first update."""
     saturation_weight: float = 0.03
@@ -159,6 +168,7 @@ RANGES = {
     "target_noise": FROM_ZERO,
     "target_noise_bound": FROM_ZERO,
     "exploration_initial": FROM_ZERO,
+    "exploration_correlation": SHARE,
     "exploration_final": FROM_ZERO,
     "exploration_decay": SHARE,
     "exploration_bound": FROM_ZERO,
@@ -169,6 +179,7 @@ RANGES = {
     "beta": SHARE,
     "cloning_weight": FROM_ZERO,
     "intervention_penalty": ANY,
+    "action_bound": FROM_ZERO,
     "warmup_steps": FROM_ONE,
     "saturation_weight": FROM_ZERO,
 }
@@ -176,12 +187,14 @@ RANGES = {
 
 PRINTED_LEARNER = LearnerConfig(
     exploration_initial=1.0,
+    exploration_correlation=0.0,
     actor_learning_rate=5e-4,
     critic_learning_rate=2e-4,
     return_steps=1,
     tau=1e-3,
     split_loss=True,
     penalty_on=HUMANS_ACTION,
+    action_bound=0.0,
     saturation_weight=0.0,
 )
 """Tables A5 and A6 and the equations as they are printed. The weight on cloning, for which the

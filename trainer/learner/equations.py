@@ -6,6 +6,8 @@ actions [n, action size].
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,10 +21,20 @@ def masked_action(policy_action: Action, human_action: Action | None) -> Action:
     return policy_action if human_action is None else human_action
 
 
-def exploration_noise(scale: float, bound: float, size: int, random: np.random.Generator) -> Action:
-    """Eq. 18b: Gaussian noise of standard deviation ``scale``, clipped to +-``bound``."""
-    noise = random.normal(0.0, scale, size)
-    return np.clip(noise, -bound, bound).astype(np.float32)
+def correlated(
+    before: NDArray[np.float64], correlation: float, random: np.random.Generator
+) -> NDArray[np.float64]:
+    """The next standard normal numbers of a first-order autoregressive process, as ``before``.
+
+    ``correlation`` is that of two in a row; 0 draws each anew.
+    """
+    fresh = random.standard_normal(before.shape)
+    return correlation * before + math.sqrt(1.0 - correlation**2) * fresh
+
+
+def exploration_noise(scale: float, bound: float, drawn: NDArray[np.float64]) -> Action:
+    """Eq. 18b: standard normal numbers times ``scale``, clipped to +-``bound``."""
+    return np.clip(scale * drawn, -bound, bound).astype(np.float32)
 
 
 def shaped_reward(reward: float, penalty: float, human: bool, human_before: bool) -> float:

@@ -131,13 +131,21 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """The value Q(s, a) (table A2): the action joins the picture's features."""
+    """The value Q(s, a) (table A2): the action joins the picture's features.
 
-    def __init__(self, action_size: int = 1, frames: int = 2) -> None:
+    Args:
+        action_size: length of an action.
+        frames: how many of the newest frames it sees.
+        action_bound: of the action's initial weights; None: as one more feature among 1,792.
+    """
+
+    def __init__(
+        self, action_size: int = 1, frames: int = 2, action_bound: float | None = None
+    ) -> None:
         super().__init__()
         self.picture = Picture(frames, more_inputs=action_size)
         self.action = nn.Linear(action_size, HIDDEN[0], bias=False)
-        bound = (FEATURES + action_size) ** -0.5
+        bound = action_bound or (FEATURES + action_size) ** -0.5
         nn.init.uniform_(self.action.weight, -bound, bound)
         self.head = Head(1)
 
@@ -157,10 +165,12 @@ class Critic(nn.Module):
 class CriticPair(nn.Module):
     """The two critics of TD3, whose smaller value is believed."""
 
-    def __init__(self, action_size: int = 1, frames: int = 2) -> None:
+    def __init__(
+        self, action_size: int = 1, frames: int = 2, action_bound: float | None = None
+    ) -> None:
         super().__init__()
-        self.first = Critic(action_size, frames)
-        self.second = Critic(action_size, frames)
+        self.first = Critic(action_size, frames, action_bound)
+        self.second = Critic(action_size, frames, action_bound)
 
     @property
     def pair(self) -> tuple[Critic, Critic]:

@@ -386,8 +386,9 @@ class ReplayBuffer:
         It ends for good, too, at an overruled action that is penalised: what the human did there
         instead, and came to, is not what the policy's actions before it were worth.
         """
-        sums, lasts = self._rewards[indices], indices
-        terminals = self._terminals[indices]
+        sums: NDArray[np.floating] = self._rewards[indices]
+        lasts = indices
+        terminals: NDArray[np.float32] = self._terminals[indices]
         spans = np.ones(len(indices), np.int64)
         going = np.ones(len(indices), np.bool_)
         for step in range(1, self.steps):

@@ -62,7 +62,8 @@ class TD3Learner:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames).to(self.device)
-            self.critics = CriticPair(action_size, config.frames).to(self.device)
+            critics = CriticPair(action_size, config.frames, config.action_bound or None)
+            self.critics = critics.to(self.device)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.actor_optimiser = torch.optim.Adam(

@@ -58,7 +58,7 @@ class ReferenceLearner:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames)
-            self.critics = CriticPair(action_size, config.frames)
+            self.critics = CriticPair(action_size, config.frames, config.action_bound or None)
         self.target_actor = copy.deepcopy(self.actor)
         self.target_critics = copy.deepcopy(self.critics)
         self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), config.actor_learning_rate)

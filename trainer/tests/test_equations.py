@@ -25,11 +25,22 @@ def test_equation_18_the_human_has_full_authority():
 
 
 def test_equation_18b_noise_has_its_scale_and_keeps_its_bound():
-    noise = eq.exploration_noise(0.2, 1.0, 50_000, np.random.default_rng(0))
+    drawn = np.random.default_rng(0).standard_normal(50_000)
+    noise = eq.exploration_noise(0.2, 1.0, drawn)
     assert noise.mean() == pytest.approx(0.0, abs=0.005)
     assert noise.std() == pytest.approx(0.2, rel=0.02)
-    wide = eq.exploration_noise(3.0, 0.5, 1000, np.random.default_rng(0))
-    assert np.abs(wide).max() == 0.5
+    assert np.abs(eq.exploration_noise(3.0, 0.5, drawn)).max() == 0.5
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_noise_keeps_its_deviation_whatever_its_correlation(correlation):
+    random, drawn = np.random.default_rng(0), np.zeros(50_000)
+    series = []
+    for _ in range(60):
+        drawn = eq.correlated(drawn, correlation, random)
+        series.append(drawn)
+    assert series[-1].std() == pytest.approx(1.0, rel=0.02)
+    assert np.corrcoef(series[-2], series[-1])[0, 1] == pytest.approx(correlation, abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -121,6 +121,7 @@ def test_a_return_ends_at_an_overruled_action_with_what_that_is_worth(overruled_
             np.zeros(1, np.float32), step + 1.0, pictures, step == 5, step >= 3, None, taken_over
         )
     batch = buffer.sample(200, np.random.default_rng(0))
+    assert isinstance(batch.spans, np.ndarray)
     rows = {number(batch.frames[row, 1]): row for row in range(200)}
     assert sorted(rows) == list(range(6))
     before, own = rows[1], rows[3]

@@ -101,7 +101,7 @@ def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):
     monkeypatch.setattr(
         equations,
         "exploration_noise",
-        lambda scale, bound, size, random: np.full(size, scale, np.float32),
+        lambda scale, bound, drawn: np.full(len(drawn), scale, np.float32),
     )
     learner = replace(
         LEARNER, exploration_initial=0.5, exploration_decay=0.5, exploration_final=0.1

@@ -32,7 +32,7 @@ from trainer.training.run import TrainingRun
 TINY = RunConfig(
     seed=3,
     episodes=4,
-    evaluate_every_steps=250,  # after two and four episodes
+    evaluate_every_steps=190,  # after two and four episodes
     evaluation_runs=2,
     checkpoint_every=1,
     learner=LearnerConfig(

@@ -237,6 +237,7 @@ class TrainingRun:
         seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
         self.wheel.start(observation, seed)
+        self._drawn = np.zeros(self.env.action_space.shape)
         guided = self.guide is not None and config.guided(self.episode, self.steps)
         if self.guide is not None:
             self.guide.reset()
@@ -310,11 +311,10 @@ class TrainingRun:
 
     def _explore(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         action = finite_action(self.learning.act(observation))
+        c = self.config.learner
+        self._drawn = equations.correlated(self._drawn, c.exploration_correlation, self.exploration)
         noise = equations.exploration_noise(
-            self._exploration_std(),
-            self.config.learner.exploration_bound,
-            len(action),
-            self.exploration,
+            self._exploration_std(), c.exploration_bound, self._drawn
         )
         return np.clip(action + noise, -1.0, 1.0)
 
