@@ -1,24 +1,389 @@
-"""``python -m bridge record``: a listener of its own that writes the wire to an MCAP file."""
+"""``python -m bridge record``: a listener of its own that writes the wire to an MCAP file.
+
+It keeps the exact payloads for replay, and copies that viewers can draw:
+
+| topic | encoding |
+|---|---|
+| ``phil/<id>/<topic>``, the keys of the wire | ``msgpack``: the payload as it was |
+| ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true}, or false |
+| ``view/<id>/frames`` | ``foxglove.RawImage``: frame t-1 above frame t |
+| ``view/<id>/<topic>``, of every topic of the wire | protobuf ``phil.State`` and so on |
+| ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages |
+
+The copies are protobuf, described at run time from the wire's structs: Foxglove and rerun both read
+it by the descriptor that the recording carries along (rerun reads no JSON), and know
+``foxglove.RawImage`` and ``foxglove.Log`` by name.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import time
+import typing
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from bridge.arguments import add_connect, add_span, add_tls
-from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
-from bridge.recording.flushed_file import check_new
-from bridge.recording.writer import RecordingWriter
-from bridge.signals import sigterm_as_interrupt
+import msgspec
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from mcap.writer import CompressionType, Writer
+
+from bridge.commands import add_connect, add_span, add_tls
+from bridge.messages import MESSAGES, TOKEN_TOPICS, Heard
+from bridge.ports import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
+from edge_runtime import __version__, wire
 from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.errors import UserError
+from edge_runtime.file_lock import hold
+from edge_runtime.files import check_writable, make_directory
 from edge_runtime.option_types import seconds
+from edge_runtime.signals import sigterm_as_interrupt
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
 from edge_runtime.words import counted
+
+Field: Any = descriptor_pb2.FieldDescriptorProto
+_SCALARS = {
+    str: Field.TYPE_STRING,
+    bool: Field.TYPE_BOOL,
+    int: Field.TYPE_INT64,
+    float: Field.TYPE_DOUBLE,
+}
+_TIMESTAMP = "google.protobuf.Timestamp"
+IMAGE_FIELDS = {
+    "timestamp": (1, _TIMESTAMP),
+    "width": (2, Field.TYPE_FIXED32),
+    "height": (3, Field.TYPE_FIXED32),
+    "encoding": (4, Field.TYPE_STRING),
+    "step": (5, Field.TYPE_FIXED32),
+    "data": (6, Field.TYPE_BYTES),
+    "frame_id": (7, Field.TYPE_STRING),
+}
+LOG_FIELDS = {
+    "timestamp": (1, _TIMESTAMP),
+    "level": (2, "foxglove.Log.Level"),
+    "message": (3, Field.TYPE_STRING),
+    "name": (4, Field.TYPE_STRING),
+}
+LOG_LEVELS = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
+
+
+class Schema(NamedTuple):
+    """A protobuf message type: its full name, its class, and its serialised FileDescriptorSet."""
+
+    name: str
+    make: Any
+    descriptors: bytes
+
+
+def schema_of(kind: type[msgspec.Struct]) -> Schema:
+    """Mirror a struct of the wire as ``phil.<its name>``; bytes and unknown types are left out."""
+    file = _file("phil", kind.__name__)
+    _add_struct(file.message_type.add(), kind)
+    return _build(file, f"phil.{kind.__name__}")
+
+
+def raw_image() -> Schema:
+    """Return ``foxglove.RawImage``."""
+    file = _file("foxglove", "RawImage")
+    _add_table(file.message_type.add(name="RawImage"), IMAGE_FIELDS)
+    return _build(file, "foxglove.RawImage")
+
+
+def log() -> Schema:
+    """Return ``foxglove.Log``, of which we fill time, level, text and sender."""
+    file = _file("foxglove", "Log")
+    message = file.message_type.add(name="Log")
+    levels = message.enum_type.add(name="Level")
+    for number, name in enumerate(LOG_LEVELS):
+        levels.value.add(name=name, number=number)
+    _add_table(message, LOG_FIELDS)
+    return _build(file, "foxglove.Log")
+
+
+def fill(target: Any, values: msgspec.Struct) -> Any:
+    """Copy the fields that both have into the protobuf message, and return it."""
+    for descriptor in target.DESCRIPTOR.fields:
+        value = getattr(values, descriptor.name)
+        if isinstance(value, Mapping):
+            getattr(target, descriptor.name).update(value)
+        elif isinstance(value, list):
+            _fill_list(getattr(target, descriptor.name), value)
+        elif value is not None:
+            setattr(target, descriptor.name, value)
+    return target
+
+
+def _fill_list(target: Any, values: list[Any]) -> None:
+    if values and isinstance(values[0], msgspec.Struct):
+        for value in values:
+            fill(target.add(), value)
+    else:
+        target.extend(values)
+
+
+def _file(package: str, name: str) -> descriptor_pb2.FileDescriptorProto:
+    file = descriptor_pb2.FileDescriptorProto(
+        name=f"{package}/{name}.proto", package=package, syntax="proto3"
+    )
+    if package == "foxglove":
+        file.dependency.append("google/protobuf/timestamp.proto")
+    return file
+
+
+def _add_table(message: Any, table: Mapping[str, tuple[int, Any]]) -> None:
+    for name, (number, kind) in table.items():
+        field = message.field.add(name=name, number=number, label=Field.LABEL_OPTIONAL)
+        if isinstance(kind, str):
+            field.type = Field.TYPE_MESSAGE if kind == _TIMESTAMP else Field.TYPE_ENUM
+            field.type_name = f".{kind}"
+        else:
+            field.type = kind
+
+
+def _add_struct(message: Any, kind: type[msgspec.Struct], path: str = "phil") -> None:
+    message.name = kind.__name__
+    for number, (name, hint) in enumerate(typing.get_type_hints(kind).items(), start=1):
+        field = Field(name=name, number=number, label=Field.LABEL_OPTIONAL)
+        if _type_field(field, _without_none(hint), message, f"{path}.{kind.__name__}"):
+            message.field.append(field)
+
+
+def _type_field(field: Any, hint: Any, message: Any, path: str) -> bool:
+    """Fill in the type; False where the viewers' copy goes without this field."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin is dict:
+        field.label, field.type = Field.LABEL_REPEATED, Field.TYPE_MESSAGE
+        field.type_name = f".{path}.{_add_map_entry(message, field.name, inner)}"
+    elif origin is list:
+        field.label = Field.LABEL_REPEATED
+        return typing.get_origin(inner[0]) is None and _type_field(field, inner[0], message, path)
+    elif hint in _SCALARS:
+        field.type = _SCALARS[hint]
+    elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        _add_struct(message.nested_type.add(), hint, path)
+        field.type, field.type_name = Field.TYPE_MESSAGE, f".{path}.{hint.__name__}"
+    else:
+        return False
+    return True
+
+
+def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
+    """Protobuf's own form of a map: a nested message of key and value."""
+    entry_name = "".join(part.title() for part in name.split("_")) + "Entry"
+    entry = message.nested_type.add(name=entry_name)
+    entry.options.map_entry = True
+    for number, (label, kind) in enumerate(zip(("key", "value"), inner, strict=True), start=1):
+        entry.field.add(name=label, number=number, label=Field.LABEL_OPTIONAL, type=_SCALARS[kind])
+    return entry_name
+
+
+def _without_none(hint: Any) -> Any:
+    inner = [part for part in typing.get_args(hint) if part is not type(None)]
+    is_optional = type(None) in typing.get_args(hint) and len(inner) == 1
+    return inner[0] if is_optional else hint
+
+
+def _build(file: descriptor_pb2.FileDescriptorProto, name: str) -> Schema:
+    stamp = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
+    files = [stamp, file] if file.dependency else [file]
+    pool = descriptor_pool.DescriptorPool()
+    for each in files:
+        pool.Add(each)
+    descriptors = descriptor_pb2.FileDescriptorSet(file=files).SerializeToString()
+    make = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+    return Schema(name, make, descriptors)
+
+
+MAX_PENDING_BYTES = 4 << 20
+NEVER_OVER = "choose another name: no recording is lost"
+
+
+def check_new(path: Path) -> None:
+    """Raise UserError now if a recording could not be begun there later."""
+    check_writable(path)
+    if path.exists():
+        raise UserError(f"{path} exists; {NEVER_OVER}")
+
+
+class FlushedFile:
+    """Collects bytes and writes them out on ``flush``; where that fails, it cuts off the torn part.
+
+    It holds the file's lock until it is closed: ``bridge repair`` keeps away meanwhile. Made for
+    ``mcap.writer.Writer``, which needs ``write``, ``tell`` and ``flush``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raise UserError where the file exists already, or cannot be made."""
+        make_directory(path.parent)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        try:
+            self._descriptor = os.open(path, flags, 0o666)
+        except FileExistsError:
+            raise UserError(f"{path} exists; {NEVER_OVER}") from None
+        except OSError as error:
+            raise UserError(f"cannot write {path}: {error.strerror}") from None
+        hold(self._descriptor)
+        self.flushed_bytes = 0
+        self._pending = bytearray()
+
+    def write(self, data: bytes) -> int:
+        """Keep the bytes for the next flush, which comes by itself when they are many."""
+        self._pending += data
+        if len(self._pending) > MAX_PENDING_BYTES:
+            self.flush()
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the length of the file, what is still to be flushed included."""
+        return self.flushed_bytes + len(self._pending)
+
+    def flush(self) -> None:
+        """Hand everything to the operating system, which keeps it when this process is killed.
+
+        Raises OSError (a full disk, for one); the file is then as it was after the last flush.
+        """
+        view = memoryview(bytes(self._pending))
+        self._pending.clear()
+        written = 0
+        try:
+            while written < len(view):
+                written += os.write(self._descriptor, view[written:])
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._descriptor, self.flushed_bytes)
+                os.lseek(self._descriptor, self.flushed_bytes, os.SEEK_SET)
+            raise
+        self.flushed_bytes += written
+
+    def close(self) -> None:
+        """Close the file without a last flush."""
+        os.close(self._descriptor)
+
+
+CHUNK_BYTES = 1 << 20
+WIRE_ENCODING = "msgpack"
+METADATA = "phil"
+INFO, WARNING = 2, 3
+"""Levels of foxglove.Log."""
+
+
+class RecordingWriter:
+    """Writes one recording; used by one thread. OSError from any call where the disk is full."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the file; UserError where it exists already."""
+        self.messages = 0
+        self._file = FlushedFile(path)
+        # Writer tells streams apart by their methods; its annotation names file types only.
+        stream: Any = self._file
+        self._mcap = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+        self._mcap.start(profile="", library=f"phil-hil {__version__}")
+        self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, tuple[Schema, int]] = {}
+        self._counts: dict[str, int] = {}
+
+    def write(self, heard: Heard, with_view: bool = True) -> None:
+        """Add one message; ``with_view`` False leaves out the copy for viewers."""
+        self.messages += 1
+        vehicle_id = heard.key.split("/")[1]
+        if heard.topic in TOKEN_TOPICS:
+            here = heard.payload == b"\x01"
+            text = b'{"here": true}' if here else b'{"here": false}'
+            self._add(heard.key, "json", heard.arrived_ns, text)
+            word = "is here" if here else "has gone"
+            who = "edge runtime" if heard.topic == "alive" else "simulator"
+            self._event(vehicle_id, heard.arrived_ns, INFO, f"{who} {word}")
+            return
+        if heard.size > len(heard.payload):
+            text_of = f"{heard.topic} of {heard.size} bytes, not kept"
+            self._event(vehicle_id, heard.arrived_ns, WARNING, text_of)
+            return
+        self._add(heard.key, WIRE_ENCODING, heard.arrived_ns, heard.payload)
+        if with_view:
+            self._view(vehicle_id, heard)
+
+    def flush(self) -> None:
+        """End the chunk: from here on a kill does not lose what has been written."""
+        self._mcap.flush()
+
+    def finish(self, dropped: int) -> None:
+        """Write the index; ``dropped`` is how many messages came too fast to be written."""
+        counts = {"messages": str(self.messages), "dropped": str(dropped)}
+        self._mcap.flush()
+        self._mcap.add_metadata(METADATA, counts)
+        self._mcap.finish()
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file, finished or not."""
+        self._file.close()
+
+    def _view(self, vehicle_id: str, heard: Heard) -> None:
+        kind, read = MESSAGES[heard.topic]
+        message = read(heard.payload)
+        if message is None or isinstance(message, wire.Rejection):
+            why = message.detail if message else "not a scene"
+            self._event(vehicle_id, heard.arrived_ns, WARNING, f"unreadable {heard.topic}: {why}")
+            return
+        schema, _ = self._schema(kind.__name__, lambda: schema_of(kind))
+        try:
+            copy = fill(schema.make(), message)
+        except ValueError as error:  # The wire carries integers that protobuf's do not hold.
+            text = f"{heard.topic} not drawn: {error}"
+            self._event(vehicle_id, heard.arrived_ns, WARNING, text)
+            return
+        self._add_view(f"view/{vehicle_id}/{heard.topic}", schema.name, heard.arrived_ns, copy)
+        if isinstance(message, wire.State):
+            self._frames(vehicle_id, heard.arrived_ns, message)
+
+    def _frames(self, vehicle_id: str, now_ns: int, state: wire.State) -> None:
+        """Both frames lie one after the other: in memory that is one picture, twice as high."""
+        schema, _ = self._schema("RawImage", raw_image)
+        count, height, width = wire.FRAMES_SHAPE
+        image = schema.make(
+            width=width,
+            height=count * height,
+            encoding="mono8",
+            step=width,
+            data=state.frames,
+            frame_id=vehicle_id,
+        )
+        _stamp(image, now_ns)
+        self._add_view(f"view/{vehicle_id}/frames", schema.name, now_ns, image)
+
+    def _event(self, vehicle_id: str, now_ns: int, level: int, text: str) -> None:
+        schema, _ = self._schema("Log", log)
+        entry = schema.make(level=level, message=text, name=vehicle_id)
+        _stamp(entry, now_ns)
+        self._add_view(f"view/{vehicle_id}/events", schema.name, now_ns, entry)
+
+    def _add_view(self, topic: str, schema: str, now_ns: int, message: Any) -> None:
+        _, schema_id = self._schemas[schema.rpartition(".")[2]]
+        self._add(topic, "protobuf", now_ns, message.SerializeToString(), schema_id)
+
+    def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._mcap.register_channel(topic, encoding, schema_id)
+        sequence = self._counts[topic] = self._counts.get(topic, 0) + 1
+        self._mcap.add_message(self._channels[topic], now_ns, data, now_ns, sequence)
+
+    def _schema(self, name: str, make: Callable[[], Schema]) -> tuple[Schema, int]:
+        if name not in self._schemas:
+            schema = make()
+            schema_id = self._mcap.register_schema(schema.name, "protobuf", schema.descriptors)
+            self._schemas[name] = (schema, schema_id)
+        return self._schemas[name]
+
+
+def _stamp(message: Any, now_ns: int) -> None:
+    message.timestamp.seconds, message.timestamp.nanos = divmod(now_ns, 10**9)
+
 
 POLL_S = 0.1
 FLUSH_S = 0.5

@@ -11,9 +11,8 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from bridge.recording.flushed_file import check_new
-from bridge.recording.reader import Recording
-from bridge.recording.writer import CHUNK_BYTES, METADATA
+from bridge.record import CHUNK_BYTES, METADATA, check_new
+from bridge.recording import Recording
 from edge_runtime.cli import ArgumentParser, UserError, examples
 from edge_runtime.file_lock import try_to_hold
 from edge_runtime.files import behind_link, check_writable, write_atomic

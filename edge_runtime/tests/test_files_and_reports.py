@@ -6,9 +6,9 @@ import socket
 import stat
 
 import pytest
+from bridge.report import EpisodeResult, summarise
 
 from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
-from edge_runtime.episode_report import EpisodeResult, summarise
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.latency_window import WINDOW, LatencyWindow
 

@@ -1,6 +1,6 @@
 """The policy as the vehicle has it: tick by tick, over a network in virtual time.
 
-The same network as lock-step's (`edge_runtime/latency/virtual_link.py`), with a function in the
+The same network as lock-step's (`bridge/virtual_link.py`), with a function in the
 edge runtime's place. What is trained here is therefore what drives there.
 """
 
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_runtime.latency.model import LatencySpec
-from edge_runtime.latency.virtual_link import VirtualLink
+from bridge.network import LatencySpec
+from bridge.virtual_link import VirtualLink
 from edge_runtime.wire import DRIVE, Command
 from trainer.human.guide import Driver
 

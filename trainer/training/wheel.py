@@ -18,8 +18,8 @@ import math
 from collections import deque
 from typing import Any, Protocol
 
-from edge_runtime.latency.command_hold import COMMAND_WINDOW_S, ROUNDING_S
-from edge_runtime.latency.model import LatencySpec
+from bridge.network import LatencySpec
+from bridge.virtual_link import COMMAND_WINDOW_S, ROUNDING_S
 from edge_runtime.wire import CONTROL_PERIOD_S
 from trainer.remote.vehicle_end import Action, Observation, Policy, VehicleEnd
 

@@ -6,10 +6,20 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
-from viewing.colours import APPLIED, HUMAN, POLICY
-from viewing.layout import frames_view, full_blueprint, road_view
-from viewing.scene import Scene
-from viewing.series import ALL_OF_IT, BLUE, GREY, ORANGE, PURPLE, Plot, plot_view
+from bridge.rerun import APPLIED, HUMAN, POLICY
+from bridge.rerun.draw import (
+    ALL_OF_IT,
+    BLUE,
+    GREY,
+    ORANGE,
+    PURPLE,
+    Plot,
+    Scene,
+    frames_view,
+    full_blueprint,
+    plot_view,
+    road_view,
+)
 
 APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
 TIMELINE = "step"
