@@ -6,7 +6,7 @@ policy never hears it: it holds what the environment knows and the vehicle does 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
@@ -36,33 +36,44 @@ class Heard(NamedTuple):
 Point = list[float]
 
 
-class SceneVehicle(msgspec.Struct, frozen=True, kw_only=True):
-    """One car, seen from above; ``x``, ``y`` (m) are its centre and y grows downwards."""
+class SeenCar(msgspec.Struct, frozen=True):
+    """One car as it is drawn; ``x``, ``y`` (m) are its centre and y grows downwards."""
 
-    id: int
     x: float
     y: float
     heading_rad: float
     length_m: float
     width_m: float
-    speed_mps: float
     ego: bool = False
 
 
-class Scene(msgspec.Struct, frozen=True, kw_only=True):
-    """Roads and the path as polylines, vehicles as oriented boxes; metres, y grows downwards."""
+class SeenScene(msgspec.Struct, frozen=True, kw_only=True):
+    """What is drawn: roads, lane lines and the path as polylines, the goal, and the cars."""
 
+    roads: Sequence[Sequence[Point]] = ()
+    road_width_m: float = 4.0
+    lane_lines: Sequence[Sequence[Point]] = ()
+    path: Sequence[Point] = ()
+    goal: Point | None = None
+    vehicles: Sequence[SeenCar] = ()
+
+
+class SceneVehicle(SeenCar, frozen=True, kw_only=True):
+    """One car on the wire."""
+
+    id: int
+    speed_mps: float
+
+
+class Scene(SeenScene, frozen=True, kw_only=True):
+    """The scene on the wire, with its place in time and what the simulator says beside it."""
+
+    vehicles: Sequence[SceneVehicle] = ()
     episode: int
     step: int
     sim_time_s: float
     round_trip_ms: float | None = None
     """Of the newest command: from its state sent until it acts, injected delays included."""
-    roads: list[list[Point]] = []
-    road_width_m: float = 4.0
-    path: list[Point] = []
-    goal: Point | None = None
-    vehicles: list[SceneVehicle] = []
-    lane_lines: list[list[Point]] = []
     answered_step: int | None = None
     """The state, of this episode, that ``round_trip_ms`` is of."""
     rejected: dict[str, int] = {}
@@ -94,6 +105,11 @@ def scene_key(vehicle_id: str) -> str:
 def encode_scene(scene: dict[str, Any], stamps: Stamps) -> bytes:
     """Encode an environment's ``scene()`` with its place in time as a MessagePack map."""
     return _ENCODER.encode({**scene, **stamps._asdict()})
+
+
+def read_scene(scene: Mapping[str, Any]) -> SeenScene:
+    """An environment's ``scene()`` as what is drawn; what is not drawn is left out."""
+    return msgspec.msgpack.decode(_ENCODER.encode(scene), type=SeenScene)
 
 
 def decode_scene(payload: bytes) -> Scene | None:

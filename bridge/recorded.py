@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from bridge.record import WIRE_ENCODING
-from bridge.recording import Recording
+from bridge.messages import Heard
+from bridge.recording import Recording, choose_vehicle, heard_of
+from edge_runtime.controller import Order
 from edge_runtime.errors import UserError
 from edge_runtime.safety import MAX_INFERENCE_S, Event
 from edge_runtime.wire import (
     Command,
     Health,
-    Rejection,
     State,
     decode_command,
     decode_health,
@@ -78,18 +78,21 @@ class RecordedDrive:
         self.policy_ids: list[str] = []
         self.vehicle = "none"
         self.runtime_starts_s: list[float] = []
+        self.vehicle_id = choose_vehicle(self.recording, vehicle_id)
         self._zero_ns: int | None = None
         self._lead_s: tuple[int, float] | None = None
-        self._seen_ids: set[str] = set()
-        self._read_answers(vehicle_id)
-        self.vehicle_id = self._choose(vehicle_id)
+        for heard in heard_of(self.recording, self.vehicle_id):
+            self._take(heard)
+        if not self.exchanges:
+            raise UserError(
+                f"{path} holds no answered state of vehicle {self.vehicle_id} to replay"
+            )
 
     def states(self) -> Iterator[State]:
         """Yield every state that can be read, answered or not, in order of arrival."""
-        key = f"phil/{self.vehicle_id}/state"
-        for stored in self.recording.messages():
-            if stored.channel.topic == key:
-                state = decode_state(stored.message.data)
+        for heard in heard_of(self.recording, self.vehicle_id):
+            if heard.topic == "state":
+                state = decode_state(heard.payload)
                 if isinstance(state, State):
                     yield state
 
@@ -102,26 +105,16 @@ class RecordedDrive:
                 done.add(key)
                 yield RecordedState(state, self.exchanges[key])
 
-    def _read_answers(self, vehicle_id: str | None) -> None:
-        for stored in self.recording.messages():
-            if self._zero_ns is None:
-                self._zero_ns = stored.message.log_time
-            parts = stored.channel.topic.split("/")
-            if stored.channel.message_encoding != WIRE_ENCODING or len(parts) != 3:
-                continue  # A copy for viewers, or nothing of ours.
-            _, id_, topic = parts
-            self._seen_ids.add(id_)
-            if vehicle_id in (None, id_):
-                heard_s = (stored.message.log_time - self._zero_ns) * 1e-9
-                self._take(topic, stored.message.data, heard_s)
-
-    def _take(self, topic: str, payload: bytes, heard_s: float) -> None:
-        if topic == "command":
-            command = decode_command(payload)
-            if not isinstance(command, Rejection) and command.reason != RUNTIME_ENDED:
+    def _take(self, heard: Heard) -> None:
+        if self._zero_ns is None:
+            self._zero_ns = heard.arrived_ns
+        heard_s = (heard.arrived_ns - self._zero_ns) * 1e-9
+        if heard.topic == "command":
+            command = decode_command(heard.payload)
+            if isinstance(command, Command) and command.reason != RUNTIME_ENDED:
                 self._take_command(command, heard_s)
-        elif topic == "health":
-            health = decode_health(payload)
+        elif heard.topic == "health":
+            health = decode_health(heard.payload)
             if isinstance(health, Health):
                 self._take_health(health, heard_s)
 
@@ -133,10 +126,7 @@ class RecordedDrive:
         if key not in self.exchanges:
             self.exchanges[key] = _first_exchange(command, sent_s)
         self.exchanges[key].last_s = sent_s
-        answers = self.exchanges[key].answers
-        answer = Answer(command.mode, command.reason, tuple(command.action))
-        if not answers or answers[-1] != answer:
-            answers.append(answer)
+        note(self.exchanges[key].answers, command)
 
     def _sent_s(self, command: Command, heard_s: float) -> float:
         """When the command was sent, in the recorder's time.
@@ -157,18 +147,12 @@ class RecordedDrive:
         if not self.runtime_starts_s or start_s > self.runtime_starts_s[-1] + RESTART_S:
             self.runtime_starts_s.append(start_s)
 
-    def _choose(self, vehicle_id: str | None) -> str:
-        found = ", ".join(sorted(self._seen_ids))
-        if vehicle_id is None and len(self._seen_ids) > 1:
-            raise UserError(
-                f"{self.recording.path} holds vehicles {found}; name one with --vehicle-id"
-            )
-        if not self.exchanges:
-            raise UserError(
-                f"{self.recording.path} holds no answered state to replay"
-                f" (vehicles in it: {found or 'none'})"
-            )
-        return vehicle_id or next(iter(self._seen_ids))
+
+def note(answers: list[Answer], decision: Command | Order) -> None:
+    """Add what was decided to the answers to a state, unless it repeats the last one."""
+    answer = Answer(decision.mode, decision.reason, tuple(decision.action))
+    if not answers or answers[-1] != answer:
+        answers.append(answer)
 
 
 def key_of(state: State) -> Key:

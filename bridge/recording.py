@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import os
 import re
-import stat
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -32,10 +32,12 @@ from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from bridge.messages import Heard
-from bridge.record import WIRE_ENCODING
 from edge_runtime.errors import UserError
+from edge_runtime.files import open_regular
 from edge_runtime.words import counted
 
+WIRE_ENCODING = "msgpack"
+METADATA = "phil"
 MAX_RECORD_BYTES = 64 << 20
 """A torn length must not ask for more memory than any record of ours needs."""
 MAX_CHUNK_BYTES = 8 << 20
@@ -64,24 +66,110 @@ _HEAD = struct.Struct("<BQ")
 _CRC_BYTES = 4
 
 
-class Records:
-    """The records of a file of ``size`` bytes; what is missing is known after ``walk``."""
+class Stored(NamedTuple):
+    """One message of a recording."""
 
-    def __init__(self, stream: IO[bytes], size: int) -> None:
+    channel: Channel
+    schema: Schema | None
+    message: Message
+
+
+@dataclass
+class Condition:
+    """What is missing of a recording, known when all of it has been read."""
+
+    cut_off: bool = False
+    """The file ends without its index, between two records or within one: its writer was killed."""
+    damaged_places: int = 0
+    """Broken parts before the end; all that is whole between them is read."""
+    damaged_bytes: int = 0
+    torn_bytes: int = 0
+    """Of the record within which the file stops."""
+    nameless_messages: int = 0
+    """Whole ones whose topic stood in a broken part alone."""
+    is_altered: bool = False
+    """The checksum over the data is wrong, though nothing in it is broken."""
+    has_checksums: bool = False
+    """Over all of the data and over the index: nothing could change without being noticed."""
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether more is amiss than a kill leaves behind."""
+        return self.damaged_places > 0 or self.nameless_messages > 0 or self.is_altered
+
+    def missing(self) -> str:
+        """Say what could not be read; empty where all of the file could."""
+        parts = []
+        if self.damaged_places:
+            places = counted(self.damaged_places, "damaged place")
+            parts.append(f"{places} of {counted(self.damaged_bytes, 'byte')}")
+        if self.is_altered:
+            parts.append("bytes that changed outside of its chunks")
+        if self.nameless_messages:
+            messages = counted(self.nameless_messages, "message")
+            parts.append(f"{messages} whose topic was in a damaged place")
+        if self.torn_bytes:
+            parts.append(f"a torn end of {counted(self.torn_bytes, 'byte')}")
+        return ", ".join(parts)
+
+    def trouble(self) -> str:
+        """Say what is wrong with the file, as a verb with its object; empty: nothing."""
+        if self.is_damaged:
+            return f"is damaged ({self.missing()})"
+        return "was cut off" if self.cut_off else ""
+
+
+class Recording(Condition):
+    """The messages of one file; its condition is known when ``messages`` has come to the end."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+        self.metadata: dict[str, str] = {}
+
+    def messages(self) -> Iterator[Stored]:
+        """Yield the messages as they stand in the file, which is the order of their arrival.
+
+        UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
+        work than its size accounts for.
+        """
+        vars(self).update(asdict(Condition(cut_off=True)), metadata={})
+        try:
+            with open_regular(self.path) as stream:
+                size = os.fstat(stream.fileno()).st_size
+                yield from self._read(Records(stream, size, str(self.path)))
+        except OSError as error:
+            raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None
+
+    def _read(self, records: Records) -> Iterator[Stored]:
+        if not records.is_mcap():
+            raise UserError(f"{self.path} is no MCAP recording")
+        names = _Names(records)
+        for record in records.walk():
+            names.learn(record)
+            if isinstance(record, Metadata):
+                self.metadata |= record.metadata
+            elif isinstance(record, Message):
+                stored = names.name(record)
+                if stored is None:
+                    records.nameless_messages += 1
+                else:
+                    yield stored
+        vars(self).update(asdict(records))
+
+
+class Records(Condition):
+    """The records of a file of ``size`` bytes; its condition is known after ``walk``.
+
+    ``name`` is for the errors, where the stream does not know it.
+    """
+
+    def __init__(self, stream: IO[bytes], size: int, name: str = "") -> None:
+        super().__init__()
         self._stream = stream
         self._size = size
-        self.is_complete = False
-        """The end was there."""
-        self.is_cut_off = False
-        """The file stops between two records, or within one: its writer was killed."""
-        self.damaged_places = 0
-        self.damaged_bytes = 0
-        self.torn_bytes = 0
-        """Of the record within which the file stops."""
-        self.is_altered = False
-        """By the checksum over the data, bytes changed that are in no damaged place."""
-        self.has_checksums = False
-        """Over all of the data and over the index."""
+        self._name = name or stream.name
+        self._has_ended = False
         self._spent_bytes = 0
 
     def is_mcap(self) -> bool:
@@ -92,7 +180,7 @@ class Records:
     def walk(self) -> Iterator[McapRecord]:
         """Yield every record that can be read, a chunk as what it holds."""
         at = MAGIC_SIZE
-        while at < self._size and not self.is_complete:
+        while at < self._size and not self._has_ended:
             found = self._read(at)
             if found is None:
                 at = self._pass_over(at)
@@ -101,14 +189,12 @@ class Records:
             for part in parts[:1]:  # Neither end is within a chunk.
                 self._note_end(part, at)
             at = end
-            self.is_cut_off = at >= self._size and not self.is_complete
+            self.cut_off = at >= self._size and not self._has_ended
             yield from parts
 
-    def names(self) -> Iterator[McapRecord]:
-        """Yield every schema and channel of the file; the index repeats them all at its end."""
-        for record in Records(self._stream, self._size).walk():
-            if isinstance(record, Schema | Channel):
-                yield record
+    def again(self) -> Records:
+        """The same file from its beginning."""
+        return Records(self._stream, self._size, self._name)
 
     def _note_end(self, record: McapRecord, at: int) -> None:
         """Note the end of the data, with its checksum, and that of the file."""
@@ -120,7 +206,7 @@ class Records:
                 self.is_altered = self._crc32(0, at) != wanted
         if isinstance(record, Footer):
             self.has_checksums &= record.summary_crc != 0
-            self.is_complete = True
+            self._has_ended = True
 
     def _pass_over(self, at: int) -> int:
         """Count what is broken there; return where the next record begins, or the file's end."""
@@ -130,7 +216,7 @@ class Records:
         else:
             next_at = self._scan(at + 1)
         if end is None and next_at == self._size and self._is_begun(at):
-            self.is_cut_off, self.torn_bytes = True, self._size - at
+            self.cut_off, self.torn_bytes = True, self._size - at
         else:
             self.damaged_places += 1
             self.damaged_bytes += next_at - at
@@ -212,7 +298,7 @@ class Records:
         self._spent_bytes += count
         if self._spent_bytes > MAX_CHUNK_BYTES + MAX_WORK * at:
             raise UserError(
-                f"recording {self._stream.name} is refused: reading it takes more than"
+                f"recording {self._name} is refused: reading it takes more than"
                 f" {MAX_WORK} times its size"
             )
 
@@ -229,104 +315,6 @@ def _written(record: McapRecord) -> bytes:
     return builder.end() + (MCAP0_MAGIC if isinstance(record, Footer) else b"")
 
 
-class Stored(NamedTuple):
-    """One message of a recording."""
-
-    channel: Channel
-    schema: Schema | None
-    message: Message
-
-
-class Recording:
-    """One file; read it with ``messages``, after which the other fields are known."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.cut_off = False
-        """The file ends without its index: what was written last may be lost."""
-        self.damaged_places = 0
-        """Broken parts before the end; all that is whole between them is read."""
-        self.damaged_bytes = 0
-        self.torn_bytes = 0
-        """Of what was being written when the file was cut off."""
-        self.nameless_messages = 0
-        """Whole ones whose topic stood in a broken part alone."""
-        self.is_altered = False
-        """The checksum over the data is wrong, though nothing in it is broken."""
-        self.has_checksums = False
-        """Nothing could change without being noticed."""
-        self.metadata: dict[str, str] = {}
-
-    @property
-    def is_damaged(self) -> bool:
-        """Whether more is amiss than a kill leaves behind."""
-        return self.damaged_places > 0 or self.nameless_messages > 0 or self.is_altered
-
-    def messages(self) -> Iterator[Stored]:
-        """Yield the messages as they stand in the file, which is the order of their arrival.
-
-        UserError for a file that is not there, cannot be read, is no MCAP at all, or takes more
-        work than its size accounts for.
-        """
-        self.cut_off, self.nameless_messages, self.metadata = True, 0, {}
-        try:
-            with _open(self.path) as stream:
-                yield from self._read(Records(stream, os.fstat(stream.fileno()).st_size))
-        except OSError as error:
-            raise UserError(f"recording {self.path} cannot be read: {error.strerror}") from None
-
-    def missing(self) -> str:
-        """Say what could not be read; empty where all of the file could."""
-        parts = []
-        if self.damaged_places:
-            places = counted(self.damaged_places, "damaged place")
-            parts.append(f"{places} of {counted(self.damaged_bytes, 'byte')}")
-        if self.is_altered:
-            parts.append("bytes that changed outside of its chunks")
-        if self.nameless_messages:
-            messages = counted(self.nameless_messages, "message")
-            parts.append(f"{messages} whose topic was in a damaged place")
-        if self.torn_bytes:
-            parts.append(f"a torn end of {counted(self.torn_bytes, 'byte')}")
-        return ", ".join(parts)
-
-    def trouble(self) -> str:
-        """Say what is wrong with the file, as a verb with its object; empty: nothing."""
-        if self.is_damaged:
-            return f"is damaged ({self.missing()})"
-        return "was cut off" if self.cut_off else ""
-
-    def _read(self, records: Records) -> Iterator[Stored]:
-        if not records.is_mcap():
-            raise UserError(f"{self.path} is no MCAP recording")
-        names = _Names(records)
-        for record in records.walk():
-            if isinstance(record, Schema | Channel):
-                names.learn(record)
-            elif isinstance(record, Metadata):
-                self.metadata |= record.metadata
-            elif isinstance(record, Message):
-                stored = names.name(record)
-                if stored is None:
-                    self.nameless_messages += 1
-                else:
-                    yield stored
-        self.cut_off = records.is_cut_off
-        self.damaged_places = records.damaged_places
-        self.damaged_bytes = records.damaged_bytes
-        self.torn_bytes = records.torn_bytes
-        self.is_altered = records.is_altered
-        self.has_checksums = records.has_checksums
-
-
-def _open(path: Path) -> IO[bytes]:
-    """Open a file to go back and forth in; a pipe would be waited for."""
-    mode = path.stat().st_mode
-    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise UserError(f"recording {path} cannot be read: it is no regular file")
-    return path.open("rb")
-
-
 class _Names:
     """What the channels are called, as far as the file has been read."""
 
@@ -337,7 +325,7 @@ class _Names:
         self._has_looked = False
 
     def learn(self, record: McapRecord) -> None:
-        """Take a schema or a channel; of two the first, which is from a chunk with a checksum."""
+        """Take a schema or channel; of two the first, which is from a chunk with a checksum."""
         if isinstance(record, Schema):
             self._schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
@@ -346,9 +334,9 @@ class _Names:
     def name(self, message: Message) -> Stored | None:
         """Find out what the message is; None where the file does not say."""
         if not self._knows(message.channel_id) and not self._has_looked:
-            # The chunk that said so is broken: the index may.
+            # The chunk that said so is broken; the index at the end repeats all names.
             self._has_looked = True
-            for record in self._records.names():
+            for record in self._records.again().walk():
                 self.learn(record)
         channel = self._channels.get(message.channel_id)
         if channel is None:
@@ -361,7 +349,7 @@ class _Names:
 
 
 def read_heard(recording: Recording, vehicle_id: str | None) -> Iterator[Heard]:
-    """Every wire message of one vehicle, in order of arrival.
+    """The wire's messages of one vehicle as a listener would have heard them, in their order.
 
     Args:
         recording: it may be cut off or damaged, and says so afterwards.
@@ -370,16 +358,11 @@ def read_heard(recording: Recording, vehicle_id: str | None) -> Iterator[Heard]:
     Raises:
         UserError: no recording, no such vehicle in it, or several and none is named.
     """
-    chosen = _choose(recording, vehicle_id)
-    for stored in recording.messages():
-        vehicle, topic = _wire_topic(stored)
-        if vehicle == chosen:
-            message = stored.message
-            key = stored.channel.topic
-            yield Heard(key, topic, message.data, message.log_time, len(message.data))
+    return heard_of(recording, choose_vehicle(recording, vehicle_id))
 
 
-def _choose(recording: Recording, vehicle_id: str | None) -> str:
+def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
+    """The vehicle of that id, or the only one; UserError where it is not in the recording."""
     there = {vehicle for vehicle, _ in map(_wire_topic, recording.messages()) if vehicle}
     names = ", ".join(sorted(there)) or "none"
     if vehicle_id is not None and vehicle_id not in there:
@@ -387,6 +370,16 @@ def _choose(recording: Recording, vehicle_id: str | None) -> str:
     if vehicle_id is None and len(there) != 1:
         raise UserError(f"{recording.path} holds vehicles {names}; name one with --vehicle-id")
     return vehicle_id or there.pop()
+
+
+def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
+    """As `read_heard`, of a vehicle that is known to be there."""
+    for stored in recording.messages():
+        vehicle, topic = _wire_topic(stored)
+        if vehicle == vehicle_id:
+            message = stored.message
+            key = stored.channel.topic
+            yield Heard(key, topic, message.data, message.log_time, len(message.data))
 
 
 def _wire_topic(stored: Stored) -> tuple[str, str]:

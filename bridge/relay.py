@@ -16,13 +16,13 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
-import numpy as np
 import zenoh
 
 from bridge.clocks import DelayLine, Publish
 from bridge.commands import add_vehicle_id, wait_to_be_told
 from bridge.network import GRAMMAR, LatencyModel, LatencySpec, make_link, parse_spec
 from bridge.ports import simulator_key
+from bridge.report import quantiles
 from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import not_negative
@@ -83,10 +83,9 @@ class RelayTraffic:
     def report(self) -> dict[str, Any]:
         """Return the counts of each topic, and how late the timers were."""
         with self._lock:
-            lags_ms = 1e3 * np.array(self._lags_s or [0.0])
+            lags_ms = [lag_s * 1e3 for lag_s in self._lags_s or (0.0,)]
             counts = {name: topic.counts() for name, topic in self._topics.items()}
-        p50, p99, most = (float(value) for value in np.percentile(lags_ms, [50, 99, 100]))
-        return {"topics": counts, "timer_lag_ms": {"p50": p50, "p99": p99, "max": most}}
+        return {"topics": counts, "timer_lag_ms": quantiles(lags_ms)}
 
     def _take_state(self, payload: bytes) -> None:
         state = decode_state(payload)

@@ -27,6 +27,7 @@ from bridge.recorded import (
     RecordedDrive,
     RecordedState,
     key_of,
+    note,
 )
 from edge_runtime.cli import ArgumentParser, UserError, add_public_key, examples, write_json_out
 from edge_runtime.config import Config, load_config
@@ -211,12 +212,8 @@ class _Replay:
             last_s = due_s
 
     def _note(self, order: Order | None) -> None:
-        if order is None:
-            return
-        answers = self._answers.setdefault(key_of(order.answers.state), [])
-        answer = Answer(order.mode, order.reason, tuple(order.action))
-        if not answers or answers[-1] != answer:
-            answers.append(answer)
+        if order is not None:
+            note(self._answers.setdefault(key_of(order.answers.state), []), order)
 
 
 OnState = Callable[[int], None]
@@ -285,10 +282,7 @@ class _Live:
         if command.session not in names:
             return
         key: Key = (names[command.session], command.episode, command.step)
-        answers = self._answers.setdefault(key, [])
-        answer = Answer(command.mode, command.reason, tuple(command.action))
-        if not answers or answers[-1] != answer:
-            answers.append(answer)
+        note(self._answers.setdefault(key, []), command)
 
 
 DEFAULT_TOLERANCE = 1e-5

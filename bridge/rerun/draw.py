@@ -8,88 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bridge.messages import SeenCar, SeenScene
 from bridge.rerun import Colour
-
-Point = Sequence[float]
-
-
-class Car(Protocol):
-    """One car; ``x``, ``y`` are its centre."""
-
-    @property
-    def x(self) -> float: ...  # noqa: D102
-    @property
-    def y(self) -> float: ...  # noqa: D102
-    @property
-    def heading_rad(self) -> float: ...  # noqa: D102
-    @property
-    def length_m(self) -> float: ...  # noqa: D102
-    @property
-    def width_m(self) -> float: ...  # noqa: D102
-    @property
-    def ego(self) -> bool: ...  # noqa: D102
-
-
-class Scene(Protocol):
-    """Roads, lane lines and the path as polylines, the goal, and the cars."""
-
-    @property
-    def roads(self) -> Sequence[Sequence[Point]]: ...  # noqa: D102
-    @property
-    def road_width_m(self) -> float: ...  # noqa: D102
-    @property
-    def lane_lines(self) -> Sequence[Sequence[Point]]: ...  # noqa: D102
-    @property
-    def path(self) -> Sequence[Point]: ...  # noqa: D102
-    @property
-    def goal(self) -> Point | None: ...  # noqa: D102
-    @property
-    def vehicles(self) -> Sequence[Car]: ...  # noqa: D102
-
-
-@dataclass(frozen=True)
-class SeenCar:
-    """A car of a scenario's ``scene()``."""
-
-    x: float
-    y: float
-    heading_rad: float
-    length_m: float
-    width_m: float
-    ego: bool = False
-
-
-@dataclass(frozen=True)
-class SeenScene:
-    """A scenario's ``scene()``."""
-
-    roads: Sequence[Sequence[Point]] = ()
-    road_width_m: float = 4.0
-    lane_lines: Sequence[Sequence[Point]] = ()
-    path: Sequence[Point] = ()
-    goal: Point | None = None
-    vehicles: Sequence[SeenCar] = ()
-
-
-_CAR_FIELDS = [field.name for field in fields(SeenCar)]
-_SCENE_FIELDS = [field.name for field in fields(SeenScene)]
-
-
-def read_scene(scene: Mapping[str, Any]) -> SeenScene:
-    """A scenario's ``scene()`` as what is drawn; what is not drawn is left out."""
-    cars = [
-        SeenCar(**{name: car[name] for name in _CAR_FIELDS if name in car})
-        for car in scene.get("vehicles", ())
-    ]
-    drawn = {name: scene[name] for name in _SCENE_FIELDS if name in scene}
-    return SeenScene(**{**drawn, "vehicles": cars})
-
 
 MARGIN_M = (10.0, 5.0)
 """Ground shown beyond path and cars: along x, along y."""
@@ -97,26 +22,26 @@ NEAR_M = 20.0
 """From the path; whoever is farther away comes into the picture when it matters."""
 
 
-def outline(car: Car) -> list[tuple[float, float]]:
+def outline(car: SeenCar) -> list[tuple[float, float]]:
     """Return the closed outline of the oriented box (five points)."""
     ahead, aside = car.length_m / 2, car.width_m / 2
     signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
     return [_place(car, sx * ahead, sy * aside) for sx, sy in signs]
 
 
-def body(car: Car) -> list[tuple[float, float]]:
+def body(car: SeenCar) -> list[tuple[float, float]]:
     """Return the axis which, drawn as wide as the car, fills its outline (with round ends)."""
     reach = max(0.0, (car.length_m - car.width_m) / 2)
     return [_place(car, -reach, 0.0), _place(car, reach, 0.0)]
 
 
-def windscreen(car: Car) -> list[tuple[float, float]]:
+def windscreen(car: SeenCar) -> list[tuple[float, float]]:
     """Return a bar across the car, before its middle, that tells front from back."""
     ahead, aside = 0.2 * car.length_m, 0.35 * car.width_m
     return [_place(car, ahead, -aside), _place(car, ahead, aside)]
 
 
-def view_bounds(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]:
+def view_bounds(scene: SeenScene) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the x and y ranges (m) that show the path, and the cars that are near it now."""
     path = [(point[0], point[1]) for point in scene.path]
     cars = [(car.x, car.y) for car in scene.vehicles]
@@ -129,7 +54,7 @@ def view_bounds(scene: Scene) -> tuple[tuple[float, float], tuple[float, float]]
     return ranges[0], ranges[1]
 
 
-def _place(car: Car, ahead_m: float, aside_m: float) -> tuple[float, float]:
+def _place(car: SeenCar, ahead_m: float, aside_m: float) -> tuple[float, float]:
     cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
     return car.x + ahead_m * cos - aside_m * sin, car.y + ahead_m * sin + aside_m * cos
 
@@ -142,7 +67,7 @@ MARKING = (235, 235, 235)
 GLASS = (30, 34, 40)
 
 
-def draw_ground(recording: rr.RecordingStream, scene: Scene) -> None:
+def draw_ground(recording: rr.RecordingStream, scene: SeenScene) -> None:
     """Draw what stays for an episode: roads, path and goal."""
     _lines(recording, "road/roads", scene.roads, ROAD, scene.road_width_m / 2, order=0.0)
     _lines(recording, "road/lanes", scene.lane_lines, MARKING, 0.06, order=0.5)
@@ -155,7 +80,7 @@ def draw_ground(recording: rr.RecordingStream, scene: Scene) -> None:
 
 
 def draw_cars(
-    recording: rr.RecordingStream, scene: Scene, ego_colour: tuple[int, int, int]
+    recording: rr.RecordingStream, scene: SeenScene, ego_colour: tuple[int, int, int]
 ) -> None:
     """Draw the cars; the ego car's colour may say what it does, or by whose will."""
     for name, ego in (("traffic", False), ("ego", True)):
@@ -166,7 +91,7 @@ def draw_cars(
 def _draw_cars(
     recording: rr.RecordingStream,
     path: str,
-    cars: Sequence[Car],
+    cars: Sequence[SeenCar],
     colour: tuple[int, int, int],
 ) -> None:
     half_widths = [car.width_m / 2 for car in cars]
@@ -189,7 +114,7 @@ def _lines(
 GROUND = [222, 229, 216]
 
 
-def road_view(scene: Scene | None, name: str) -> rrb.Spatial2DView:
+def road_view(scene: SeenScene | None, name: str) -> rrb.Spatial2DView:
     """The road from above; the ground shown is fixed by ``scene`` (None: as rerun sees fit)."""
     bounds = None
     if scene is not None:

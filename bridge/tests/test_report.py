@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from dataclasses import replace
 
-from bridge.report import EpisodeResult, SafeStopEvent, episode_line, make_report, summary_line
+import pytest
+
+from bridge.report import (
+    EpisodeResult,
+    SafeStopEvent,
+    episode_line,
+    make_report,
+    summarise,
+    summary_line,
+)
 from bridge.tests.harness import (
     SHORT_TOY,
     SLOW_TOY,
@@ -55,6 +65,29 @@ def test_a_line_an_episode():
     assert episode_line(2, 5, RESULT, []) == "episode 2 of 5: goal after 12.3 s"
     stop = SafeStopEvent(1, 3, "no\x1bcommand", 0.2)
     assert episode_line(2, 5, RESULT, [stop]).endswith("; 1 safe stop (1 no\\x1bcommand)")
+
+
+def episode(outcome, distance_m):
+    return EpisodeResult(
+        seed=1, outcome=outcome, distance_m=distance_m, reward=2.0, time_s=3.0,
+        lateral_acceleration_mps2=0.0, longitudinal_acceleration_mps2=1.0, steps=30,
+    )  # fmt: skip
+
+
+def test_summarise_by_hand():
+    report = summarise(
+        [episode("goal", 10.0), episode("collision", 20.0)], "left_turn", "nominal", "id", 7
+    )
+    assert report["success_rate"] == report["collision_rate"] == 0.5
+    assert report["surviving_distance_m"] == {"mean": 15.0, "std": 5.0}
+    assert set(report) == {
+        "scenario", "condition", "episodes", "success_rate", "collision_rate",
+        "surviving_distance_m", "episode_reward", "episode_time_s", "lateral_acceleration_mps2",
+        "longitudinal_acceleration_mps2", "policy_id", "seed",
+    }  # fmt: skip
+    json.dumps(report, allow_nan=False)
+    with pytest.raises(ValueError, match="no episode"):
+        summarise([], "left_turn", "nominal", "id", 7)
 
 
 def test_without_a_terminal_each_episode_is_told_as_it_ends(tmp_path):

@@ -13,8 +13,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
+from bridge.messages import SeenCar, SeenScene, read_scene
 from bridge.rerun import sinks
-from bridge.rerun.draw import Pace, SeenCar, SeenScene, outline, read_scene, view_bounds
+from bridge.rerun.draw import Pace, outline, view_bounds
 from bridge.rerun.sinks import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.wire_view import Timeline
 from bridge.tests.viewers import NO_GPU, in_place, listens

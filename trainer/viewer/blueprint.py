@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
+from bridge.messages import SeenScene
 from bridge.rerun import APPLIED, HUMAN, POLICY
 from bridge.rerun.draw import (
     ALL_OF_IT,
@@ -14,7 +15,6 @@ from bridge.rerun.draw import (
     ORANGE,
     PURPLE,
     Plot,
-    Scene,
     frames_view,
     full_blueprint,
     plot_view,
@@ -60,7 +60,7 @@ POINTS = {"advantage/of_the_human": HUMAN}
 ROAD = "Road from above (blue: the policy drives, green: the human)"
 
 
-def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
+def make_blueprint(scene: SeenScene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
     left = rrb.Vertical(
         road_view(scene, ROAD),

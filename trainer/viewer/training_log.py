@@ -11,14 +11,13 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from bridge.messages import SeenScene, read_scene
 from bridge.report import GOAL
 from bridge.rerun import HUMAN, POLICY
 from bridge.rerun.draw import (
     Plot,
-    SeenScene,
     draw_cars,
     draw_ground,
-    read_scene,
     style_lines,
     style_points,
 )
