@@ -36,6 +36,8 @@ from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Reason, Stat
 
 Publish = Callable[[bytes], None]
 """Sends an encoded state over the wire; must not block."""
+WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
+"""Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
 
 
 class Clock(Protocol):
@@ -72,73 +74,11 @@ class Clock(Protocol):
         """Stop any thread."""
 
 
-Action = Callable[[], None]
-
-
-class DelayLine:
-    """Runs actions at their time on the monotonic clock, on a thread of its own.
-
-    ``close`` ends the thread; as a daemon, a forgotten one does not hold up the process's end.
-    What an action raises ends the line, and is raised by the next ``push`` or ``close``.
-    """
-
-    def __init__(self) -> None:
-        self._heap: EventHeap[Action] = EventHeap()
-        self._changed = threading.Condition()
-        self._closed = False
-        self._failure: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="delay-line", daemon=True)
-        self._thread.start()
-
-    def push(self, release_s: float, action: Action) -> None:
-        """Run ``action`` at ``release_s`` (monotonic seconds); at once if that has passed."""
-        with self._changed:
-            self._raise_failure()
-            self._heap.push(release_s, action)
-            self._changed.notify()
-
-    def clear(self) -> None:
-        """Forget what is still under way."""
-        with self._changed:
-            self._heap.clear()
-
-    def close(self) -> None:
-        """Stop the thread and wait for it."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
-        self._thread.join()
-        self._raise_failure()
-
-    def _run(self) -> None:
-        try:
-            while (action := self._next_action()) is not None:
-                action()
-        except Exception as error:  # Handed to whoever uses the line.
-            self._failure = error
-
-    def _raise_failure(self) -> None:
-        if self._failure is not None:
-            raise self._failure
-
-    def _next_action(self) -> Action | None:
-        """Sleep until an action is due and return it; None once the line is closed."""
-        with self._changed:
-            while not self._closed:
-                due = self._heap.pop_due(time.monotonic())
-                if due is not None:
-                    return due[1]
-                next_s = self._heap.next_arrival_s()
-                self._changed.wait(None if next_s is None else next_s - time.monotonic())
-        return None
-
-
-WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
-"""Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
-
-
 class LockStepClock:
-    """The clock of ``--clock lockstep``."""
+    """The clock of ``--clock lockstep``.
+
+    One thread runs all this; Zenoh's thread only fills the inbox.
+    """
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
@@ -248,7 +188,11 @@ class LockStepClock:
 
 
 class RealTimeClock:
-    """The clock of ``--clock realtime``."""
+    """The clock of ``--clock realtime``.
+
+    The caller's thread runs the ticks, Zenoh's hands in commands, the delay line's delivers both
+    directions. The condition guards everything that the delay line and the ticks share.
+    """
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self.latencies_ms: list[float] = []
@@ -363,3 +307,62 @@ CLOCKS: dict[str, Callable[[Publish, CommandCheck, LatencySpec], Clock]] = {
     "lockstep": LockStepClock,
     REALTIME: RealTimeClock,
 }
+Action = Callable[[], None]
+
+
+class DelayLine:
+    """Runs actions at their time on the monotonic clock, on a thread of its own.
+
+    ``close`` ends the thread; as a daemon, a forgotten one does not hold up the process's end.
+    What an action raises ends the line, and is raised by the next ``push`` or ``close``.
+    """
+
+    def __init__(self) -> None:
+        self._heap: EventHeap[Action] = EventHeap()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="delay-line", daemon=True)
+        self._thread.start()
+
+    def push(self, release_s: float, action: Action) -> None:
+        """Run ``action`` at ``release_s`` (monotonic seconds); at once if that has passed."""
+        with self._changed:
+            self._raise_failure()
+            self._heap.push(release_s, action)
+            self._changed.notify()
+
+    def clear(self) -> None:
+        """Forget what is still under way."""
+        with self._changed:
+            self._heap.clear()
+
+    def close(self) -> None:
+        """Stop the thread and wait for it."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+        self._raise_failure()
+
+    def _run(self) -> None:
+        try:
+            while (action := self._next_action()) is not None:
+                action()
+        except Exception as error:  # Handed to whoever uses the line.
+            self._failure = error
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _next_action(self) -> Action | None:
+        """Sleep until an action is due and return it; None once the line is closed."""
+        with self._changed:
+            while not self._closed:
+                due = self._heap.pop_due(time.monotonic())
+                if due is not None:
+                    return due[1]
+                next_s = self._heap.next_arrival_s()
+                self._changed.wait(None if next_s is None else next_s - time.monotonic())
+        return None

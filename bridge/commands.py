@@ -107,7 +107,10 @@ def wait_to_be_told() -> NoReturn:
 
 
 class EpisodeBar:
-    """Shows the episodes done and what the vehicle does at the moment."""
+    """Shows the episodes done and what the vehicle does at the moment.
+
+    Where nobody watches a terminal, it prints a line an episode instead.
+    """
 
     def __init__(self, progress: Progress, episodes: int) -> None:
         self._progress = progress

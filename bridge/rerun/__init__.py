@@ -8,7 +8,7 @@ from types import MappingProxyType
 # Read when rerun is imported. It has several lines for a viewer that is gone; ours says it all.
 os.environ.setdefault("RUST_LOG", "warn,re_grpc_client=off,re_sdk=off")
 
-
+# Who decides what the car is told: one colour each, on light and on dark ground.
 Colour = tuple[int, int, int]
 POLICY: Colour = (40, 120, 230)
 HUMAN: Colour = (60, 170, 90)

@@ -16,55 +16,25 @@ import rerun.blueprint as rrb
 from bridge.messages import SeenCar, SeenScene
 from bridge.rerun import Colour
 
-MARGIN_M = (10.0, 5.0)
-"""Ground shown beyond path and cars: along x, along y."""
-NEAR_M = 20.0
-"""From the path; whoever is farther away comes into the picture when it matters."""
-
-
-def outline(car: SeenCar) -> list[tuple[float, float]]:
-    """Return the closed outline of the oriented box (five points)."""
-    ahead, aside = car.length_m / 2, car.width_m / 2
-    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
-    return [_place(car, sx * ahead, sy * aside) for sx, sy in signs]
-
-
-def body(car: SeenCar) -> list[tuple[float, float]]:
-    """Return the axis which, drawn as wide as the car, fills its outline (with round ends)."""
-    reach = max(0.0, (car.length_m - car.width_m) / 2)
-    return [_place(car, -reach, 0.0), _place(car, reach, 0.0)]
-
-
-def windscreen(car: SeenCar) -> list[tuple[float, float]]:
-    """Return a bar across the car, before its middle, that tells front from back."""
-    ahead, aside = 0.2 * car.length_m, 0.35 * car.width_m
-    return [_place(car, ahead, -aside), _place(car, ahead, aside)]
-
-
-def view_bounds(scene: SeenScene) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the x and y ranges (m) that show the path, and the cars that are near it now."""
-    path = [(point[0], point[1]) for point in scene.path]
-    cars = [(car.x, car.y) for car in scene.vehicles]
-    ranges = []
-    for axis, margin in enumerate(MARGIN_M):
-        known = [point[axis] for point in path] or [point[axis] for point in cars] or [0.0]
-        low, high = min(known), max(known)
-        near = [point[axis] for point in cars if low - NEAR_M < point[axis] < high + NEAR_M]
-        ranges.append((min([low, *near]) - margin, max([high, *near]) + margin))
-    return ranges[0], ranges[1]
-
-
-def _place(car: SeenCar, ahead_m: float, aside_m: float) -> tuple[float, float]:
-    cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
-    return car.x + ahead_m * cos - aside_m * sin, car.y + ahead_m * sin + aside_m * cos
-
-
 ROAD = (92, 97, 105)
 PATH = (120, 190, 255)
 GOAL = (84, 200, 120)
 TRAFFIC = (235, 140, 40)
 MARKING = (235, 235, 235)
 GLASS = (30, 34, 40)
+BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
+PURPLE, GREY = (150, 80, 200), (120, 124, 130)
+GROUND = [222, 229, 216]
+MARGIN_M = (10.0, 5.0)
+"""Ground shown beyond path and cars: along x, along y."""
+NEAR_M = 20.0
+"""From the path; whoever is farther away comes into the picture when it matters."""
+ALL_OF_IT = rrb.TimeRange(
+    start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+)
+"""Of the time axis. Otherwise rerun moves the axis with the cursor, and the beginning out of it."""
+PICTURE_INTERVAL_S = 0.1
+"""Ten a second are as many as a control period makes, and plenty for an eye."""
 
 
 def draw_ground(recording: rr.RecordingStream, scene: SeenScene) -> None:
@@ -111,7 +81,41 @@ def _lines(
     recording.log(path, rr.LineStrips2D(strips, colors=[colour], radii=radii_m, draw_order=order))
 
 
-GROUND = [222, 229, 216]
+def outline(car: SeenCar) -> list[tuple[float, float]]:
+    """Return the closed outline of the oriented box (five points)."""
+    ahead, aside = car.length_m / 2, car.width_m / 2
+    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
+    return [_place(car, sx * ahead, sy * aside) for sx, sy in signs]
+
+
+def body(car: SeenCar) -> list[tuple[float, float]]:
+    """Return the axis which, drawn as wide as the car, fills its outline (with round ends)."""
+    reach = max(0.0, (car.length_m - car.width_m) / 2)
+    return [_place(car, -reach, 0.0), _place(car, reach, 0.0)]
+
+
+def windscreen(car: SeenCar) -> list[tuple[float, float]]:
+    """Return a bar across the car, before its middle, that tells front from back."""
+    ahead, aside = 0.2 * car.length_m, 0.35 * car.width_m
+    return [_place(car, ahead, -aside), _place(car, ahead, aside)]
+
+
+def view_bounds(scene: SeenScene) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the x and y ranges (m) that show the path, and the cars that are near it now."""
+    path = [(point[0], point[1]) for point in scene.path]
+    cars = [(car.x, car.y) for car in scene.vehicles]
+    ranges = []
+    for axis, margin in enumerate(MARGIN_M):
+        known = [point[axis] for point in path] or [point[axis] for point in cars] or [0.0]
+        low, high = min(known), max(known)
+        near = [point[axis] for point in cars if low - NEAR_M < point[axis] < high + NEAR_M]
+        ranges.append((min([low, *near]) - margin, max([high, *near]) + margin))
+    return ranges[0], ranges[1]
+
+
+def _place(car: SeenCar, ahead_m: float, aside_m: float) -> tuple[float, float]:
+    cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
+    return car.x + ahead_m * cos - aside_m * sin, car.y + ahead_m * sin + aside_m * cos
 
 
 def road_view(scene: SeenScene | None, name: str) -> rrb.Spatial2DView:
@@ -145,10 +149,6 @@ def full_blueprint(
     )
 
 
-BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
-PURPLE, GREY = (150, 80, 200), (120, 124, 130)
-
-
 class Plot(NamedTuple):
     """One plot of a layout."""
 
@@ -156,12 +156,6 @@ class Plot(NamedTuple):
     title: str
     limits: tuple[float, float] | None = None
     """Of the y axis; None: as the values need."""
-
-
-ALL_OF_IT = rrb.TimeRange(
-    start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
-)
-"""Of the time axis. Otherwise rerun moves the axis with the cursor, and the beginning out of it."""
 
 
 def plot_view(plot: Plot, shown: rrb.TimeRange = ALL_OF_IT) -> rrb.TimeSeriesView:
@@ -189,10 +183,6 @@ def style_points(recording: rr.RecordingStream, points: Mapping[str, Colour]) ->
         name = path.rpartition("/")[2].replace("_", " ")
         style = rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[4.0])
         recording.log(path, style, static=True)
-
-
-PICTURE_INTERVAL_S = 0.1
-"""Ten a second are as many as a control period makes, and plenty for an eye."""
 
 
 class Pace:

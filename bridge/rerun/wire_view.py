@@ -49,47 +49,112 @@ from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import CONTROL_PERIOD_S, Command, Feedback, Health, State
 
-
-class Moment(NamedTuple):
-    """One place on all timelines."""
-
-    episode: int
-    step: int
-    """Within the episode."""
-    total_step: int
-    """Episodes end to end."""
-
-    @property
-    def sim_time_s(self) -> float:
-        """Simulated time with the episodes end to end, in seconds."""
-        return self.total_step * CONTROL_PERIOD_S
-
-    @property
-    def episode_time_s(self) -> float:
-        """Simulated time within the episode, in seconds."""
-        return self.step * CONTROL_PERIOD_S
-
-
-class Timeline:
-    """Learns where each episode begins from what is seen, so that a viewer may come late."""
-
-    def __init__(self) -> None:
-        self.now = Moment(0, 0, 0)
-        self._starts: dict[int, int] = {}
-        self._end_step = 0
-
-    def place(self, episode: int, step: int) -> Moment:
-        """Return the moment of a step and move ``now`` there if that is forward."""
-        # A viewer that comes late begins at zero as well: its first step is the first it saw.
-        start = self._starts.setdefault(episode, self._end_step)
-        moment = Moment(episode, step, start + step)
-        self._end_step = max(self._end_step, moment.total_step + 1)
-        if moment.total_step > self.now.total_step:
-            self.now = moment
-        return moment
-
-
+POLL_S = 0.1
 APPLICATION = "phil_hil"
+EXAMPLE = examples(
+    "python -m bridge view --serve",
+    "python -m bridge view --save drive.rrd --wait-s 60",
+    "python -m bridge view hil_tests/recordings/left_turn.mcap --save left_turn.rrd",
+)
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "recording",
+        nargs="?",
+        metavar="F.mcap",
+        help="show what bridge record has written, instead of listening",
+    )
+    add_sink(parser)
+    add_connect(parser)
+    add_tls(parser)
+    parser.add_argument(
+        "--vehicle-id",
+        metavar="ID",
+        help=f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)",
+    )
+    add_span(parser)
+
+
+def run(arguments: Any) -> int:
+    """Run the command until the simulator goes, the time is over, or somebody interrupts."""
+    if arguments.vehicle_id is not None:
+        wire.check_vehicle_id(arguments.vehicle_id)
+    sink = chosen_sink(arguments)
+    if arguments.recording is not None:
+        check_sink(sink)
+        _show_recording(arguments, sink)
+    else:
+        tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+        check_sink(sink)
+        dropped = _watch(arguments, sink, tls)
+        if dropped:
+            print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
+    if sink.path:
+        print(f"wrote {sink.path}")
+    return 0
+
+
+def _show_recording(arguments: Any, sink: Sink) -> None:
+    """Draw all of it; a page is served until somebody interrupts."""
+    file = Recording(Path(arguments.recording))
+    heard = read_heard(file, arguments.vehicle_id)
+    first = next(heard, None)  # Says what is wrong with the file before anything is opened.
+    with (
+        sigterm_as_interrupt(),
+        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        log = WireLog(recording)
+        for each in chain([first] if first else [], heard):
+            _write(log, each)
+        if file.trouble():
+            text = f"the recording {file.trouble()}; what is whole of it is shown"
+            print(text, file=sys.stderr, flush=True)
+        if sink.kind == SERVE:
+            flush(recording)
+            print("all of it is there; ^C ends", flush=True)
+            wait_to_be_told()
+
+
+def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
+    """Draw until there is a reason to stop; return how many messages had to be dropped."""
+    vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    with (
+        sigterm_as_interrupt(),
+        open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,
+        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
+        # Being interrupted is the ordinary way to end a view: what was drawn is kept.
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
+        _show(feed, log, arguments.duration_s)
+    return feed.dropped
+
+
+def _show(feed: Feed, log: WireLog, duration_s: float | None) -> None:
+    """Draw messages until the simulator has gone and the queue is empty, or the time is over."""
+    end_s = None if duration_s is None else time.monotonic() + duration_s
+    while end_s is None or time.monotonic() < end_s:
+        heard = feed.next(POLL_S)
+        if heard is not None:
+            _write(log, heard)
+        elif feed.simulator_gone.is_set():
+            return
+
+
+def _write(log: WireLog, heard: Heard) -> None:
+    row = MESSAGES.get(heard.topic)
+    if row is None:
+        return  # A token: it shows as silence.
+    message = row.decode(heard.payload)
+    if message is None or isinstance(message, wire.Rejection):
+        log.write_unreadable(heard.topic, message.detail if message else "not a scene")
+    else:
+        getattr(log, f"write_{heard.topic}")(message, heard.arrived_ns)
+
+
 PLOTS = (
     Plot("action", "Command in [-1, 1]: asked and achieved", (-1.1, 1.1)),
     Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
@@ -146,7 +211,7 @@ SIDES = {"edge": ORANGE, "simulator": BLUE}
 
 
 class WireLog:
-    """Draws the messages of one vehicle; used by one thread.
+    """Draws the messages of one vehicle; used by one thread. Times are passed in.
 
     Args:
         recording: where.
@@ -333,107 +398,46 @@ def _health_lines(health: Health) -> list[str]:
     ]
 
 
-POLL_S = 0.1
+class Moment(NamedTuple):
+    """One place on all timelines."""
 
-EXAMPLE = examples(
-    "python -m bridge view --serve",
-    "python -m bridge view --save drive.rrd --wait-s 60",
-    "python -m bridge view hil_tests/recordings/left_turn.mcap --save left_turn.rrd",
-)
+    episode: int
+    step: int
+    """Within the episode."""
+    total_step: int
+    """Episodes end to end."""
 
+    @property
+    def sim_time_s(self) -> float:
+        """Simulated time with the episodes end to end, in seconds."""
+        return self.total_step * CONTROL_PERIOD_S
 
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "recording",
-        nargs="?",
-        metavar="F.mcap",
-        help="show what bridge record has written, instead of listening",
-    )
-    add_sink(parser)
-    add_connect(parser)
-    add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        help=f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)",
-    )
-    add_span(parser)
+    @property
+    def episode_time_s(self) -> float:
+        """Simulated time within the episode, in seconds."""
+        return self.step * CONTROL_PERIOD_S
 
 
-def run(arguments: Any) -> int:
-    """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    if arguments.vehicle_id is not None:
-        wire.check_vehicle_id(arguments.vehicle_id)
-    sink = chosen_sink(arguments)
-    if arguments.recording is not None:
-        check_sink(sink)
-        _show_recording(arguments, sink)
-    else:
-        tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
-        check_sink(sink)
-        dropped = _watch(arguments, sink, tls)
-        if dropped:
-            print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
-    if sink.path:
-        print(f"wrote {sink.path}")
-    return 0
+class Timeline:
+    """Where a message stands in time.
 
+    Each episode's steps begin at 0; laid over one another they could not be told apart. So episodes
+    are put end to end on the timelines ``sim_time`` and ``step``, and each has its own besides,
+    ``episode_0`` and so on, that begins at 0. Where each begins is learnt from what is seen, so
+    that a viewer may come late.
+    """
 
-def _show_recording(arguments: Any, sink: Sink) -> None:
-    """Draw all of it; a page is served until somebody interrupts."""
-    file = Recording(Path(arguments.recording))
-    heard = read_heard(file, arguments.vehicle_id)
-    first = next(heard, None)  # Says what is wrong with the file before anything is opened.
-    with (
-        sigterm_as_interrupt(),
-        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
-        contextlib.suppress(KeyboardInterrupt),
-    ):
-        log = WireLog(recording)
-        for each in chain([first] if first else [], heard):
-            _write(log, each)
-        if file.trouble():
-            text = f"the recording {file.trouble()}; what is whole of it is shown"
-            print(text, file=sys.stderr, flush=True)
-        if sink.kind == SERVE:
-            flush(recording)
-            print("all of it is there; ^C ends", flush=True)
-            wait_to_be_told()
+    def __init__(self) -> None:
+        self.now = Moment(0, 0, 0)
+        self._starts: dict[int, int] = {}
+        self._end_step = 0
 
-
-def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
-    """Draw until there is a reason to stop; return how many messages had to be dropped."""
-    vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
-    with (
-        sigterm_as_interrupt(),
-        open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,
-        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
-        # Being interrupted is the ordinary way to end a view: what was drawn is kept.
-        contextlib.suppress(KeyboardInterrupt),
-    ):
-        log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
-        _show(feed, log, arguments.duration_s)
-    return feed.dropped
-
-
-def _show(feed: Feed, log: WireLog, duration_s: float | None) -> None:
-    """Draw messages until the simulator has gone and the queue is empty, or the time is over."""
-    end_s = None if duration_s is None else time.monotonic() + duration_s
-    while end_s is None or time.monotonic() < end_s:
-        heard = feed.next(POLL_S)
-        if heard is not None:
-            _write(log, heard)
-        elif feed.simulator_gone.is_set():
-            return
-
-
-def _write(log: WireLog, heard: Heard) -> None:
-    row = MESSAGES.get(heard.topic)
-    if row is None:
-        return  # A token: it shows as silence.
-    message = row.decode(heard.payload)
-    if message is None or isinstance(message, wire.Rejection):
-        log.write_unreadable(heard.topic, message.detail if message else "not a scene")
-    else:
-        getattr(log, f"write_{heard.topic}")(message, heard.arrived_ns)
+    def place(self, episode: int, step: int) -> Moment:
+        """Return the moment of a step and move ``now`` there if that is forward."""
+        # A viewer that comes late begins at zero as well: its first step is the first it saw.
+        start = self._starts.setdefault(episode, self._end_step)
+        moment = Moment(episode, step, start + step)
+        self._end_step = max(self._end_step, moment.total_step + 1)
+        if moment.total_step > self.now.total_step:
+            self.now = moment
+        return moment
