@@ -168,19 +168,19 @@ def _read_ms(text: str) -> float | None:
     return value_ms
 
 
-def _read_percent(text: str) -> float | None:
-    percent = _measure(text, {"%": 1.0})
-    return percent if percent is not None and percent <= 100.0 else None
+def _measured(units: dict[str, float], fits: Callable[[float], bool]) -> Callable[[str], Any]:
+    """Return a reader of numbers with a unit that fit; it returns None for any other text."""
+
+    def read(text: str) -> float | None:
+        value = _measure(text, units)
+        return value if value is not None and fits(value) else None
+
+    return read
 
 
-def _read_messages(text: str) -> float | None:
-    count = _measure(text, {"": 1.0})
-    return count if count is not None and 1.0 <= count <= 1e6 else None
-
-
-def _read_rate(text: str) -> float | None:
-    rate_kbps = _measure(text, _KBPS_PER_UNIT)
-    return rate_kbps if rate_kbps is not None and 0.0 < rate_kbps <= 1e9 else None
+_PERCENT = _measured({"%": 1.0}, lambda percent: percent <= 100.0)
+_COUNT = _measured({"": 1.0}, lambda count: 1.0 <= count <= 1e6)
+_RATE = _measured(_KBPS_PER_UNIT, lambda rate_kbps: 0.0 < rate_kbps <= 1e9)
 
 
 def _choice(choices: tuple[str, ...]) -> Callable[[str], str | None]:
@@ -227,7 +227,7 @@ def _ms(name: str, field: str, example: str) -> Setting:
 
 
 def _percent(name: str, field: str, example: str) -> Setting:
-    return Setting(name, field, _read_percent, lambda value: f"{_number(value)}%", example)
+    return Setting(name, field, _PERCENT, lambda value: f"{_number(value)}%", example)
 
 
 SETTINGS: tuple[Setting, ...] = (
@@ -235,14 +235,14 @@ SETTINGS: tuple[Setting, ...] = (
     _ms("jitter", "jitter_ms", "10ms"),
     _percent("loss", "loss_percent", "1%"),
     Setting("tail", "tail", _choice(TAILS), str, "|".join(TAILS)),
-    Setting("burst", "burst_messages", _read_messages, _number, "5"),
+    Setting("burst", "burst_messages", _COUNT, _number, "5"),
     _percent("burst_loss", "burst_loss_percent", "80%"),
     _percent("clear_loss", "clear_loss_percent", "0.1%"),
     _percent("reorder", "reorder_percent", "1%"),
     _ms("reorder_by", "reorder_by_ms", "300ms"),
     Setting("order", "order", _choice(ORDERS), str, "|".join(ORDERS)),
     _percent("duplicate", "duplicate_percent", "1%"),
-    Setting("rate", "rate_kbps", _read_rate, lambda v: f"{_number(v)}kbit/s", "1Mbit/s"),
+    Setting("rate", "rate_kbps", _RATE, lambda v: f"{_number(v)}kbit/s", "1Mbit/s"),
     _ms("queue", "queue_ms", "100ms"),
     Setting("outage", "outages", _read_outages, _write_outages, "0.5s@2s+0.2s/10s"),
 )

@@ -29,6 +29,8 @@ from edge_runtime.transport import only_own, open_session
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
+POLL_S = 0.1
+"""How soon a listener sees that the simulator has gone."""
 RETRY_S = 0.2
 TOKEN_S = 1.0
 """A simulator that is there has this time to say so, however short the wait asked for."""
@@ -203,6 +205,16 @@ class Feed:
             return self._queue.get(timeout=timeout_s)
         except queue.Empty:
             return None
+
+    def until_gone(self, duration_s: float | None) -> Iterator[Heard]:
+        """Yield messages until no simulator is left and the queue is empty, or the time is over."""
+        end_s = None if duration_s is None else time.monotonic() + duration_s
+        while end_s is None or time.monotonic() < end_s:
+            heard = self.next(POLL_S)
+            if heard is not None:
+                yield heard
+            elif self.simulator_gone.is_set():
+                return
 
     def now_ns(self) -> int:
         """Return the clock of ``Heard.arrived_ns``."""

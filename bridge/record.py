@@ -34,7 +34,7 @@ from mcap.writer import CompressionType, Writer
 
 from bridge.commands import add_connect, add_span, add_tls
 from bridge.messages import MESSAGES, TOKEN_TOPICS, Heard
-from bridge.ports import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
+from bridge.ports import ANY_VEHICLE, POLL_S, QUEUE_MESSAGES, Feed, open_feed
 from bridge.recording import METADATA, WIRE_ENCODING
 from edge_runtime import __version__, wire
 from edge_runtime.cli import ArgumentParser, examples
@@ -48,7 +48,6 @@ from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
 from edge_runtime.words import counted
 
-POLL_S = 0.1
 FLUSH_S = 0.5
 """A kill loses at most this much, and what waits in the queue."""
 NOT_WRITTEN = 1

@@ -44,7 +44,6 @@ from edge_runtime.wire import (
     check_vehicle_id,
 )
 
-POLL_S = 0.1
 MAX_RATE_HZ = 20.0
 RETRY_S = 2.0
 BURST = 2.0
@@ -144,19 +143,9 @@ def _run(arguments: Any, namespace: str, tls: TlsFiles | None) -> dict[str, Any]
         print(f"ready vehicle_id={arguments.vehicle_id} namespace={namespace}", flush=True)
         # Being interrupted is the ordinary way to end.
         with contextlib.suppress(KeyboardInterrupt):
-            _show(feed, outlet, arguments.duration_s)
+            for heard in feed.until_gone(arguments.duration_s):
+                outlet.take(heard)
         return _report(feed, node, outlet)
-
-
-def _show(feed: Feed, outlet: Outlet, duration_s: float | None) -> None:
-    """Translate until the simulator has gone and the queue is empty, or the time is over."""
-    end_s = None if duration_s is None else time.monotonic() + duration_s
-    while end_s is None or time.monotonic() < end_s:
-        heard = feed.next(POLL_S)
-        if heard is not None:
-            outlet.take(heard)
-        elif feed.simulator_gone.is_set():
-            return
 
 
 def _report(feed: Feed, node: Ros2Node, outlet: Outlet) -> dict[str, Any]:

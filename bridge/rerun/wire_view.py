@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -17,7 +16,7 @@ import rerun.blueprint as rrb
 
 from bridge.commands import add_connect, add_span, add_tls, wait_to_be_told
 from bridge.messages import MESSAGES, Heard, Scene
-from bridge.ports import Feed, open_feed
+from bridge.ports import open_feed
 from bridge.recording import Recording, read_heard
 from bridge.rerun import APPLIED, POLICY
 from bridge.rerun.draw import (
@@ -49,7 +48,6 @@ from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import CONTROL_PERIOD_S, Command, Feedback, Health, State
 
-POLL_S = 0.1
 APPLICATION = "phil_hil"
 EXAMPLE = examples(
     "python -m bridge view --serve",
@@ -129,19 +127,9 @@ def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
         contextlib.suppress(KeyboardInterrupt),
     ):
         log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
-        _show(feed, log, arguments.duration_s)
-    return feed.dropped
-
-
-def _show(feed: Feed, log: WireLog, duration_s: float | None) -> None:
-    """Draw messages until the simulator has gone and the queue is empty, or the time is over."""
-    end_s = None if duration_s is None else time.monotonic() + duration_s
-    while end_s is None or time.monotonic() < end_s:
-        heard = feed.next(POLL_S)
-        if heard is not None:
+        for heard in feed.until_gone(arguments.duration_s):
             _write(log, heard)
-        elif feed.simulator_gone.is_set():
-            return
+    return feed.dropped
 
 
 def _write(log: WireLog, heard: Heard) -> None:
