@@ -5,20 +5,21 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
+from rich.progress import Progress
 
 from bridge.clocks import CLOCKS, REALTIME, Clock
 from bridge.commands import (
-    EpisodeBar,
     add_tls,
     add_vehicle_id,
     add_wait_edge,
     add_where,
     check_where,
-    episode_bar,
+    progress_bar,
 )
 from bridge.environments import (
     CONDITIONS,
@@ -42,6 +43,7 @@ from edge_runtime.option_types import not_negative, positive
 from edge_runtime.signals import sigterm_as_interrupt
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.topics import CONTROL_PERIOD_S, check_vehicle_id
+from edge_runtime.words import printable
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 
@@ -275,3 +277,43 @@ def _as_asked(settings: SimulateSettings) -> dict[str, Any]:
         "standing": settings.standing,
         "latency_spec": str(settings.latency),
     }
+
+
+class EpisodeBar:
+    """Shows the episodes done and what the vehicle does at the moment.
+
+    Where nobody watches a terminal, it prints a line an episode instead.
+    """
+
+    def __init__(self, progress: Progress, episodes: int) -> None:
+        self._progress = progress
+        self._task = progress.add_task("waiting for an edge runtime", total=episodes)
+        self._waits_for = ""
+
+    def tick(self, episode: int, step: int, decision: Decision, waits_for: str = "") -> None:
+        """Show one tick; ``waits_for`` is the command that the vehicle needs to drive again."""
+        reason = printable(decision.brake_reason)
+        doing = f"braking: {reason}" if reason else "driving"
+        self._progress.update(
+            self._task, completed=episode, description=f"step {step:3d}  {doing[:40]}"
+        )
+        if waits_for and not self._waits_for:
+            self._say(f"the vehicle stands until it is re-armed: {waits_for}")
+        self._waits_for = waits_for
+
+    def done(self, episodes: int, told: str) -> None:
+        """Show how many episodes are done, and without a bar what became of the last one."""
+        self._progress.update(self._task, completed=episodes)
+        if self._progress.disable:
+            self._say(told)
+
+    def _say(self, line: str) -> None:
+        """Print a line above the bar, as it is."""
+        self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def episode_bar(episodes: int) -> Iterator[EpisodeBar]:
+    """Show a bar on stderr while the block runs; lines if stderr is no terminal."""
+    with progress_bar("episodes") as progress:
+        yield EpisodeBar(progress, episodes)

@@ -6,6 +6,8 @@ import math
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -197,3 +199,11 @@ def test_a_viewer_that_is_gone_is_one_plain_error(where, kind, why, tmp_path, mo
         pytest.raises(UserError, match=f"viewer gone: .*{why}"),
     ):
         show(where, for_s=5.0)
+
+
+def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
+    """A scenario needs a colour of the view, and not the view; an evaluation needs no network."""
+    taken = ("messages", "network", "recording", "report", "virtual_link", "rerun.sinks")
+    code = "import sys\n" + "".join(f"import bridge.{name}\n" for name in taken)
+    code += "assert not {'zenoh', 'rerun', 'gymnasium'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
