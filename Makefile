@@ -55,7 +55,7 @@ test-board: $(STAMP)  ## whole bundles installed, on an emulated board, too, wit
 lint: $(STAMP)  ## ruff, mypy, and what the board's Python 3.8 would refuse
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy edge_runtime viewing bridge trainer deploy hil_tests
+	$(BIN)/mypy edge_runtime bridge trainer deploy hil_tests
 	$(BIN)/vermin --quiet --no-tips --violations -t=3.8- --exclude tomllib edge_runtime deploy/installer
 
 $(CONTAINER_STAMP): requirements/container.txt

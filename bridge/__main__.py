@@ -23,7 +23,7 @@ COMMANDS = {
     ),
     "repair": ("bridge.repair", "save what is whole of a recording that was cut off or damaged"),
     "ros2": ("bridge.ros2", "show the wire to ROS 2, through a zenoh-bridge-ros2dds"),
-    "view": ("bridge.view", "show the wire in rerun, live or in a file"),
+    "view": ("bridge.rerun.wire_view", "show the wire in rerun, live or in a file"),
 }
 EXAMPLE = examples(
     "python -m bridge simulate --env left_turn --episodes 5 --clock realtime",

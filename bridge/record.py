@@ -1,30 +1,60 @@
-"""``python -m bridge record``: a listener of its own that writes the wire to an MCAP file."""
+"""``python -m bridge record``: a listener of its own that writes the wire to an MCAP file.
+
+It keeps the exact payloads for replay, and copies that viewers can draw:
+
+| topic | encoding |
+|---|---|
+| ``phil/<id>/<topic>``, the keys of the wire | ``msgpack``: the payload as it was |
+| ``phil/<id>/alive``, ``phil/<id>/simulator`` | ``json``: {"here": true}, or false |
+| ``view/<id>/frames`` | ``foxglove.RawImage``: frame t-1 above frame t |
+| ``view/<id>/<topic>``, of every topic of the wire | protobuf ``phil.State`` and so on |
+| ``view/<id>/events`` | ``foxglove.Log``: tokens, unreadable and oversized messages |
+
+The copies are protobuf: Foxglove and rerun both read it by the descriptor that the recording
+carries along, and know ``foxglove.RawImage`` and ``foxglove.Log`` by name. (rerun 0.41 decodes no
+JSON.) The descriptors are made at run time from structs: no compiler, no generated file.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import enum
+import os
 import sys
 import time
+import typing
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
-from bridge.arguments import add_connect, add_span, add_tls
-from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
-from bridge.recording.flushed_file import check_new
-from bridge.recording.writer import RecordingWriter
-from bridge.signals import sigterm_as_interrupt
+import msgspec
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from mcap.writer import CompressionType, Writer
+
+from bridge.commands import add_connect, add_span, add_tls
+from bridge.messages import MESSAGES, TOKEN_TOPICS, Heard
+from bridge.ports import ANY_VEHICLE, POLL_S, QUEUE_MESSAGES, Feed, open_feed
+from bridge.recording import METADATA, WIRE_ENCODING
+from edge_runtime import __version__, wire
 from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.errors import UserError
+from edge_runtime.file_lock import hold
+from edge_runtime.files import check_writable, make_directory
 from edge_runtime.option_types import seconds
+from edge_runtime.signals import sigterm_as_interrupt
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import check_vehicle_id
 from edge_runtime.words import counted
 
-POLL_S = 0.1
 FLUSH_S = 0.5
 """A kill loses at most this much, and what waits in the queue."""
 NOT_WRITTEN = 1
 """Exit status where the disk did not take the recording to its end."""
+CHUNK_BYTES = 1 << 20
+MAX_PENDING_BYTES = 4 << 20
+NEVER_OVER = "choose another name: no recording is lost"
 
 EXAMPLE = examples(
     "python -m bridge record --out drive.mcap",
@@ -104,3 +134,311 @@ def _listen(feed: Feed, writer: RecordingWriter, arguments: Any) -> None:
         # An edge runtime behind a router goes on sending health: that is no drive to wait for.
         elif now_s - seen_s >= arguments.linger_s and not feed.waiting:
             return
+
+
+class RecordingWriter:
+    """Writes one recording; used by one thread. OSError from any call where the disk is full."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the file; UserError where it exists already."""
+        self.messages = 0
+        self._file = FlushedFile(path)
+        self._mcap = start_mcap(self._file)
+        self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, tuple[Schema, int]] = {}
+        self._counts: Counter[str] = Counter()
+
+    def write(self, heard: Heard, with_view: bool = True) -> None:
+        """Add one message; ``with_view`` False leaves out the copy for viewers."""
+        self.messages += 1
+        if heard.topic in TOKEN_TOPICS:
+            here = heard.payload == b"\x01"
+            text = b'{"here": true}' if here else b'{"here": false}'
+            self._add(heard.key, "json", heard.arrived_ns, text)
+            who = "edge runtime" if heard.topic == "alive" else "simulator"
+            self._event(heard, Level.INFO, f"{who} {'is here' if here else 'has gone'}")
+        elif heard.size > len(heard.payload):
+            self._event(heard, Level.WARNING, f"{heard.topic} of {heard.size} bytes, not kept")
+        else:
+            self._add(heard.key, WIRE_ENCODING, heard.arrived_ns, heard.payload)
+            if with_view:
+                self._view(heard)
+
+    def flush(self) -> None:
+        """End the chunk: from here on a kill does not lose what has been written."""
+        self._mcap.flush()
+
+    def finish(self, dropped: int) -> None:
+        """Write the index; ``dropped`` is how many messages came too fast to be written."""
+        counts = {"messages": str(self.messages), "dropped": str(dropped)}
+        self._mcap.flush()
+        self._mcap.add_metadata(METADATA, counts)
+        self._mcap.finish()
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file, finished or not."""
+        self._file.close()
+
+    def _view(self, heard: Heard) -> None:
+        message = MESSAGES[heard.topic].decode(heard.payload)
+        if message is None or isinstance(message, wire.Rejection):
+            why = message.detail if message else "not a scene"
+            self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {why}")
+            return
+        try:
+            self._copy(heard, heard.topic, message)
+        except ValueError as error:  # The wire carries integers that protobuf's do not hold.
+            self._event(heard, Level.WARNING, f"{heard.topic} not drawn: {error}")
+            return
+        if isinstance(message, wire.State):
+            # The frames lie one after the other: in memory that is one picture, twice as high.
+            count, height, width = wire.FRAMES_SHAPE
+            picture = RawImage(
+                timestamp=heard.arrived_ns,
+                width=width,
+                height=count * height,
+                encoding="mono8",
+                step=width,
+                data=message.frames,
+                frame_id=_vehicle_id(heard),
+            )
+            self._copy(heard, "frames", picture)
+
+    def _event(self, heard: Heard, level: Level, text: str) -> None:
+        self._copy(heard, "events", Log(heard.arrived_ns, level, text, _vehicle_id(heard)))
+
+    def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
+        """Add what viewers can draw, to the vehicle's topic of that name."""
+        kind = type(values).__name__
+        if kind not in self._schemas:
+            schema = describe(type(values))
+            schema_id = self._mcap.register_schema(schema.name, "protobuf", schema.descriptors)
+            self._schemas[kind] = schema, schema_id
+        schema, schema_id = self._schemas[kind]
+        data = fill(schema.make(), values).SerializeToString()
+        topic = f"view/{_vehicle_id(heard)}/{name}"
+        self._add(topic, "protobuf", heard.arrived_ns, data, schema_id)
+
+    def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._mcap.register_channel(topic, encoding, schema_id)
+        self._counts[topic] += 1
+        self._mcap.add_message(self._channels[topic], now_ns, data, now_ns, self._counts[topic])
+
+
+def _vehicle_id(heard: Heard) -> str:
+    return heard.key.split("/")[1]
+
+
+def start_mcap(stream: Any) -> Writer:
+    """Begin an MCAP file as all of ours are: in chunks with checksums, ``stream`` at its start."""
+    writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(profile="", library=f"phil-hil {__version__}")
+    return writer
+
+
+def check_new(path: Path) -> None:
+    """Raise UserError now if a recording could not be begun there later."""
+    check_writable(path)
+    if path.exists():
+        raise UserError(f"{path} exists; {NEVER_OVER}")
+
+
+class FlushedFile:
+    """Collects bytes and writes them out on ``flush``; where that fails, it cuts off the torn part.
+
+    So what has been flushed stays whole on a full disk, too. It holds the file's lock until it is
+    closed: ``bridge repair`` keeps away meanwhile. ``mcap.writer.Writer`` needs ``write``, ``tell``
+    and ``flush``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raise UserError where the file exists already, or cannot be made."""
+        make_directory(path.parent)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        try:
+            self._descriptor = os.open(path, flags, 0o666)
+        except FileExistsError:
+            raise UserError(f"{path} exists; {NEVER_OVER}") from None
+        except OSError as error:
+            raise UserError(f"cannot write {path}: {error.strerror}") from None
+        hold(self._descriptor)
+        self.flushed_bytes = 0
+        self._pending = bytearray()
+
+    def write(self, data: bytes) -> int:
+        """Keep the bytes for the next flush, which comes by itself when they are many."""
+        self._pending += data
+        if len(self._pending) > MAX_PENDING_BYTES:
+            self.flush()
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the length of the file, what is still to be flushed included."""
+        return self.flushed_bytes + len(self._pending)
+
+    def flush(self) -> None:
+        """Hand everything to the operating system, which keeps it when this process is killed.
+
+        Raises OSError (a full disk, for one); the file is then as it was after the last flush.
+        """
+        view = memoryview(bytes(self._pending))
+        self._pending.clear()
+        written = 0
+        try:
+            while written < len(view):
+                written += os.write(self._descriptor, view[written:])
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._descriptor, self.flushed_bytes)
+                os.lseek(self._descriptor, self.flushed_bytes, os.SEEK_SET)
+            raise
+        self.flushed_bytes += written
+
+    def close(self) -> None:
+        """Close the file without a last flush."""
+        os.close(self._descriptor)
+
+
+Field: Any = descriptor_pb2.FieldDescriptorProto
+TIMESTAMP = "google.protobuf.Timestamp"
+Time = Annotated[int, TIMESTAMP]
+"""Nanoseconds since 1970."""
+Fixed32 = Annotated[int, Field.TYPE_FIXED32]
+Data = Annotated[bytes, Field.TYPE_BYTES]
+_SCALARS = {
+    str: Field.TYPE_STRING,
+    bool: Field.TYPE_BOOL,
+    int: Field.TYPE_INT64,
+    float: Field.TYPE_DOUBLE,
+    Fixed32: Field.TYPE_FIXED32,
+    Data: Field.TYPE_BYTES,
+}
+
+
+class RawImage(msgspec.Struct):
+    """``foxglove.RawImage``; the order is that of Foxglove's field numbers, as in `Log`."""
+
+    timestamp: Time
+    width: Fixed32
+    height: Fixed32
+    encoding: str
+    step: Fixed32
+    data: Data
+    frame_id: str
+
+
+class Level(enum.IntEnum):
+    """``foxglove.Log.Level``."""
+
+    UNKNOWN, DEBUG, INFO, WARNING, ERROR, FATAL = range(6)
+
+
+class Log(msgspec.Struct):
+    """``foxglove.Log``, of which we fill time, level, text and sender."""
+
+    timestamp: Time
+    level: Level
+    message: str
+    name: str
+
+
+class Schema(NamedTuple):
+    """A protobuf message type: its full name, its class, and its serialised FileDescriptorSet."""
+
+    name: str
+    make: Any
+    descriptors: bytes
+
+
+def describe(kind: type[msgspec.Struct]) -> Schema:
+    """Mirror a struct: one of the two above by Foxglove's name, one of the wire as ``phil.<name>``.
+
+    Plain bytes and types that protobuf does not have are left out.
+    """
+    package = "foxglove" if kind in (RawImage, Log) else "phil"
+    stamp = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
+    file = descriptor_pb2.FileDescriptorProto(
+        name=f"{package}/{kind.__name__}.proto",
+        package=package,
+        syntax="proto3",
+        dependency=[stamp.name],
+    )
+    _add_struct(file.message_type.add(), kind, package)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(stamp)
+    pool.Add(file)
+    name = f"{package}.{kind.__name__}"
+    make = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+    files = descriptor_pb2.FileDescriptorSet(file=[stamp, file])
+    return Schema(name, make, files.SerializeToString())
+
+
+def fill(target: Any, values: msgspec.Struct) -> Any:
+    """Copy the fields that both have into the protobuf message, and return it."""
+    for descriptor in target.DESCRIPTOR.fields:
+        value, own = getattr(values, descriptor.name), getattr(target, descriptor.name)
+        if isinstance(value, Mapping):
+            own.update(value)
+        elif isinstance(value, list | tuple):
+            for one in value:
+                fill(own.add(), one) if isinstance(one, msgspec.Struct) else own.append(one)
+        elif descriptor.message_type is not None:
+            own.FromNanoseconds(value)
+        elif value is not None:
+            setattr(target, descriptor.name, value)
+    return target
+
+
+def _add_struct(message: Any, kind: type[msgspec.Struct], path: str) -> None:
+    message.name = kind.__name__
+    hints = typing.get_type_hints(kind, include_extras=True)
+    for number, (name, hint) in enumerate(hints.items(), start=1):
+        field = Field(name=name, number=number, label=Field.LABEL_OPTIONAL)
+        if _type_field(field, _without_none(hint), message, f"{path}.{kind.__name__}"):
+            message.field.append(field)
+
+
+def _type_field(field: Any, hint: Any, message: Any, path: str) -> bool:
+    """Fill in the type; False where the viewers' copy goes without this field."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if hint in _SCALARS:
+        field.type = _SCALARS[hint]
+    elif hint == Time:
+        field.type, field.type_name = Field.TYPE_MESSAGE, f".{TIMESTAMP}"
+    elif origin is dict:
+        field.label, field.type = Field.LABEL_REPEATED, Field.TYPE_MESSAGE
+        field.type_name = f".{path}.{_add_map_entry(message, field.name, inner)}"
+    elif origin in (list, Sequence):
+        field.label = Field.LABEL_REPEATED
+        return typing.get_origin(inner[0]) is None and _type_field(field, inner[0], message, path)
+    elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        _add_struct(message.nested_type.add(), hint, path)
+        field.type, field.type_name = Field.TYPE_MESSAGE, f".{path}.{hint.__name__}"
+    elif isinstance(hint, type) and issubclass(hint, enum.IntEnum):
+        levels = message.enum_type.add(name=hint.__name__)
+        for one in hint:
+            levels.value.add(name=one.name, number=one.value)
+        field.type, field.type_name = Field.TYPE_ENUM, f".{path}.{hint.__name__}"
+    else:
+        return False
+    return True
+
+
+def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
+    """Protobuf's own form of a map: a nested message of key and value."""
+    entry_name = "".join(part.title() for part in name.split("_")) + "Entry"
+    entry = message.nested_type.add(name=entry_name)
+    entry.options.map_entry = True
+    for number, (label, kind) in enumerate(zip(("key", "value"), inner, strict=True), start=1):
+        entry.field.add(name=label, number=number, label=Field.LABEL_OPTIONAL, type=_SCALARS[kind])
+    return entry_name
+
+
+def _without_none(hint: Any) -> Any:
+    inner = [part for part in typing.get_args(hint) if part is not type(None)]
+    is_optional = type(None) in typing.get_args(hint) and len(inner) == 1
+    return inner[0] if is_optional else hint

@@ -9,14 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import CompressionType, Writer
-
-from bridge.recording.flushed_file import check_new
-from bridge.recording.reader import Recording
-from bridge.recording.writer import CHUNK_BYTES, METADATA
+from bridge.record import check_new, start_mcap
+from bridge.recording import METADATA, Recording
 from edge_runtime.cli import ArgumentParser, UserError, examples
 from edge_runtime.file_lock import try_to_hold
-from edge_runtime.files import behind_link, check_writable, write_atomic
+from edge_runtime.files import behind_link, check_writable, open_regular, write_atomic
 from edge_runtime.words import counted
 
 KEPT = ".damaged"
@@ -78,15 +75,13 @@ def _nothing_done(recording: Recording, messages: int) -> str:
 def _held(source: Path) -> Iterator[None]:
     """Refuse a recording that is still growing: what comes later would go into the old file."""
     try:
-        descriptor = os.open(source, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        stream = open_regular(source)
     except OSError as error:
         raise UserError(f"recording {source} cannot be read: {error.strerror}") from None
-    try:
-        if not try_to_hold(descriptor):
+    with stream:
+        if not try_to_hold(stream.fileno()):
             raise UserError(f"{source} is being written; repair it when its writer has ended")
         yield
-    finally:
-        os.close(descriptor)
 
 
 def _write(data: bytes, recording: Recording, out: str | None) -> str:
@@ -123,8 +118,7 @@ def _link(file: Path, kept: Path) -> None:
 def _rewrite(recording: Recording) -> tuple[bytes, int]:
     """Copy every message into a new recording, held in memory."""
     stream = io.BytesIO()
-    writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
-    writer.start()
+    writer = start_mcap(stream)
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
     messages = 0

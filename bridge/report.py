@@ -1,17 +1,135 @@
-"""The report of ``bridge simulate``: the contract's keys, and what explains them. Pure."""
+"""What a run of episodes has come to: results, safe stops, and the report with the contract's keys.
+
+`EpisodeResult` and `summarise` serve driving in process (trainer) and over the wire (bridge); the
+rest is for ``bridge simulate``. Pure: numbers in, a dict or a line of text out (contract, section
+2).
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from bridge.safe_stops import SafeStopEvent
-from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
+from bridge.virtual_link import Decision
 from edge_runtime.words import counted, printable
+
+GOAL = "goal"
+COLLISION = "collision"
+OUTCOMES = (GOAL, COLLISION, "timeout", "off_road")
+
+
+@dataclass
+class EpisodeResult:
+    """One driven episode.
+
+    `outcome` is one of OUTCOMES for this repository's environments; another environment may
+    report its own word. Accelerations are the mean of |a| over the episode's steps. `actions`
+    holds one action (a list of floats in [-1, 1]) for each step.
+    """
+
+    seed: int
+    outcome: str
+    distance_m: float
+    reward: float
+    time_s: float
+    lateral_acceleration_mps2: float
+    longitudinal_acceleration_mps2: float
+    steps: int
+    actions: list[list[float]] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The row of `per_episode` in a report."""
+        return asdict(self)
+
+
+def summarise(
+    results: Sequence[EpisodeResult], scenario: str, condition: str, policy_id: str, seed: int
+) -> dict[str, Any]:
+    """The contract's summary of `results`. `std` is over the episodes (population, ddof 0).
+
+    Raises ValueError for no episode at all: a mean of nothing is no number.
+    """
+    if not results:
+        raise ValueError("no episode to summarise")
+    return {
+        "scenario": scenario,
+        "condition": condition,
+        "episodes": len(results),
+        "success_rate": _rate(results, GOAL),
+        "collision_rate": _rate(results, COLLISION),
+        "surviving_distance_m": _spread([r.distance_m for r in results]),
+        "episode_reward": _spread([r.reward for r in results]),
+        "episode_time_s": _spread([r.time_s for r in results]),
+        "lateral_acceleration_mps2": _spread([r.lateral_acceleration_mps2 for r in results]),
+        "longitudinal_acceleration_mps2": _spread(
+            [r.longitudinal_acceleration_mps2 for r in results]
+        ),
+        "policy_id": policy_id,
+        "seed": seed,
+    }
+
+
+def _rate(results: Sequence[EpisodeResult], outcome: str) -> float:
+    return sum(result.outcome == outcome for result in results) / len(results)
+
+
+def _spread(values: Sequence[float]) -> dict[str, float]:
+    return {"mean": float(np.mean(values)), "std": float(np.std(values))}
+
+
+STANDSTILL_MPS = 0.05
+
+
+@dataclass
+class SafeStopEvent:
+    """One unbroken stretch of braking; its fields are those of the report."""
+
+    episode: int
+    step: int
+    """The first tick in which the vehicle braked."""
+    reason: str
+    """``no_command`` if the simulator braked by itself, else the edge runtime's reason; with a
+    vehicle in the loop also ``no_feedback`` and ``self_braking``."""
+    brake_after_s: float
+    """From the last ``drive`` command to the brake (in lock-step: wall time if the edge runtime
+    does not answer, virtual time otherwise)."""
+    stopped_after_s: float | None = None
+    """From the brake to standstill, simulated time; None if it never stood."""
+    resumed_after_s: float | None = None
+    """From the brake until it drove again, simulated time; None if the episode ended first."""
+
+
+class SafeStopLog:
+    """Collects the events of a whole run."""
+
+    def __init__(self, period_s: float) -> None:
+        self.events: list[SafeStopEvent] = []
+        self._period_s = period_s
+        self._open: SafeStopEvent | None = None
+
+    def observe(self, episode: int, step: int, decision: Decision, speed_mps: float) -> None:
+        """Note one tick: what was decided at ``step``, and the speed at the tick's end (m/s)."""
+        event = self._open
+        if event is not None and not (decision.brake_reason and event.episode == episode):
+            if event.episode == episode:
+                event.resumed_after_s = self._since(event, step)
+            self._open = event = None
+        if not decision.brake_reason:
+            return
+        if event is None:
+            event = SafeStopEvent(episode, step, decision.brake_reason, decision.undriven_s)
+            self.events.append(event)
+            self._open = event
+        if event.stopped_after_s is None and abs(speed_mps) < STANDSTILL_MPS:
+            event.stopped_after_s = self._since(event, step + 1)
+
+    def _since(self, event: SafeStopEvent, step: int) -> float:
+        return round((step - event.step) * self._period_s, 6)
+
 
 QUANTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 

@@ -2,33 +2,66 @@
 
 It has two sessions: one listens to our wire, as `view` does, the other one speaks to a
 zenoh-bridge-ros2dds. So ROS 2 hears what we show it, and can say nothing on our wire.
+
+Commands are in the scenario's metres, as the policy means them; feedback is in the vehicle's own.
+ROS has x ahead, y and positive angles to the left (REP 103).
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import math
+import sys
 import time
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
-from bridge.arguments import add_connect, add_span, add_tls, add_vehicle_id
-from bridge.feed import Feed, open_feed
-from bridge.signals import sigterm_as_interrupt
-from bridge.to_ros2.outlet import Outlet
-from bridge.to_ros2.policies import Policies
-from edge_runtime.cli import ArgumentParser, examples, write_json_out
+from bridge.commands import add_connect, add_span, add_tls, add_vehicle_id
+from bridge.messages import Heard
+from bridge.ports import Feed, open_feed
+from edge_runtime import wire
+from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.operator_commands import ask
 from edge_runtime.option_types import number
+from edge_runtime.ros2 import messages as ros
 from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT, check_ros2_endpoint, open_ros2_session
 from edge_runtime.ros2.names import check_ros_name, namespace_of
 from edge_runtime.ros2.node import Ros2Node, open_node
+from edge_runtime.signals import sigterm_as_interrupt
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import check_endpoint
-from edge_runtime.wire import check_vehicle_id
+from edge_runtime.vehicles.similarity import CARS, ScenarioCar, Similarity
+from edge_runtime.wire import (
+    CONTROL_PERIOD_S,
+    FRAMES_SHAPE,
+    Command,
+    Feedback,
+    Rejection,
+    State,
+    check_vehicle_id,
+)
 
-POLL_S = 0.1
 MAX_RATE_HZ = 20.0
+RETRY_S = 2.0
+BURST = 2.0
+"""So that jitter of a stream at just this rate costs no message."""
+LONGEST_GAP_S = 0.5
+"""After a longer silence nobody knows how fast it was meanwhile: only so much is made up."""
+ERROR_PER_METRE = 0.1
+"""Guessed, not measured: a standard deviation of 10 % of the way, and 0.1 rad a metre."""
+UNKNOWN = 1e6
+"""A variance for what a car on a plane does not know: height, roll and pitch."""
+
+# Not cmd_vel and not ackermann_cmd: this shows what is commanded, and must move nothing.
+IMAGE, ODOMETRY = "image_raw", "odom"
+DRIVE, TWIST = "command/ackermann", "command/twist"
+CAMERA_FRAME, ODOMETRY_FRAME, BASE_FRAME = "camera", "odom", "base_link"
+_, HEIGHT, WIDTH = FRAMES_SHAPE
+Ask = Callable[[], dict[str, Any]]
+
 _TOPICS = """
 
 topics below the namespace: image_raw (sensor_msgs/Image), odom (nav_msgs/Odometry, dead reckoning),
@@ -110,19 +143,9 @@ def _run(arguments: Any, namespace: str, tls: TlsFiles | None) -> dict[str, Any]
         print(f"ready vehicle_id={arguments.vehicle_id} namespace={namespace}", flush=True)
         # Being interrupted is the ordinary way to end.
         with contextlib.suppress(KeyboardInterrupt):
-            _show(feed, outlet, arguments.duration_s)
+            for heard in feed.until_gone(arguments.duration_s):
+                outlet.take(heard)
         return _report(feed, node, outlet)
-
-
-def _show(feed: Feed, outlet: Outlet, duration_s: float | None) -> None:
-    """Translate until the simulator has gone and the queue is empty, or the time is over."""
-    end_s = None if duration_s is None else time.monotonic() + duration_s
-    while end_s is None or time.monotonic() < end_s:
-        heard = feed.next(POLL_S)
-        if heard is not None:
-            outlet.take(heard)
-        elif feed.simulator_gone.is_set():
-            return
 
 
 def _report(feed: Feed, node: Ros2Node, outlet: Outlet) -> dict[str, Any]:
@@ -142,3 +165,287 @@ def _summary(report: dict[str, Any]) -> str:
             counts = ", ".join(f"{name} {count}" for name, count in report[what].items())
             text += f"; {what}: {counts}"
     return text
+
+
+class Outlet:
+    """Publishes what it is given; used by one thread.
+
+    `rejected` counts what our wire brought and could not be read or shown, by topic and reason.
+    """
+
+    def __init__(self, node: Ros2Node, policies: Policies, max_rate_hz: float) -> None:
+        self.rejected: Counter[str] = Counter()
+        self._policies = policies
+        self._bounds = {topic: RateBound(max_rate_hz) for topic in ("state", "command", "feedback")}
+        self._image = node.publisher(IMAGE, ros.Image)
+        self._odometry = node.publisher(ODOMETRY, ros.Odometry)
+        self._drive = node.publisher(DRIVE, ros.AckermannDriveStamped)
+        self._twist = node.publisher(TWIST, ros.Twist)
+        self._pose = DeadReckoning()
+        self._speed_mps, self._scale = 0.0, 1.0
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        """Return how many messages of each topic came faster than the bound."""
+        return {topic: bound.skipped for topic, bound in self._bounds.items() if bound.skipped}
+
+    def take(self, heard: Heard) -> None:
+        """Show one message; topics that ROS 2 has no standard message for are left out."""
+        row = _ROWS.get(heard.topic)
+        if row is None:
+            return
+        decode, show = row
+        message = decode(heard.payload)
+        if isinstance(message, Rejection):
+            self.rejected[f"{heard.topic}_{message.reason.value}"] += 1
+        else:
+            show(self, message, self._bounds[heard.topic].lets(heard.arrived_ns * 1e-9))
+
+    def show_state(self, state: State, may_publish: bool) -> None:
+        """Publish the newest frame; the speed is kept, whatever the rate."""
+        self._speed_mps = state.speed_mps
+        if may_publish:
+            self._image(image_of(state))
+
+    def show_command(self, command: Command, may_publish: bool) -> None:
+        """Publish the command in both forms, once its policy is known."""
+        if not may_publish:
+            return
+        policy = self._policies.find(command.policy_id)
+        if policy is None:
+            self.rejected["command_unknown_policy"] += 1
+            return
+        drive = drive_of(command, self._speed_mps, policy)
+        self._drive(drive)
+        self._twist(twist_of(drive.drive, policy.car))
+
+    def show_feedback(self, feedback: Feedback, may_publish: bool) -> None:
+        """Go on with the dead reckoning at every message, and publish it at the bounded rate."""
+        self._scale = _scale_of(feedback, self._scale)
+        policy = self._policies.newest
+        curvature = policy and feedback_curvature(feedback, policy, self._scale)
+        self._pose.advance(feedback.speed_mps, curvature or 0.0, feedback.sent_ns)
+        if may_publish:
+            self._odometry(odometry_of(feedback, self._pose, curvature))
+
+
+def _scale_of(feedback: Feedback, last: float) -> float:
+    """Metres of the vehicle for one of the scenario, where it moves and reports both speeds."""
+    if not feedback.scenario_speed_mps or not feedback.speed_mps:
+        return last
+    return abs(feedback.speed_mps / feedback.scenario_speed_mps)
+
+
+_ROWS: dict[str, tuple[Callable[[bytes], Any], Callable[[Outlet, Any, bool], None]]] = {
+    "state": (wire.decode_state, Outlet.show_state),
+    "command": (wire.decode_command, Outlet.show_command),
+    "feedback": (wire.decode_feedback, Outlet.show_feedback),
+}
+
+
+class RateBound:
+    """Lets ``rate_hz`` messages a second through on average, and two at once at most."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self.skipped = 0
+        self._rate_hz = rate_hz
+        self._tokens = BURST
+        self._filled_s: float | None = None
+
+    def lets(self, now_s: float) -> bool:
+        """Return whether a message may pass now; one that may not is counted."""
+        elapsed_s = 0.0 if self._filled_s is None else max(0.0, now_s - self._filled_s)
+        self._filled_s = now_s
+        self._tokens = min(BURST, self._tokens + elapsed_s * self._rate_hz)
+        if self._tokens < 1.0:
+            self.skipped += 1
+            return False
+        self._tokens -= 1.0
+        return True
+
+
+class Policies:
+    """Which policy gives the commands: asked of the edge runtime, for the wire has numbers only.
+
+    ``ask`` returns the edge's status, UserError if none answers.
+
+    ``newest`` is what the last call of ``find`` returned.
+    """
+
+    def __init__(self, ask: Ask, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._ask, self._clock_s = ask, clock_s
+        self._known: dict[str, Policy | None] = {}
+        self._ask_again_s = -1.0
+        self.newest: Policy | None = None
+
+    def find(self, policy_id: str) -> Policy | None:
+        """Return the policy of that id; None while nobody says, and for an unknown scenario.
+
+        Waits for the edge's answer once for each new policy, and seldom where none comes.
+        """
+        if policy_id not in self._known and self._clock_s() >= self._ask_again_s:
+            self._ask_again_s = self._clock_s() + RETRY_S
+            self._learn()
+        self.newest = self._known.get(policy_id)
+        return self.newest
+
+    def _learn(self) -> None:
+        try:
+            status = self._ask()
+        except UserError:
+            return  # The edge has just gone; its next command asks again.
+        manifest = status["manifest"]
+        scenario = manifest["scenario"]
+        car = CARS.get(scenario)
+        if car is None:
+            known = ", ".join(sorted(CARS))
+            print(
+                f"commands are not shown: the car of scenario {scenario!r} is not known; it is for"
+                f" {known}",
+                file=sys.stderr,
+            )
+        names = [action["name"] for action in manifest["action"]]
+        self._known[status["policy_id"]] = None if car is None else Policy(names, car)
+
+
+class Policy(NamedTuple):
+    """What a command's numbers mean: the policy's action names, and the car it was trained on."""
+
+    action_names: Sequence[str]
+    car: ScenarioCar
+
+    def action(self, values: Sequence[float], name: str) -> float | None:
+        """Return one action; None where the policy has none of that name."""
+        named = dict(zip(self.action_names, values, strict=False))
+        return named.get(name)
+
+
+def image_of(state: State) -> ros.Image:
+    """Return the newer of the two frames, as ``mono8``."""
+    return ros.Image(
+        header=ros.Header(ros.stamp_of(state.sent_ns), CAMERA_FRAME),
+        height=HEIGHT,
+        width=WIDTH,
+        encoding="mono8",
+        is_bigendian=0,
+        step=WIDTH,
+        data=state.frames_array()[1].tobytes(),
+    )
+
+
+def drive_of(command: Command, speed_mps: float, policy: Policy) -> ros.AckermannDriveStamped:
+    """Return the command as speed, acceleration and steering angle of the scenario's car.
+
+    ``speed_mps`` is the car's now. ``speed`` is what the pedal makes of it by the end of the
+    control period, ``acceleration`` its magnitude; a policy without a pedal asks for no change.
+    ``steering_angle`` is that of the wheel whose path has the asked curvature at this wheelbase.
+    """
+    acceleration = _acceleration(policy.action(command.action, "pedal") or 0.0, policy.car)
+    target_mps = speed_mps + acceleration * CONTROL_PERIOD_S
+    curvature = _curvature(policy, command.action, 1.0)
+    return ros.AckermannDriveStamped(
+        header=ros.Header(ros.stamp_of(command.sent_ns), BASE_FRAME),
+        drive=ros.AckermannDrive(
+            speed=min(max(target_mps, 0.0), policy.car.max_speed_mps),
+            acceleration=abs(acceleration),
+            steering_angle=math.atan(curvature * policy.car.wheelbase_m),
+        ),
+    )
+
+
+def twist_of(drive: ros.AckermannDrive, car: ScenarioCar) -> ros.Twist:
+    """Return the same as speed and yaw rate."""
+    yaw_radps = drive.speed * math.tan(drive.steering_angle) / car.wheelbase_m
+    return ros.Twist(linear=ros.Vector3(x=drive.speed), angular=ros.Vector3(z=yaw_radps))
+
+
+def feedback_curvature(feedback: Feedback, policy: Policy, scale: float) -> float | None:
+    """Return the path's curvature (1/m) that the steering has reached; None if none is reported."""
+    if policy.action(feedback.action, "steering") is None:
+        return None
+    return _curvature(policy, feedback.action, scale)
+
+
+def odometry_of(feedback: Feedback, pose: DeadReckoning, curvature: float | None) -> ros.Odometry:
+    """Return the vehicle's speed, and where that has brought it by dead reckoning.
+
+    Without a steering report the pose is a way straight ahead, and its y and yaw are unknown.
+    """
+    lateral = UNKNOWN if curvature is None else pose.variance
+    yaw_radps = feedback.speed_mps * (curvature or 0.0)
+    half = 0.5 * pose.yaw_rad
+    return ros.Odometry(
+        header=ros.Header(ros.stamp_of(feedback.sent_ns), ODOMETRY_FRAME),
+        child_frame_id=BASE_FRAME,
+        pose=ros.PoseWithCovariance(
+            ros.Pose(
+                ros.Vector3(pose.x_m, pose.y_m, 0.0),
+                ros.Quaternion(z=math.sin(half), w=math.cos(half)),
+            ),
+            _diagonal(pose.variance, lateral, lateral),
+        ),
+        twist=ros.TwistWithCovariance(
+            ros.Twist(ros.Vector3(x=feedback.speed_mps), ros.Vector3(z=yaw_radps)),
+            _diagonal(0.0, 0.0, 0.0 if curvature is not None else UNKNOWN),
+        ),
+    )
+
+
+def _acceleration(pedal: float, car: ScenarioCar) -> float:
+    return pedal * (car.throttle_mps2 if pedal > 0.0 else car.brake_mps2)
+
+
+def _curvature(policy: Policy, values: Sequence[float], scale: float) -> float:
+    steering = policy.action(values, "steering") or 0.0
+    return Similarity(policy.car, scale).vehicle_curvature(steering)
+
+
+def _diagonal(x: float, y: float, yaw: float) -> list[float]:
+    """A 6x6 covariance, row by row: x, y, z, roll, pitch, yaw."""
+    covariance = [0.0] * 36
+    for index, variance in enumerate((x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw)):
+        covariance[7 * index] = variance
+    return covariance
+
+
+class DeadReckoning:
+    """A pose in the frame in which the vehicle was first heard of: x ahead, y to its left.
+
+    It is made from the vehicle's own word on speed and steering, and nothing corrects it: wheel
+    slip and scale errors add up, as the variance says.
+    """
+
+    def __init__(self) -> None:
+        self.x_m, self.y_m, self.yaw_rad, self.way_m = 0.0, 0.0, 0.0, 0.0
+        self._time_ns: int | None = None
+        self._speed_mps, self._curvature = 0.0, 0.0
+
+    @property
+    def variance(self) -> float:
+        """Return the variance of x, y (m2) and yaw (rad2)."""
+        return (ERROR_PER_METRE * self.way_m) ** 2
+
+    def advance(self, speed_mps: float, curvature: float, time_ns: int) -> None:
+        """Go on to ``time_ns`` along arcs of the mean of the last two reports.
+
+        ``curvature`` in 1/m, positive to the left. A clock that goes back moves nothing.
+        """
+        if self._time_ns is not None and time_ns > self._time_ns:
+            step_s = min((time_ns - self._time_ns) * 1e-9, LONGEST_GAP_S)
+            self._move(
+                0.5 * (speed_mps + self._speed_mps) * step_s,
+                0.5 * (curvature + self._curvature),
+            )
+        self._time_ns = time_ns
+        self._speed_mps, self._curvature = speed_mps, curvature
+
+    def _move(self, way_m: float, curvature: float) -> None:
+        turn_rad = way_m * curvature
+        heading_rad = self.yaw_rad + 0.5 * turn_rad
+        # The chord of the arc: sin(x) / x is 1 where it goes straight.
+        half = 0.5 * turn_rad
+        chord_m = way_m * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+        self.x_m += chord_m * math.cos(heading_rad)
+        self.y_m += chord_m * math.sin(heading_rad)
+        self.yaw_rad = math.remainder(self.yaw_rad + turn_rad, math.tau)
+        self.way_m += abs(way_m)

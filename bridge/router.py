@@ -7,12 +7,12 @@ from typing import Any
 
 import zenoh
 
-from bridge.arguments import add_tls
-from bridge.signals import sigterm_as_interrupt, wait_to_be_told
+from bridge.commands import add_tls, wait_to_be_told
 from edge_runtime import access
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
+from edge_runtime.signals import sigterm_as_interrupt
 from edge_runtime.tls import tls_for
 from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, open_session

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
+from rich.progress import Progress
 
-from bridge.actions import policy_action
-from bridge.arguments import add_tls, add_vehicle_id, add_wait_edge, add_where, check_where
-from bridge.clock import Clock
-from bridge.clocks import CLOCKS, REALTIME, running_clock
-from bridge.command_check import CommandCheck
+from bridge.clocks import CLOCKS, REALTIME, Clock
+from bridge.commands import (
+    add_tls,
+    add_vehicle_id,
+    add_wait_edge,
+    add_where,
+    check_where,
+    progress_bar,
+)
 from bridge.environments import (
     CONDITIONS,
     NOMINAL,
@@ -22,22 +29,21 @@ from bridge.environments import (
     scenario_of,
     task_of,
 )
-from bridge.episode import EpisodeRunner
-from bridge.feedback_check import FeedbackCheck
-from bridge.port import SimulatorPort, open_port
-from bridge.progress import EpisodeBar, episode_bar
+from bridge.episode import EpisodeRunner, policy_action
+from bridge.inbound import CommandCheck, FeedbackCheck
+from bridge.network import GRAMMAR, LatencySpec, parse_spec
+from bridge.ports import SimulatorPort, open_port
 from bridge.report import episode_line, make_report, rejections, summary_line
-from bridge.signals import sigterm_as_interrupt
-from bridge.vehicle_clock import VehicleClock
-from bridge.vehicle_loop import VehicleInLoop
+from bridge.vehicle import VehicleClock, VehicleInLoop
+from bridge.virtual_link import Decision
 from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
 from edge_runtime.files import check_writable
-from edge_runtime.latency.command_hold import Decision
-from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.operator_commands import rearm_command
 from edge_runtime.option_types import not_negative, positive
+from edge_runtime.signals import sigterm_as_interrupt
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.topics import CONTROL_PERIOD_S, check_vehicle_id
+from edge_runtime.words import printable
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 
@@ -163,20 +169,23 @@ def _serve(settings: SimulateSettings, environment: gymnasium.Env[Any, Any]) -> 
     wait_s, tls = settings.wait_edge_s, settings.tls
     with open_port(settings.listen, settings.vehicle_id, tls, settings.connect, wait_s) as port:
         check = CommandCheck(port.session, action_size)
-        in_loop = settings.loop == VEHICLE
-        feedback = FeedbackCheck(port.session, action_size) if in_loop else None
-        with (
-            running_clock(
-                settings.clock, port.publish_state, check, settings.latency, feedback
-            ) as clock,
-            episode_bar(settings.episodes) as bar,
-        ):
+        clock = _make_clock(settings, port, check, action_size)
+        with contextlib.closing(clock), episode_bar(settings.episodes) as bar:
             port.on_command(clock.receive)
             port.wait_for_edge(wait_s, str(settings.connect or settings.listen))
             vehicle = (
                 VehicleInLoop(clock, port, wait_s) if isinstance(clock, VehicleClock) else None
             )
             return _drive(settings, environment, port, clock, check, bar, vehicle)
+
+
+def _make_clock(
+    settings: SimulateSettings, port: SimulatorPort, check: CommandCheck, action_size: int
+) -> Clock:
+    if settings.loop == VEHICLE:
+        feedback = FeedbackCheck(port.session, action_size)
+        return VehicleClock(port.publish_state, check, settings.latency, feedback)
+    return CLOCKS[settings.clock](port.publish_state, check, settings.latency)
 
 
 def _drive(
@@ -268,3 +277,43 @@ def _as_asked(settings: SimulateSettings) -> dict[str, Any]:
         "standing": settings.standing,
         "latency_spec": str(settings.latency),
     }
+
+
+class EpisodeBar:
+    """Shows the episodes done and what the vehicle does at the moment.
+
+    Where nobody watches a terminal, it prints a line an episode instead.
+    """
+
+    def __init__(self, progress: Progress, episodes: int) -> None:
+        self._progress = progress
+        self._task = progress.add_task("waiting for an edge runtime", total=episodes)
+        self._waits_for = ""
+
+    def tick(self, episode: int, step: int, decision: Decision, waits_for: str = "") -> None:
+        """Show one tick; ``waits_for`` is the command that the vehicle needs to drive again."""
+        reason = printable(decision.brake_reason)
+        doing = f"braking: {reason}" if reason else "driving"
+        self._progress.update(
+            self._task, completed=episode, description=f"step {step:3d}  {doing[:40]}"
+        )
+        if waits_for and not self._waits_for:
+            self._say(f"the vehicle stands until it is re-armed: {waits_for}")
+        self._waits_for = waits_for
+
+    def done(self, episodes: int, told: str) -> None:
+        """Show how many episodes are done, and without a bar what became of the last one."""
+        self._progress.update(self._task, completed=episodes)
+        if self._progress.disable:
+            self._say(told)
+
+    def _say(self, line: str) -> None:
+        """Print a line above the bar, as it is."""
+        self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def episode_bar(episodes: int) -> Iterator[EpisodeBar]:
+    """Show a bar on stderr while the block runs; lines if stderr is no terminal."""
+    with progress_bar("episodes") as progress:
+        yield EpisodeBar(progress, episodes)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_runtime.episode_report import EpisodeResult
-from edge_runtime.latency.model import LatencySpec
+from bridge.network import LatencySpec
+from bridge.report import EpisodeResult
 from trainer.conditions import CONDITIONS
 from trainer.human.guide import Action, Driver
 from trainer.training.delayed import RemoteDriver

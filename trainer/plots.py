@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge_runtime.episode_report import GOAL
+from bridge.report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic
 from trainer.training.metrics import read_metrics

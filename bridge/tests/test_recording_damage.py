@@ -13,15 +13,14 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, Header, Message
 from mcap.writer import MCAP0_MAGIC
 
-from bridge.feed import Heard
-from bridge.recording.reader import Recording
-from bridge.recording.writer import RecordingWriter
-from bridge.tests.commands import make_command
-from bridge.tests.processes import bridge_status
+from bridge import recording as records
+from bridge.messages import Heard
+from bridge.record import RecordingWriter
+from bridge.recording import Recording
+from bridge.tests.harness import bridge_status, make_command
 from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
 from edge_runtime.wire import encode
-from viewing import records
 
 OVERWRITTEN = 10
 

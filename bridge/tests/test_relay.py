@@ -7,18 +7,18 @@ import time
 
 import pytest
 
-from bridge.relay_traffic import DOWN, RelayTraffic
-from bridge.tests.commands import make_command
-from bridge.tests.processes import (
+from bridge.network import parse_spec
+from bridge.relay import DOWN, RelayTraffic
+from bridge.tests.harness import (
     SHORT_TOY,
     BridgeProcess,
     bridge_status,
+    make_command,
     make_policy,
     read,
     simulate,
     start_edge,
 )
-from edge_runtime.latency.model import parse_spec
 from edge_runtime.operator_commands import ask
 from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import free_endpoint

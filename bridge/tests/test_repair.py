@@ -11,15 +11,22 @@ import sys
 import pytest
 from mcap.reader import make_reader
 
-from bridge.recording.reader import Recording, Stored
-from bridge.tests.damage import LEFT_TURN, chunks, flip, flip_chunk, messages_of
-from bridge.tests.processes import bridge_status, make_policy
+from bridge.recording import Recording, Stored
+from bridge.tests.harness import (
+    LEFT_TURN,
+    bridge_status,
+    chunks,
+    flip,
+    flip_chunk,
+    make_policy,
+    messages_of,
+)
 from bridge.tests.test_replay import Hand
 
 HELD_OPEN = """
 import sys
 from pathlib import Path
-from bridge.recording.flushed_file import FlushedFile
+from bridge.record import FlushedFile
 file = FlushedFile(Path(sys.argv[1]))
 file.write(sys.stdin.buffer.read(int(sys.argv[2])))
 file.flush()

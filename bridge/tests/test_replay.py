@@ -7,11 +7,10 @@ import shutil
 
 import pytest
 
-from bridge.feed import Heard
-from bridge.recording.writer import RecordingWriter
-from bridge.tests.commands import make_command
-from bridge.tests.processes import BridgeProcess, bridge_status, make_policy, start_edge
-from bridge.tests.test_edge_counts import health
+from bridge.messages import Heard
+from bridge.record import RecordingWriter
+from bridge.tests.harness import BridgeProcess, bridge_status, make_command, make_policy, start_edge
+from bridge.tests.test_inbound import health
 from edge_runtime.tests.harness import BLACK, WHITE, make_state
 from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import FRAMES_BYTES, encode

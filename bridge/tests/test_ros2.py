@@ -1,14 +1,34 @@
-"""``python -m bridge ros2`` beside a real drive, heard through a second library."""
+"""Our messages as ROS 2 messages: by hand, and over their whole range."""
 
 from __future__ import annotations
 
+import json
+import math
 import signal
 import time
 from collections import defaultdict
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec import structs
 
-from bridge.tests.processes import (
+from bridge.messages import Heard
+from bridge.ros2 import (
+    UNKNOWN,
+    DeadReckoning,
+    Outlet,
+    Policies,
+    Policy,
+    RateBound,
+    drive_of,
+    feedback_curvature,
+    image_of,
+    odometry_of,
+    twist_of,
+)
+from bridge.tests.harness import (
     SLOW_TOY,
     BridgeProcess,
     bridge_status,
@@ -17,9 +37,218 @@ from bridge.tests.processes import (
     start_edge,
     start_simulate,
 )
+from edge_runtime.cli import UserError
+from edge_runtime.ros2 import names
 from edge_runtime.ros2.tests import second
-from edge_runtime.tests.harness import wait_until
+from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.vehicles.similarity import CARS
+from edge_runtime.wire import Command, Feedback, encode
+
+PEDAL = Policy(["pedal"], CARS["left_turn"])
+STEERING = Policy(["steering"], CARS["congestion"])
+S = 10**9
+
+
+def make_command(*action, policy_id="p"):
+    return Command(
+        session="a", episode=0, step=1, mode="drive", action=list(action), policy_id=policy_id,
+        received_ns=1, inference_ns=1, sent_ns=3 * S + 5,
+    )  # fmt: skip
+
+
+def make_feedback(speed_mps, *action, sent_ns=0):
+    return Feedback(
+        vehicle="mock", session="a", episode=0, step=1, mode="drive", action=list(action),
+        speed_mps=speed_mps, self_braking=False, faults=[], sent_ns=sent_ns,
+    )  # fmt: skip
+
+
+def test_the_newer_frame_is_shown():
+    image = image_of(make_state(1, frames=bytes([1]) * 3600 + bytes([2]) * 3600, sent_ns=2 * S + 7))
+    assert image.data == bytes([2]) * 3600
+    assert (image.header.stamp.sec, image.header.stamp.nanosec) == (2, 7)
+
+
+@pytest.mark.parametrize(
+    ("pedal", "now_mps", "speed", "acceleration"),
+    [(1.0, 2.0, 2.3, 3.0), (-1.0, 2.0, 1.6, 4.0), (-1.0, 0.1, 0.0, 4.0), (1.0, 5.9, 6.0, 3.0)],
+)
+def test_a_pedal_is_the_speed_at_the_end_of_the_period(pedal, now_mps, speed, acceleration):
+    drive = drive_of(make_command(pedal), now_mps, PEDAL).drive
+    assert (drive.speed, drive.acceleration) == pytest.approx((speed, acceleration))
+    assert drive.steering_angle == 0.0
+
+
+def test_steering_to_the_right_is_negative_and_keeps_the_speed():
+    """Congestion's +1 turns right, by 0.15 rad at a bicycle that turns about its centre."""
+    stamped = drive_of(make_command(1.0), 5.0, STEERING)
+    assert (stamped.drive.speed, stamped.drive.acceleration) == (5.0, 0.0)
+    curvature = -math.sin(math.atan(0.5 * math.tan(0.15))) / 2.5
+    assert stamped.drive.steering_angle == pytest.approx(math.atan(5.0 * curvature))
+    twist = twist_of(stamped.drive, STEERING.car)
+    assert twist.linear.x == 5.0
+    assert twist.angular.z == pytest.approx(5.0 * curvature)
+
+
+@given(st.floats(-1, 1), st.floats(0, 20))
+def test_no_command_asks_for_more_than_the_car_can(value, speed_mps):
+    for policy in (PEDAL, STEERING):
+        drive = drive_of(make_command(value), speed_mps, policy).drive
+        assert 0.0 <= drive.speed <= 6.0
+        assert abs(drive.steering_angle) < math.pi / 2
+        assert math.isfinite(twist_of(drive, policy.car).angular.z)
+
+
+def test_an_action_more_or_less_than_the_policys_names_is_taken_as_none():
+    assert drive_of(make_command(0.5, 0.5), 1.0, PEDAL).drive.steering_angle == 0.0
+    assert PEDAL.action([], "pedal") is None
+
+
+def test_a_circle_of_dead_reckoning_ends_where_it_began():
+    pose = DeadReckoning()
+    # 2 pi m at 1 m/s around a circle of 1 m to the left, in 100 steps.
+    for step in range(101):
+        pose.advance(1.0, 1.0, round(step * math.tau / 100 * S))
+        if step == 25:
+            assert (pose.x_m, pose.y_m) == pytest.approx((1.0, 1.0), abs=1e-6)
+            assert pose.yaw_rad == pytest.approx(math.pi / 2)
+    assert (pose.x_m, pose.y_m, pose.yaw_rad) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert pose.way_m == pytest.approx(math.tau)
+
+
+def test_a_gap_and_a_clock_that_goes_back_invent_no_way():
+    pose = DeadReckoning()
+    for time_ns in (100 * S, 50 * S, 50 * S):
+        pose.advance(2.0, 0.0, time_ns)
+    assert pose.way_m == 0.0
+    pose.advance(2.0, 0.0, 5000 * S)
+    assert pose.x_m == pytest.approx(1.0)  # half a second's, not 83 minutes'
+
+
+def test_the_odometry_says_what_it_does_not_know():
+    pose = DeadReckoning()
+    pose.advance(1.0, 0.0, 0)
+    pose.advance(1.0, 0.0, S // 2)
+    unsteered = odometry_of(
+        make_feedback(1.0, 0.5), pose, feedback_curvature(make_feedback(1.0, 0.5), PEDAL, 1.0)
+    )
+    assert unsteered.pose.covariance[7] == unsteered.pose.covariance[35] == UNKNOWN
+    assert unsteered.pose.covariance[0] == pytest.approx(0.05**2)
+    steered = make_feedback(1.0, -1.0)
+    curvature = feedback_curvature(steered, STEERING, 0.25)
+    assert curvature is not None
+    assert curvature > 0  # to the left
+    message = odometry_of(steered, pose, curvature)
+    assert message.twist.twist.angular.z == pytest.approx(curvature)
+    assert message.pose.covariance[35] == pytest.approx(0.05**2)
+
+
+@given(st.lists(st.floats(0, 0.2), min_size=1, max_size=300), st.floats(1, 100))
+def test_no_rate_is_passed(steps, rate_hz):
+    bound, now_s, passed = RateBound(rate_hz), 0.0, 0
+    for step in steps:
+        now_s += step
+        passed += bound.lets(now_s)
+    assert passed <= rate_hz * now_s + 2
+    assert bound.skipped == len(steps) - passed
+
+
+@given(st.lists(st.floats(-0.02, 0.02), min_size=50, max_size=200))
+def test_jitter_at_the_rate_itself_costs_nothing(jitters):
+    bound = RateBound(20.0)
+    assert all(bound.lets(step * 0.05 + jitter) for step, jitter in enumerate(jitters))
+
+
+class FakeNode:
+    """Where an Outlet would publish to: what was published, by topic."""
+
+    def __init__(self):
+        self.published = defaultdict(list)
+
+    def publisher(self, topic, _kind):
+        names.key("/x", topic)
+        return self.published[topic].append
+
+
+def heard(topic, payload, at_s=0.0):
+    return Heard(f"phil/x/{topic}", topic, payload, round(at_s * S), len(payload))
+
+
+def outlet_with(status, rate_hz=20.0):
+    node: Any = FakeNode()
+    return node, Outlet(node, Policies(status, clock_s=lambda: 0.0), rate_hz)
+
+
+def left_turn_status():
+    manifest = {"scenario": "left_turn", "action": [{"name": "pedal"}]}
+    return {"policy_id": "p", "manifest": manifest}
+
+
+def congestion_status():
+    manifest = {"scenario": "congestion", "action": [{"name": "steering"}]}
+    return {"policy_id": "p", "manifest": manifest}
+
+
+def nobody():
+    raise UserError("nobody")
+
+
+def test_what_cannot_be_read_is_counted_by_topic_and_reason():
+    node, outlet = outlet_with(left_turn_status)
+    for topic in ("state", "command", "feedback", "health", "scene", "alive"):
+        outlet.take(heard(topic, b"\xc1"))
+    assert outlet.rejected == {
+        "state_malformed": 1, "command_malformed": 1, "feedback_malformed": 1,
+    }  # fmt: skip
+    assert not any(node.published.values())
+
+
+def test_commands_are_shown_once_the_edge_says_whose_they_are():
+    node, outlet = outlet_with(left_turn_status)
+    outlet.take(heard("command", encode(make_command(1.0))))
+    (drive,) = node.published["command/ackermann"]
+    assert drive.drive.acceleration == 3.0
+    node, outlet = outlet_with(nobody)
+    outlet.take(heard("command", encode(make_command(1.0))))
+    assert outlet.rejected == {"command_unknown_policy": 1}
+
+
+def test_a_policy_of_an_unknown_car_is_said_once(capsys):
+    def status():
+        return {"policy_id": "p", "manifest": {"scenario": "parking", "action": []}}
+
+    _, outlet = outlet_with(status)
+    for _ in range(2):
+        outlet.take(heard("command", encode(make_command(1.0))))
+    assert capsys.readouterr().err.count("'parking' is not known") == 1
+
+
+@pytest.mark.parametrize(("scenario_mps", "scale"), [(None, 1.0), (4.0, 0.25)])
+def test_the_vehicles_scale_is_its_speed_over_the_scenarios(scenario_mps, scale):
+    """The Hunter's path is four times as curved as the car's; a stand says nothing of the scale."""
+    node, outlet = outlet_with(congestion_status)
+    outlet.take(heard("command", encode(make_command(0.0))))
+    for speed_mps in (1.0, 0.0, 1.0):
+        feedback = structs.replace(
+            make_feedback(speed_mps, -1.0),
+            scenario_speed_mps=None if scenario_mps is None else scenario_mps * speed_mps,
+        )
+        outlet.take(heard("feedback", encode(feedback), at_s=len(node.published["odom"])))
+    car_curvature = feedback_curvature(make_feedback(1.0, -1.0), STEERING, 1.0)
+    yaw_rates = [message.twist.twist.angular.z for message in node.published["odom"]]
+    assert yaw_rates == pytest.approx([car_curvature / scale, 0.0, car_curvature / scale])
+
+
+def test_a_flood_is_bounded_and_the_pose_still_right():
+    node, outlet = outlet_with(left_turn_status, rate_hz=10.0)
+    for step in range(201):  # 2 s at 100 Hz and 1 m/s
+        feedback = make_feedback(1.0, 0.0, sent_ns=step * S // 100)
+        outlet.take(heard("feedback", encode(feedback), at_s=step / 100))
+    assert 20 <= len(node.published["odom"]) <= 22
+    assert outlet.skipped == {"feedback": 201 - len(node.published["odom"])}
+    assert node.published["odom"][-1].pose.pose.position.x == pytest.approx(2.0, abs=0.11)
+    assert json.dumps(outlet.skipped)
 
 
 class Listener:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
+import subprocess
+import sys
+import textwrap
 import time
 
 import numpy as np
 import pytest
 
 from bridge.environments import make_environment, scenario_of
-from bridge.tests.processes import (
+from bridge.tests.harness import (
     SHORT_TOY,
     SLOW_TOY,
     TOY,
+    BridgeProcess,
     bridge_status,
     drive_in_process,
     make_policy,
@@ -215,3 +220,115 @@ def test_an_interrupted_run_writes_no_report(tmp_path):
     assert "now=standby" in edge.log
     assert "now=safe_stop" not in edge.log.split("now=standby")[-1]
     assert list(tmp_path.glob("*half*")) == []
+
+
+PAIRS = {"car-a": ("mean", 0.0, 40), "car-b": ("constant", 0.25, 60)}
+"""Vehicle id -> kind and value of its policy, and its seed."""
+
+
+def drive_all(folder, endpoint):
+    """Drive every pair at once; return the reports by vehicle id."""
+    runs = {}
+    with contextlib.ExitStack() as stack:
+        for vehicle_id, (kind, value, seed) in PAIRS.items():
+            policy = make_policy(folder, kind, value)
+            out = folder / f"{vehicle_id}.json"
+            options = ("--connect", endpoint, "--vehicle-id", vehicle_id)
+            arguments = ("simulate", "--env", TOY, "--seed", str(seed), "--out", str(out))
+            run = stack.enter_context(BridgeProcess(*arguments, "--episodes", "2", *options))
+            stack.enter_context(start_edge(endpoint, policy, "--vehicle-id", vehicle_id))
+            runs[vehicle_id] = (run, policy, out)
+        for run, _, _ in runs.values():
+            assert run.wait() == 0, run.errors
+    return {vehicle_id: (read(out), policy) for vehicle_id, (_, policy, out) in runs.items()}
+
+
+def test_two_vehicles_on_one_router_each_drive_as_if_alone(tmp_path):
+    endpoint = free_endpoint()
+    router = open_session(listen=endpoint, mode="router")
+    try:
+        for _ in range(3):  # A busy machine may pause a process for over 2 T.
+            reports = drive_all(tmp_path, endpoint)
+            if not any(r["safe_stops"] or r["rejected"] for r, _ in reports.values()):
+                break
+    finally:
+        router.close()
+    assert len({report["policy_id"] for report, _ in reports.values()}) == 2
+    for report, policy in reports.values():
+        assert report["rejected"] == {}
+        for row in report["per_episode"]:
+            outcome, actions = drive_in_process(policy, row["seed"])
+            assert row["outcome"] == outcome
+            np.testing.assert_allclose(row["actions"], actions, atol=1e-5)
+
+
+PROJECT = """
+[build-system]
+requires = ["setuptools"]
+build-backend = "setuptools.build_meta"
+[project]
+name = "somebodys-envs"
+version = "1.0"
+[project.entry-points."gymnasium.envs"]
+somebody = "somebodys_envs:register"
+"""
+MODULE = """
+import gymnasium
+import numpy as np
+
+class Creep(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(0, 255, (2, 45, 80), np.uint8)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.travelled_m = 0.0
+        return self.picture(), {"speed_mps": 1.0, "distance_m": 0.0}
+
+    def step(self, action):
+        self.travelled_m += 0.1
+        ended = self.travelled_m > 1.95
+        info = {"speed_mps": 1.0, "distance_m": self.travelled_m}
+        return self.picture(), float(action[0]), ended, False, info
+
+    def picture(self):
+        return np.full((2, 45, 80), 7, np.uint8)
+
+def register():
+    gymnasium.register("Creep-v0", entry_point="somebodys_envs:Creep")
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder into which pip has installed the package, from source and without a network."""
+    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
+    (source / "pyproject.toml").write_text(textwrap.dedent(PROJECT))
+    (source / "somebodys_envs.py").write_text(MODULE)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]
+    command = [*pip, "--no-build-isolation", "--target", str(target), str(source)]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    return target
+
+
+def test_an_installed_environment_is_served_by_its_id(site, tmp_path):
+    endpoint, out = free_endpoint(), tmp_path / "r.json"
+    arguments = ["simulate", "--env", "somebody/Creep-v0", "--listen", endpoint, "--out", str(out)]
+    with (
+        BridgeProcess(*arguments, environment={"PYTHONPATH": str(site)}) as run,
+        start_edge(endpoint, make_policy(tmp_path, "constant")),
+    ):
+        assert run.wait() == 0, run.errors
+    report = read(out)
+    assert report["scenario"] == "somebody/Creep-v0"
+    (row,) = report["per_episode"]
+    assert (row["steps"], row["outcome"]) == (20, "ended")
+    assert row["reward"] == pytest.approx(20 * 0.3, rel=1e-6)
+
+
+def test_what_is_not_installed_is_one_line_and_status_2():
+    with BridgeProcess("simulate", "--env", "somebody/Creep-v0") as run:
+        assert run.wait() == 2
+    (line,) = run.errors.splitlines()
+    assert "somebody" in line
+    assert "a gymnasium id" in line

@@ -13,20 +13,21 @@ import pytest
 import rerun as rr
 
 from bridge.__main__ import main
-from bridge.port import open_port
-from bridge.scene import Scene, Stamps, decode_scene, encode_scene
-from bridge.tests.commands import make_command
-from bridge.tests.damage import LEFT_TURN, flip_chunk
-from bridge.tests.processes import (
+from bridge.messages import Scene, Stamps, decode_scene, encode_scene
+from bridge.ports import open_port
+from bridge.rerun.wire_view import WireLog
+from bridge.tests.harness import (
+    LEFT_TURN,
     SLOW_TOY,
     BridgeProcess,
     bridge_status,
+    flip_chunk,
+    make_command,
     make_policy,
     start_edge,
     start_simulate,
 )
 from bridge.tests.toy import ToyEnv
-from bridge.viewer.wire_log import WireLog
 from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import free_endpoint
 

@@ -30,7 +30,6 @@ UNWANTED = {
     "onnx",
     "trainer",
     "bridge",
-    "viewing",
 }
 WHITE_FRAMES = bytes([WHITE]) * FRAMES_BYTES
 

@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from bridge.environments import make_environment
-from bridge.port import SimulatorPort, open_port
-from bridge.scene import Stamps
+from bridge.messages import Stamps
+from bridge.ports import SimulatorPort, open_port
+from bridge.rerun.sinks import Sink
 from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import positive
@@ -35,7 +36,6 @@ from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import Seen, TrainingRun
 from trainer.viewer.command import watched
-from viewing.sinks import Sink
 
 LIMIT_MS = 1.0
 TICK_S = 0.02

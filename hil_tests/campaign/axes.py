@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edge_runtime.latency.model import parse_spec
+from bridge.network import parse_spec
 
 
 @dataclass(frozen=True)

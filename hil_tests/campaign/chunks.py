@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.episode_report import GOAL
+from bridge.report import GOAL
 from hil_tests.kept import KeptResults
 
 CHUNK_EPISODES = 50

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.latency.model import parse_spec
+from bridge.network import parse_spec
 from edge_runtime.policy import load_policy
 from hil_tests.campaign.axes import Axis
 from hil_tests.campaign.budget import budget

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from edge_runtime.episode_report import COLLISION, GOAL
+from bridge.report import COLLISION, GOAL
 from trainer.experiments.statistics import Estimate, mean_estimate, success_estimate
 
 

@@ -6,7 +6,7 @@ import resource
 import time
 from pathlib import Path
 
-from bridge.recording.reader import Recording
+from bridge.recording import Recording
 from edge_runtime.wire import CONTROL_PERIOD_S, State, decode_state
 from hil_tests.faults.ends import at_any_phase
 from hil_tests.faults.processes import Process

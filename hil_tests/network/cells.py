@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bridge.network import LatencySpec
 from edge_runtime.files import read_json
-from edge_runtime.latency.model import LatencySpec
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand
 from hil_tests.network.kernel import MTU, kernel_network

@@ -19,8 +19,9 @@ from typing import Any
 
 import zenoh
 
-from bridge.signals import sigterm_as_interrupt, wait_to_be_told
+from bridge.commands import wait_to_be_told
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
+from edge_runtime.signals import sigterm_as_interrupt
 from edge_runtime.topics import CONTROL_PERIOD_S
 
 STATE_BYTES, COMMAND_BYTES = 7_322, 217

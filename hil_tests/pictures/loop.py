@@ -10,14 +10,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bridge.recording.reader import Recording
-from bridge.scene import Scene, decode_scene
-from bridge.viewer.recorded import read_heard
+from bridge.messages import Scene, decode_scene
+from bridge.recording import Recording, read_heard
+from bridge.rerun.wire_view import Timeline
 from edge_runtime import wire
 from edge_runtime.files import write_atomic
 from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.pictures.drive import LATENCY, VEHICLE, recorded_drive
-from viewing.timeline import Timeline
 
 PARTS = {
     "uplink": "#2878e6",

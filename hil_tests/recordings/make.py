@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bridge.recording.reader import Recording
+from bridge.recording import Recording
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
 from edge_runtime.files import check_writable, read_bytes, write_atomic
 from edge_runtime.transport import free_endpoint

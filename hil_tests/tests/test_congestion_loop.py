@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bridge.tests.processes import simulate_undisturbed
+from bridge.tests.harness import simulate_undisturbed
 from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.transport import free_endpoint
 from trainer.drivers import OnnxDriver, make_environment

@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from bridge.tests.processes import (
-    read,
-    simulate_undisturbed,
-    start_simulate,
-    wait_until_driving,
-)
+from bridge.tests.harness import read, simulate_undisturbed, start_simulate, wait_until_driving
 from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ("edge_runtime", "viewing", "bridge", "trainer", "hil_tests", "deploy")
+FOLDERS = ("edge_runtime", "bridge", "trainer", "hil_tests", "deploy")
 UNPICKLERS = {"pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
 RUNNERS = {"eval", "exec", "compile", "__import__"}
 SAFE_YAML = {"SafeLoader", "CSafeLoader"}

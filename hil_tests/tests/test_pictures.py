@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from bridge.scene import Scene
-from bridge.tests.commands import make_command
+from bridge.messages import Scene
+from bridge.tests.harness import make_command
 from edge_runtime.cli import run_cli
 from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from bridge.tests.processes import simulate_undisturbed
-from edge_runtime.latency.model import parse_spec
+from bridge.network import parse_spec
+from bridge.tests.harness import simulate_undisturbed
 from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.transport import free_endpoint
 from trainer.drivers import OnnxDriver, make_environment

@@ -14,8 +14,7 @@ import pytest
 import zenoh
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
-from bridge.feed import open_feed
-from bridge.port import SimulatorPort
+from bridge.ports import SimulatorPort, open_feed
 from deploy.certs import CLOCK_SLACK, issue, read_authority
 from edge_runtime import wire
 from edge_runtime.access import rules_for_edge, rules_for_listener

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from bridge.tests.processes import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
+from bridge.tests.harness import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
 from edge_runtime.access import rules_for_edge, rules_for_listener
 from edge_runtime.errors import UserError
 from edge_runtime.operator_commands import ask

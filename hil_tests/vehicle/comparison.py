@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from typing import Any
 
-from edge_runtime.episode_report import GOAL
+from bridge.report import GOAL
 from hil_tests.campaign.rows import make_row
 from hil_tests.vehicle.rigs import LOOPS, POLICY, VEHICLE, Drive, run_rig
 from hil_tests.vehicle.sweep import as_dict

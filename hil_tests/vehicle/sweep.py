@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from edge_runtime.episode_report import GOAL
+from bridge.report import GOAL
 from edge_runtime.errors import UserError
 from hil_tests.campaign.axes import Axis
 from hil_tests.campaign.budget import budget

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from bridge.actions import vehicle_action
-from bridge.feedback_hold import VehicleDecision
+from bridge.episode import vehicle_action
+from bridge.inbound import VehicleDecision
 from bridge.tracking import TrackingLog
 from edge_runtime.vehicles.hunter.states import State
 from edge_runtime.vehicles.interface import VehicleReport

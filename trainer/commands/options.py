@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from bridge.network import GRAMMAR
 from edge_runtime import files
 from edge_runtime.errors import UserError
-from edge_runtime.latency.model import GRAMMAR
 from edge_runtime.option_types import whole_number
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import MOST_THREADS

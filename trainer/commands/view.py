@@ -6,10 +6,10 @@ import argparse
 import time
 from pathlib import Path
 
+from bridge.rerun.sinks import add_sink, chosen_sink
 from edge_runtime.cli import examples
 from edge_runtime.words import counted
 from trainer.person.recording import find_recordings, read_steps
-from viewing.options import add_sink, chosen_sink
 
 EXAMPLE = examples(
     "python -m trainer view runs/drives --serve",
@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw all of it; a page is served until somebody interrupts. Returns the exit status."""
+    from bridge.rerun.sinks import SERVE, check_sink
     from trainer.viewer.command import show_sittings
-    from viewing.sinks import SERVE, check_sink
 
     paths = find_recordings([Path(place) for place in arguments.recordings])
     sink = chosen_sink(arguments)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_runtime.episode_report import GOAL
+from bridge.report import GOAL
 from edge_runtime.errors import UserError
 from trainer.conditions import CONDITIONS
 from trainer.experiments.plan import (

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_runtime.episode_report import GOAL, EpisodeResult
+from bridge.report import GOAL, EpisodeResult
 from edge_runtime.errors import UserError
 from edge_runtime.files import make_directory, read_bytes, write_atomic
 from trainer import seeds

@@ -21,12 +21,12 @@ from mcap.records import Channel, Message
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from numpy.typing import NDArray
 
+from bridge.recording import Records
 from edge_runtime import __version__
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import hold
 from edge_runtime.files import make_directory, open_regular
 from trainer.person.interface import Control
-from viewing.records import Records
 
 TOPIC = "person/step"
 WIRE = ("phil/", "view/")

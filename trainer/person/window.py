@@ -9,11 +9,11 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
+from bridge.rerun import BY_NAME
 from edge_runtime.errors import UserError
 from trainer.person.interface import View
 from trainer.person.quiet import quiet_stderr
 from trainer.scenarios.scene import draw_scene
-from viewing.colours import BY_NAME
 
 SIZE = (1040, 680)
 """Of what is drawn; the window shows it larger or smaller."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from bridge.rerun import POLICY, Colour
 from trainer.scenarios.picture import Rectangle, corners
-from viewing.colours import POLICY, Colour
 
 PIXELS_PER_METRE = 16
 WIDTH_M, HEIGHT_M = 46.0, 25.0

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.episode_report import COLLISION, GOAL
+from bridge.report import COLLISION, GOAL
 from trainer.drivers import MODEL_FILE
 from trainer.evaluation import CONDITIONS
 from trainer.experiments.data import Result, Results

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_runtime.latency.model import LatencySpec, parse_spec
+from bridge.network import LatencySpec, parse_spec
 from trainer.drivers import make_environment
 from trainer.evaluation import drive_episode
 from trainer.training.delayed import (

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.latency.model import parse_spec
+from bridge.network import parse_spec
 from trainer.learner import equations
 from trainer.tests.scripted import CONFIG, HUMAN, LEARNER, POLICY, scripted_run
 from trainer.training.delayed import make_wheel

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
+from bridge.report import COLLISION
 from edge_runtime.cli import INTERRUPTED
-from edge_runtime.episode_report import COLLISION
 from edge_runtime.errors import UserError
 from trainer import seeds
 from trainer.commands.train import _quit as ask_to_quit

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 import torch
 
+from bridge.rerun import APPLIED, HUMAN, POLICY
+from bridge.rerun.sinks import Sink
+from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
 from trainer.human.guide import Intervention, Reason
@@ -31,9 +34,6 @@ from trainer.viewer.command import watched
 from trainer.viewer.entries import Correction, Entry, Episode, Steps
 from trainer.viewer.training_log import DRIVERS, TrainingLog
 from trainer.viewer.watcher import CORRECTIONS, STEPS_TOGETHER, Watcher
-from viewing.colours import APPLIED, HUMAN, POLICY
-from viewing.sinks import Sink
-from viewing.tests.viewers import in_place
 
 ROOT = Path(__file__).parents[2]
 TINY = RunConfig(

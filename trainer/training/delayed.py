@@ -23,9 +23,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_runtime.latency.command_hold import COMMAND_WINDOW_S, ROUNDING_S
-from edge_runtime.latency.model import LatencySpec
-from edge_runtime.latency.virtual_link import VirtualLink
+from bridge.network import LatencySpec
+from bridge.virtual_link import COMMAND_WINDOW_S, ROUNDING_S, VirtualLink
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command
 from trainer.human.guide import Driver
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from edge_runtime.episode_report import GOAL
+from bridge.report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes, write_atomic
 from trainer.training.learning import EpisodeLearning

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.episode_report import GOAL, EpisodeResult
-from edge_runtime.latency.model import LatencySpec
+from bridge.network import LatencySpec
+from bridge.report import GOAL, EpisodeResult
 from trainer import seeds
 from trainer.drivers import BEST_FILE, make_environment
 from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together

@@ -8,8 +8,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 
+from bridge.rerun.sinks import ViewerGone
 from trainer.viewer.entries import Entry
-from viewing.viewer import ViewerGone
 
 MOST_WAITING = 500
 """Entries, some 50 s of pictures: a view that is slower loses some, and the loop nothing."""

@@ -6,10 +6,20 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
-from viewing.colours import APPLIED, HUMAN, POLICY
-from viewing.layout import frames_view, full_blueprint, road_view
-from viewing.scene import Scene
-from viewing.series import ALL_OF_IT, BLUE, GREY, ORANGE, PURPLE, Plot, plot_view
+from bridge.messages import SeenScene
+from bridge.rerun import APPLIED, HUMAN, POLICY
+from bridge.rerun.draw import (
+    ALL_OF_IT,
+    BLUE,
+    GREY,
+    ORANGE,
+    PURPLE,
+    Plot,
+    frames_view,
+    full_blueprint,
+    plot_view,
+    road_view,
+)
 
 APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
 TIMELINE = "step"
@@ -50,7 +60,7 @@ POINTS = {"advantage/of_the_human": HUMAN}
 ROAD = "Road from above (blue: the policy drives, green: the human)"
 
 
-def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
+def make_blueprint(scene: SeenScene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
     left = rrb.Vertical(
         road_view(scene, ROAD),

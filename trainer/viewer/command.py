@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from bridge.rerun.sinks import Sink, check_sink, flush, open_sink, read_sink
 from edge_runtime.signals import sigterm_as_interrupt
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
@@ -21,8 +22,6 @@ from trainer.viewer.blueprint import (
 from trainer.viewer.sittings import Shown
 from trainer.viewer.training_log import TrainingLog
 from trainer.viewer.watcher import Watcher
-from viewing.sinks import Sink, check_sink, open_sink, read_sink
-from viewing.viewer import flush
 
 OnEpisode = Callable[[EpisodeMetrics], None]
 

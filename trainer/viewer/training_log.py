@@ -11,18 +11,23 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from edge_runtime.episode_report import GOAL
+from bridge.messages import SeenScene, read_scene
+from bridge.report import GOAL
+from bridge.rerun import HUMAN, POLICY
+from bridge.rerun.draw import (
+    Plot,
+    draw_cars,
+    draw_ground,
+    style_lines,
+    style_points,
+)
+from bridge.rerun.sinks import flush
 from edge_runtime.words import counted
 from trainer.human.guide import Reason
 from trainer.training.metrics import EpisodeMetrics
 from trainer.viewer.advantage import q_advantage
 from trainer.viewer.blueprint import LINES, POINTS, TIMELINE, make_blueprint
 from trainer.viewer.entries import Entry, Episode, Picture, StepEntry, Steps
-from viewing.colours import HUMAN, POLICY
-from viewing.road import draw_cars, draw_ground
-from viewing.scene import SeenScene, read_scene
-from viewing.series import Plot, style_lines, style_points
-from viewing.viewer import flush
 
 BY_POLICY = "policy"
 DRIVERS = {BY_POLICY: POLICY, **dict.fromkeys(get_args(Reason), HUMAN)}

@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from bridge.rerun.draw import PICTURE_INTERVAL_S, Pace
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import Seen, TrainingRun
 from trainer.viewer.entries import Correction, Entry, Episode, Picture, StepEntry, Steps
-from viewing.pace import PICTURE_INTERVAL_S, Pace
 
 STEPS_TOGETHER = 50
 """Numbers are handed over with a picture, or when there are so many."""

@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from bridge import recording
 from bridge.tests.test_recording_damage import MIB, crafted, zeros
 from edge_runtime.errors import UserError
 from edge_runtime.file_lock import try_to_hold
 from trainer.person.recording import Recorder, Step, find_recordings, read_steps, sittings
 from trainer.person.tests.steps import recorded_step
-from viewing import records
 
 
 def record(directory, count: int) -> list[Step]:
@@ -121,7 +121,7 @@ def test_another_file_is_refused(tmp_path, data):
 
 
 def test_a_file_made_to_keep_its_reader_busy_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(records, "MAX_CHUNK_BYTES", MIB)
+    monkeypatch.setattr(recording, "MAX_CHUNK_BYTES", MIB)
     path = crafted(tmp_path / "sitting-0001.mcap", *[(zeros(1), MIB)] * 40)
     with pytest.raises(UserError, match="is refused"):
         list(read_steps(path))

@@ -19,11 +19,11 @@ from urllib.parse import urlsplit
 import msgspec
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from bridge.rerun import BY_NAME
 from trainer.person.interface import View
 from trainer.person.web.door import Door
 from trainer.person.web.messages import END, MAX_INPUT_BYTES, decode_input, encode_echo, encode_view
 from trainer.person.web.seat import Seat
-from viewing.colours import BY_NAME
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 GONE_S = 2.0

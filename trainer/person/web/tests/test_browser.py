@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import pytest
 
+from bridge.rerun import BY_NAME
 from trainer.person.interface import LET_GO
 from trainer.person.web.tests.pages import page
 from trainer.person.web.tests.readings import LIVE, READY, TWO_HEARTBEATS, WHY, YOU, poll, reads
 from trainer.person.web.tests.tunnel import Tunnel
 from trainer.person.web.tests.views import first_view
-from viewing.colours import BY_NAME
 
 pytestmark = pytest.mark.usefixtures("opened")
 

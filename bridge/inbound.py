@@ -1,0 +1,319 @@
+"""What the simulator believes of the commands, feedback and health that it hears. No socket.
+
+What it does not believe is counted by reason. In the loop with a vehicle, feedback moves the car:
+it is checked as commands are, and `FeedbackHold` says how long the newest one counts.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from bridge.virtual_link import ROUNDING_S, SILENCE_LIMIT_S, UNKNOWN_SAFE_STOP, Decision
+from edge_runtime.wire import (
+    SAFE_STOP,
+    Command,
+    Feedback,
+    Health,
+    Reason,
+    Rejection,
+    decode_command,
+    decode_feedback,
+    decode_health,
+)
+
+ACTION_SIZE = "action_size"
+"""Rejection reason: the policy has another number of actions than the environment."""
+UNKNOWN_STEP = "unknown_step"
+"""Rejection reason: the command (that the vehicle has taken) answers a state never sent."""
+
+
+class CommandCheck:
+    """Reads commands for one simulator session and keeps the counts of the whole run.
+
+    ``policy_ids`` holds the policies that answered, each once, in order of appearance.
+    One thread at a time: the clock that owns it.
+    """
+
+    def __init__(self, session: str, action_size: int) -> None:
+        self.rejected: Counter[str] = Counter()
+        self.policy_ids: list[str] = []
+        self._session = session
+        self._action_size = action_size
+        self._episode = 0
+        self._newest_step = -1
+        self._ended = (-1, -1)
+
+    def begin(self, episode: int) -> None:
+        """Note that an episode begins: whatever answers an earlier one is stale from now on."""
+        self._episode, self._newest_step = episode, -1
+
+    def sent(self, step: int) -> None:
+        """Note that a state has been sent, so that its answer can be told from an invention."""
+        self._newest_step = step
+
+    def end(self, final_step: int, answered_step: int) -> None:
+        """Note that the episode has ended, and up to which step its states were answered.
+
+        The answers to those after it are still on their way, and come too late without a fault.
+        """
+        self._newest_step = final_step
+        self._ended = (self._episode, answered_step)
+
+    def read(self, payload: bytes) -> Command | None:
+        """Return the command if it answers a state of this episode; None otherwise.
+
+        An answer that the end of its episode overtook is None, too, but is not counted.
+        """
+        command = decode_command(payload)
+        if isinstance(command, Rejection):
+            self.reject(command.reason.value)
+            return None
+        fault = self._fault(command)
+        if fault:
+            self.reject(fault)
+            return None
+        if self._overtaken(command):
+            return None
+        if command.policy_id not in self.policy_ids:
+            self.policy_ids.append(command.policy_id)
+        return command
+
+    def reject(self, reason: str) -> None:
+        """Count one rejected command."""
+        self.rejected[reason] += 1
+
+    def _fault(self, command: Command) -> str:
+        """Why a well-formed command answers nothing in this episode; empty if it does."""
+        if command.session != self._session:
+            return Reason.FOREIGN_SESSION.value
+        if len(command.action) != self._action_size:
+            return ACTION_SIZE
+        if (command.episode, command.step) > (self._episode, self._newest_step):
+            return UNKNOWN_STEP
+        if command.episode < self._episode and not self._overtaken(command):
+            return Reason.STALE.value
+        return ""
+
+    def _overtaken(self, command: Command) -> bool:
+        ended_episode, answered_step = self._ended
+        return command.episode == ended_episode and command.step > answered_step
+
+
+ACTION_RANGE = "action_range"
+"""Rejection reason: no actuator is beyond its end."""
+ROUNDING = 1e-3
+NOT_COMMANDED = ""
+"""Session of a vehicle that has not taken a command since its edge runtime was started."""
+
+
+class FeedbackCheck:
+    """Reads feedback for one simulator session and keeps the counts of the whole run.
+
+    Another simulator's session is nobody's fault before the vehicle has heard of this one, and is
+    not believed either. Its stamps say which feedback is the newest; after 2 T without any, order
+    begins anew: another board, with another clock, may have taken over.
+    """
+
+    def __init__(self, session: str, action_size: int) -> None:
+        self.rejected: Counter[str] = Counter()
+        self.heard: Feedback | None = None
+        """The last that could be read, of whatever session: it tells that a vehicle is there."""
+        self.heard_s = 0.0
+        self._session = session
+        self._action_size = action_size
+        self._sent = (-1, -1)
+        self._met = False
+        self._newest: Feedback | None = None
+        self._newest_s = 0.0
+
+    def sent(self, episode: int, step: int) -> None:
+        """Note that a state has been sent."""
+        self._sent = (episode, step)
+
+    def read(self, payload: bytes, now_s: float) -> Feedback | None:
+        """Return the feedback if it is this vehicle's newest; None otherwise.
+
+        ``now_s``: monotonic time.
+        """
+        feedback = decode_feedback(payload)
+        if isinstance(feedback, Rejection):
+            self.rejected[feedback.reason.value] += 1
+            return None
+        self.heard, self.heard_s = feedback, now_s
+        own = feedback.session in (self._session, NOT_COMMANDED)
+        if not own and not self._met:
+            return None
+        fault = self._fault(feedback, now_s) if own else Reason.FOREIGN_SESSION.value
+        if fault:
+            self.rejected[fault] += 1
+            return None
+        self._met = self._met or feedback.session == self._session
+        self._newest, self._newest_s = feedback, now_s
+        return feedback
+
+    def _fault(self, feedback: Feedback, now_s: float) -> str:
+        """Why a well-formed feedback of this session is not believed; empty if it is."""
+        if len(feedback.action) != self._action_size:
+            return ACTION_SIZE
+        if any(abs(value) > 1.0 + ROUNDING for value in feedback.action):
+            return ACTION_RANGE
+        if (feedback.episode, feedback.step) > self._sent:
+            return UNKNOWN_STEP
+        newest = self._newest
+        if newest is None:
+            return ""
+        if feedback.sent_ns == newest.sent_ns:
+            return Reason.DUPLICATE.value
+        in_order = now_s - self._newest_s <= SILENCE_LIMIT_S
+        return Reason.STALE.value if in_order and feedback.sent_ns < newest.sent_ns else ""
+
+
+NO_FEEDBACK = "no_feedback"
+"""Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
+SELF_BRAKING = "self_braking"
+"""Brake reason: the vehicle says that it brakes by itself."""
+
+
+@dataclass(frozen=True)
+class VehicleDecision(Decision):
+    """What the vehicle did in one tick; without feedback, nobody knows."""
+
+    feedback: Feedback | None = None
+    feedback_age_s: float | None = None
+    """From its arrival here, before any injected delay; None without feedback."""
+
+
+class FeedbackHold:
+    """The newest feedback, and how long ago it arrived. Times are monotonic seconds."""
+
+    def __init__(self, now_s: float) -> None:
+        self._newest: Feedback | None = None
+        self._received_s = self._heard_s = now_s
+
+    def admit(self, feedback: Feedback, received_s: float, now_s: float) -> None:
+        """Take the newest feedback: received from the wire, and (network injected) heard now."""
+        self._newest, self._received_s, self._heard_s = feedback, received_s, now_s
+
+    def newest(self, now_s: float) -> Feedback | None:
+        """Return the newest feedback; None if it has been silent for 2 T."""
+        silent = now_s - self._heard_s > SILENCE_LIMIT_S + ROUNDING_S
+        return None if silent else self._newest
+
+    def decide(self, heard: Decision, episode: int, now_s: float) -> VehicleDecision:
+        """Say what the vehicle did in the tick that ends now.
+
+        ``heard`` is what its commands would have it do: the simulator hears those, too. They give
+        a stop its reason, and decide nothing.
+        """
+        feedback = self.newest(now_s)
+        known = _fields(heard)
+        if feedback is None:
+            return VehicleDecision(**{**known, "brake_reason": NO_FEEDBACK, "command_age_s": None})
+        known["brake_reason"] = _brake_reason(feedback, heard, episode)
+        if known["brake_reason"]:
+            known["command_age_s"] = None
+        age_s = now_s - self._received_s
+        return VehicleDecision(**known, feedback=feedback, feedback_age_s=age_s)
+
+
+def _fields(decision: Decision) -> dict[str, Any]:
+    return {name: getattr(decision, name) for name in Decision.__dataclass_fields__}
+
+
+def _brake_reason(feedback: Feedback, heard: Decision, episode: int) -> str:
+    """Why the vehicle brakes; empty while it obeys the policy.
+
+    Until it has taken a command of this episode it stands because the last one has ended: no
+    fault, unless there are no commands.
+    """
+    if feedback.episode != episode:
+        return heard.brake_reason
+    if feedback.mode == SAFE_STOP:
+        return heard.brake_reason or UNKNOWN_SAFE_STOP
+    return SELF_BRAKING if feedback.self_braking else ""
+
+
+class EdgeCounts:
+    """Adds up how the edge's counts grow; the first health seen is where they stood before.
+
+    Two threads report here: health messages on Zenoh's, answers to the status query on the
+    caller's.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._rejected: Counter[str] = Counter()
+        self._unreadable: Counter[str] = Counter()
+        self._changes = 0
+        self._last: Health | None = None
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Return the states rejected by reason, without zeros."""
+        with self._lock:
+            return dict(self._rejected)
+
+    @property
+    def unreadable(self) -> dict[str, int]:
+        """Return the health messages that could not be read, by reason."""
+        with self._lock:
+            return dict(self._unreadable)
+
+    @property
+    def changes(self) -> int:
+        """Return how often another edge runtime took over, or the same was started again."""
+        with self._lock:
+            return self._changes
+
+    @property
+    def policy_id(self) -> str:
+        """Return the policy of the newest health; empty before the first."""
+        with self._lock:
+            return "" if self._last is None else self._last.policy_id
+
+    @property
+    def waits_for_rearm(self) -> bool:
+        """Return whether, by the newest health, only an operator can let the vehicle drive."""
+        with self._lock:
+            return self._last is not None and self._last.needs_rearm
+
+    def observe_message(self, payload: bytes) -> None:
+        """Take a health message; one that cannot be read is counted, as ``health_REASON``."""
+        health = decode_health(payload)
+        if isinstance(health, Health):
+            self.observe(health)
+            return
+        with self._lock:
+            self._unreadable[f"health_{health.reason.value}"] += 1
+
+    def observe_status(self, payload: bytes) -> None:
+        """Take the JSON answer to the status query, which holds the fields of a health message."""
+        try:
+            self.observe(msgspec.json.decode(payload, type=Health))
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            return
+
+    def observe(self, health: Health) -> None:
+        """Add what is new since the last health."""
+        with self._lock:
+            last = self._last
+            if last is None:
+                self._last = health
+                return
+            # Where a message and an answer have overtaken one another both clocks say so; a wall
+            # clock that was set back, or a restart, turns back only one of the two.
+            if health.sent_ns <= last.sent_ns and health.uptime_s <= last.uptime_s:
+                return
+            self._last = health
+            # A restarted edge runtime has a younger clock; it and another one count for themselves.
+            another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id
+            self._changes += another
+            before = {} if another else last.rejected
+            grown = Counter(health.rejected)
+            grown.subtract(before)
+            self._rejected += grown

@@ -1,0 +1,318 @@
+"""Both ends of the bridge on Zenoh: the simulator's port, and the feed of a listener.
+
+The port publishes states and hands on what comes back. The feed hears every topic through a bounded
+queue, for viewer, recorder and ROS 2: Zenoh's threads only put into it, so a listener that falls
+behind loses messages and never holds up the vehicle.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import zenoh
+
+from bridge.environments import scene_of
+from bridge.inbound import EdgeCounts
+from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Stamps, encode_scene, scene_key
+from edge_runtime import access
+from edge_runtime.cli import UserError
+from edge_runtime.manifest import Manifest
+from edge_runtime.tls import TlsFiles
+from edge_runtime.transport import only_own, open_session
+from edge_runtime.wire import MAX_PAYLOAD_BYTES, check_vehicle_id, key
+
+ANY_VEHICLE = "*"
+POLL_S = 0.1
+"""How soon a listener sees that the simulator has gone."""
+RETRY_S = 0.2
+TOKEN_S = 1.0
+"""A simulator that is there has this time to say so, however short the wait asked for."""
+QUEUE_MESSAGES = 2000
+"""About a minute of real time, all topics together."""
+EDGE_POLL_S = 0.1
+QUERY_S = 1.0
+PayloadHandler = Callable[[bytes], None]
+
+
+class _Status(msgspec.Struct):
+    """What is needed of the answer to the status query."""
+
+    manifest: Manifest
+
+
+def simulator_key(vehicle_id: str) -> str:
+    """Return the liveliness key by which viewers see that the simulator is there (extension)."""
+    return f"phil/{vehicle_id}/simulator"
+
+
+class SimulatorPort:
+    """Publishes states and scenes, hands on commands, and sees whether an edge runtime lives."""
+
+    def __init__(self, zenoh_session: zenoh.Session, vehicle_id: str) -> None:
+        self.session = secrets.token_hex(8)
+        self._zenoh = zenoh_session
+        self.vehicle_id = vehicle_id
+        # DROP: a slow listener must never hold up the simulation.
+        drop = zenoh.CongestionControl.DROP
+        self._states = zenoh_session.declare_publisher(
+            key(vehicle_id, "state"), congestion_control=drop
+        )
+        self._scenes = zenoh_session.declare_publisher(
+            scene_key(vehicle_id), congestion_control=drop
+        )
+        self._token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
+        self._commands: Any = None
+        self._feedback: Any = None
+        self.edge_counts = EdgeCounts()
+        self._health = self._subscribe("health", self.edge_counts.observe_message)
+
+    def on_command(self, handler: PayloadHandler) -> None:
+        """Call ``handler(payload)`` for every command, on Zenoh's thread: it must be quick."""
+        self._commands = self._subscribe("command", handler)
+
+    def on_feedback(self, handler: PayloadHandler) -> None:
+        """Call ``handler(payload)`` for every feedback of the vehicle, as ``on_command`` does."""
+        self._feedback = self._subscribe("feedback", handler)
+
+    def _subscribe(self, topic: str, handler: PayloadHandler) -> Any:
+        own = key(self.vehicle_id, topic)
+        hear = only_own(own, lambda sample: handler(sample.payload.to_bytes()))
+        return self._zenoh.declare_subscriber(own, hear)
+
+    def publish_state(self, payload: bytes) -> None:
+        """Send an encoded state to the edge runtime (and to viewers)."""
+        self._states.put(payload)
+
+    def publish_scene(self, environment: Any, stamps: Stamps) -> None:
+        """Send the scene, if the environment has one and anybody is listening."""
+        somebody: Any = self._scenes.matching_status
+        if not somebody.matching:
+            return
+        scene = scene_of(environment)
+        if scene is not None:
+            self._scenes.put(encode_scene(scene, stamps))
+
+    def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
+        """Wait until an edge runtime for this vehicle is there; UserError after ``limit_s``."""
+        give_up_s = time.monotonic() + limit_s
+        while not self._edge_is_there():
+            if time.monotonic() >= give_up_s:
+                raise UserError(
+                    f"no edge runtime after {limit_s:g} s; start one: python -m edge_runtime run "
+                    f"--policy POLICY.onnx --connect {endpoint} --vehicle-id {self.vehicle_id}"
+                )
+            time.sleep(EDGE_POLL_S)
+
+    def note_edge_counts(self) -> None:
+        """Ask the edge runtime for its counts now: before and after the drive."""
+        for reply in self._status_replies():
+            if reply.ok is not None:
+                self.edge_counts.observe_status(reply.ok.payload.to_bytes())
+
+    def edge_policy_id(self) -> str:
+        """Return the policy that the edge runtime says it drives; empty if it says nothing."""
+        self.note_edge_counts()
+        return self.edge_counts.policy_id
+
+    def edge_manifest(self) -> Manifest | None:
+        """Return the manifest of the edge runtime's policy; None if it says nothing."""
+        for reply in self._status_replies():
+            if reply.ok is not None:
+                with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
+                    status = msgspec.json.decode(reply.ok.payload.to_bytes(), type=_Status)
+                    return status.manifest
+        return None
+
+    def _edge_is_there(self) -> bool:
+        """Its token is seen, or it answers: the board's Zenoh can lose the token for a while."""
+        alive = key(self.vehicle_id, "alive")
+        tokens = self._zenoh.liveliness().get(alive, timeout=QUERY_S)
+        return any(reply.ok for reply in tokens) or any(
+            reply.ok for reply in self._status_replies()
+        )
+
+    def _status_replies(self) -> Any:
+        return self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S)
+
+    def close(self) -> None:
+        """Undeclare everything: a callback left open hangs the process at its end."""
+        callbacks = (self._commands, self._feedback, self._health)
+        for declared in (*callbacks, self._token, self._scenes, self._states):
+            if declared is not None:
+                declared.undeclare()
+
+
+@contextlib.contextmanager
+def open_port(
+    listen: str | None,
+    vehicle_id: str,
+    tls: TlsFiles | None = None,
+    connect: str | None = None,
+    wait_s: float = 0.0,
+) -> Iterator[SimulatorPort]:
+    """Listen at ``listen`` for the edge runtime, or share the router at ``connect`` with others.
+
+    With ``tls``, every other party has the rights of its certificate's name and no more; behind a
+    router it is the router that sees to that.
+    UserError if the port is busy, or if no router answers within ``wait_s``.
+    """
+    rules = None
+    if tls is not None:
+        able = (access.ROUTER,) if connect is None else ()
+        access.check_name(tls.name, access.common_name(access.SIMULATOR, vehicle_id), *able)
+        rules = access.rules_for_listener([vehicle_id])
+    # Behind a router a client: two peers there would not hear one another.
+    if connect is not None:
+        zenoh_session = connect_client(connect, wait_s, tls)
+    else:
+        zenoh_session = open_session(listen=listen, mode="router", tls=tls, access=rules)
+    try:
+        port = SimulatorPort(zenoh_session, vehicle_id)
+        try:
+            yield port
+        finally:
+            port.close()
+    finally:
+        zenoh_session.close()
+
+
+class Feed:
+    """The messages in order of arrival, and whether their simulators are there."""
+
+    def __init__(self) -> None:
+        self.simulator_gone = threading.Event()
+        self.simulator_seen = threading.Event()
+        self.dropped = 0
+        self._simulators: set[str] = set()
+        self._queue: queue.Queue[Heard] = queue.Queue(QUEUE_MESSAGES)
+        self._zero_ns = time.time_ns() - time.monotonic_ns()
+
+    @property
+    def waiting(self) -> int:
+        """Return how many messages wait in the queue."""
+        return self._queue.qsize()
+
+    def next(self, timeout_s: float) -> Heard | None:
+        """Return the next message, None if there is none within ``timeout_s``."""
+        try:
+            return self._queue.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def until_gone(self, duration_s: float | None) -> Iterator[Heard]:
+        """Yield messages until no simulator is left and the queue is empty, or the time is over."""
+        end_s = None if duration_s is None else time.monotonic() + duration_s
+        while end_s is None or time.monotonic() < end_s:
+            heard = self.next(POLL_S)
+            if heard is not None:
+                yield heard
+            elif self.simulator_gone.is_set():
+                return
+
+    def now_ns(self) -> int:
+        """Return the clock of ``Heard.arrived_ns``."""
+        return self._zero_ns + time.monotonic_ns()
+
+    def hearer(self, topic: str) -> Callable[[zenoh.Sample], None]:
+        """Return the subscriber callback of one topic."""
+
+        def hear(sample: zenoh.Sample) -> None:
+            if "*" in str(sample.key_expr):
+                return  # put to many vehicles at once: it is nobody's own
+            size = len(sample.payload)
+            # A flood of huge messages must not fill the memory.
+            payload = sample.payload.to_bytes() if size <= MAX_PAYLOAD_BYTES else b""
+            self._put(Heard(str(sample.key_expr), topic, payload, self.now_ns(), size))
+
+        return hear
+
+    def watch(self, topic: str) -> Callable[[zenoh.Sample], None]:
+        """Return the subscriber callback of one kind of token."""
+
+        def change(sample: zenoh.Sample) -> None:
+            key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
+            if topic == "simulator":
+                self._note_simulator(key, here)
+            self._put(Heard(key, topic, bytes([here]), self.now_ns(), 1))
+
+        return change
+
+    def _note_simulator(self, key: str, here: bool) -> None:
+        if here:
+            self._simulators.add(key)
+            self.simulator_gone.clear()
+            self.simulator_seen.set()
+            return
+        self._simulators.discard(key)
+        if not self._simulators:
+            self.simulator_gone.set()
+
+    def _put(self, heard: Heard) -> None:
+        try:
+            self._queue.put_nowait(heard)
+        except queue.Full:
+            self.dropped += 1
+
+
+@contextlib.contextmanager
+def open_feed(
+    connect: str, vehicle_id: str, wait_s: float = 0.0, tls: TlsFiles | None = None
+) -> Iterator[Feed]:
+    """Listen to one vehicle, or to ANY_VEHICLE.
+
+    UserError if no simulator for it is at ``connect`` within ``wait_s``, and for a certificate that
+    may not listen: from here that would look the same.
+    """
+    if tls is not None:
+        access.check_name(tls.name, access.VIEWER)
+    if vehicle_id != ANY_VEHICLE:
+        check_vehicle_id(vehicle_id)
+    give_up_s = time.monotonic() + wait_s
+    session = connect_client(connect, wait_s, tls)
+    try:
+        feed = Feed()
+        declared = [
+            session.declare_subscriber(f"phil/{vehicle_id}/{topic}", feed.hearer(topic))
+            for topic in WIRE_TOPICS
+        ]
+        liveliness = session.liveliness()
+        for topic in TOKEN_TOPICS:
+            token = f"phil/{vehicle_id}/{topic}"
+            declared.append(liveliness.declare_subscriber(token, feed.watch(topic), history=True))
+        try:
+            _wait_for_simulator(feed, give_up_s, vehicle_id, connect)
+            yield feed
+        finally:
+            for subscriber in declared:
+                subscriber.undeclare()
+    finally:
+        session.close()
+
+
+def _wait_for_simulator(feed: Feed, give_up_s: float, vehicle_id: str, endpoint: str) -> None:
+    """Without it, a listener to a vehicle that is not there would never see it go, nor end."""
+    if not feed.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
+        if vehicle_id == ANY_VEHICLE:
+            raise UserError(f"no simulator at {endpoint}; start one: python -m bridge simulate")
+        raise UserError(
+            f"no simulator with vehicle id {vehicle_id} at {endpoint}; name it with --vehicle-id"
+        )
+
+
+def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:
+    """Open a client; try again for ``wait_s``: both ends are often started together."""
+    give_up_s = time.monotonic() + wait_s
+    while True:
+        try:
+            return open_session(connect=endpoint, mode="client", tls=tls)
+        except UserError:
+            if time.monotonic() >= give_up_s:
+                raise
+            time.sleep(RETRY_S)

@@ -1,1 +1,0 @@
-"""MCAP recordings of the wire."""

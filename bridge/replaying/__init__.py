@@ -1,1 +1,0 @@
-"""Recorded states through another policy or runtime, and what differs."""

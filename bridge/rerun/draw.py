@@ -1,0 +1,211 @@
+"""What both views draw: the road from above, plots, and their places in a layout.
+
+Metres; y grows downwards, as in the scene. Cars are lines, because rerun's flat boxes cannot be
+turned.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bridge.messages import SeenCar, SeenScene
+from bridge.rerun import Colour
+
+ROAD = (92, 97, 105)
+PATH = (120, 190, 255)
+GOAL = (84, 200, 120)
+TRAFFIC = (235, 140, 40)
+MARKING = (235, 235, 235)
+GLASS = (30, 34, 40)
+BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
+PURPLE, GREY = (150, 80, 200), (120, 124, 130)
+GROUND = [222, 229, 216]
+MARGIN_M = (10.0, 5.0)
+"""Ground shown beyond path and cars: along x, along y."""
+NEAR_M = 20.0
+"""From the path; whoever is farther away comes into the picture when it matters."""
+ALL_OF_IT = rrb.TimeRange(
+    start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+)
+"""Of the time axis. Otherwise rerun moves the axis with the cursor, and the beginning out of it."""
+PICTURE_INTERVAL_S = 0.1
+"""Ten a second are as many as a control period makes, and plenty for an eye."""
+
+
+def draw_ground(recording: rr.RecordingStream, scene: SeenScene) -> None:
+    """Draw what stays for an episode: roads, path and goal."""
+    _lines(recording, "road/roads", scene.roads, ROAD, scene.road_width_m / 2, order=0.0)
+    _lines(recording, "road/lanes", scene.lane_lines, MARKING, 0.06, order=0.5)
+    _lines(recording, "road/path", [scene.path] if scene.path else [], PATH, 0.15, order=1.0)
+    if scene.goal is not None:
+        recording.log(
+            "road/goal",
+            rr.Points2D([scene.goal], colors=[GOAL], radii=[0.9], labels=["goal"], draw_order=2.0),
+        )
+
+
+def draw_cars(
+    recording: rr.RecordingStream, scene: SeenScene, ego_colour: tuple[int, int, int]
+) -> None:
+    """Draw the cars; the ego car's colour may say what it does, or by whose will."""
+    for name, ego in (("traffic", False), ("ego", True)):
+        cars = [car for car in scene.vehicles if car.ego == ego]
+        _draw_cars(recording, f"road/{name}", cars, ego_colour if ego else TRAFFIC)
+
+
+def _draw_cars(
+    recording: rr.RecordingStream,
+    path: str,
+    cars: Sequence[SeenCar],
+    colour: tuple[int, int, int],
+) -> None:
+    half_widths = [car.width_m / 2 for car in cars]
+    _lines(recording, f"{path}/body", [body(car) for car in cars], colour, half_widths, order=3.0)
+    _lines(recording, f"{path}/outline", [outline(car) for car in cars], GLASS, 0.1, order=4.0)
+    _lines(recording, f"{path}/glass", [windscreen(car) for car in cars], GLASS, 0.3, order=5.0)
+
+
+def _lines(
+    recording: rr.RecordingStream,
+    path: str,
+    strips: Sequence[Sequence[Sequence[float]]],
+    colour: tuple[int, int, int],
+    radii_m: float | list[float],
+    order: float,
+) -> None:
+    recording.log(path, rr.LineStrips2D(strips, colors=[colour], radii=radii_m, draw_order=order))
+
+
+def outline(car: SeenCar) -> list[tuple[float, float]]:
+    """Return the closed outline of the oriented box (five points)."""
+    ahead, aside = car.length_m / 2, car.width_m / 2
+    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
+    return [_place(car, sx * ahead, sy * aside) for sx, sy in signs]
+
+
+def body(car: SeenCar) -> list[tuple[float, float]]:
+    """Return the axis which, drawn as wide as the car, fills its outline (with round ends)."""
+    reach = max(0.0, (car.length_m - car.width_m) / 2)
+    return [_place(car, -reach, 0.0), _place(car, reach, 0.0)]
+
+
+def windscreen(car: SeenCar) -> list[tuple[float, float]]:
+    """Return a bar across the car, before its middle, that tells front from back."""
+    ahead, aside = 0.2 * car.length_m, 0.35 * car.width_m
+    return [_place(car, ahead, -aside), _place(car, ahead, aside)]
+
+
+def view_bounds(scene: SeenScene) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the x and y ranges (m) that show the path, and the cars that are near it now."""
+    path = [(point[0], point[1]) for point in scene.path]
+    cars = [(car.x, car.y) for car in scene.vehicles]
+    ranges = []
+    for axis, margin in enumerate(MARGIN_M):
+        known = [point[axis] for point in path] or [point[axis] for point in cars] or [0.0]
+        low, high = min(known), max(known)
+        near = [point[axis] for point in cars if low - NEAR_M < point[axis] < high + NEAR_M]
+        ranges.append((min([low, *near]) - margin, max([high, *near]) + margin))
+    return ranges[0], ranges[1]
+
+
+def _place(car: SeenCar, ahead_m: float, aside_m: float) -> tuple[float, float]:
+    cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
+    return car.x + ahead_m * cos - aside_m * sin, car.y + ahead_m * sin + aside_m * cos
+
+
+def road_view(scene: SeenScene | None, name: str) -> rrb.Spatial2DView:
+    """The road from above; the ground shown is fixed by ``scene`` (None: as rerun sees fit)."""
+    bounds = None
+    if scene is not None:
+        x_range, y_range = view_bounds(scene)
+        bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
+    return rrb.Spatial2DView(origin="road", name=name, background=GROUND, visual_bounds=bounds)
+
+
+def frames_view() -> rrb.Horizontal:
+    """What the policy sees, and what is to be said of it now."""
+    return rrb.Horizontal(
+        rrb.Spatial2DView(origin="frames/before", name="Policy sees t-1"),
+        rrb.Spatial2DView(origin="frames/now", name="Policy sees t"),
+        rrb.TextDocumentView(origin="status", name="Now"),
+        column_shares=[1, 1, 1],
+    )
+
+
+def full_blueprint(
+    left: rrb.Container, right: rrb.Container, column_shares: list[int], timeline: str
+) -> rrb.Blueprint:
+    """Two columns and nothing else open, along ``timeline``."""
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right, column_shares=column_shares),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=timeline),
+    )
+
+
+class Plot(NamedTuple):
+    """One plot of a layout."""
+
+    origin: str
+    title: str
+    limits: tuple[float, float] | None = None
+    """Of the y axis; None: as the values need."""
+
+
+def plot_view(plot: Plot, shown: rrb.TimeRange = ALL_OF_IT) -> rrb.TimeSeriesView:
+    """The view of a plot; ``shown`` is the part of the time axis."""
+    return rrb.TimeSeriesView(
+        origin=plot.origin,
+        name=plot.title,
+        axis_y=None if plot.limits is None else rrb.ScalarAxis(range=plot.limits),
+        axis_x=rrb.TimeAxis(view_range=shown),
+        plot_legend=rrb.Corner2D.LeftTop,
+    )
+
+
+def style_lines(recording: rr.RecordingStream, lines: Mapping[str, Colour]) -> None:
+    """Name and colour lines by their entities; the name is the path's last part."""
+    for path, colour in lines.items():
+        name = path.rpartition("/")[2].replace("_", " ")
+        style = rr.SeriesLines(colors=[colour], names=[name], widths=[2.0])
+        recording.log(path, style, static=True)
+
+
+def style_points(recording: rr.RecordingStream, points: Mapping[str, Colour]) -> None:
+    """The same for what happens now and then: dots instead of a line."""
+    for path, colour in points.items():
+        name = path.rpartition("/")[2].replace("_", " ")
+        style = rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[4.0])
+        recording.log(path, style, static=True)
+
+
+class Pace:
+    """Says when the next one is due, so that in the long run no more than one an interval is.
+
+    An interval of 0 s takes all.
+
+    One that comes up to half an interval early is taken: what is sent every 0.1 s arrives with
+    some jitter, and waiting for the next would lose every second one.
+    """
+
+    def __init__(self, interval_s: float) -> None:
+        self.interval_s = interval_s
+        self._next_s: float | None = None
+
+    def due(self, now_s: float) -> bool:
+        """Whether one may come now; if so, it is counted."""
+        if not self.interval_s:
+            return True
+        half_s = 0.5 * self.interval_s
+        if self._next_s is None:
+            self._next_s = now_s
+        if now_s < self._next_s - half_s:
+            return False
+        self._next_s = max(self._next_s, now_s - half_s) + self.interval_s
+        return True

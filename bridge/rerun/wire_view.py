@@ -1,0 +1,431 @@
+"""``python -m bridge view``: the wire in rerun, as a listener of its own or from a recording."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bridge.commands import add_connect, add_span, add_tls, wait_to_be_told
+from bridge.messages import MESSAGES, Heard, Scene
+from bridge.ports import open_feed
+from bridge.recording import Recording, read_heard
+from bridge.rerun import APPLIED, POLICY
+from bridge.rerun.draw import (
+    ALL_OF_IT,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PICTURE_INTERVAL_S,
+    PURPLE,
+    RED,
+    Pace,
+    Plot,
+    draw_cars,
+    draw_ground,
+    frames_view,
+    full_blueprint,
+    plot_view,
+    road_view,
+    style_lines,
+)
+from bridge.rerun.sinks import SERVE, Sink, add_sink, check_sink, chosen_sink, flush, open_sink
+from bridge.virtual_link import SILENCE_LIMIT_S
+from edge_runtime import wire
+from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.tls import TlsFiles, tls_for
+from edge_runtime.topics import DEFAULT_VEHICLE_ID
+from edge_runtime.transport import check_endpoint
+from edge_runtime.wire import CONTROL_PERIOD_S, Command, Feedback, Health, State
+
+APPLICATION = "phil_hil"
+EXAMPLE = examples(
+    "python -m bridge view --serve",
+    "python -m bridge view --save drive.rrd --wait-s 60",
+    "python -m bridge view hil_tests/recordings/left_turn.mcap --save left_turn.rrd",
+)
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "recording",
+        nargs="?",
+        metavar="F.mcap",
+        help="show what bridge record has written, instead of listening",
+    )
+    add_sink(parser)
+    add_connect(parser)
+    add_tls(parser)
+    parser.add_argument(
+        "--vehicle-id",
+        metavar="ID",
+        help=f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)",
+    )
+    add_span(parser)
+
+
+def run(arguments: Any) -> int:
+    """Run the command until the simulator goes, the time is over, or somebody interrupts."""
+    if arguments.vehicle_id is not None:
+        wire.check_vehicle_id(arguments.vehicle_id)
+    sink = chosen_sink(arguments)
+    if arguments.recording is not None:
+        check_sink(sink)
+        _show_recording(arguments, sink)
+    else:
+        tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+        check_sink(sink)
+        dropped = _watch(arguments, sink, tls)
+        if dropped:
+            print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
+    if sink.path:
+        print(f"wrote {sink.path}")
+    return 0
+
+
+def _show_recording(arguments: Any, sink: Sink) -> None:
+    """Draw all of it; a page is served until somebody interrupts."""
+    file = Recording(Path(arguments.recording))
+    heard = read_heard(file, arguments.vehicle_id)
+    first = next(heard, None)  # Says what is wrong with the file before anything is opened.
+    with (
+        sigterm_as_interrupt(),
+        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        log = WireLog(recording)
+        for each in chain([first] if first else [], heard):
+            _write(log, each)
+        if file.trouble():
+            text = f"the recording {file.trouble()}; what is whole of it is shown"
+            print(text, file=sys.stderr, flush=True)
+        if sink.kind == SERVE:
+            flush(recording)
+            print("all of it is there; ^C ends", flush=True)
+            wait_to_be_told()
+
+
+def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
+    """Draw until there is a reason to stop; return how many messages had to be dropped."""
+    vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
+    with (
+        sigterm_as_interrupt(),
+        open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,
+        open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
+        # Being interrupted is the ordinary way to end a view: what was drawn is kept.
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
+        for heard in feed.until_gone(arguments.duration_s):
+            _write(log, heard)
+    return feed.dropped
+
+
+def _write(log: WireLog, heard: Heard) -> None:
+    row = MESSAGES.get(heard.topic)
+    if row is None:
+        return  # A token: it shows as silence.
+    message = row.decode(heard.payload)
+    if message is None or isinstance(message, wire.Rejection):
+        log.write_unreadable(heard.topic, message.detail if message else "not a scene")
+    else:
+        getattr(log, f"write_{heard.topic}")(message, heard.arrived_ns)
+
+
+PLOTS = (
+    Plot("action", "Command in [-1, 1]: asked and achieved", (-1.1, 1.1)),
+    Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
+    Plot("latency", "Latency, ms: round trip, and its parts"),
+    Plot("rejected", "Messages rejected so far, by reason"),
+)
+"""From top to bottom."""
+SERIES = {
+    "action/asked": POLICY,
+    "action/achieved": APPLIED,
+    "speed/simulated": BLUE,
+    "speed/vehicle": ORANGE,
+    "latency/uplink": BLUE,
+    "latency/inference": GREEN,
+    "latency/downlink": PURPLE,
+    "latency/round_trip": ORANGE,
+}
+"""Lines that are there from the start; those of rejections come with their reasons."""
+
+
+def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
+    """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
+    left = rrb.Vertical(road_view(scene, "Road from above"), frames_view(), row_shares=[3, 1.4])
+    return full_blueprint(left, _numbers(), [3, 2], "sim_time")
+
+
+def _numbers() -> rrb.Vertical:
+    return rrb.Vertical(
+        rrb.StateTimelineView(
+            origin="mode",
+            name="Mode, and why it does not drive",
+            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+        ),
+        *map(plot_view, PLOTS),
+        rrb.TextLogView(
+            origin="events",
+            name="Events: modes, rejections, episodes",
+            columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
+        ),
+        row_shares=[2.2, 2, 2, 2, 1.6, 1.8],
+    )
+
+
+SILENT = "no command"
+NOTHING_WRONG = "-"
+REMEMBERED_STATES = 64
+"""States whose sending time is kept, for the latency of their commands."""
+EGO = {"drive": POLICY, "safe_stop": RED, SILENT: (160, 30, 120)}
+"""Colour of the ego car by what it is told."""
+ALL = "all"
+"""The sum over the reasons, which has a line from the start."""
+SIDES = {"edge": ORANGE, "simulator": BLUE}
+"""Who rejects, and the colour of all that it has rejected."""
+
+
+class WireLog:
+    """Draws the messages of one vehicle; used by one thread. Times are passed in.
+
+    Args:
+        recording: where.
+        picture_interval_s: frames and scenes are drawn no more often than this by their arrival;
+            numbers always are. 0: all, as in a file, where simulated time is what counts.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, picture_interval_s: float = 0.0) -> None:
+        self._recording = recording
+        self._frames_pace, self._cars_pace = Pace(picture_interval_s), Pace(picture_interval_s)
+        self._timeline = Timeline()
+        self._told, self._reason = "", ""
+        self._heard_command_ns: int | None = None
+        self._sent_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._answered_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
+        """From the sending of a state to that of its command, by the stamps of both."""
+        self._split: tuple[int, int] | None = None
+        """The state whose round trip was drawn in its parts last."""
+        self._edge_counts: dict[str, int] = {}
+        self._reasons: set[tuple[str, str]] = set()
+        self._drawn_episode = -1
+        self._health: Health | None = None
+        self._define_series()
+
+    def write_state(self, state: State, arrived_ns: int) -> None:
+        """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
+        self._stand_at(self._timeline.place(state.episode, state.step))
+        self._remember(state)
+        if self._frames_pace.due(arrived_ns * 1e-9):
+            before, now = state.frames_array()
+            self._recording.log("frames/before", rr.Image(before, color_model="L"))
+            self._recording.log("frames/now", rr.Image(now, color_model="L"))
+        self._scalar("speed/simulated", state.speed_mps)
+        if state.step == 0:
+            self._event(f"episode {state.episode} begins")
+        if state.final:
+            self._event(f"episode {state.episode} ends at step {state.step}")
+        if self._heard_command_ns is None:
+            # A viewer that comes late has not yet had the time to hear one.
+            self._heard_command_ns = arrived_ns
+        silent = arrived_ns - self._heard_command_ns > SILENCE_LIMIT_S * 1e9
+        # Between two episodes nobody owes a command.
+        if silent and state.step > 0 and not state.final:
+            self._scalar("action/asked", math.nan)  # A gap in the line: nothing is asked.
+            self._tell(SILENT, "the simulator brakes by itself", rr.TextLogLevel.WARN)
+
+    def write_command(self, command: Command, arrived_ns: int) -> None:
+        """Draw what is asked, the mode, and where the time went."""
+        self._stand_at(self._timeline.place(command.episode, command.step))
+        self._heard_command_ns = arrived_ns
+        self._action("action/asked", command.action)
+        sent_ns = self._sent_ns.get((command.episode, command.step))
+        if sent_ns is not None:
+            self._scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
+            # A safe stop is repeated for as long as it lasts: only the first is the answer.
+            if (command.episode, command.step) not in self._answered_ns:
+                answered_ns = command.sent_ns - sent_ns
+                _keep(self._answered_ns, (command.episode, command.step), answered_ns)
+        self._scalar("latency/inference", command.inference_ns * 1e-6)
+        driving = command.mode == "drive"
+        level = rr.TextLogLevel.INFO if driving else rr.TextLogLevel.WARN
+        self._tell(command.mode, command.reason, level)
+
+    def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
+        """Draw what the vehicle has reached."""
+        self._action("action/achieved", feedback.action)
+        self._scalar("speed/vehicle", feedback.speed_mps)
+
+    def write_health(self, health: Health, _arrived_ns: int) -> None:
+        """Refresh the status text, and note what the edge runtime has newly rejected."""
+        for reason, count in health.rejected.items():
+            new = count - self._edge_counts.get(reason, 0)
+            if new > 0:
+                self._event(f"edge rejected {new} states: {reason}", rr.TextLogLevel.WARN)
+        self._edge_counts = dict(health.rejected)
+        self._rejections("edge", health.rejected)
+        self._health = health
+        self._write_status()
+
+    def write_scene(self, scene: Scene, arrived_ns: int) -> None:
+        """Draw the road from above; the first scene also decides which ground is shown."""
+        self._stand_at(self._timeline.place(scene.episode, scene.step))
+        if self._drawn_episode < 0:
+            self._recording.send_blueprint(make_blueprint(scene))
+        if self._drawn_episode != scene.episode:
+            self._drawn_episode = scene.episode
+            draw_ground(self._recording, scene)
+        self._round_trip(scene)
+        self._rejections("simulator", scene.rejected)
+        if self._cars_pace.due(arrived_ns * 1e-9):
+            draw_cars(self._recording, scene, EGO[self._told or SILENT])
+
+    def write_unreadable(self, topic: str, why: str) -> None:
+        """Note a message that the viewer cannot read."""
+        self._event(f"unreadable {topic}: {why}", rr.TextLogLevel.ERROR)
+
+    def _define_series(self) -> None:
+        style_lines(self._recording, SERIES)
+        for side, colour in SIDES.items():
+            self._style_rejections(side, ALL, colour)
+        lanes = rr.StateConfiguration(values=list(EGO), labels=list(EGO), colors=list(EGO.values()))
+        self._recording.log("mode/mode", lanes, static=True)
+        quiet = rr.StateConfiguration(values=[NOTHING_WRONG], labels=[" "], colors=[GREY])
+        self._recording.log("mode/reason", quiet, static=True)
+
+    def _stand_at(self, moment: Moment) -> None:
+        recording = self._recording
+        recording.reset_time()
+        recording.set_time("sim_time", duration=moment.sim_time_s)
+        recording.set_time("step", sequence=moment.total_step)
+        recording.set_time(f"episode_{moment.episode}", duration=moment.episode_time_s)
+
+    def _remember(self, state: State) -> None:
+        _keep(self._sent_ns, (state.episode, state.step), state.sent_ns)
+
+    def _round_trip(self, scene: Scene) -> None:
+        """The newest round trip, and what is left of it for the way down."""
+        if scene.round_trip_ms is None or scene.answered_step is None:
+            return
+        self._scalar("latency/round_trip", scene.round_trip_ms)
+        answered_ns = self._answered_ns.get((scene.episode, scene.answered_step))
+        # It is told with every scene until the next one is known.
+        is_new = (scene.episode, scene.answered_step) != self._split
+        if answered_ns is not None and is_new:
+            self._split = (scene.episode, scene.answered_step)
+            self._scalar("latency/downlink", scene.round_trip_ms - answered_ns * 1e-6)
+
+    def _rejections(self, side: str, counts: Mapping[str, int]) -> None:
+        self._scalar(f"rejected/{side}/{ALL}", sum(counts.values()))
+        for reason, count in counts.items():
+            if count and (side, reason) not in self._reasons:
+                self._reasons.add((side, reason))
+                self._style_rejections(side, reason, GREY)
+                self._scalar(f"rejected/{side}/{reason}", 0)
+            if count:
+                self._scalar(f"rejected/{side}/{reason}", count)
+
+    def _style_rejections(self, side: str, reason: str, colour: tuple[int, int, int]) -> None:
+        style = rr.SeriesLines(colors=[colour], names=[f"{side}: {reason}"], widths=[2.0])
+        self._recording.log(f"rejected/{side}/{reason}", style, static=True)
+
+    def _tell(self, mode: str, reason: str, level: rr.TextLogLevel) -> None:
+        """Draw the mode where it changes."""
+        if (mode, reason) == (self._told, self._reason):
+            return
+        self._told, self._reason = mode, reason
+        self._recording.log("mode/mode", rr.StateChange(state=mode))
+        self._recording.log("mode/reason", rr.StateChange(state=reason or NOTHING_WRONG))
+        self._event(f"{mode}: {reason}" if reason else mode, level)
+        self._write_status()
+
+    def _action(self, path: str, action: Sequence[float]) -> None:
+        self._recording.log(path, rr.Scalars(list(action)))
+
+    def _scalar(self, path: str, value: float) -> None:
+        self._recording.log(path, rr.Scalars(value))
+
+    def _event(self, text: str, level: rr.TextLogLevel = rr.TextLogLevel.INFO) -> None:
+        self._recording.log("events", rr.TextLog(text, level=level))
+
+    def _write_status(self) -> None:
+        lines = [f"# {self._told or 'waiting'}", self._reason]
+        if self._health is not None:
+            lines += _health_lines(self._health)
+        text = "\n\n".join(line for line in lines if line)
+        self._recording.log("status", rr.TextDocument(text, media_type="text/markdown"))
+
+
+def _keep(table: OrderedDict[tuple[int, int], int], key: tuple[int, int], value: int) -> None:
+    table[key] = value
+    if len(table) > REMEMBERED_STATES:
+        table.popitem(last=False)
+
+
+def _health_lines(health: Health) -> list[str]:
+    rejected = ", ".join(f"{reason} {count}" for reason, count in health.rejected.items() if count)
+    return [
+        f"policy `{health.policy_id[:12]}`, vehicle `{health.vehicle}`",
+        f"states accepted {health.accepted}, rejected: {rejected or 'none'}",
+        f"safe stops {health.safe_stops}, deadline misses {health.deadline_misses}",
+        "inference p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**health.inference_ms)
+        if {"p50", "p99"} <= set(health.inference_ms)
+        else "",
+    ]
+
+
+class Moment(NamedTuple):
+    """One place on all timelines."""
+
+    episode: int
+    step: int
+    """Within the episode."""
+    total_step: int
+    """Episodes end to end."""
+
+    @property
+    def sim_time_s(self) -> float:
+        """Simulated time with the episodes end to end, in seconds."""
+        return self.total_step * CONTROL_PERIOD_S
+
+    @property
+    def episode_time_s(self) -> float:
+        """Simulated time within the episode, in seconds."""
+        return self.step * CONTROL_PERIOD_S
+
+
+class Timeline:
+    """Where a message stands in time.
+
+    Each episode's steps begin at 0; laid over one another they could not be told apart. So episodes
+    are put end to end on the timelines ``sim_time`` and ``step``, and each has its own besides,
+    ``episode_0`` and so on, that begins at 0. Where each begins is learnt from what is seen, so
+    that a viewer may come late.
+    """
+
+    def __init__(self) -> None:
+        self.now = Moment(0, 0, 0)
+        self._starts: dict[int, int] = {}
+        self._end_step = 0
+
+    def place(self, episode: int, step: int) -> Moment:
+        """Return the moment of a step and move ``now`` there if that is forward."""
+        # A viewer that comes late begins at zero as well: its first step is the first it saw.
+        start = self._starts.setdefault(episode, self._end_step)
+        moment = Moment(episode, step, start + step)
+        self._end_step = max(self._end_step, moment.total_step + 1)
+        if moment.total_step > self.now.total_step:
+            self.now = moment
+        return moment

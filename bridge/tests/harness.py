@@ -1,0 +1,216 @@
+"""The bridge's commands as processes, for the tests."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from mcap.reader import make_reader
+from mcap.records import Chunk, ChunkIndex, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from bridge.__main__ import main
+from edge_runtime.policy import load_policy
+from edge_runtime.tests.commands import exit_status
+from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, wait_until
+from edge_runtime.tests.policies import write_policy
+from edge_runtime.wire import Command, Feedback
+
+TOY = "bridge.tests.toy:BridgeToy-v0"
+SHORT_TOY = "bridge.tests.toy:BridgeToyShort-v0"
+SLOW_TOY = "bridge.tests.toy:BridgeToySlow-v0"
+
+
+class BridgeProcess:
+    """``python -m bridge`` with a subcommand; killed at the end of the block if need be."""
+
+    def __init__(self, *arguments: str, environment: dict[str, str] | None = None) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "bridge", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **(environment or {})},
+        )
+        self.output, self.errors = "", ""
+
+    def wait(self, timeout_s: float = 60.0) -> int:
+        """Return the exit status; ``output`` and ``errors`` hold what was printed."""
+        self.output, self.errors = self.process.communicate(timeout=timeout_s)
+        return self.process.returncode
+
+    def __enter__(self) -> BridgeProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate()
+
+
+def start_edge(
+    endpoint: str, policy: Path, *options: str, stderr: Any = subprocess.PIPE
+) -> EdgeProcess:
+    """Start ``python -m edge_runtime run`` with an unsigned test policy and wait until ready."""
+    fixed = ("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
+    return EdgeProcess(*fixed, *options, stderr=stderr)
+
+
+def bridge_status(arguments: list[str]) -> int:
+    """Run ``python -m bridge`` in this process; return its exit status."""
+    return exit_status(main, arguments)
+
+
+def wait_until_driving(edge: EdgeProcess) -> None:
+    """Wait for the log line with which the edge runtime says that it drives."""
+    log = edge.process.stderr
+    assert log is not None
+    wait_until(lambda: "now=drive" in log.readline(), "the first drive")
+
+
+def wait_until_driving_steadily(log: Path, steady_s: float = 0.4) -> None:
+    """Wait until the edge runtime, whose stderr is ``log``, has driven that long without a stop.
+
+    On a busy machine it may stop for a reason of its own, at any time.
+    """
+
+    def steady() -> bool:
+        before = log.read_text()
+        if not before.rpartition("now=")[2].startswith("drive"):
+            return False
+        time.sleep(steady_s)
+        return log.read_text() == before
+
+    wait_until(steady, "a steady drive")
+
+
+def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
+    """Write a test policy file."""
+    path = folder / f"{kind}{value:g}.onnx"
+    write_policy(path, kind, value)
+    return path
+
+
+def start_simulate(endpoint: str, out: Path, env: str, *options: str) -> BridgeProcess:
+    """Start ``python -m bridge simulate``."""
+    fixed = ["simulate", "--env", env, "--listen", endpoint, "--out", str(out)]
+    return BridgeProcess(*fixed, *options)
+
+
+def simulate(folder: Path, endpoint: str, env: str, options: Sequence[str]) -> dict[str, Any]:
+    """Run ``simulate`` to its end and return the report."""
+    out = folder / f"report-{time.monotonic_ns()}.json"
+    with start_simulate(endpoint, out, env, *options) as run:
+        assert run.wait(PATIENCE_S * 3) == 0, run.errors
+    return read(out)
+
+
+def simulate_undisturbed(
+    folder: Path, endpoint: str, env: str, options: Sequence[str], attempts: int = 4
+) -> dict[str, Any]:
+    """Run ``simulate`` again where the machine itself stood still for over 2 T in the middle.
+
+    Both ends live in wall time, so a test machine that pauses causes a rightful safe stop. In lock
+    step the report counts those; in real time the reasons are the edge runtime's, and what a test
+    injects shows as ``no_command``.
+    """
+    for _ in range(attempts):
+        report = simulate(folder, endpoint, env, options)
+        reasons = {event["reason"] for event in report["safe_stop_events"]}
+        if report["clock"] == "lockstep" and not report["wall_clock_stalls"]:
+            return report
+        if report["clock"] == "realtime" and reasons <= {"no_command"}:
+            return report
+    raise AssertionError(f"disturbed {attempts} times: {report['safe_stop_events']}")
+
+
+def drive_in_process(policy_path: Path, seed: int) -> tuple[str, np.ndarray]:
+    """Drive one episode of TOY without any wire; return its outcome and actions."""
+    policy = load_policy(str(policy_path), allow_unsigned=True)
+    environment = gymnasium.make(TOY)
+    frames, info = environment.reset(seed=seed)
+    actions, ended = [], False
+    while not ended:
+        actions.append(policy.act(frames))
+        frames, _, terminated, truncated, info = environment.step(actions[-1])
+        ended = terminated or truncated
+    return info["outcome"], np.array(actions)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Return a JSON report."""
+    return json.loads(path.read_text())
+
+
+def make_command(step: int, **changes: Any) -> Command:
+    """Make a valid command of session ``here``, episode 0; ``changes`` replace its fields."""
+    fields: dict[str, Any] = {
+        "session": "here",
+        "episode": 0,
+        "step": step,
+        "mode": "drive",
+        "action": [0.5],
+        "policy_id": "p",
+        "received_ns": 1,
+        "inference_ns": 1,
+        "sent_ns": 1,
+    }
+    return Command(**{**fields, **changes})
+
+
+def make_feedback(step: int, **changes: Any) -> Feedback:
+    """Make a valid feedback of a vehicle that obeys ``make_command(step)``, stamped at its tick."""
+    fields: dict[str, Any] = {
+        "vehicle": "robot",
+        "session": "here",
+        "episode": 0,
+        "step": step,
+        "mode": "drive",
+        "action": [0.5],
+        "speed_mps": 1.0,
+        "self_braking": False,
+        "faults": [],
+        "sent_ns": 1_000_000_000 + step * 100_000_000,
+    }
+    return Feedback(**{**fields, **changes})
+
+
+LEFT_TURN = Path(__file__).parents[2] / "hil_tests" / "recordings" / "left_turn.mcap"
+
+
+def chunks(path: Path) -> list[ChunkIndex]:
+    """Where the chunks of a whole recording lie."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary.chunk_indexes
+
+
+def messages_of(path: Path, chunk: ChunkIndex) -> int:
+    """How many messages a chunk of an undamaged file holds."""
+    with path.open("rb") as stream:
+        stream.seek(chunk.chunk_start_offset)
+        record = next(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
+    assert isinstance(record, Chunk)
+    return sum(isinstance(part, Message) for part in breakup_chunk(record, True))
+
+
+def flip(path: Path, at: int, count: int = 4) -> None:
+    """Turn round every bit of some bytes."""
+    data = bytearray(path.read_bytes())
+    data[at : at + count] = bytes(byte ^ 0xFF for byte in data[at : at + count])
+    path.write_bytes(data)
+
+
+def flip_chunk(path: Path, number: int) -> None:
+    """Damage what the chunk holds, so that its checksum is wrong."""
+    index = chunks(path)[number]
+    flip(path, index.chunk_start_offset + index.chunk_length // 2)

@@ -1,0 +1,232 @@
+"""The timer thread: what goes wrong on it is heard."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from bridge.clocks import DelayLine, LockStepClock, RealTimeClock
+from bridge.inbound import CommandCheck
+from bridge.network import parse_spec
+from bridge.tests.harness import make_command
+from bridge.virtual_link import NO_COMMAND
+from edge_runtime.tests.harness import make_state, wait_until
+from edge_runtime.wire import State, decode_state, encode
+
+
+def test_what_an_action_raises_reaches_the_caller():
+    def fail():
+        raise ValueError("no link")
+
+    line = DelayLine()
+    line.push(time.monotonic(), fail)
+    wait_until(lambda: not line._thread.is_alive(), "the line to end")
+    with pytest.raises(ValueError, match="no link"):
+        line.push(time.monotonic(), fail)
+    with pytest.raises(ValueError, match="no link"):
+        line.close()
+
+
+def obedient(step):
+    return make_command(step, action=[step / 1000])
+
+
+class Rig:
+    """A clock whose publications are answered in the same call; ``answer`` None is a dead edge."""
+
+    def __init__(self, spec="none", answer=obedient):
+        self.check = CommandCheck("here", action_size=1)
+        self.clock = LockStepClock(self.publish, self.check, parse_spec(spec))
+        self.published: list[int] = []
+        self.answer = answer
+
+    def publish(self, payload):
+        state = decode_state(payload)
+        assert isinstance(state, State)
+        # The edge runtime answers no state that is as old as one it has seen, or older.
+        refused = any(state.step <= step for step in self.published)
+        self.published.append(state.step)
+        if not refused and self.answer is not None:
+            self.clock.receive(encode(self.answer(state.step)))
+
+    def drive(self, steps, seed=0):
+        self.clock.begin(0, seed)
+        return [self.clock.exchange(make_state(step, session="here")) for step in range(steps)]
+
+
+def used(decisions):
+    return [None if d.command is None else d.command.step for d in decisions]
+
+
+def test_without_latency_every_state_meets_its_own_command():
+    rig = Rig()
+    assert used(rig.drive(10)) == list(range(10))
+    assert not rig.check.rejected
+
+
+def test_a_command_inside_the_window_acts_in_its_tick_and_outside_it_in_the_next():
+    assert used(Rig("up.delay=10ms,down.delay=15ms").drive(4)) == [0, 1, 2, 3]
+    assert used(Rig("up.delay=10ms,down.delay=15.1ms").drive(4)) == [None, 0, 1, 2]
+
+
+def test_the_action_is_as_old_as_the_latency():
+    decisions = Rig("100ms").drive(6)
+    assert used(decisions) == [None, None, 0, 1, 2, 3]
+    assert not any(decision.brake_reason for decision in decisions)
+
+
+def test_the_latency_reported_is_the_virtual_one():
+    rig = Rig("50ms")
+    rig.drive(10)
+    assert all(100 <= latency_ms < 150 for latency_ms in rig.clock.latencies_ms)
+    assert len(rig.clock.latencies_ms) == 9
+
+
+def test_the_same_seed_is_the_same_run_and_another_seed_another():
+    spec = "60ms+-40ms,loss=10%"
+    first, again, other = (used(Rig(spec).drive(60, seed)) for seed in (3, 3, 4))
+    assert first == again
+    assert first != other
+
+
+def test_jitter_reorders_and_the_overtaken_state_is_not_waited_for():
+    rig = Rig("up.delay=100ms,up.jitter=80ms")
+    started_s = time.monotonic()
+    rig.drive(60)
+    assert rig.published != sorted(rig.published)
+    assert time.monotonic() - started_s < 2.0  # Nothing timed out.
+
+
+def test_duplicates_reach_the_edge_and_the_vehicle_and_nobody_waits_for_an_answer():
+    rig = Rig("10ms,duplicate=100%")
+    started_s = time.monotonic()
+    decisions = rig.drive(20)
+    assert time.monotonic() - started_s < 2.0  # Nothing timed out.
+    assert rig.published == [step for step in range(20) for _ in range(2)]
+    assert used(decisions) == list(range(20))
+    assert dict(rig.check.rejected) == {"stale": 20}
+    assert len(rig.clock.latencies_ms) == 20
+
+
+def test_a_slow_line_carries_no_more_states_than_its_rate():
+    # One state of 7.3 kB takes 146 ms at 400 kbit/s: with a short queue two of three get through.
+    rig = Rig("up.rate=400kbit/s,up.queue=50ms")
+    rig.drive(60)
+    assert 38 <= len(rig.published) <= 42
+
+
+def test_an_outage_brakes_and_ends_with_the_fifth_fresh_state():
+    reasons = [d.brake_reason for d in Rig("outage=0.5s@1s").drive(20)]
+    assert [bool(reason) for reason in reasons] == [11 <= step < 19 for step in range(20)]
+    assert set(reasons[11:15]) == {NO_COMMAND}
+    assert set(reasons[15:19]) == {"no_fresh_state"}
+
+
+def test_one_lost_state_is_no_silence_and_two_are():
+    one, two = (Rig(f"up.outage={length}s@0.95s").drive(20) for length in (0.1, 0.2))
+    assert not any(decision.brake_reason for decision in one)
+    braking = [decision.brake_reason for decision in two if decision.brake_reason]
+    assert braking == [NO_COMMAND, *["no_fresh_state"] * 4]
+
+
+def test_a_machine_that_stalls_is_counted_apart_from_the_network():
+    rig = Rig()
+    rig.drive(3)
+    rig.answer = lambda step: make_command(step, mode="safe_stop", reason="no_fresh_state")
+    rig.clock.exchange(make_state(3, session="here"))
+    assert rig.clock.wall_clock_stalls == 1
+    late = Rig("outage=0.5s@1s")
+    late.drive(20)
+    assert late.clock.wall_clock_stalls == 0
+
+
+def test_every_feature_at_once_repeats_itself():
+    spec = (
+        "60ms+-40ms,tail=pareto,loss=5%,burst=3,reorder=5%,duplicate=5%,rate=2Mbit/s,outage=0.3s/2s"
+    )
+    first, again, other = (Rig(spec) for _ in range(3))
+    runs = [used(rig.drive(100, seed)) for rig, seed in ((first, 3), (again, 3), (other, 4))]
+    assert runs[0] == runs[1] != runs[2]
+    assert first.published == again.published != other.published
+    assert first.check.rejected == again.check.rejected
+
+
+def test_a_dead_link_brakes_after_2_periods_of_virtual_time():
+    for spec in ("up.loss=100%", "down.loss=100%"):
+        rig = Rig(spec)
+        reasons = [decision.brake_reason for decision in rig.drive(6)]
+        assert reasons == ["", "", NO_COMMAND, NO_COMMAND, NO_COMMAND, NO_COMMAND]
+
+
+def test_a_silent_edge_costs_2_periods_of_wall_time_once_then_one_a_step():
+    rig = Rig()
+    rig.drive(3)
+    rig.answer = None
+    started_s = time.monotonic()
+    decisions = [rig.clock.exchange(make_state(step, session="here")) for step in (3, 4)]
+    waited_s = time.monotonic() - started_s
+    assert [decision.brake_reason for decision in decisions] == [NO_COMMAND, NO_COMMAND]
+    assert decisions[0].undriven_s >= 0.2
+    assert 0.28 <= waited_s < 1.0
+    rig.answer = obedient
+    assert rig.clock.exchange(make_state(5, session="here")).brake_reason == ""
+
+
+def test_a_safe_stop_command_brakes_with_its_reason():
+    stop = make_command(0, mode="safe_stop", reason="inference_too_slow")
+    assert Rig(answer=lambda step: stop).drive(1)[0].brake_reason == "inference_too_slow"
+
+
+def test_only_faults_are_counted_among_what_comes_unasked():
+    rig = Rig()
+    rig.drive(3)
+    rig.clock.receive(encode(make_command(2, mode="safe_stop")))  # The edge's own watchdog.
+    rig.clock.receive(encode(make_command(2, session="elsewhere")))
+    rig.clock.receive(b"junk")
+    rig.clock.exchange(make_state(3, session="here"))
+    assert dict(rig.check.rejected) == {"foreign_session": 1, "malformed": 1}
+
+
+STEPS = 7
+
+
+class RealTimeRig:
+    """A clock whose first publication of each state is answered on the delay line's thread."""
+
+    def __init__(self, spec: str) -> None:
+        self.check = CommandCheck("here", action_size=1)
+        self.clock = RealTimeClock(self.publish, self.check, parse_spec(spec))
+        self.published: list[int] = []
+
+    def publish(self, payload):
+        state = decode_state(payload)
+        assert isinstance(state, State)
+        fresh = state.step not in self.published
+        self.published.append(state.step)
+        if fresh:
+            self.clock.receive(encode(make_command(state.step)))
+
+    def drive(self):
+        self.clock.begin(0, seed=0)
+        try:
+            for step in range(STEPS):
+                self.clock.exchange(make_state(step, session="here"))
+        finally:
+            self.clock.close()
+
+
+def test_duplicates_come_out_twice_on_both_ways():
+    rig = RealTimeRig("5ms,duplicate=100%")
+    rig.drive()
+    # The last command's copy may come after the last tick.
+    assert rig.published == [step for step in range(STEPS) for _ in range(2)]
+    assert STEPS - 1 <= rig.check.rejected["stale"] <= STEPS
+    assert len(rig.clock.latencies_ms) == STEPS
+
+
+def test_an_outage_is_timed_from_the_episodes_start():
+    rig = RealTimeRig("up.outage=1000s@0.25s")
+    rig.drive()
+    assert rig.published[0] == 0
+    assert STEPS - 1 not in rig.published

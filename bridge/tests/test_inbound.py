@@ -1,0 +1,361 @@
+"""The vehicle's side of the safety rules: what is believed, held, and braked for."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.episode import vehicle_action
+from bridge.inbound import (
+    NO_FEEDBACK,
+    SELF_BRAKING,
+    CommandCheck,
+    EdgeCounts,
+    FeedbackCheck,
+    FeedbackHold,
+    VehicleDecision,
+)
+from bridge.report import SafeStopLog, rejections
+from bridge.tests.harness import make_command, make_feedback
+from bridge.tests.toy import ToyEnv
+from bridge.virtual_link import NO_COMMAND, CommandHold
+from edge_runtime.wire import Health, encode
+
+
+def checking(newest_step=5):
+    check = CommandCheck("here", action_size=1)
+    check.begin(0)
+    check.sent(newest_step)
+    return check
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"\x00", "malformed"),
+        (bytes(70_000), "oversized"),
+        (encode(make_command(5, schema=2)), "schema"),
+        (encode(make_command(5, action=[float("nan")])), "not_finite"),
+        (encode(make_command(5, action=[1.5])), "malformed"),
+        (encode(make_command(5, session="elsewhere")), "foreign_session"),
+        (encode(make_command(5, action=[0.1, 0.1])), "action_size"),
+        (encode(make_command(5, action=[])), "malformed"),
+        (encode(make_command(6)), "unknown_step"),
+        (encode(make_command(0, episode=1)), "unknown_step"),
+    ],
+)
+def test_a_command_that_answers_nothing_is_counted_by_reason(payload, reason):
+    check = checking()
+    assert check.read(payload) is None
+    assert dict(check.rejected) == {reason: 1}
+
+
+def test_a_good_command_passes_and_names_the_policy():
+    check = checking()
+    command = make_command(5, policy_id="abc")
+    assert check.read(encode(command)) == command
+    assert (check.policy_ids, dict(check.rejected)) == (["abc"], {})
+
+
+def test_an_earlier_episode_is_stale_but_an_overtaken_answer_is_no_fault():
+    check = checking(newest_step=5)
+    check.end(final_step=6, answered_step=4)
+    check.begin(1)
+    assert check.read(encode(make_command(5))) is None
+    assert check.read(encode(make_command(6))) is None
+    assert dict(check.rejected) == {}
+    assert check.read(encode(make_command(3))) is None
+    assert dict(check.rejected) == {"stale": 1}
+
+
+def test_the_newest_command_is_held_for_2_periods_and_no_longer():
+    hold = CommandHold(now_s=0.0)
+    assert hold.admit(make_command(0), now_s=0.01, sent_s=0.01)
+    assert hold.decide(0.025).brake_reason == ""
+    held = hold.decide(0.2)
+    assert (held.brake_reason, held.fresh, held.command) == ("", False, make_command(0))
+    braking = hold.decide(0.22)
+    assert braking.brake_reason == NO_COMMAND
+    assert braking.undriven_s == pytest.approx(0.21)
+    assert braking.command_age_s is None  # It obeys none.
+
+
+def test_a_command_is_as_old_as_the_state_that_it_answers():
+    hold = CommandHold(now_s=0.0)
+    assert hold.decide(0.025).command_age_s is None
+    hold.admit(make_command(0), now_s=0.06, sent_s=0.0)
+    assert hold.decide(0.125).command_age_s == pytest.approx(0.125)
+    assert hold.decide(0.225).command_age_s == pytest.approx(0.225)
+
+
+def test_without_any_command_it_brakes_after_2_periods():
+    hold = CommandHold(now_s=5.0)
+    assert hold.decide(5.2).brake_reason == ""
+    assert hold.decide(5.201).brake_reason == NO_COMMAND
+
+
+def test_a_repeated_drive_command_is_no_heartbeat_but_a_repeated_safe_stop_is():
+    hold = CommandHold(now_s=0.0)
+    assert hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
+    assert not hold.admit(make_command(3), now_s=0.1, sent_s=0.1)
+    assert not hold.admit(make_command(2), now_s=0.1, sent_s=0.1)
+    stop = make_command(3, mode="safe_stop", reason="no_fresh_state")
+    assert hold.admit(stop, now_s=0.15, sent_s=0.15)
+    assert hold.admit(stop, now_s=0.25, sent_s=0.25)
+    assert hold.decide(0.4).brake_reason == "no_fresh_state"
+
+
+def test_lock_step_brakes_at_once_when_the_edge_is_silent():
+    hold = CommandHold(now_s=0.0)
+    hold.admit(make_command(0), now_s=0.0, sent_s=0.0)
+    decision = hold.decide(0.025, edge_silence_s=0.21)
+    assert (decision.brake_reason, decision.undriven_s) == (NO_COMMAND, 0.21)
+
+
+def decisions(*reasons):
+    """Decisions of a hold that is silent in the ticks with a reason."""
+    hold = CommandHold(now_s=0.0)
+    return [hold.decide(0.0, 0.25 if reason else None) for reason in reasons]
+
+
+def test_one_stretch_of_braking_is_one_event():
+    log = SafeStopLog(period_s=0.1)
+    speeds = [4.0, 3.0, 0.0, 0.0, 1.0, 0.5]
+    braking = decisions("", "x", "x", "x", "", "x")
+    for step, (decision, speed) in enumerate(zip(braking, speeds, strict=True)):
+        log.observe(7, step, decision, speed)
+    first, second = log.events
+    assert (first.episode, first.step, first.reason) == (7, 1, NO_COMMAND)
+    assert (first.brake_after_s, first.stopped_after_s, first.resumed_after_s) == (0.25, 0.2, 0.3)
+    assert (second.step, second.stopped_after_s, second.resumed_after_s) == (5, None, None)
+
+
+def test_a_new_episode_closes_the_event_of_the_last():
+    log = SafeStopLog(period_s=0.1)
+    (braking,) = decisions("x")
+    log.observe(0, 9, braking, 1.0)
+    log.observe(1, 0, braking, 1.0)
+    assert [(event.episode, event.resumed_after_s) for event in log.events] == [
+        (0, None),
+        (1, None),
+    ]
+
+
+def checking_feedback(newest_step=5):
+    check = FeedbackCheck("here", action_size=1)
+    check.sent(0, newest_step)
+    return check
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"\x00", "malformed"),
+        (bytes(70_000), "oversized"),
+        (encode(make_feedback(5, schema=2)), "schema"),
+        (encode(make_feedback(5, speed_mps=float("nan"))), "not_finite"),
+        (encode(make_feedback(5, scenario_speed_mps=float("inf"))), "not_finite"),
+        (encode(make_feedback(5, session="elsewhere")), "foreign_session"),
+        (encode(make_feedback(5, action=[0.1, 0.1])), "action_size"),
+        (encode(make_feedback(5, action=[1.01])), "action_range"),
+        (encode(make_feedback(6)), "unknown_step"),
+        (encode(make_feedback(0, episode=1)), "unknown_step"),
+        (encode(make_feedback(4)), "duplicate"),
+        (encode(make_feedback(3)), "stale"),
+    ],
+)
+def test_feedback_that_cannot_be_believed_is_counted_by_reason(payload, reason):
+    check = checking_feedback()
+    believed = make_feedback(4)
+    assert check.read(encode(believed), now_s=0.0) == believed
+    assert check.read(payload, now_s=0.05) is None
+    assert dict(check.rejected) == {reason: 1}
+
+
+@given(st.binary(max_size=300))
+def test_no_bytes_raise_or_are_believed_by_chance(payload):
+    check = checking_feedback()
+    assert check.read(payload, now_s=0.0) is None
+    assert sum(check.rejected.values()) == 1
+
+
+def test_a_vehicle_that_answers_the_last_simulator_is_there_but_not_believed():
+    check = checking_feedback()
+    before = make_feedback(900, session="the one before")
+    assert check.read(encode(before), now_s=0.0) is None
+    assert (check.heard, dict(check.rejected)) == (before, {})
+    uncommanded = make_feedback(-1, session="", episode=-1)
+    assert check.read(encode(uncommanded), now_s=0.1) == uncommanded
+
+
+def test_after_silence_another_board_with_a_slow_clock_is_believed():
+    check = checking_feedback()
+    check.read(encode(make_feedback(5)), now_s=0.0)
+    early = encode(make_feedback(-1, session="", episode=-1, sent_ns=7))
+    assert check.read(early, now_s=0.15) is None
+    assert check.read(early, now_s=0.25) is not None
+    assert dict(check.rejected) == {"stale": 1}
+
+
+HEARD = CommandHold(now_s=0.0).decide(0.0)
+STOPPED = CommandHold(now_s=0.0).decide(0.0, edge_silence_s=0.3)
+
+
+def decide(feedback, after_s=0.05, heard=HEARD, episode=0):
+    hold = FeedbackHold(now_s=0.0)
+    hold.admit(feedback, received_s=1.0, now_s=1.0)
+    return hold.decide(heard, episode, now_s=1.0 + after_s)
+
+
+def test_feedback_holds_for_2_periods_and_no_longer():
+    held = decide(make_feedback(3), after_s=0.2)
+    assert (held.brake_reason, held.feedback) == ("", make_feedback(3))
+    assert held.feedback_age_s == pytest.approx(0.2)
+    silent = decide(make_feedback(3), after_s=0.21)
+    assert (silent.brake_reason, silent.feedback) == (NO_FEEDBACK, None)
+
+
+def test_a_delay_on_the_way_makes_feedback_older_and_the_vehicle_not_silent():
+    hold = FeedbackHold(now_s=0.0)
+    hold.admit(make_feedback(3), received_s=1.0, now_s=1.3)
+    decision = hold.decide(HEARD, 0, now_s=1.35)
+    assert decision.brake_reason == ""
+    assert decision.feedback_age_s == pytest.approx(0.35)
+
+
+@pytest.mark.parametrize(
+    ("feedback", "heard", "reason"),
+    [
+        (make_feedback(3), STOPPED, ""),  # The vehicle is believed, not what it was told.
+        (make_feedback(3, mode="safe_stop"), STOPPED, NO_COMMAND),
+        (make_feedback(3, mode="safe_stop"), HEARD, "safe_stop"),
+        (make_feedback(3, self_braking=True), HEARD, SELF_BRAKING),
+        # It still stands after the last episode.
+        (make_feedback(3, episode=-1, mode="safe_stop", self_braking=True), HEARD, ""),
+        (make_feedback(3, episode=-1, self_braking=True), STOPPED, NO_COMMAND),
+    ],
+)
+def test_why_the_vehicle_brakes(feedback, heard, reason):
+    assert decide(feedback, heard=heard).brake_reason == reason
+
+
+class PedalEnv(ToyEnv):
+    """The toy, and which pedal it takes to a speed."""
+
+    def pedal_for_speed(self, speed_mps):
+        return 0.125 * speed_mps
+
+
+@pytest.mark.parametrize(
+    ("environment", "changes", "applied"),
+    [
+        (ToyEnv(), {"action": [0.25]}, 0.25),
+        (ToyEnv(), {"action": [1.0009]}, 1.0),
+        (ToyEnv(), {"action": [0.25], "scenario_speed_mps": 2.0}, 0.25),
+        (PedalEnv(), {"action": [0.5]}, 0.5),
+        (PedalEnv(), {"action": [0.5], "scenario_speed_mps": 2.0}, 0.25),
+        (PedalEnv(), {"action": [0.5], "scenario_speed_mps": 2.0, "mode": "safe_stop"}, 0.25),
+    ],
+)
+def test_the_car_does_what_the_vehicle_did(environment, changes, applied):
+    apply = vehicle_action(["pedal"])
+    action = apply(environment, decide(make_feedback(3, **changes)))
+    assert (action.dtype, action.tolist()) == (np.float32, [applied])
+
+
+def test_a_pedal_takes_its_own_place_only():
+    apply = vehicle_action(["steering", "pedal"])
+    feedback = make_feedback(3, action=[0.75, 0.5], scenario_speed_mps=2.0)
+    assert apply(PedalEnv(), decide(feedback)).tolist() == [0.75, 0.25]
+    assert vehicle_action(["steering"])(
+        PedalEnv(), decide(make_feedback(3, action=[0.75], scenario_speed_mps=2.0))
+    ).tolist() == [0.75]
+
+
+class SteeredEnv(ToyEnv):
+    """The toy, steered: its brake is beside the action."""
+
+    def __init__(self):
+        super().__init__()
+        self.pressed = []
+        self.brake_action = np.array([0.1], np.float32)
+
+    def press_brake(self, pressed):
+        self.pressed.append(pressed)
+
+
+def test_a_steered_car_brakes_when_its_vehicle_does():
+    environment, apply = SteeredEnv(), vehicle_action(["steering"])
+    stop = decide(make_feedback(3, mode="safe_stop", action=[0.5]))
+    assert apply(environment, stop).tolist() == [0.5]
+    assert apply(environment, decide(make_feedback(3))).tolist() == [0.5]
+    silent = decide(make_feedback(3), after_s=1.0)
+    assert apply(environment, silent).tolist() == [pytest.approx(0.1)]
+    assert environment.pressed == [True, False, True]
+    assert isinstance(silent, VehicleDecision)
+
+
+def test_a_command_that_nobody_obeys_has_no_age():
+    hold = CommandHold(now_s=0.0)
+    hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
+    heard = hold.decide(0.05)
+    assert decide(make_feedback(3), heard=heard).command_age_s == heard.command_age_s
+    assert decide(make_feedback(3, mode="safe_stop"), heard=heard).command_age_s is None
+    assert decide(make_feedback(3), after_s=1.0, heard=heard).command_age_s is None
+
+
+def health(sent_ns, uptime_s, vehicle="none", needs_rearm=False, **rejected):
+    return Health(
+        vehicle_id="v", vehicle=vehicle, mode="drive", reason="", needs_rearm=needs_rearm,
+        accepted=1, superseded=0, rejected=rejected, deadline_misses=0, safe_stops=0, policy_id="p",
+        inference_ms={}, uptime_s=uptime_s, sent_ns=sent_ns,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("messages", "expected"),
+    [
+        ([], {}),
+        ([health(1, 1.0, stale=7)], {}),
+        ([health(1, 1.0, stale=7), health(2, 2.0, stale=9, schema=1)], {"stale": 2, "schema": 1}),
+        # Restarted: it counts from zero, even where it has passed the old count.
+        ([health(1, 9.0, stale=1), health(2, 0.5, stale=3)], {"stale": 3}),
+        # The board's wall clock was set back in between.
+        ([health(9, 1.0), health(2, 2.0, stale=1), health(3, 3.0, stale=2)], {"stale": 2}),
+        # A message that an answer has overtaken is no restart.
+        ([health(1, 1.0), health(3, 3.0, stale=2), health(2, 2.0, stale=1)], {"stale": 2}),
+    ],
+)
+def test_growth_is_added_up(messages, expected):
+    counts = EdgeCounts()
+    for message in messages:
+        counts.observe_message(encode(message))
+    assert counts.rejected == expected
+
+
+def test_the_status_answer_counts_as_a_message_and_junk_does_not():
+    counts = EdgeCounts()
+    counts.observe_message(encode(health(1, 1.0)))
+    status = {**msgspec.to_builtins(health(2, 2.0, stale=1)), "version": "1", "manifest": {}}
+    counts.observe_status(msgspec.json.encode(status))
+    counts.observe_status(b"junk")
+    counts.observe_message(b"junk")
+    assert counts.rejected == {"stale": 1}
+
+
+def test_the_report_joins_both_sides():
+    report = rejections({"stale": 2}, {"stale": 1, "schema": 3})
+    assert report["rejected"] == {"stale": 3, "schema": 3}
+    assert report["rejected_by_edge"] == {"stale": 2}
+    assert report["rejected_by_simulator"] == {"stale": 1, "schema": 3}
+
+
+def test_health_that_cannot_be_read_is_counted_by_reason():
+    counts = EdgeCounts()
+    for payload in (b"junk", bytes(70_000), encode(health(1, 1.0))):
+        counts.observe_message(payload)
+    assert counts.unreadable == {"health_malformed": 1, "health_oversized": 1}
+    assert counts.rejected == {}

@@ -1,0 +1,92 @@
+"""What is put to many vehicles at once is nobody's own: neither end takes it, nor a listener."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from bridge.ports import ANY_VEHICLE, SimulatorPort, open_feed
+from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.wire import TOPICS
+
+HEARS_S = 0.3
+WILD = ("phil/*/{}", "phil/**", "phil/v$*/{}", "*/v1/{}", "**/{}")
+
+
+@pytest.fixture
+def sessions():
+    """The simulator's router, and somebody else's client."""
+    endpoint = free_endpoint()
+    router = open_session(listen=endpoint, mode="router")
+    client = open_session(connect=endpoint, mode="client")
+    yield endpoint, router, client
+    client.close()
+    router.close()
+
+
+def put_wildly(session, topic):
+    for pattern in WILD:
+        session.put(pattern.format(topic), b"wild")
+    session.put(f"phil/v1/{topic}", b"own")
+
+
+def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
+    _, router, client = sessions
+    port = SimulatorPort(router, "v1")
+    heard: list[bytes] = []
+    port.on_command(heard.append)
+    port.on_feedback(heard.append)
+    time.sleep(HEARS_S)
+    for topic in ("command", "feedback", "health"):
+        put_wildly(client, topic)
+    time.sleep(HEARS_S)
+    port.close()
+    assert heard == [b"own"] * 2
+    assert port.edge_counts.policy_id == ""
+
+
+@pytest.mark.parametrize("vehicle_id", ["v1", ANY_VEHICLE])
+def test_a_listener_hears_what_was_put_to_one_vehicle(sessions, vehicle_id):
+    endpoint, router, client = sessions
+    port = SimulatorPort(router, "v1")
+    with open_feed(endpoint, vehicle_id, 5.0) as feed:
+        for topic in ("state", "command", "feedback", "health"):
+            put_wildly(client, topic)
+        time.sleep(HEARS_S)
+        heard = iter(lambda: feed.next(0.1), None)
+        found = {(one.key, one.payload) for one in heard if one.topic in TOPICS}
+    topics = ("state", "command", "feedback", "health")
+    assert found == {(f"phil/v1/{topic}", b"own") for topic in topics}
+    port.close()
+
+
+_ANOTHER_THREAD_TAKES_IT = """
+import signal, threading, time
+from bridge.commands import wait_to_be_told
+from edge_runtime.signals import sigterm_as_interrupt
+with sigterm_as_interrupt():
+    threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+    try:
+        print("ready", flush=True)
+        wait_to_be_told()
+    except KeyboardInterrupt:
+        print("told")
+"""
+
+
+def test_a_signal_that_another_thread_takes_ends_the_wait():
+    command = [sys.executable, "-c", _ANOTHER_THREAD_TAKES_IT]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            process.terminate()
+            output, _ = process.communicate(timeout=20)
+        finally:
+            process.kill()
+    assert output == "told\n"
+    assert process.returncode == 0

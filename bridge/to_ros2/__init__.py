@@ -1,1 +1,0 @@
-"""What is on our wire, as ROS 2 messages."""

@@ -1,0 +1,245 @@
+"""The command that the simulated vehicle holds, and one episode's network in virtual time. Pure.
+
+`CommandHold` is the vehicle's side of the contract's safety rule, on every clock: the newest
+command is held from tick to tick; when none has arrived for 2 T, or when the command itself says
+``safe_stop``, the vehicle brakes. The command is its own heartbeat, so there is nothing else to
+listen to.
+
+`VirtualLink` is shared by lock-step and by training under latency. Tick n stands at virtual time
+n T. Its state arrives at the edge runtime after the uplink's delay; the answer takes no time, and
+arrives at the vehicle after the downlink's; the tick is decided at n T + 25 ms from what has
+arrived by then. Who answers is the caller's business: a real edge runtime that is waited for, or a
+function.
+
+The edge runtime's rule for silence counts time, and here time is virtual: a real one, which sees
+states come faster than in life, would miss the gaps. So its safety machine runs along, and what it
+would not drive becomes a safe stop. It begins each episode in standby: episodes do not depend on
+each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import msgspec
+
+from bridge.network import EventHeap, LatencySpec, make_link
+from edge_runtime.safety import (
+    Mode,
+    Safety,
+    advance,
+    classify_arrival,
+    classify_fresh,
+    note_arrival,
+)
+from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command
+
+SILENCE_LIMIT_S = 2 * CONTROL_PERIOD_S
+COMMAND_WINDOW_S = 0.025
+"""A command that arrives within this time after the tick still acts in it."""
+ROUNDING_S = 1e-9
+"""Sums such as 0.3 + 0.01 + 0.015 miss 0.325 by less than this; no real delay is as short."""
+
+NO_COMMAND = "no_command"
+"""Brake reason: the vehicle brakes by itself because nothing arrived for 2 T."""
+UNKNOWN_SAFE_STOP = "safe_stop"
+"""Brake reason when a safe_stop command gives none of its own."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the vehicle does in one tick."""
+
+    command: Command | None
+    """The newest command, held; None before the first of the episode."""
+    fresh: bool
+    """It arrived since the decision before this one."""
+    brake_reason: str
+    """Why the vehicle brakes; empty while it obeys the command."""
+    undriven_s: float
+    """Time since the newest ``drive`` command arrived (since the episode began, if none has)."""
+    command_age_s: float | None = None
+    """From the sending of the state that the obeyed command answers; None where none is obeyed."""
+
+
+class CommandHold:
+    """The newest command of one episode, and its age."""
+
+    def __init__(self, now_s: float) -> None:
+        self.newest: Command | None = None
+        self._heard_s = now_s
+        self._driven_s = now_s
+        self._sent_s = now_s
+        self._fresh = False
+
+    @property
+    def newest_step(self) -> int:
+        """Return the step of the newest command; -1 before the first."""
+        return -1 if self.newest is None else self.newest.step
+
+    def admit(self, command: Command, now_s: float, sent_s: float) -> bool:
+        """Take the command if it is newer than the newest one; return whether it was taken.
+
+        ``sent_s`` is when the state was sent that the command answers.
+
+        An edge runtime in safe stop repeats its answer to the last state it heard at rate 1/T;
+        such a repetition is as good a heartbeat as a new answer. A repeated ``drive`` is not: it
+        would keep a frozen controller alive.
+        """
+        if self.newest is not None and not _supersedes(command, self.newest):
+            return False
+        self.newest = command
+        self._heard_s, self._sent_s = now_s, sent_s
+        if command.mode == "drive":
+            self._driven_s = now_s
+        self._fresh = True
+        return True
+
+    def decide(self, now_s: float, edge_silence_s: float | None = None) -> Decision:
+        """Decide this tick.
+
+        ``edge_silence_s`` is given when lock-step has waited in vain: virtual time stood still
+        meanwhile, so the wall time without an answer (s) counts in its place.
+        """
+        brake_reason = self._brake_reason(now_s, edge_silence_s)
+        obeys = self.newest is not None and not brake_reason
+        decision = Decision(
+            command=self.newest,
+            fresh=self._fresh,
+            brake_reason=brake_reason,
+            undriven_s=now_s - self._driven_s if edge_silence_s is None else edge_silence_s,
+            command_age_s=now_s - self._sent_s if obeys else None,
+        )
+        self._fresh = False
+        return decision
+
+    def _brake_reason(self, now_s: float, edge_silence_s: float | None) -> str:
+        if edge_silence_s is not None or now_s - self._heard_s > SILENCE_LIMIT_S + ROUNDING_S:
+            return NO_COMMAND
+        if self.newest is not None and self.newest.mode == "safe_stop":
+            return self.newest.reason or UNKNOWN_SAFE_STOP
+        return ""
+
+
+def _supersedes(command: Command, newest: Command) -> bool:
+    if command.step == newest.step:
+        return command.mode == "safe_stop"
+    return command.step > newest.step
+
+
+STATE_BYTES = 7322
+COMMAND_BYTES = 217
+"""What the messages take on the wire, for links of limited rate: the same for every message, so
+that a longer session name or another digit does not change a drive."""
+
+_SESSION = ""
+"""An episode has one simulator."""
+
+Message = TypeVar("Message")
+
+
+@dataclass(frozen=True)
+class Arrival(Generic[Message]):
+    """A state that has come to the edge runtime."""
+
+    step: int
+    arrived_s: float
+    message: Message
+    overtaken: bool
+    """One as new or newer came before it: an edge runtime rejects it, and does not answer."""
+
+
+@dataclass(frozen=True)
+class _Answer:
+    command: Command
+    sent_s: float
+    """Virtual time of the state's tick."""
+    computing_s: float
+
+
+class VirtualLink(Generic[Message]):
+    """The network between vehicle and edge runtime, and the command that the vehicle holds.
+
+    For each tick: ``send_state``; ``next_at_edge`` and ``answer`` until None comes; ``decide``.
+
+    Args:
+        spec: delays, losses and the like.
+        seed: of the episode.
+        on_heard: called with each newest answer's latency in s, state sent to command received.
+        on_stale: called for each answer that is not newer than the newest.
+    """
+
+    def __init__(
+        self,
+        spec: LatencySpec,
+        seed: int,
+        on_heard: Callable[[float], None] = lambda latency_s: None,
+        on_stale: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.hold = CommandHold(now_s=0.0)
+        self._link = make_link(spec, seed)
+        self._on_heard, self._on_stale = on_heard, on_stale
+        self._under_way: EventHeap[tuple[int, Message] | _Answer] = EventHeap()
+        self._newest_at_edge = -1
+        self._safety = Safety()
+        self._step, self._window_end_s = 0, COMMAND_WINDOW_S
+        self._admitted_s = 0.0
+
+    def send_state(self, step: int, message: Message) -> None:
+        """Begin tick ``step``: its state leaves the vehicle."""
+        tick_s = step * CONTROL_PERIOD_S
+        self._step, self._window_end_s = step, tick_s + COMMAND_WINDOW_S
+        for arrival_s in self._link.up.arrivals(tick_s, STATE_BYTES):
+            self._under_way.push(arrival_s, (step, message))
+
+    def next_at_edge(self) -> Arrival[Message] | None:
+        """Let time run to the next state's arrival at the edge runtime; None: the window ends."""
+        while True:
+            due = self._under_way.pop_due(self._window_end_s + ROUNDING_S)
+            if due is None:
+                return None
+            now_s, message = due
+            if isinstance(message, _Answer):
+                self._arrive_at_vehicle(message, now_s)
+                continue
+            step, content = message
+            overtaken = step <= self._newest_at_edge
+            if not overtaken:
+                self._newest_at_edge = step
+                self._note_fresh(now_s)
+            return Arrival(step, now_s, content, overtaken)
+
+    def answer(self, arrival: Arrival[Message], command: Command, computing_s: float = 0.0) -> None:
+        """Send the answer to the newest state back; ``computing_s`` is reported only."""
+        if self._safety.mode is Mode.SAFE_STOP:
+            command = msgspec.structs.replace(command, mode=SAFE_STOP, reason=self._safety.reason)
+        answer = _Answer(command, arrival.step * CONTROL_PERIOD_S, computing_s)
+        for arrival_s in self._link.down.arrivals(arrival.arrived_s, COMMAND_BYTES):
+            self._under_way.push(arrival_s, answer)
+
+    def decide(self, edge_silence_s: float | None = None) -> Decision:
+        """What the vehicle does in this tick; for ``edge_silence_s`` see ``CommandHold.decide``."""
+        # Answered already, the vehicle acts at once: nothing newer can come in this tick.
+        answered = self.hold.newest_step >= self._step
+        acts_s = self._admitted_s if answered else self._window_end_s
+        return self.hold.decide(acts_s, edge_silence_s)
+
+    def _note_fresh(self, now_s: float) -> None:
+        """What the edge runtime's safety machine makes of a fresh state's moment."""
+        gap = classify_arrival(self._safety, _SESSION, now_s - ROUNDING_S, needs_rearm=False)
+        if gap is not None:
+            self._safety = advance(self._safety, gap)
+        self._safety = note_arrival(self._safety, _SESSION, now_s)
+        fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
+        self._safety = advance(self._safety, fresh)
+
+    def _arrive_at_vehicle(self, answer: _Answer, now_s: float) -> None:
+        answered_step = self.hold.newest_step
+        if not self.hold.admit(answer.command, now_s, answer.sent_s):
+            self._on_stale()
+            return
+        self._admitted_s = now_s
+        if answer.command.step > answered_step:
+            self._on_heard(now_s - answer.sent_s + answer.computing_s)

@@ -1,1 +1,0 @@
-"""The injected network: one model for every end that stands in for a real one."""
