@@ -5,9 +5,9 @@ from __future__ import annotations
 from argparse import ArgumentParser
 from typing import Any
 
-from edge_runtime.option_types import seconds
-from edge_runtime.topics import DEFAULT_VEHICLE_ID
+from edge_runtime.cli import seconds
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+from edge_runtime.wire import DEFAULT_VEHICLE_ID
 
 
 def add_connect(parser: ArgumentParser) -> None:

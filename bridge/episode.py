@@ -14,10 +14,10 @@ from bridge.actions import Apply, policy_action
 from bridge.clock import Clock
 from bridge.safe_stops import SafeStopLog
 from bridge.scene import Stamps
-from edge_runtime.cli import UserError
 from edge_runtime.episode_report import EpisodeResult
 from edge_runtime.latency.command_hold import Decision
 from edge_runtime.safety import Event
+from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, State
 
 PublishScene = Callable[[Any, Stamps], None]

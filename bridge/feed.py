@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import zenoh
 
-from edge_runtime import access
-from edge_runtime.cli import UserError
+from edge_runtime import tls as access
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import open_session
+from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, check_vehicle_id
 
 WIRE_TOPICS = ("state", "command", "feedback", "health", "scene")

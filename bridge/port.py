@@ -15,11 +15,11 @@ from bridge.edge_counts import EdgeCounts
 from bridge.environments import scene_of
 from bridge.feed import connect_client
 from bridge.scene import Stamps, encode_scene, scene_key
-from edge_runtime import access
-from edge_runtime.cli import UserError
-from edge_runtime.manifest import Manifest
+from edge_runtime import tls as access
+from edge_runtime.policy import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import only_own, open_session
+from edge_runtime.util import UserError
 from edge_runtime.wire import key
 
 PayloadHandler = Callable[[bytes], None]

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from edge_runtime.latency.command_hold import Decision
-from edge_runtime.words import printable
+from edge_runtime.util import printable
 
 
 class EpisodeBar:

@@ -13,12 +13,11 @@ from bridge.feed import ANY_VEHICLE, QUEUE_MESSAGES, Feed, open_feed
 from bridge.recording.flushed_file import check_new
 from bridge.recording.writer import RecordingWriter
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.option_types import seconds
+from edge_runtime.cli import ArgumentParser, examples, seconds
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
+from edge_runtime.util import counted
 from edge_runtime.wire import check_vehicle_id
-from edge_runtime.words import counted
 
 POLL_S = 0.1
 FLUSH_S = 0.5

@@ -15,8 +15,8 @@ import zenoh
 from bridge.port import simulator_key
 from bridge.relay_traffic import DOWN, RelayTraffic
 from edge_runtime.latency.model import LatencySpec
-from edge_runtime.topics import key
 from edge_runtime.transport import only_own, open_session
+from edge_runtime.wire import key
 
 REARM = "rearm"
 QUERIES = ("status", REARM)

@@ -14,10 +14,15 @@ from mcap.writer import CompressionType, Writer
 from bridge.recording.flushed_file import check_new
 from bridge.recording.reader import Recording
 from bridge.recording.writer import CHUNK_BYTES, METADATA
-from edge_runtime.cli import ArgumentParser, UserError, examples
-from edge_runtime.file_lock import try_to_hold
-from edge_runtime.files import behind_link, check_writable, write_atomic
-from edge_runtime.words import counted
+from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.util import (
+    UserError,
+    behind_link,
+    check_writable,
+    counted,
+    try_to_lock_file,
+    write_atomic,
+)
 
 KEPT = ".damaged"
 """Ends the name under which a damaged recording is kept beside the repaired one."""
@@ -82,7 +87,7 @@ def _held(source: Path) -> Iterator[None]:
     except OSError as error:
         raise UserError(f"recording {source} cannot be read: {error.strerror}") from None
     try:
-        if not try_to_hold(descriptor):
+        if not try_to_lock_file(descriptor):
             raise UserError(f"{source} is being written; repair it when its writer has ended")
         yield
     finally:

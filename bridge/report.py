@@ -11,7 +11,7 @@ import numpy as np
 
 from bridge.safe_stops import SafeStopEvent
 from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
-from edge_runtime.words import counted, printable
+from edge_runtime.util import counted, printable
 
 QUANTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
 

@@ -16,15 +16,19 @@ from bridge.feed import Feed, open_feed
 from bridge.signals import sigterm_as_interrupt
 from bridge.to_ros2.outlet import Outlet
 from bridge.to_ros2.policies import Policies
-from edge_runtime.cli import ArgumentParser, examples, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.operator_commands import ask
-from edge_runtime.option_types import number
-from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT, check_ros2_endpoint, open_ros2_session
-from edge_runtime.ros2.names import check_ros_name, namespace_of
-from edge_runtime.ros2.node import Ros2Node, open_node
+from edge_runtime.cli import ArgumentParser, examples, number, write_json_out
+from edge_runtime.commands import ask
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import check_endpoint
+from edge_runtime.util import check_writable
+from edge_runtime.vehicles.ros2.names import (
+    DEFAULT_ROS2_ENDPOINT,
+    check_ros2_endpoint,
+    check_ros_name,
+    namespace_of,
+    open_ros2_session,
+)
+from edge_runtime.vehicles.ros2.node import Ros2Node, open_node
 from edge_runtime.wire import check_vehicle_id
 
 POLL_S = 0.1

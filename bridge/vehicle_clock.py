@@ -18,9 +18,9 @@ from bridge.feedback_hold import FeedbackHold, VehicleDecision
 from bridge.realtime import RealTimeClock
 from bridge.safe_stops import STANDSTILL_MPS
 from bridge.tracking import TrackingLog
-from edge_runtime.cli import UserError
 from edge_runtime.latency.command_hold import SILENCE_LIMIT_S
 from edge_runtime.latency.model import LatencySpec, make_link
+from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, Command, Feedback, State
 
 POLL_S = 0.02

@@ -20,8 +20,8 @@ from bridge.viewer.wire_log import WireLog
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import check_endpoint
+from edge_runtime.wire import DEFAULT_VEHICLE_ID
 from viewing.options import add_sink, chosen_sink
 from viewing.pace import PICTURE_INTERVAL_S
 from viewing.sinks import SERVE, Sink, check_sink, open_sink

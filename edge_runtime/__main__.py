@@ -8,8 +8,7 @@ from typing import List
 
 from edge_runtime import __version__, log
 from edge_runtime.cli import ArgumentParser, add_public_key, examples, run_cli
-from edge_runtime.config import Config
-from edge_runtime.vehicles.registry import VEHICLE_NAMES
+from edge_runtime.config import VEHICLE_NAMES, Config
 
 _DEFAULTS = Config()
 _TRUSTED = "results/policies/left_turn.onnx \\\n    --public-key results/policies/policy.pub"
@@ -46,13 +45,13 @@ def dispatch(argv: List[str]) -> int:
     """Parse and run one command; each is imported only when it is asked for."""
     arguments = build_parser().parse_args(argv)
     if arguments.command == "check":
-        from edge_runtime.check_command import check as command
+        from edge_runtime.commands import check as command
     elif arguments.command == "run":
-        from edge_runtime.run_command import run as command
+        from edge_runtime.run import run as command
     elif arguments.command == "status":
-        from edge_runtime.operator_commands import status as command
+        from edge_runtime.commands import status as command
     else:
-        from edge_runtime.operator_commands import rearm as command
+        from edge_runtime.commands import rearm as command
     return command(arguments)
 
 

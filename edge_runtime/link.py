@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
-from typing import Any, Callable, Dict, List, Optional
+import os
+import threading
+import time
+from typing import Any, Callable, Dict, List, Optional, Set
 
 import msgspec
 import zenoh
 
 from edge_runtime import __version__, log
-from edge_runtime.manifest import Manifest
-from edge_runtime.native_thread import keep_state
-from edge_runtime.presence import OpenClient, Presence
-from edge_runtime.transport import only_own
+from edge_runtime.policy import Manifest
+from edge_runtime.transport import LEASE_MS, only_own
+from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
 _PUBLISHED = ("command", "feedback", "health")
@@ -125,3 +128,170 @@ def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
 
 def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
     query.reply(query.key_expr, json.dumps(value).encode(), encoding="application/json")
+
+
+_thread = threading.local()
+
+
+def keep_state() -> None:
+    """Let this thread keep its Python state until it ends.
+
+    A native thread that calls into Python is given a new state by PyGILState_Ensure, and it is
+    taken down when the call returns: tens of microseconds of each call. One Ensure that is never
+    released keeps it. These threads live as long as the session, so nothing piles up.
+    """
+    if not getattr(_thread, "kept", False):
+        ctypes.pythonapi.PyGILState_Ensure()
+        _thread.kept = True
+
+
+_POLL_S = 0.1
+# Two looks so far apart: a claim that is seen in both is no leftover of a lost connection.
+_FIRST_LOOKS_S = 0.3
+_LOOK_S = 1.0
+_CONNECT_S = 0.2
+_JOIN_S = 0.5
+_LEFTOVER_S = 1.5 * LEASE_MS / 1000.0
+
+OpenClient = Callable[[], zenoh.Session]
+
+
+def require_free(open_client: OpenClient, alive_key: str, vehicle_id: str) -> bool:
+    """Whether a router answers. Raises UserError where another runtime has this vehicle id.
+
+    Two peers do not hear each other through a router, so a client asks it. The token of a process
+    that was just killed may stay for a lease: one that is found must outlast it.
+    """
+    found = _ask(open_client, f"{alive_key}/**")
+    if found:
+        time.sleep(_LEFTOVER_S)
+        found = _ask(open_client, f"{alive_key}/**")
+    if found:
+        raise taken(vehicle_id)
+    return found is not None
+
+
+def taken(vehicle_id: str) -> UserError:
+    """The error of a runtime that must give way."""
+    return UserError(
+        f"another edge runtime is connected with vehicle id {vehicle_id};"
+        " end that one first, or name this one with another --vehicle-id"
+    )
+
+
+class Presence:
+    """Declares the tokens, and again whenever the routers that this session sees have changed.
+
+    Zenoh 1.5 (the board's) does not tell a router that comes later of a token declared before.
+    It has a thread of its own, because all of this may wait for the network and the watchdog
+    must not. `give_way` is called, once, where an elder claim than this one's is found.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        alive_key: str,
+        open_client: OpenClient,
+        give_way: Callable[[], None],
+    ) -> None:
+        self.rivals = 0
+        self._session = session
+        self._key = alive_key
+        self._open_client = open_client
+        self._give_way: Optional[Callable[[], None]] = give_way
+        self._known: Set[str] = set()
+        self._seen_before: Set[str] = set()
+        self._looks = 0
+        self._routers = self._seen_routers()
+        self._tokens: List[Any] = []
+        self._declare()
+        self._stopping = threading.Event()
+        self._thread: Optional[threading.Thread] = None
+
+    def start(self) -> None:
+        """Begin to look for changes."""
+        self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
+        self._thread.start()
+
+    def refresh(self) -> bool:
+        """Declare the tokens again if other routers are there than the last time."""
+        routers = self._seen_routers()
+        changed, self._routers = routers != self._routers, routers
+        if not changed or not routers:
+            return False
+        self._undeclare_tokens()
+        self._declare()
+        return True
+
+    def look(self) -> None:
+        """Look for other claims; give way to an elder one that is seen for the second time."""
+        found = _ask(self._open_client, f"{self._key}/*") or []
+        claims = {key.rsplit("/", 1)[1] for key in found} - {self.claim}
+        for claim in sorted((claims & self._seen_before) - self._known):
+            self._known.add(claim)
+            self.rivals += 1
+            log.event("error", "another_edge", claim=claim, elder=claim < self.claim)
+        elders = {claim for claim in claims & self._seen_before if claim < self.claim}
+        self._seen_before = claims
+        self._looks += 1
+        if elders and self._give_way is not None:
+            give_way, self._give_way = self._give_way, None
+            give_way()
+
+    def undeclare(self) -> None:
+        """Stop looking and take the tokens away."""
+        self._stopping.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(_JOIN_S)
+        self._undeclare_tokens()
+
+    def _declare(self) -> None:
+        # Wall clock, because two boards compare it; the rest tells two of one moment apart.
+        self.claim = f"{time.time_ns():016x}-{os.urandom(4).hex()}"
+        self._seen_before = set()
+        self._looks = 0
+        self._tokens = [
+            self._session.liveliness().declare_token(key)
+            for key in (self._key, f"{self._key}/{self.claim}")
+        ]
+
+    def _undeclare_tokens(self) -> None:
+        for token in self._tokens:
+            token.undeclare()
+
+    def _seen_routers(self) -> List[str]:
+        return sorted(map(str, self._session.info.routers_zid()))
+
+    def _run(self) -> None:
+        next_look_s = time.monotonic() + _FIRST_LOOKS_S
+        while not self._stopping.wait(_POLL_S):
+            try:
+                if self.refresh():
+                    next_look_s = time.monotonic() + _FIRST_LOOKS_S
+                if self._routers and time.monotonic() >= next_look_s:
+                    self.look()
+                    next_look_s = time.monotonic() + (
+                        _LOOK_S if self._looks > 1 else _FIRST_LOOKS_S
+                    )
+            except zenoh.ZError as error:
+                log.event("error", "token_not_declared", detail=error)
+
+
+def wait_for_router(session: zenoh.Session) -> None:
+    """For 0.2 s at most, so that the tokens are not declared twice. One is known to answer."""
+    end_s = time.monotonic() + _CONNECT_S
+    while not session.info.routers_zid() and time.monotonic() < end_s:
+        time.sleep(0.002)
+
+
+def _ask(open_client: OpenClient, selector: str) -> Optional[List[str]]:
+    """The tokens that a router knows, None where none answers."""
+    try:
+        session = open_client()
+    except UserError:
+        return None
+    try:
+        replies = session.liveliness().get(selector, timeout=1.0)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+    finally:
+        session.close()

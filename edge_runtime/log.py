@@ -12,7 +12,7 @@ import logging
 import queue
 import threading
 import time
-from typing import Any, Dict, Optional
+from typing import Any, Dict, NamedTuple, Optional
 
 LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
@@ -102,3 +102,30 @@ def _quoted(value: Any) -> str:
     # Other parties' words may hold what a terminal would act upon: repr writes it as escapes.
     is_plain = text and text.isprintable() and not any(c in " \"'=" for c in text)
     return text if is_plain else repr(text)
+
+
+PERIOD_S = 1.0
+
+
+class _Said(NamedTuple):
+    at_s: float
+    unsaid: int
+
+
+class Flood:
+    """Lets the first of each kind through, then one a second. Kinds must be few: all are kept."""
+
+    def __init__(self) -> None:
+        self._said: Dict[str, _Said] = {}
+
+    def admit(self, kind: str, now_s: float) -> Optional[int]:
+        """How many of this kind went unsaid since the last line, or None: so does this one."""
+        said = self._said.get(kind)
+        if said is None:
+            self._said[kind] = _Said(now_s, 0)
+            return 0
+        if now_s - said.at_s < PERIOD_S:
+            self._said[kind] = said._replace(unsaid=said.unsaid + 1)
+            return None
+        self._said[kind] = _Said(now_s, 0)
+        return said.unsaid

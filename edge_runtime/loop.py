@@ -12,27 +12,27 @@ A command is sent under the lock, so that no late answer can follow a safe stop.
 
 from __future__ import annotations
 
+import fcntl
 import math
 import queue
 import threading
 import time
 import traceback
-from typing import Optional
+from typing import TYPE_CHECKING, BinaryIO, Optional
 
 from edge_runtime import log
-from edge_runtime.board import BoardWatch
 from edge_runtime.controller import Controller, Order, Received
-from edge_runtime.flood import Flood
-from edge_runtime.hold import Hold
-from edge_runtime.inference import infer
-from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
-from edge_runtime.policy import Policy
+from edge_runtime.log import Flood
+from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import MAX_INFERENCE_S, Event, Mode, Safety
-from edge_runtime.sd_notify import Notifier
-from edge_runtime.vehicles.runner import VehicleRunner
+from edge_runtime.service import BoardWatch, LatencyWindow, Notifier
+from edge_runtime.util import UserError, open_regular
 from edge_runtime.wire import MAX_TEXT_CHARS, TOPICS, Command, Health, Rejection, decode_state
+
+if TYPE_CHECKING:  # Only who has a vehicle loads it.
+    from edge_runtime.vehicles.base import VehicleRunner
 
 _HEALTH_PERIOD_S = 1.0 / TOPICS["health"].rate_hz
 _JOIN_S = 0.5
@@ -296,3 +296,36 @@ class ControlLoop:
         unsaid = self._flood.admit(reason, now_s)
         if unsaid is not None:
             log.event("warning", "rejected", reason=reason, detail=rejection.detail, unsaid=unsaid)
+
+
+class Hold:
+    """`path` is the file; None, or one that is not there, holds nothing.
+
+    Raises UserError for one that cannot be read: nobody could say whether it holds.
+    """
+
+    def __init__(self, path: Optional[str] = None) -> None:
+        self._stream: Optional[BinaryIO] = None
+        if path is not None:
+            try:
+                self._stream = open_regular(path)  # kept until it is free
+            except FileNotFoundError:
+                return
+            except OSError as error:
+                raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
+
+    def is_on(self) -> bool:
+        """Whether commands must stay here. Never waits."""
+        if self._stream is None:
+            return False
+        try:
+            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        self._stream.close()
+        self._stream = None
+        return False
+
+    def refusal(self) -> str:
+        """Why nobody may re-arm now; empty when free."""
+        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

@@ -11,15 +11,17 @@ import errno
 import json
 import re
 import socket
-from typing import Any, Callable, Dict, List, Optional, Sequence, Union
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
-from edge_runtime.errors import UserError
-from edge_runtime.link_probe import addresses, why_refused, why_unreachable
-from edge_runtime.tls import TLS_PROTOCOLS, TlsFiles, check_fits, zenoh_rows
+from edge_runtime.util import UserError
+
+if TYPE_CHECKING:
+    from edge_runtime.tls import TlsFiles
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+TLS_PROTOCOLS = ("tls", "quic")
 MODES = ("router", "peer", "client")
 
 # At Zenoh's default lease a peer that was stopped, or whose cable was cut, lives on for 10 s.
@@ -39,6 +41,25 @@ def check_endpoint(endpoint: str) -> str:
             " (tcp or udp; tls or quic with --tls)"
         )
     return endpoint
+
+
+def is_tls(endpoint: str) -> bool:
+    """Is it an endpoint of a protocol that asks for certificates?"""
+    return endpoint.split("/", 1)[0] in TLS_PROTOCOLS
+
+
+def check_fits(endpoint: str, with_tls: bool) -> None:
+    """Raise UserError for a TLS endpoint without files, and for files with a plain endpoint."""
+    address = endpoint.split("/", 1)[1]
+    if with_tls and not is_tls(endpoint):
+        raise UserError(
+            f"endpoint {endpoint} would send plain text despite --tls: write tls/{address}"
+        )
+    if not with_tls and is_tls(endpoint):
+        raise UserError(
+            f"endpoint {endpoint} needs certificates: name a directory of"
+            " `python -m deploy certs` with --tls"
+        )
 
 
 def open_session(
@@ -77,7 +98,9 @@ def open_session(
 
 def _check_refusal(session: zenoh.Session, connect: str, tls: TlsFiles) -> None:
     """A peer goes on trying for ever, also where it will never be let in: say so now."""
-    refusal = why_refused(connect, tls)
+    from edge_runtime import link_probe  # Only for who does not get a link.
+
+    refusal = link_probe.why_refused(connect, tls)
     if refusal and not session.info.routers_zid():
         session.close()
         raise UserError(refusal)
@@ -106,7 +129,7 @@ def session_rows(
         "transport/shared_memory/enabled": False,
     }
     if tls is not None:
-        rows["transport/link/tls"] = zenoh_rows(tls)
+        rows["transport/link/tls"] = tls.zenoh_rows()
         # A port that speaks TLS only, whatever an endpoint's metadata may ask for.
         rows["transport/link/protocols"] = list(TLS_PROTOCOLS)
     if access is not None:
@@ -127,17 +150,18 @@ def _listed(endpoint: Optional[str]) -> List[str]:
 
 def _check_port_is_free(endpoint: str) -> None:
     """Zenoh's own message for a busy port names neither the port nor the cause."""
+    from edge_runtime import link_probe  # As above; and no board listens.
+
     protocol, address = endpoint.split("/", 1)
     host, port = address.rsplit(":", 1)
     kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
     try:
-        family, _, _, _, target = addresses(endpoint)[0]
+        family, _, _, _, target = link_probe.addresses(endpoint)[0]
     except OSError:
         raise UserError(f"host {host!r} of endpoint {endpoint} cannot be resolved") from None
     with socket.socket(family, kind) as probe:
-        if (
-            kind == socket.SOCK_STREAM
-        ):  # as the listener does: the last run's closed links are no bar
+        if kind == socket.SOCK_STREAM:
+            # As the listener does: the last run's closed links are no bar.
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(target)
@@ -152,10 +176,12 @@ def _explain_bind(error: OSError, host: str, port: str) -> str:
 
 
 def _explain(text: str, listens: List[str], connect: Optional[str], tls: Optional[TlsFiles]) -> str:
+    from edge_runtime import link_probe  # As above.
+
     if connect is None or listens:
         return f"Zenoh cannot open {', '.join(listens) or connect}: {text}"
-    why = why_unreachable(connect)
-    refusal = "" if why else why_refused(connect, tls)
+    why = link_probe.why_unreachable(connect)
+    refusal = "" if why else link_probe.why_refused(connect, tls)
     if connect.startswith("quic/"):  # such a link does not say why it fails
         why = why or "or one end does not believe the other's certificate"
     return refusal or (

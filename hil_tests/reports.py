@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edge_runtime.cli import write_json_out
-from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.util import UserError, check_writable, write_atomic
 
 MARKDOWN = ".md"
 

@@ -17,8 +17,8 @@ from typing import Any
 import torch
 
 from edge_runtime.episode_report import EpisodeResult
-from edge_runtime.errors import UserError
 from edge_runtime.latency.model import LatencySpec
+from edge_runtime.util import UserError
 from trainer.drivers import load_driver, make_environment
 from trainer.evaluation import NO_NETWORK, drive_episodes
 from trainer.human.guide import Driver

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 if TYPE_CHECKING:
     from viewing.sinks import Sink

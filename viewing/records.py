@@ -26,7 +26,7 @@ from mcap.records import Channel, Chunk, DataEnd, Footer, McapRecord, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 MAX_RECORD_BYTES = 64 << 20
 """A torn length must not ask for more memory than any record of ours needs."""

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import rerun as rr
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 LOOPBACK = "127.0.0.1"
 START_S = 30.0

@@ -6,9 +6,7 @@ import contextlib
 import os
 from pathlib import Path
 
-from edge_runtime.errors import UserError
-from edge_runtime.file_lock import hold
-from edge_runtime.files import check_writable, make_directory
+from edge_runtime.util import UserError, check_writable, lock_file, make_directory
 
 MAX_PENDING_BYTES = 4 << 20
 NEVER_OVER = "choose another name: no recording is lost"
@@ -38,7 +36,7 @@ class FlushedFile:
             raise UserError(f"{path} exists; {NEVER_OVER}") from None
         except OSError as error:
             raise UserError(f"cannot write {path}: {error.strerror}") from None
-        hold(self._descriptor)
+        lock_file(self._descriptor)
         self.flushed_bytes = 0
         self._pending = bytearray()
 

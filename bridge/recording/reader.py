@@ -10,8 +10,7 @@ from typing import IO, NamedTuple
 
 from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 
-from edge_runtime.errors import UserError
-from edge_runtime.words import counted
+from edge_runtime.util import UserError, counted
 from viewing.records import Records
 
 

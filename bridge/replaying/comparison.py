@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bridge.replaying.recorded import Answer, Exchange, Key
-from edge_runtime.messages import SAFE_STOP
+from edge_runtime.wire import SAFE_STOP
 
 SHOWN_DIFFERENCES = 10
 

@@ -15,13 +15,11 @@ from bridge.replaying.recorded import (
     RecordedState,
     key_of,
 )
-from edge_runtime.config import Config
-from edge_runtime.controller import Controller, Order, Received
-from edge_runtime.inference import infer
-from edge_runtime.limiter import LimitRow, limit_rows
-from edge_runtime.policy import Policy
+from edge_runtime.config import NONE, Config
+from edge_runtime.controller import Controller, LimitRow, Order, Received, limit_rows
+from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import Event
-from edge_runtime.vehicles.registry import NONE, vehicle_limits
+from edge_runtime.vehicles.registry import vehicle_limits
 
 Answers = dict[Key, list[Answer]]
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from bridge.recording.reader import Recording
 from bridge.recording.writer import WIRE_ENCODING
-from edge_runtime.errors import UserError
 from edge_runtime.safety import MAX_INFERENCE_S, Event
+from edge_runtime.util import UserError
 from edge_runtime.wire import (
     Command,
     Health,

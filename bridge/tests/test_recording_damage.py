@@ -18,8 +18,8 @@ from bridge.recording.reader import Recording
 from bridge.recording.writer import RecordingWriter
 from bridge.tests.commands import make_command
 from bridge.tests.processes import bridge_status
-from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
+from edge_runtime.util import UserError
 from edge_runtime.wire import encode
 from viewing import records
 

@@ -14,10 +14,10 @@ from bridge.scene import Stamps, encode_scene
 from bridge.tests.commands import make_command
 from bridge.tests.processes import make_policy
 from bridge.tests.test_edge_counts import health
-from edge_runtime.cli import UserError
 from edge_runtime.config import Config
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.harness import make_state
+from edge_runtime.util import UserError
 from edge_runtime.wire import FRAMES_BYTES, MAX_PAYLOAD_BYTES, encode
 
 SECOND_NS = 10**9

@@ -18,8 +18,8 @@ from bridge.tests.processes import (
     simulate,
     start_edge,
 )
+from edge_runtime.commands import ask
 from edge_runtime.latency.model import parse_spec
-from edge_runtime.operator_commands import ask
 from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import encode

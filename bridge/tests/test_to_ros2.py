@@ -26,10 +26,10 @@ from bridge.to_ros2.translate import (
     odometry_of,
     twist_of,
 )
-from edge_runtime.cli import UserError
-from edge_runtime.ros2 import names
 from edge_runtime.tests.harness import make_state
-from edge_runtime.vehicles.similarity import CARS
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.mapping import CARS
+from edge_runtime.vehicles.ros2 import names
 from edge_runtime.wire import Command, Feedback, encode
 
 PEDAL = Policy(["pedal"], CARS["left_turn"])

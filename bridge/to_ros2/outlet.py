@@ -18,8 +18,8 @@ from bridge.to_ros2.translate import (
     twist_of,
 )
 from edge_runtime import wire
-from edge_runtime.ros2 import messages as ros
-from edge_runtime.ros2.node import Ros2Node
+from edge_runtime.vehicles.ros2 import node as ros
+from edge_runtime.vehicles.ros2.node import Ros2Node
 from edge_runtime.wire import Command, Feedback, Rejection, State
 
 # Not cmd_vel and not ackermann_cmd: this shows what is commanded, and must move nothing.

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge.to_ros2.translate import Policy
-from edge_runtime.cli import UserError
-from edge_runtime.vehicles.similarity import CARS
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.mapping import CARS
 
 RETRY_S = 2.0
 

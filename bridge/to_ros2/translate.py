@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from bridge.to_ros2.dead_reckoning import DeadReckoning
-from edge_runtime.ros2 import messages as ros
-from edge_runtime.vehicles.similarity import ScenarioCar, Similarity
+from edge_runtime.vehicles.mapping import ScenarioCar, Similarity
+from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE, Command, Feedback, State
 
 CAMERA_FRAME, ODOMETRY_FRAME, BASE_FRAME = "camera", "odom", "base_link"

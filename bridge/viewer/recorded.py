@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from bridge.feed import Heard
 from bridge.recording.reader import Recording, Stored
 from bridge.recording.writer import WIRE_ENCODING
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 
 def read_heard(recording: Recording, vehicle_id: str | None) -> Iterator[Heard]:

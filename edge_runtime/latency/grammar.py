@@ -16,8 +16,8 @@ import re
 from dataclasses import fields
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Tuple
 
-from edge_runtime.errors import UserError
 from edge_runtime.latency.spec import DIRECTIONS, ORDERS, TAILS, DirectionSpec, LatencySpec, Outage
+from edge_runtime.util import UserError
 
 MAX_DELAY_MS = 60_000.0
 MAX_TIME_S = 1e6

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Optional, Tuple
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 DIRECTIONS = ("up", "down")
 """State to edge runtime, and command to simulator."""

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.cli import UserError
 from edge_runtime.latency.grammar import SETTINGS
 from edge_runtime.latency.model import DirectionSpec, LatencySpec, Outage, parse_spec
 from edge_runtime.tests.latency_strategies import specs
+from edge_runtime.util import UserError
 
 
 @pytest.mark.parametrize(

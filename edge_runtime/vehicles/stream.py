@@ -1,16 +1,122 @@
-"""Sends 50 times a second from a thread of its own, and at once when it is woken.
+"""What drivers have in common whose vehicle must hear from them 50 times a second.
 
-A chassis takes a stream that pauses for a lost link, so its deadlines are absolute and its thread
-does nothing else. The thread inherits the priority that `realtime` gave the process.
+Such a driver is a core without clock and thread (a state machine, its tests, its mutants), a stream
+that sends what the core asks for, and a lock around every call of the core. Whatever it is sent
+through is called outside of the lock, so that nobody waits for a bus or a network.
 """
 
 from __future__ import annotations
 
+import abc
 import threading
 import time
+from enum import Enum
 from typing import Callable, Dict, Optional
 
-from edge_runtime.latency_window import LatencyWindow
+from edge_runtime import log
+from edge_runtime.safety import SILENCE_S
+from edge_runtime.service import LatencyWindow
+from edge_runtime.vehicles.base import Vehicle, VehicleReport
+
+# A beat later than the runtime's own silence rule, which then tells the reason; still within
+# the promise of 2 T + 50 ms, and less than half of the 500 ms of a Hunter's chassis.
+COMMAND_TIMEOUT_S = SILENCE_S + 0.02
+# At the end zeros go out for so long, unless it is known to stand before; and what is then not
+# known to stand gets the parking brake, where there is one.
+STOP_TAKES_S = 1.0
+
+
+class Core(abc.ABC):
+    """What a core must have. `words` says why it is stopped, empty where our own side asked."""
+
+    state: Enum
+    words: str
+
+    @property
+    @abc.abstractmethod
+    def late_at_s(self) -> float:
+        """After which moment its newest command is too old to be obeyed; inf where it has none."""
+
+    @abc.abstractmethod
+    def command(
+        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+    ) -> None:
+        """The newest command; forgotten where it may not drive. ValueError: unfit."""
+
+    @abc.abstractmethod
+    def brake(self, now_s: float, latch: bool = True) -> None:
+        """Speed 0 at the next tick, until the next command or (latched) the next `enable`."""
+
+    @abc.abstractmethod
+    def report(self, now_s: float) -> VehicleReport:
+        """What the vehicle does, in the policy's terms and in its own."""
+
+    @abc.abstractmethod
+    def is_at_rest(self, now_s: float) -> bool:
+        """Whether the vehicle is known to stand, or nobody here can do more about it."""
+
+
+class StreamedVehicle(Vehicle):
+    """A core behind a lock, and the stream that sends what it asks for."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._lock = threading.Lock()
+        self._closed = False
+        self._logged = ""
+        self._stream = Stream(f"{self.name}-stream", self._send_due, self._late_at_s)
+
+    def command(
+        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+    ) -> None:
+        """A pedal, or the speed of the scenario's car; and a steering, which else stays."""
+        with self._lock:
+            self._core.command(action, now_s, scenario_speed_mps)
+
+    def brake(self, now_s: float, latch: bool = True) -> None:
+        """Speed 0 leaves at once, not with the next period."""
+        with self._lock:
+            self._core.brake(now_s, latch)
+        self._stream.wake()
+
+    def feedback(self, now_s: float) -> VehicleReport:
+        """From the newest that was heard of the vehicle."""
+        with self._lock:
+            report = self._core.report(now_s)
+            self._log_state()
+        return report
+
+    @abc.abstractmethod
+    def _send_due(self) -> bool:
+        """Send what the core's `tick` gives; whether anything was. Never raises."""
+
+    def _end_stream(self) -> None:
+        """Stand, and send no more."""
+        self.brake(time.monotonic())
+        self._stream.run_until(self._is_at_rest, STOP_TAKES_S)
+        self._stream.stop()
+
+    def _log_gaps(self) -> None:
+        gaps_ms = self._stream.gaps_ms()
+        if gaps_ms:
+            log.event("info", f"{self.name}_stream", **gaps_ms)
+
+    def _is_at_rest(self) -> bool:
+        with self._lock:
+            return self._core.is_at_rest(time.monotonic())
+
+    def _late_at_s(self) -> float:
+        with self._lock:
+            return self._core.late_at_s
+
+    def _log_state(self) -> None:
+        """Each state once, when feedback is asked for: never from the stream's thread."""
+        state, words = self._core.state.value, self._core.words
+        line = f"{state} {words}".strip()
+        if line != self._logged:
+            self._logged = line
+            log.event("warning" if words else "info", self.name, state=state, why=words)
+
 
 PERIOD_S = 0.02
 _JOIN_S = 0.5

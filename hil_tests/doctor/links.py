@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.doctor.check import MissingError, output_of
 
 ARRIVAL_S = 5.0

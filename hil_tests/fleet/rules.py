@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from deploy.router_config import router_config
-from edge_runtime import access
+from edge_runtime import tls as access
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint
 from hil_tests.faults.processes import Process

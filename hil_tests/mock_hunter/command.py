@@ -9,12 +9,11 @@ import sys
 import time
 from typing import Any
 
-from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
-from edge_runtime.option_types import seconds
-from edge_runtime.vehicles.hunter import multicast
+from edge_runtime.cli import examples, seconds
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.hunter import bus as multicast
 from edge_runtime.vehicles.hunter.bus import BusName, open_bus, parse_bus
-from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE, PROFILES
+from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.faults import FAULTS, check_fault
 from hil_tests.mock_hunter.hunter import MockHunter
 from hil_tests.mock_hunter.parameters import MODELS, SOURCES, make_parameters, read_changes

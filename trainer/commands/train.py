@@ -15,12 +15,10 @@ from typing import Any
 
 import torch
 
-from edge_runtime.cli import INTERRUPTED, examples
+from edge_runtime.cli import INTERRUPTED, examples, not_negative, positive
 from edge_runtime.episode_report import GOAL
-from edge_runtime.errors import UserError
 from edge_runtime.latency.model import parse_spec
-from edge_runtime.option_types import not_negative, positive
-from edge_runtime.words import counted
+from edge_runtime.util import UserError, counted
 from trainer.commands.options import add_latency, add_scenario, add_threads, set_threads
 from trainer.commands.resuming import check_directory
 from trainer.commands.settings import DEFAULTS, settings, with_setting

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from edge_runtime.cli import examples
-from edge_runtime.words import counted
+from edge_runtime.util import counted
 from trainer.person.recording import find_recordings, read_steps
 from viewing.options import add_sink, chosen_sink
 

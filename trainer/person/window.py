@@ -9,7 +9,7 @@ import numpy as np
 import pygame
 from numpy.typing import NDArray
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.person.interface import View
 from trainer.person.quiet import quiet_stderr
 from trainer.scenarios.scene import draw_scene

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.learner.td3 import TD3Learner
 from trainer.training.learning import Action
 

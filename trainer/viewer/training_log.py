@@ -12,7 +12,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from edge_runtime.episode_report import GOAL
-from edge_runtime.words import counted
+from edge_runtime.util import counted
 from trainer.human.guide import Reason
 from trainer.training.metrics import EpisodeMetrics
 from trainer.viewer.advantage import q_advantage

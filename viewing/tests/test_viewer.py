@@ -7,7 +7,7 @@ import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from viewing import sinks
 from viewing.sinks import Sink, open_sink
 from viewing.tests.viewers import NO_GPU, in_place, listens

@@ -12,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from viewing.pace import Pace
 from viewing.scene import SeenCar, SeenScene, read_scene
 from viewing.shapes import outline, view_bounds

@@ -1,24 +1,142 @@
-"""The driver of a ROS 2 vehicle without clock, thread and network: odometry in, motion out.
+"""How the driver sees a vehicle behind ROS 2: a pure state machine. LEADS_TO is all of it.
 
-Whoever holds it (vehicle.py, a test) serialises the calls, passes monotonic seconds, gives `hear`
-every odometry, and publishes what `tick` returns, 50 times a second.
+STOPPED is a latch: the chassis drives again by itself as soon as somebody sends it a speed. Only
+ENABLE leads out.
 """
 
 from __future__ import annotations
 
 import math
+from enum import Enum
 from typing import Dict, List, NamedTuple, Optional
 
+from edge_runtime.config import Ros2Settings
 from edge_runtime.vehicles import mapping
-from edge_runtime.vehicles.hunter.set_point import SetPoint, SpeedWatch, Wish, steering_of, wish_of
-from edge_runtime.vehicles.hunter.specs import HunterSpec
-from edge_runtime.vehicles.interface import VehicleReport
-from edge_runtime.vehicles.ros2.odometry import Measured, OdometryReports
-from edge_runtime.vehicles.ros2.settings import Ros2Settings
-from edge_runtime.vehicles.ros2.states import LEADS_TO, Event, State
-from edge_runtime.vehicles.similarity import Similarity
-from edge_runtime.vehicles.streamed import COMMAND_TIMEOUT_S, Core
+from edge_runtime.vehicles.base import VehicleReport
+from edge_runtime.vehicles.core import (
+    IMPOSSIBLE,
+    SetPoint,
+    Speeds,
+    SpeedWatch,
+    Wish,
+    steering_of,
+    wish_of,
+)
+from edge_runtime.vehicles.mapping import HunterSpec, Similarity
+from edge_runtime.vehicles.ros2.names import STEERING
+from edge_runtime.vehicles.stream import COMMAND_TIMEOUT_S, Core
 from edge_runtime.wire import CONTROL_PERIOD_S
+
+
+class State(str, Enum):
+    """DISABLED: nothing is sent. ENABLING and STOPPED: speed 0 is sent. ENABLED: commands are."""
+
+    DISABLED = "disabled"
+    ENABLING = "enabling"
+    ENABLED = "enabled"
+    STOPPED = "stopped"
+
+
+class Event(str, Enum):
+    """What can happen. All after CLOSE are what the odometry or time do."""
+
+    ENABLE = "enable"
+    BRAKE = "brake"
+    CLOSE = "close"
+    CONFIRMED = "confirmed"  # fresh odometry
+    NOT_CONFIRMED = "not_confirmed"  # within ENABLE_TIMEOUT_S
+    COMMAND_LATE = "command_late"  # no fresh command for 2 T
+    SILENT = "odometry_silent"
+    LYING = "odometry_impossible"
+    STUCK = "speed_stuck"
+
+
+_D, _G, _E, _X = State.DISABLED, State.ENABLING, State.ENABLED, State.STOPPED
+
+# By the state before. A state that is not named stays as it is.
+LEADS_TO: Dict[Event, Dict[State, State]] = {
+    Event.ENABLE: {_D: _G, _E: _G, _X: _G},
+    Event.BRAKE: {_G: _X, _E: _X},
+    Event.CLOSE: {_G: _D, _E: _D, _X: _D},
+    Event.CONFIRMED: {_G: _E},
+    Event.NOT_CONFIRMED: {_G: _X},
+    Event.COMMAND_LATE: {_E: _X},  # while ENABLING nothing moves yet
+    Event.SILENT: {_E: _X},  # while ENABLING that is what is to be ended
+    Event.LYING: {_G: _X, _E: _X},
+    Event.STUCK: {_E: _X},
+}
+
+
+# Below this the path's curvature, yaw rate over speed, is more noise than steering.
+STEERS_FROM_MPS = 0.2
+
+
+class Measured(NamedTuple):
+    """One odometry message: `stamp_ns` by its sender's clock, `angular` as the settings say."""
+
+    stamp_ns: int
+    speed_mps: float
+    angular: float
+
+
+class OdometryReports:
+    """The newest odometry, and the speeds of the last control period."""
+
+    def __init__(self, settings: Ros2Settings, spec: HunterSpec) -> None:
+        self.heard_s = -math.inf
+        self.stale = 0  # repetitions and late ones: they show nobody alive
+        self._newest: Optional[Measured] = None
+        self._spec = spec
+        self._is_angle = settings.odometry_angular == STEERING
+        self._speeds = Speeds()
+
+    def begin(self) -> None:
+        """Take whatever comes next: a clock on the other side may have been set back."""
+        self._newest = None
+        self._speeds.forget()
+
+    def hear(self, measured: Measured, now_s: float) -> bool:
+        """Note a message; False for one that is not newer than the last by its own stamp.
+
+        A sender that leaves its stamps at 0 is believed by the time of arrival alone.
+        """
+        newest = self._newest
+        if newest is not None and 0 < measured.stamp_ns <= newest.stamp_ns:
+            self.stale += 1
+            return False
+        self._newest, self.heard_s = measured, now_s
+        self._speeds.note(measured.speed_mps, now_s)
+        return True
+
+    @property
+    def speed_mps(self) -> float:
+        """The newest speed, 0 before the first."""
+        return self._speeds.newest_mps
+
+    @property
+    def stands(self) -> bool:
+        """Whether it stood when it was last heard."""
+        return self._speeds.stands
+
+    @property
+    def is_impossible(self) -> bool:
+        """Whether it says a speed that the vehicle cannot have."""
+        return abs(self.speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps
+
+    def acceleration_mps2(self) -> float:
+        """Over the last control period; 0 while there is too little to tell."""
+        return self._speeds.acceleration_mps2()
+
+    def centre_rad(self) -> Optional[float]:
+        """The front wheels' centre angle; None where a yaw rate cannot tell it: it hardly moves."""
+        if self._newest is None:
+            return None
+        if self._is_angle:
+            return self._newest.angular
+        if abs(self.speed_mps) < STEERS_FROM_MPS:
+            return None
+        return math.atan(self._spec.wheelbase_m * self._newest.angular / self.speed_mps)
+
 
 ODOMETRY_SILENCE_S = 2 * CONTROL_PERIOD_S
 ENABLE_TIMEOUT_S = 1.0

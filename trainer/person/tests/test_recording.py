@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from bridge.tests.test_recording_damage import MIB, crafted, zeros
-from edge_runtime.errors import UserError
-from edge_runtime.file_lock import try_to_hold
+from edge_runtime.util import UserError, try_to_lock_file
 from trainer.person.recording import Recorder, Step, find_recordings, read_steps, sittings
 from trainer.person.tests.steps import recorded_step
 from viewing import records
@@ -74,9 +73,9 @@ def test_a_sitting_is_held_until_it_is_closed(tmp_path):
     recorder = Recorder(tmp_path)
     recorder.write(recorded_step(1, 0))
     with recorder.path.open("rb") as other:
-        assert not try_to_hold(other.fileno())
+        assert not try_to_lock_file(other.fileno())
         recorder.close()
-        assert try_to_hold(other.fileno())
+        assert try_to_lock_file(other.fileno())
 
 
 def test_every_step_is_there_before_the_next_is_taken(tmp_path):

@@ -8,12 +8,20 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from edge_runtime.vehicles.ros2.convert import drive_of, twist_of
-from edge_runtime.vehicles.ros2.core import COMMAND_TIMEOUT_S, ENABLE_TIMEOUT_S, Motion, Ros2Core
-from edge_runtime.vehicles.ros2.odometry import Measured
-from edge_runtime.vehicles.ros2.settings import STEERING, YAW_RATE, Ros2Settings
-from edge_runtime.vehicles.ros2.states import LEADS_TO, Event, State
-from edge_runtime.vehicles.ros2.tests.drive import CONGESTION, LEFT_TURN, SPEC, TICK_S, Drive
+from edge_runtime.config import Ros2Settings
+from edge_runtime.vehicles.ros2.core import (
+    COMMAND_TIMEOUT_S,
+    ENABLE_TIMEOUT_S,
+    LEADS_TO,
+    Event,
+    Measured,
+    Motion,
+    Ros2Core,
+    State,
+)
+from edge_runtime.vehicles.ros2.names import STEERING, YAW_RATE
+from edge_runtime.vehicles.ros2.tests.ros_hunter import CONGESTION, LEFT_TURN, SPEC, TICK_S, Drive
+from edge_runtime.vehicles.ros2.vehicle import drive_of, twist_of
 
 
 def test_nothing_is_sent_before_enable():

@@ -1,0 +1,263 @@
+"""`python -m edge_runtime run`: the control loop as a process."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from functools import partial
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional
+
+import zenoh
+
+from edge_runtime import log, service
+from edge_runtime.config import NONE, Config, load_config
+from edge_runtime.controller import Controller, limit_rows
+from edge_runtime.link import Link, require_free, taken, wait_for_router
+from edge_runtime.loop import ControlLoop, Hold
+from edge_runtime.policy import Policy, load_policy
+from edge_runtime.transport import is_tls, open_session
+from edge_runtime.util import UserError, ending_signals
+from edge_runtime.wire import key
+
+if TYPE_CHECKING:  # Only who has a certificate or a vehicle loads what these need.
+    from edge_runtime.tls import TlsFiles
+    from edge_runtime.vehicles.base import Vehicle, VehicleRunner
+
+
+_WAITING_PERIOD_S = 5.0
+_POLL_S = 0.1
+
+
+class StopSignal:
+    """Whatever would end it: remembered from the start, handed on once there is a loop to stop."""
+
+    def __init__(self) -> None:
+        self.came = False
+        self.on_stop: Callable[[], None] = lambda: None
+        for number in {signal.SIGTERM, signal.SIGINT, *ending_signals()}:
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        self.came = True
+        self.on_stop()
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Verify, connect, drive until a signal comes. Raises UserError before the network opens."""
+    flags = {name: getattr(arguments, name, None) for name in Config.__struct_fields__}
+    config = load_config(arguments.config, flags)
+    log.configure(config.log_level, config.log_format)
+    try:
+        return _run(config)
+    finally:
+        log.close()
+
+
+def _run(config: Config) -> int:
+    stop = StopSignal()
+    tls = _certificate(config)
+    service.configure(config.realtime_priority, config.cpus, config.lock_memory)
+    policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
+    vehicle = _make_vehicle(config, policy)
+    with _closed_on_error(vehicle):
+        rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
+    task = policy.manifest.task
+    controller = Controller(rows, vehicle is not None, config.armed_at_start, task)
+    return _serve(config, tls, policy, controller, vehicle, stop)
+
+
+@contextlib.contextmanager
+def _closed_on_error(vehicle: Optional[Vehicle]) -> Iterator[None]:
+    """For what may fail while the vehicle has no runner yet, who would close it."""
+    try:
+        yield
+    except BaseException:
+        if vehicle is not None:
+            vehicle.close()
+        raise
+
+
+def _make_vehicle(config: Config, policy: Policy) -> Optional[Vehicle]:
+    if config.vehicle == NONE:
+        return None
+    from edge_runtime.vehicles.registry import make_vehicle
+
+    return make_vehicle(config.vehicle, config.vehicle_setup(policy.manifest.scenario))
+
+
+def _certificate(config: Config) -> Optional[TlsFiles]:
+    if config.tls is None:
+        return None
+    from edge_runtime import tls
+
+    files = tls.load_tls(config.tls)
+    tls.check_name(files.name, tls.common_name(tls.EDGE, config.vehicle_id))
+    return files
+
+
+def _serve(
+    config: Config,
+    tls: Optional[TlsFiles],
+    policy: Policy,
+    controller: Controller,
+    vehicle: Optional[Vehicle],
+    stop: StopSignal,
+) -> int:
+    # Both of its sessions hear only whom this vehicle's edge may hear.
+    connected = partial(open_session, connect=config.connect, tls=tls, access=_rules(config, tls))
+    open_client = partial(connected, mode="client")
+    notifier = service.Notifier()
+    with _closed_on_error(vehicle):
+        alive = key(config.vehicle_id, "alive")
+        router_is_there = require_free(open_client, alive, config.vehicle_id)
+        session = connected(mode="peer")
+        try:
+            link = Link(session, config.vehicle_id, policy.manifest)
+            runner = _attach(vehicle, policy, link)
+            rearm = rearm_command(config.connect, config.vehicle_id)
+            loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold), rearm)
+        except BaseException:
+            session.close()  # An open session would hang the process at its exit.
+            raise
+    rivals: List[UserError] = []
+
+    def give_way() -> None:
+        rivals.append(taken(config.vehicle_id))
+        link.mute()
+        loop.stop()
+
+    stop.on_stop = loop.stop
+    why = partial(why_no_state, session, config.connect, config.vehicle_id, tls)
+    waiting = Waiting(loop.has_heard, why)
+    # What is loaded stays: the collector need not look at it again in the middle of a drive.
+    gc.collect()
+    gc.freeze()
+    try:
+        if runner is not None:
+            runner.start(config.armed_at_start)
+        loop.start()
+        if router_is_there:
+            wait_for_router(session)
+        link.appear(open_client, give_way)
+        _say_ready(config, policy, tls)
+        waiting.start(bool(session.info.routers_zid()))
+        notifier.ready(controller.safety.mode.value)
+        if not stop.came:
+            loop.run()
+    finally:
+        waiting.stop()
+        notifier.stopping()
+        ended = loop.close()
+        if runner is not None:
+            runner.close()
+        link.close()
+        log.event("info", "ended", **_totals(loop))
+    if rivals:
+        raise rivals[0]
+    if not ended:
+        # The policy's thread hangs in native code, and would hold the interpreter's exit.
+        log.close()
+        os._exit(0)
+    return 0
+
+
+def _rules(config: Config, tls: Optional[TlsFiles]) -> Optional[Dict[str, Any]]:
+    if tls is None:
+        return None
+    from edge_runtime.tls import rules_for_edge
+
+    return rules_for_edge(config.vehicle_id)
+
+
+def _attach(vehicle: Optional[Vehicle], policy: Policy, link: Link) -> Optional[VehicleRunner]:
+    if vehicle is None:
+        return None
+    from edge_runtime.vehicles.base import VehicleRunner
+
+    names = [action.name for action in policy.manifest.action]
+    return VehicleRunner(vehicle, names, lambda feedback: link.send("feedback", feedback))
+
+
+def _say_ready(config: Config, policy: Policy, tls: Optional[TlsFiles]) -> None:
+    if policy.trust != "verified":
+        log.event("warning", "policy_not_verified", trust=policy.trust)
+    if tls is not None:
+        log.event("info", "certificate", of=tls.name, expires=f"{tls.expires:%Y-%m-%dT%H:%MZ}")
+    print(
+        f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
+        f" connect={config.connect} policy_id={policy.policy_id}",
+        flush=True,
+    )
+    sys.stdout.flush()
+
+
+def rearm_command(connect: str, vehicle_id: str) -> str:
+    """What an operator types to let a vehicle drive again."""
+    tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
+    return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"
+
+
+def _totals(loop: ControlLoop) -> dict:
+    health = loop.health()
+    return {
+        "accepted": health.accepted,
+        "rejected": sum(health.rejected.values()),
+        "deadline_misses": health.deadline_misses,
+        "safe_stops": health.safe_stops,
+        "uptime_s": round(health.uptime_s, 1),
+    }
+
+
+class Waiting:
+    """`look` says it where that is due; `start` has a thread look: a name server takes its time."""
+
+    def __init__(self, has_heard: Callable[[], bool], why: Callable[[], str]) -> None:
+        self._has_heard = has_heard
+        self._why = why
+        self._next_s = -math.inf
+        self._ended = threading.Event()
+
+    def look(self, now_s: float) -> bool:
+        """Say what is waited for, at once and every 5 s; False once a state was heard."""
+        if self._has_heard():
+            return False
+        if now_s >= self._next_s:
+            self._next_s = now_s + _WAITING_PERIOD_S
+            why = self._why()
+            if why and not self._has_heard():
+                log.event("info", "waiting", why=why)
+        return True
+
+    def start(self, is_linked: bool) -> None:
+        """Look until a state comes, or `stop`. One that is linked has 5 s for its first state."""
+        if is_linked:
+            self._next_s = time.monotonic() + _WAITING_PERIOD_S
+        threading.Thread(target=self._run, name="waiting", daemon=True).start()
+
+    def stop(self) -> None:
+        """Say nothing more. Waits for nobody."""
+        self._ended.set()
+
+    def _run(self) -> None:
+        while self.look(time.monotonic()) and not self._ended.wait(_POLL_S):
+            pass
+
+
+def why_no_state(
+    session: zenoh.Session, connect: str, vehicle_id: str, tls: Optional[TlsFiles]
+) -> str:
+    """What keeps states away, on one line."""
+    if not session.info.routers_zid():
+        from edge_runtime.link_probe import why_no_link
+
+        refusal = why_no_link(connect, tls)
+        if not session.info.routers_zid():  # it may have come meanwhile
+            return refusal or f"{connect} gives no link yet"
+    return f"{connect} is there, and has sent no state for vehicle id {vehicle_id} yet"
