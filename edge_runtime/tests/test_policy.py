@@ -192,6 +192,32 @@ def test_manifest_and_graph_must_agree(tmp_path, options, match):
     refused(tmp_path / "p.onnx", match, allow_unsigned=True)
 
 
+def _rename(graph):
+    graph.input[0].name = graph.node[0].input[0] = "pictures"
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (_rename, r"pictures tensor\(uint8\) \['batch', 2, 45, 80\]"),
+        (lambda g: setattr(_input(g), "elem_type", onnx.TensorProto.FLOAT), r"tensor\(float\)"),
+        (lambda g: setattr(_input(g).shape.dim[2], "dim_value", 46), "'batch', 2, 46, 80"),
+        (lambda g: setattr(_input(g).shape.dim[0], "dim_value", 2), "2, 2, 45, 80"),
+        (lambda g: g.input.append(helper.make_tensor_value_info("more", 1, [1])), "more tensor"),
+    ],
+)
+def test_a_graph_of_another_input_is_refused(tmp_path, change, found):
+    write_policy(tmp_path / "p.onnx")
+    model = onnx.load(str(tmp_path / "p.onnx"))
+    change(model.graph)
+    onnx.save(model, str(tmp_path / "p.onnx"))
+    refused(tmp_path / "p.onnx", rf"its input must be frames .*{found}", allow_unsigned=True)
+
+
+def _input(graph):
+    return graph.input[0].type.tensor_type
+
+
 def test_an_action_that_nobody_can_stop_is_refused(tmp_path):
     horn = type(PEDAL)(name="horn", meaning="loud", unit="dB", low=-1.0, high=1.0)
     write_policy(tmp_path / "p.onnx", actions=(horn,))

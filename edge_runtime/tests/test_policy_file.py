@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from edge_runtime.policy import MANIFEST_KEY, decode_manifest
-from edge_runtime.policy_file import FLOAT32, UINT8, read_onnx, verify
+from edge_runtime.policy_file import read_onnx, verify
 from edge_runtime.tests.harness import run_command
 from edge_runtime.tests.policies import public_pem, write_policy
 from edge_runtime.util import UserError
@@ -30,8 +30,6 @@ def written(tmp_path_factory):
 def test_it_reads_what_the_onnx_package_wrote(written):
     model = read_onnx(written.read_bytes())
     assert (model.ir_version, model.opset) == (8, 17)
-    assert model.inputs == [("frames", UINT8, ("batch", 2, 45, 80))]
-    assert model.outputs == [("action", FLOAT32, ("batch", 1))]
     assert decode_manifest(model.metadata[MANIFEST_KEY]).scenario == "left_turn"
 
 
