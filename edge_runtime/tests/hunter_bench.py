@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import HunterCore, State
+from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import Sent
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 

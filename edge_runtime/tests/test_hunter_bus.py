@@ -16,6 +16,7 @@ from edge_runtime.config import CarSettings, SimilaritySettings, VehicleSetup
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import stream
+from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter import bus as buses
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.bus import (
@@ -27,7 +28,6 @@ from edge_runtime.vehicles.hunter.bus import (
     open_bus,
     parse_bus,
 )
-from edge_runtime.vehicles.hunter.core import State
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 from edge_runtime.vehicles.registry import make_vehicle, vehicle_limits
 

@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 
 import edge_runtime
 from edge_runtime.tests.hunter_bench import OK, STREAM_S, Bench, sent_ids, told_by
-from edge_runtime.vehicles.hunter import core as rules
+from edge_runtime.vehicles import core as rules
+from edge_runtime.vehicles.core import LEADS_TO, Event, Finding, State, render_table
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import TRANSITIONS, Event, State, render_table
+from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S
+from edge_runtime.vehicles.mapping import wish_of
 
 
 def test_nothing_leaves_before_enable():
@@ -117,8 +119,8 @@ def test_time_limits_to_the_instant():
     core.state = State.ENABLED
     for at_s, state in (
         (0.0, State.ENABLED),
-        (rules.BUS_PATIENCE_S, State.ENABLED),
-        (rules.BUS_PATIENCE_S + 1e-9, State.STOPPED),
+        (BUS_PATIENCE_S, State.ENABLED),
+        (BUS_PATIENCE_S + 1e-9, State.STOPPED),
     ):
         core.bus_failed("full", at_s)
         assert core.state is state
@@ -337,9 +339,9 @@ def expected(state, event):
 
 
 def test_every_pair_of_state_and_event():
-    assert {
-        (state, event): expected(state, event) for state in State for event in Event
-    } == TRANSITIONS
+    assert {(state, event): expected(state, event) for state in State for event in Event} == {
+        (state, event): LEADS_TO[event].get(state, state) for state in State for event in Event
+    }
     assert render_table().count("\n") == len(Event) + 1
 
 
@@ -355,9 +357,9 @@ def test_the_core_goes_where_the_table_says(state, event):
     core = bench.core
     core.state = state
     core.set_point.speed_mps = 1.0
-    core._wish = core_wish = rules.wish_of({"pedal": 1.0}, None)
-    core._apply(rules.Finding(event, "why"), bench.now_s)
-    after = TRANSITIONS[state, event]
+    core._wish = core_wish = wish_of({"pedal": 1.0}, None)
+    core._apply(Finding(event, "why"), bench.now_s)
+    after = LEADS_TO[event].get(state, state)
     assert core.state is after
     if after is State.STOPPED and state is not State.STOPPED:
         assert (core.cause, core.words) == (event, "why")

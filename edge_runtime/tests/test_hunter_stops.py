@@ -10,8 +10,8 @@ from edge_runtime.tests.hunter_bench import (
     Bench,
     sent_ids,
 )
+from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import Event, State
 
 
 @pytest.mark.parametrize(

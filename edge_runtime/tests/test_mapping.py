@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import mapping
-from edge_runtime.vehicles.core import inner_of, steering_of
-from edge_runtime.vehicles.mapping import CARS, SPECS, car_of, similarity_to
+from edge_runtime.vehicles.mapping import CARS, SPECS, car_of, inner_of, similarity_to, steering_of
 
 CONGESTION = similarity_to(CARS["congestion"], 1.5)
 

@@ -10,7 +10,6 @@ from edge_runtime.config import NONE, VEHICLE_NAMES, SimilaritySettings, Vehicle
 from edge_runtime.controller import ActionLimit
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle
-from edge_runtime.vehicles.core import limits_of
 from edge_runtime.vehicles.hunter.bus import parse_bus
 from edge_runtime.vehicles.hunter.protocol import PROFILES
 from edge_runtime.vehicles.mapping import (
@@ -20,6 +19,7 @@ from edge_runtime.vehicles.mapping import (
     ScenarioCar,
     Similarity,
     car_of,
+    limits_of,
     similarity_to,
 )
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle

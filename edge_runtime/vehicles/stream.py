@@ -1,8 +1,9 @@
-"""What drivers have in common whose vehicle must hear from them 50 times a second.
+"""The shell of a vehicle that must hear from us 50 times a second: a thread, a lock, and its core.
 
-Such a driver is a core without clock and thread (a state machine, its tests, its mutants), a stream
-that sends what the core asks for, and a lock around every call of the core. Whatever it is sent
-through is called outside of the lock, so that nobody waits for a bus or a network.
+The stream sends what the core (core.py) asks for, and a lock is around every call of the core.
+Whatever it is sent through is called outside of the lock, so that nobody waits for a bus or a
+network. A chassis takes a stream that pauses for a lost link: the deadlines are absolute, and the
+thread does nothing else. It inherits the priority that the runtime gave the process.
 """
 
 from __future__ import annotations
@@ -10,56 +11,21 @@ from __future__ import annotations
 import abc
 import threading
 import time
-from enum import Enum
 from typing import Callable, Dict, Optional
 
 from edge_runtime import log
-from edge_runtime.safety import SILENCE_S
 from edge_runtime.service import LatencyWindow
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
+from edge_runtime.vehicles.core import STOP_TAKES_S, StreamedCore
 
-# A beat later than the runtime's own silence rule, which then tells the reason; still within
-# the promise of 2 T + 50 ms, and less than half of the 500 ms of a Hunter's chassis.
-COMMAND_TIMEOUT_S = SILENCE_S + 0.02
-# At the end zeros go out for so long, unless it is known to stand before; and what is then not
-# known to stand gets the parking brake, where there is one.
-STOP_TAKES_S = 1.0
-
-
-class Core(abc.ABC):
-    """What a core must have. `words` says why it is stopped, empty where our own side asked."""
-
-    state: Enum
-    words: str
-
-    @property
-    @abc.abstractmethod
-    def late_at_s(self) -> float:
-        """After which moment its newest command is too old to be obeyed; inf where it has none."""
-
-    @abc.abstractmethod
-    def command(
-        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
-    ) -> None:
-        """The newest command; forgotten where it may not drive. ValueError: unfit."""
-
-    @abc.abstractmethod
-    def brake(self, now_s: float, latch: bool = True) -> None:
-        """Speed 0 at the next tick, until the next command or (latched) the next `enable`."""
-
-    @abc.abstractmethod
-    def report(self, now_s: float) -> VehicleReport:
-        """What the vehicle does, in the policy's terms and in its own."""
-
-    @abc.abstractmethod
-    def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or nobody here can do more about it."""
+PERIOD_S = 0.02
+_JOIN_S = 0.5
 
 
 class StreamedVehicle(Vehicle):
     """A core behind a lock, and the stream that sends what it asks for."""
 
-    def __init__(self, core: Core) -> None:
+    def __init__(self, core: StreamedCore) -> None:
         self._core = core
         self._lock = threading.Lock()
         self._closed = False
@@ -116,10 +82,6 @@ class StreamedVehicle(Vehicle):
         if line != self._logged:
             self._logged = line
             log.event("warning" if words else "info", self.name, state=state, why=words)
-
-
-PERIOD_S = 0.02
-_JOIN_S = 0.5
 
 
 class Stream:

@@ -9,7 +9,7 @@ from bridge.actions import vehicle_action
 from bridge.feedback_hold import VehicleDecision
 from bridge.tracking import TrackingLog
 from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.hunter.core import State
+from edge_runtime.vehicles.core import State
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command, Feedback
 from hil_tests.mock_hunter.parameters import Parameters
 from hil_tests.vehicle.virtual_hunter import VirtualHunter

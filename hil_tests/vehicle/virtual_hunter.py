@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.hunter.core import HunterCore, State
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE
 from edge_runtime.vehicles.mapping import SPECS, Similarity, car_of, similarity_to
 from edge_runtime.wire import TOPICS

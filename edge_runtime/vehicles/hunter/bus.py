@@ -24,10 +24,10 @@ from edge_runtime import log
 from edge_runtime.controller import ActionLimit
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.core import limits_of
-from edge_runtime.vehicles.hunter.core import HunterCore, State
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import BITRATE, COMMANDS, Frame
-from edge_runtime.vehicles.mapping import HunterSpec, Similarity
+from edge_runtime.vehicles.mapping import HunterSpec, Similarity, limits_of
 from edge_runtime.vehicles.stream import PERIOD_S, StreamedVehicle
 
 _LISTEN_S = 0.1

@@ -14,10 +14,10 @@ from typing import Callable, ClassVar, Dict, List
 from edge_runtime import log
 from edge_runtime.config import Ros2Settings
 from edge_runtime.controller import ActionLimit
-from edge_runtime.vehicles.core import limits_of
-from edge_runtime.vehicles.mapping import HunterSpec, Similarity
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.mapping import HunterSpec, Similarity, limits_of
 from edge_runtime.vehicles.ros2 import node as ros
-from edge_runtime.vehicles.ros2.core import Measured, Motion, Ros2Core, State
+from edge_runtime.vehicles.ros2.core import Measured, Motion, Ros2Core
 from edge_runtime.vehicles.ros2.names import STEERING, check_settings, open_ros2_session
 from edge_runtime.vehicles.ros2.node import Ros2Node
 from edge_runtime.vehicles.stream import StreamedVehicle

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import pytest
 
-from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S
+from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S, State
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import HunterCore, State
+from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 from hil_tests.mock_hunter.faults import BITS, FAULTS
 from hil_tests.mock_hunter.hunter import MockHunter

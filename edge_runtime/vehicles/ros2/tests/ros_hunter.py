@@ -14,8 +14,9 @@ from typing import Any, Dict, List, Optional, Tuple
 
 from edge_runtime.config import Ros2Settings
 from edge_runtime.transport import open_session
+from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
-from edge_runtime.vehicles.ros2.core import Measured, Ros2Core, State
+from edge_runtime.vehicles.ros2.core import Measured, Ros2Core
 from edge_runtime.vehicles.ros2.tests import second
 
 WHEELBASE_M, TRACK_M, MAX_INNER_RAD = 0.650, 0.605, 0.576

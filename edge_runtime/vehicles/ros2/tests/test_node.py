@@ -243,7 +243,7 @@ LOOPBACK_ONLY = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
     "<AllowMulticast>false</AllowMulticast></General></Domain></CycloneDDS>"
 )
-pytestmark = pytest.mark.skipif(
+needs_cyclone = pytest.mark.skipif(
     shutil.which("idlc") is None or shutil.which("gcc") is None, reason="no Cyclone DDS in C here"
 )
 
@@ -274,6 +274,7 @@ def through_dds(tmp_path_factory):
     return go
 
 
+@needs_cyclone
 @settings(
     max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -289,6 +290,7 @@ def test_dds_takes_any_message_and_gives_it_back(through_dds, message):
     assert type_name == f"{package}::{part}::dds_::{name}_"
 
 
+@needs_cyclone
 def test_dds_refuses_another_type(through_dds):
     assert through_dds(node.encode(ros.Twist()), ros.Odometry) is None
 
