@@ -1,4 +1,4 @@
-"""`python -m edge_runtime check`: may this policy drive, and how fast does it answer here?"""
+"""The commands that do not drive: `check` of a policy, and an operator's `status` and `rearm`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""The edge runtime's end of the wire: its publishers, subscriber, queryables and token."""
+"""The edge runtime's end of the wire: what it publishes and answers, and that it is the only one.
+
+Besides `phil/<id>/alive` each runtime declares `phil/<id>/alive/<claim>`, because Zenoh shows
+equal tokens of two sessions as one. Of two runtimes with one vehicle id the younger claim gives
+way; a claim is as old as the connection to the router, so a runtime that reconnects loses its
+seniority.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +24,18 @@ from edge_runtime.transport import LEASE_MS, only_own
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
+OpenClient = Callable[[], zenoh.Session]
+
+_POLL_S = 0.1
+# Two looks so far apart: a claim that is seen in both is no leftover of a lost connection.
+_FIRST_LOOKS_S = 0.3
+_LOOK_S = 1.0
+_CONNECT_S = 0.2
+_JOIN_S = 0.5
+_LEFTOVER_S = 1.5 * LEASE_MS / 1000.0
 _PUBLISHED = ("command", "feedback", "health")
+
+_thread = threading.local()
 
 
 class Link:
@@ -126,13 +143,6 @@ def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
     return zenoh.handlers.Callback(call, indirect=False)
 
 
-def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
-    query.reply(query.key_expr, json.dumps(value).encode(), encoding="application/json")
-
-
-_thread = threading.local()
-
-
 def keep_state() -> None:
     """Let this thread keep its Python state until it ends.
 
@@ -145,15 +155,8 @@ def keep_state() -> None:
         _thread.kept = True
 
 
-_POLL_S = 0.1
-# Two looks so far apart: a claim that is seen in both is no leftover of a lost connection.
-_FIRST_LOOKS_S = 0.3
-_LOOK_S = 1.0
-_CONNECT_S = 0.2
-_JOIN_S = 0.5
-_LEFTOVER_S = 1.5 * LEASE_MS / 1000.0
-
-OpenClient = Callable[[], zenoh.Session]
+def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
+    query.reply(query.key_expr, json.dumps(value).encode(), encoding="application/json")
 
 
 def require_free(open_client: OpenClient, alive_key: str, vehicle_id: str) -> bool:

@@ -19,6 +19,7 @@ FORMATS = ("text", "json")
 _LOGGER = logging.getLogger("edge_runtime")
 _WAITING_LINES = 1000
 _FLUSH_S = 0.5
+_FLOOD_PERIOD_S = 1.0
 
 
 def configure(level: str, log_format: str = "text") -> None:
@@ -104,9 +105,6 @@ def _quoted(value: Any) -> str:
     return text if is_plain else repr(text)
 
 
-PERIOD_S = 1.0
-
-
 class _Said(NamedTuple):
     at_s: float
     unsaid: int
@@ -124,7 +122,7 @@ class Flood:
         if said is None:
             self._said[kind] = _Said(now_s, 0)
             return 0
-        if now_s - said.at_s < PERIOD_S:
+        if now_s - said.at_s < _FLOOD_PERIOD_S:
             self._said[kind] = said._replace(unsaid=said.unsaid + 1)
             return None
         self._said[kind] = _Said(now_s, 0)

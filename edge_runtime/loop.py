@@ -41,6 +41,42 @@ _RETRY_S = 0.1
 _HUNG_S = 2.0
 
 
+class Hold:
+    """No command while an installer tries this release: neither on the wire nor to the vehicle.
+
+    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
+    process, so an installer that dies leaves nobody silent. Once free, this process never asks
+    again. None, or a file that is not there, holds nothing; UserError for one that cannot be read:
+    nobody could say whether it holds.
+    """
+
+    def __init__(self, path: Optional[str] = None) -> None:
+        self._stream: Optional[BinaryIO] = None
+        if path is not None:
+            try:
+                self._stream = open_regular(path)  # kept until it is free
+            except FileNotFoundError:
+                return
+            except OSError as error:
+                raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
+
+    def is_on(self) -> bool:
+        """Whether commands must stay here. Never waits."""
+        if self._stream is None:
+            return False
+        try:
+            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        self._stream.close()
+        self._stream = None
+        return False
+
+    def refusal(self) -> str:
+        """Why nobody may re-arm now; empty when free."""
+        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""
+
+
 class ControlLoop:
     """Answers states with commands until it is stopped."""
 
@@ -296,36 +332,3 @@ class ControlLoop:
         unsaid = self._flood.admit(reason, now_s)
         if unsaid is not None:
             log.event("warning", "rejected", reason=reason, detail=rejection.detail, unsaid=unsaid)
-
-
-class Hold:
-    """`path` is the file; None, or one that is not there, holds nothing.
-
-    Raises UserError for one that cannot be read: nobody could say whether it holds.
-    """
-
-    def __init__(self, path: Optional[str] = None) -> None:
-        self._stream: Optional[BinaryIO] = None
-        if path is not None:
-            try:
-                self._stream = open_regular(path)  # kept until it is free
-            except FileNotFoundError:
-                return
-            except OSError as error:
-                raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
-
-    def is_on(self) -> bool:
-        """Whether commands must stay here. Never waits."""
-        if self._stream is None:
-            return False
-        try:
-            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        self._stream.close()
-        self._stream = None
-        return False
-
-    def refusal(self) -> str:
-        """Why nobody may re-arm now; empty when free."""
-        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

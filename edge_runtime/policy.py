@@ -1,6 +1,7 @@
-"""The manifest inside a policy file: what the policy sees, does, and where it comes from.
+"""A policy: its manifest, checked, and the network, loaded and probed. Frames in, action out.
 
-Contract, section 4. It is JSON in the ONNX metadata under MANIFEST_KEY.
+The manifest is JSON in the ONNX metadata under MANIFEST_KEY: what the policy sees, does, and where
+it comes from. Contract, section 4.
 """
 
 from __future__ import annotations
@@ -24,6 +25,12 @@ from edge_runtime.wire import FRAMES_SHAPE
 
 MANIFEST_KEY = "phil.manifest"
 MANIFEST_SCHEMA = 1
+
+OPSET = 17
+MAX_IR_VERSION = 8
+INPUT, OUTPUT = "frames", "action"
+_RANGE_TOLERANCE = 1e-5
+_WARM_UP_RUNS = 10
 
 # The runtime must know how to stop each action safely (limiter.py), so it takes only these.
 ACTION_NAMES = ("pedal", "steering")
@@ -132,13 +139,6 @@ def _check_action(action: Action) -> None:
             f"the range of pedal begins at {action.low}, not {FULL_BRAKE}: it could not brake"
             " fully in a safe stop"
         )
-
-
-OPSET = 17
-MAX_IR_VERSION = 8
-INPUT, OUTPUT = "frames", "action"
-_RANGE_TOLERANCE = 1e-5
-_WARM_UP_RUNS = 10
 
 
 class Policy:
@@ -275,7 +275,10 @@ class Inference(NamedTuple):
 
 
 def infer(policy: Policy, frames: np.ndarray) -> Inference:
-    """Run the policy on frames, uint8 [2, 45, 80]. Where it raises, there is no answer."""
+    """Run the policy on frames, uint8 [2, 45, 80]. Where it raises, there is no answer.
+
+    Called by the policy's own thread: the watchdog runs on while it computes.
+    """
     begun_ns = time.perf_counter_ns()
     output: Optional[np.ndarray] = None
     try:

@@ -63,7 +63,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _run(config: Config) -> int:
     stop = StopSignal()
     tls = _certificate(config)
-    service.configure(config.realtime_priority, config.cpus, config.lock_memory)
+    if config.realtime_priority or config.cpus or config.lock_memory:
+        from edge_runtime import realtime
+
+        realtime.configure(config.realtime_priority, config.cpus, config.lock_memory)
     policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
     vehicle = _make_vehicle(config, policy)
     with _closed_on_error(vehicle):

@@ -1,19 +1,25 @@
-"""What systemd wants to hear of a service (Type=notify): sd_notify(3), without its library."""
+"""What the runtime tells of itself: to systemd (sd_notify(3), Type=notify), and in its health.
+
+The board's sensors are Linux's; elsewhere they are unknown.
+"""
 
 from __future__ import annotations
 
-import ctypes
 import os
-import resource
 import socket
 import threading
 from collections import deque
 from pathlib import Path
-from typing import Callable, Deque, Dict, List, Mapping, NamedTuple, Optional, Sequence
+from typing import Deque, Dict, Mapping, NamedTuple, Optional
 
 import numpy as np
 
 from edge_runtime import log
+
+WINDOW = 1024
+_LOOK_PERIOD_S = 2.0
+_THERMAL = Path("/sys/class/thermal")
+_STATM = Path("/proc/self/statm")
 
 
 class Notifier:
@@ -76,67 +82,6 @@ def _watchdog_period_s(environment: Mapping[str, str]) -> Optional[float]:
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
-def configure(priority: int, cpus: Sequence[int], lock_memory: bool) -> List[str]:
-    """Apply what is asked for (0, empty and False ask for nothing).
-
-    What the system refuses is logged, one line each, and its name is in the list returned.
-    """
-    refused = []
-    if priority and not _try("realtime_priority", _set_priority, priority, _PRIORITY_HELP):
-        refused.append("realtime_priority")
-    if cpus and not _try("cpus", _set_cpus, cpus, f"this process may use {_usable()}"):
-        refused.append("cpus")
-    if lock_memory and not _try("lock_memory", _lock_memory, True, _MEMORY_HELP):
-        refused.append("lock_memory")
-    return refused
-
-
-_PRIORITY_HELP = "allow it with LimitRTPRIO=99 in the service, CAP_SYS_NICE, or ulimit -r 99"
-_MEMORY_HELP = "allow it with LimitMEMLOCK=infinity in the service, CAP_IPC_LOCK, or ulimit -l"
-
-
-def _try(key: str, apply: Callable, value: object, help_text: str) -> bool:
-    try:
-        apply(value)
-    except (OSError, ValueError, AttributeError) as error:
-        log.event("warning", "not_permitted", key=key, value=value, detail=error, help=help_text)
-        return False
-    return True
-
-
-def _set_priority(priority: int) -> None:
-    # FIFO: it runs until it waits. Linux itself leaves 5 % of each second to all others.
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-
-
-def _set_cpus(cpus: Sequence[int]) -> None:
-    missing = set(cpus) - os.sched_getaffinity(0)
-    if missing:  # the kernel would silently take those that exist
-        raise ValueError(f"no processor {sorted(missing)} for this process")
-    os.sched_setaffinity(0, cpus)
-
-
-def _lock_memory(_: object) -> None:
-    """Keep every page that is ever touched; pages that nobody touches take no room."""
-    soft, _hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
-        # With a limit it would succeed now, and an allocation would fail in mid-drive.
-        raise PermissionError(f"at most {soft // 1024} KiB may be locked")
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
-
-
-def _usable() -> str:
-    return ",".join(map(str, sorted(os.sched_getaffinity(0))))
-
-
-PERIOD_S = 2.0
-_THERMAL = Path("/sys/class/thermal")
-_STATM = Path("/proc/self/statm")
-
-
 class Board(NamedTuple):
     """One look. `temperature_c`: the hottest sensor in degrees Celsius, None without any."""
 
@@ -183,15 +128,12 @@ class BoardWatch:
         self._stopping.set()
 
     def _run(self) -> None:
-        while not self._stopping.wait(PERIOD_S):
+        while not self._stopping.wait(_LOOK_PERIOD_S):
             self.last = look()
 
 
-WINDOW = 1024
-
-
 class LatencyWindow:
-    """The last WINDOW durations. Not thread-safe: the caller holds a lock."""
+    """Quantiles of the last WINDOW durations. Not thread-safe: the caller holds a lock."""
 
     def __init__(self) -> None:
         self._durations_ns: Deque[int] = deque(maxlen=WINDOW)

@@ -1,7 +1,10 @@
-"""The three files with which a party shows who it is: `ca.pem`, `cert.pem`, `key.pem`.
+"""Who a party is, and what it may say and hear: certificates, private keys, access rights.
 
-All of them are read and held against one another before a session is opened, because Zenoh's own
-message for any fault in them is "Unable to connect".
+`ca.pem`, `cert.pem` and `key.pem` are read and held against one another before a session is opened,
+because Zenoh's own message for any fault in them is "Unable to connect". ROLES is the table of
+rights, by the common name of the certificate. Zenoh filters only in the process that holds the
+configuration. That is whoever listens, the simulator or the router, and each edge runtime for what
+comes to it. A refused message is dropped without a word to its sender.
 """
 
 from __future__ import annotations

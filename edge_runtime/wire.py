@@ -1,4 +1,9 @@
-"""The keys on the wire: one table of topics, their rates and directions. Contract, section 3."""
+"""The wire: its keys, and its messages as MessagePack maps that are validated on arrival.
+
+Pure: no clock and no socket. A decoder never raises: it returns the message, or a Rejection that
+says why it never reaches the policy. A field that came after schema 1 was first spoken has a
+default, so that both sides of a mixed pair go on understanding each other. Contract, section 3.
+"""
 
 from __future__ import annotations
 
@@ -13,25 +18,35 @@ import numpy as np
 from edge_runtime.util import UserError
 
 CONTROL_PERIOD_S = 0.1
+SCHEMA = 1
+FRAMES_SHAPE = (2, 45, 80)
+FRAMES_BYTES = 2 * 45 * 80
+
+DRIVE = "drive"
+SAFE_STOP = "safe_stop"
+COMMAND_MODES = (DRIVE, SAFE_STOP)
+
+MAX_PAYLOAD_BYTES = 64 * 1024
+MAX_TEXT_CHARS = 256
+
 DEFAULT_VEHICLE_ID = "hunter01"  # of both ends, so that a single vehicle needs no option
 
 
 class Topic(NamedTuple):
-    """One row of TOPICS."""
+    """A row of TOPICS."""
 
-    suffix: str
     rate_hz: float
     direction: str
 
 
 TOPICS: Dict[str, Topic] = {
-    "state": Topic("state", 1 / CONTROL_PERIOD_S, "simulator to edge"),
-    "command": Topic("command", 1 / CONTROL_PERIOD_S, "edge to simulator and vehicle"),
-    "feedback": Topic("feedback", 20.0, "vehicle to all"),
-    "health": Topic("health", 2.0, "edge to all"),
-    "alive": Topic("alive", 0.0, "liveliness token of the edge"),
-    "status": Topic("status", 0.0, "queryable of the edge: JSON"),
-    "rearm": Topic("rearm", 0.0, "queryable of the edge: an operator lets it drive again"),
+    "state": Topic(1 / CONTROL_PERIOD_S, "simulator to edge"),
+    "command": Topic(1 / CONTROL_PERIOD_S, "edge to simulator and vehicle"),
+    "feedback": Topic(20.0, "vehicle to all"),
+    "health": Topic(2.0, "edge to all"),
+    "alive": Topic(0.0, "liveliness token of the edge"),
+    "status": Topic(0.0, "queryable of the edge: JSON"),
+    "rearm": Topic(0.0, "queryable of the edge: an operator lets it drive again"),
 }
 _VEHICLE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -47,16 +62,8 @@ def check_vehicle_id(vehicle_id: str) -> str:
 
 def key(vehicle_id: str, topic: str) -> str:
     """The Zenoh key of a row of TOPICS, as in `phil/hunter01/state`."""
-    return f"phil/{check_vehicle_id(vehicle_id)}/{TOPICS[topic].suffix}"
-
-
-SCHEMA = 1
-FRAMES_SHAPE = (2, 45, 80)
-FRAMES_BYTES = 2 * 45 * 80
-
-DRIVE = "drive"
-SAFE_STOP = "safe_stop"
-COMMAND_MODES = (DRIVE, SAFE_STOP)
+    assert topic in TOPICS, topic
+    return f"phil/{check_vehicle_id(vehicle_id)}/{topic}"
 
 
 class Reason(str, Enum):
@@ -183,43 +190,13 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
 Message = Union[State, Command, Feedback, Health]
 
 
-__all__ = [
-    "COMMAND_MODES",
-    "CONTROL_PERIOD_S",
-    "DRIVE",
-    "FRAMES_BYTES",
-    "FRAMES_SHAPE",
-    "MAX_PAYLOAD_BYTES",
-    "MAX_TEXT_CHARS",
-    "SAFE_STOP",
-    "SCHEMA",
-    "TOPICS",
-    "Command",
-    "Feedback",
-    "Health",
-    "Message",
-    "Reason",
-    "Rejection",
-    "State",
-    "Topic",
-    "check_vehicle_id",
-    "decode_command",
-    "decode_feedback",
-    "decode_health",
-    "decode_state",
-    "encode",
-    "key",
-]
-
-MAX_PAYLOAD_BYTES = 64 * 1024
-MAX_TEXT_CHARS = 256
-
-
 class _Envelope(msgspec.Struct):
     schema: int
 
 
 _M = TypeVar("_M", State, Command, Feedback, Health)
+# A vehicle that has not yet had a command reports step -1.
+_LEAST: Dict[Any, int] = {Feedback: -1}
 _ENVELOPE = msgspec.msgpack.Decoder(_Envelope)
 _DECODERS: Dict[Any, Any] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in (State, Command, Feedback, Health)
@@ -296,10 +273,6 @@ def _check_fields(message: _M) -> Union[_M, Rejection]:
         elif isinstance(value, int) and value < least:
             return Rejection(Reason.MALFORMED, f"{name} is {value}, below the least value")
     return message
-
-
-# A vehicle that has not yet had a command reports step -1.
-_LEAST: Dict[Any, int] = {Feedback: -1}
 
 
 def _leaves(message: Message) -> Iterator[Tuple[str, Any]]:

@@ -219,3 +219,15 @@ def stop(controller):
     answer(controller, 0, 0.0)
     controller.tick(0.3)
     return controller
+
+
+def render_table(events, states, after):
+    """A table of transitions as README.md shows it: a row for each event, a column a state."""
+    lines = [
+        "| event | " + " | ".join(f"in {state.value}" for state in states) + " |",
+        "|---" * (len(states) + 1) + "|",
+    ]
+    for event in events:
+        cells = (after(state, event).value for state in states)
+        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)

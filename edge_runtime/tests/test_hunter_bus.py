@@ -12,12 +12,11 @@ import can
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
 
-from edge_runtime.config import CarSettings, SimilaritySettings, VehicleSetup
+from edge_runtime.config import DEFAULT_BUS, CarSettings, SimilaritySettings, VehicleSetup
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import stream
 from edge_runtime.vehicles.core import State
-from edge_runtime.vehicles.hunter import bus as buses
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.bus import (
     GROUP,
@@ -327,7 +326,7 @@ def test_buses_that_cannot_be_opened_are_one_line(caplog):
 def test_python_can_is_asked_for_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "can", None)
     with pytest.raises(UserError, match=r"pip install 'phil-edge-runtime\[can\]'"):
-        open_bus(parse_bus(buses.DEFAULT_BUS))
+        open_bus(parse_bus(DEFAULT_BUS))
 
 
 def test_the_registry_makes_it_for_a_known_scenario_only(channel):

@@ -16,7 +16,7 @@ from typing import Any, List
 import numpy as np
 import pytest
 
-from edge_runtime import log, loop, service
+from edge_runtime import log, loop, realtime
 from edge_runtime.controller import Controller, limit_rows
 from edge_runtime.log import Flood
 from edge_runtime.loop import ControlLoop
@@ -57,11 +57,11 @@ def test_what_the_system_refuses_is_named_and_the_rest_applied(monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: asked.update(cpus=cpus))
-    monkeypatch.setattr(service, "_lock_memory", lambda _: asked.update(locked=True))
-    assert service.configure(50, [1], True) == ["realtime_priority"]
+    monkeypatch.setattr(realtime, "_lock_memory", lambda _: asked.update(locked=True))
+    assert realtime.configure(50, [1], True) == ["realtime_priority"]
     assert asked == {"cpus": [1], "locked": True}
-    assert service.configure(0, [1, 7], False) == ["cpus"]
-    assert service.configure(0, [], False) == []
+    assert realtime.configure(0, [1, 7], False) == ["cpus"]
+    assert realtime.configure(0, [], False) == []
 
 
 def test_lines_as_text_and_the_fields_of_json(capfd):

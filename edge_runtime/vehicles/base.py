@@ -1,6 +1,8 @@
-"""What a vehicle driver must do. A driver lives in a folder of its own beside this file.
+"""What a vehicle driver must do, whether it can be believed, and the thread that runs it.
 
-Time is passed in as monotonic seconds. A driver is called by one thread at a time (runner.py).
+A driver is called by one thread at a time, and is passed the time as monotonic seconds. The thread
+is apart from the control loop: so the feedback goes on when the loop hangs, and shows the vehicle
+braking by itself; and the loop goes on, and says safe stop, when the driver raises or hangs.
 """
 
 from __future__ import annotations

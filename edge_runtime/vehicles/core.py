@@ -98,18 +98,6 @@ LEADS_TO: Dict[Event, Dict[State, State]] = {
 }
 
 
-def render_table() -> str:
-    """LEADS_TO as a Markdown table: a row for each event, a column for each state."""
-    lines = [
-        "| event | " + " | ".join(f"in {state.value}" for state in State) + " |",
-        "|---" * (len(State) + 1) + "|",
-    ]
-    for event, leads in LEADS_TO.items():
-        cells = (leads.get(state, state).value for state in State)
-        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
 class Finding(NamedTuple):
     """An event with what it is in words, empty where our own side asked for it."""
 

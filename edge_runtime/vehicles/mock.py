@@ -1,4 +1,8 @@
-"""A vehicle of arithmetic, for the bench without a chassis."""
+"""A vehicle of arithmetic: dead time, rate limit and first-order lag before the wheels obey.
+
+It integrates its own motion up to the time it is asked about, so that it needs no thread, and a
+test with made-up times sees exactly what a process sees.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +13,6 @@ from typing import ClassVar, Deque, Dict, NamedTuple, Optional, Tuple
 from edge_runtime.controller import ActionLimit
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
 from edge_runtime.wire import CONTROL_PERIOD_S
-
-__all__ = ["MockParameters", "MockState", "MockVehicle", "advance"]
-
 
 COMMAND_TIMEOUT_S = 2 * CONTROL_PERIOD_S
 _INTEGRATION_STEP_S = 0.005

@@ -13,7 +13,7 @@ import time
 
 import can
 
-from edge_runtime import service
+from edge_runtime import realtime
 from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
 
 PERIOD_S = 0.02
@@ -22,7 +22,7 @@ CAN_ID = 0x111
 
 def main(name: str, priority: int) -> None:
     """Stream until SIGTERM; a priority other than 0 is one of SCHED_FIFO."""
-    service.configure(priority, [], lock_memory=False)
+    realtime.configure(priority, [], lock_memory=False)
     end = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: end.set())
     bus = open_bus(parse_bus(name))

@@ -15,7 +15,7 @@ import sys
 import time
 from pathlib import Path
 
-from edge_runtime import vehicles
+from edge_runtime.vehicles import registry
 from hil_tests.faults.endless import DIRECTORY
 from hil_tests.faults.faulty_vehicle import FaultyMockVehicle
 
@@ -53,7 +53,7 @@ def main(package: str) -> None:
     signal.signal(signal.SIGUSR2, clock.back)
     time.time, time.time_ns = clock.time, clock.time_ns
     switch = Path(os.environ[DIRECTORY]) / "vehicle"
-    vehicles._MAKERS["mock"] = lambda setup: FaultyMockVehicle(switch)
+    registry._MAKERS["mock"] = lambda setup: FaultyMockVehicle(switch)
     sys.argv = [package, *sys.argv[2:]]
     runpy.run_module(package, run_name="__main__", alter_sys=True)
 

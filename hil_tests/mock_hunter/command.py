@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
     )
     parser.add_argument(
-        "--bus", default=multicast.SYNTAX, metavar="INTERFACE:CHANNEL", help="where it is"
+        "--bus", default=multicast.MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is"
     )
     parser.add_argument("--model", default="hunter-2.0", choices=list(MODELS))
     parser.add_argument(
@@ -83,7 +83,7 @@ def _check_reachable(text: str) -> BusName:
     if bus.interface == "virtual":
         raise UserError(
             f"--bus {text}: a virtual bus ends with its process, and nobody could reach the mock;"
-            f" use {multicast.SYNTAX} or socketcan:vcan0"
+            f" use {multicast.MULTICAST_BUS} or socketcan:vcan0"
         )
     return bus
 

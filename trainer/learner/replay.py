@@ -7,7 +7,7 @@ a transition points at three of them, so 100,000 transitions take 380 MB instead
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,8 @@ class Batch:
     next_frames: NDArray[np.uint8]
     """s' after those steps, [n, 2, 45, 80]."""
     terminals: NDArray[np.float32]
-    """1 where s' ends the episode for good; a timeout is not terminal, [n]."""
+    """1 where s' ends the episode for good, or the policy's action in s' is overruled and
+    penalised; a timeout is not terminal, [n]."""
     human: NDArray[np.bool_]
     """Delta of the first step: whether the human acted, [n]."""
     probabilities: NDArray[np.float64]
@@ -47,6 +48,17 @@ class Batch:
     """What the policy would have done where the human acted, else the action, [n, action size]."""
     penalised: NDArray[np.bool_] | None = None
     """Whether the overruled action is penalised (eq. 17), [n]; None: in no row."""
+
+
+class _Returns(NamedTuple):
+    """n-step returns without their bootstrap, [n] each."""
+
+    rewards: NDArray[np.float32]
+    lasts: Indices
+    """The transitions that they end with."""
+    terminals: NDArray[np.float32]
+    """1 where nothing is to be bootstrapped from."""
+    spans: NDArray[np.int64]
 
 
 class ReplayBuffer:
@@ -60,6 +72,8 @@ class ReplayBuffer:
             often as its share of all (section VII-A: RD2).
         steps: rewards that a drawn transition sums up, at most (n of n-step returns).
         gamma: their discount factor.
+        overruled_value: what a penalised action is worth, if a sum that reaches one is to end with
+            it; None: a sum goes on with what the human did instead.
     """
 
     def __init__(
@@ -70,9 +84,10 @@ class ReplayBuffer:
         separate: bool = False,
         steps: int = 1,
         gamma: float = 1.0,
+        overruled_value: float | None = None,
     ) -> None:
         self.capacity, self.alpha = capacity, alpha
-        self.steps, self.gamma = steps, gamma
+        self.steps, self.gamma, self.overruled_value = steps, gamma, overruled_value
         self._ledger = Ledger(capacity)
         self._pictures = np.empty((self._ledger.frame_slots, *FRAME_SHAPE), np.uint8)
         self._actions = np.zeros((capacity, action_size), np.float32)
@@ -188,17 +203,17 @@ class ReplayBuffer:
             self._set_weights(alive, self._priorities[alive] ** self.alpha)
 
     def _gather(self, indices: Indices) -> Batch:
-        rewards, lasts, spans = self._sums(indices)
+        returns = self._returns(indices)
         return Batch(
             indices=indices,
             frames=self._pictures[self._places(indices, 0)],
             actions=self._actions[indices],
-            rewards=rewards,
-            next_frames=self._pictures[self._places(lasts, 1)],
-            terminals=self._terminals[lasts],
+            rewards=returns.rewards,
+            next_frames=self._pictures[self._places(returns.lasts, 1)],
+            terminals=returns.terminals,
             human=self._human[indices],
             probabilities=self._probabilities(indices),
-            spans=spans,
+            spans=returns.spans,
             overruled=self._overruled[indices],
             penalised=self._penalised[indices],
         )
@@ -207,23 +222,33 @@ class ReplayBuffer:
         """Where the two pictures from ``first`` on of each transition lie, [n, 2]."""
         return self._ledger.frame_ids[indices, first : first + 2] % self._ledger.frame_slots
 
-    def _sums(self, indices: Indices) -> tuple[NDArray[np.float32], Indices, Indices]:
-        """n-step returns without their bootstrap: sums, last transitions, lengths, each [n].
+    def _returns(self, indices: Indices) -> _Returns:
+        """The n-step returns, without their bootstrap, that begin with these transitions.
 
         A sum ends early where the episode does, for good or by a timeout, and at the newest step.
+        It ends for good, too, at an overruled action that is penalised: what the human did there
+        instead, and came to, is not what the policy's actions before it were worth.
         """
         sums, lasts = self._rewards[indices], indices
+        terminals = self._terminals[indices]
         spans = np.ones(len(indices), np.int64)
         going = np.ones(len(indices), np.bool_)
         for step in range(1, self.steps):
             following = (lasts + 1) % self.capacity
-            going &= (self._terminals[lasts] == 0.0) & self._ledger.follows(lasts, following)
+            going &= (terminals == 0.0) & self._ledger.follows(lasts, following)
             if not going.any():
                 break
+            discount = np.float32(self.gamma**step)
+            if self.overruled_value is not None:
+                overruled = going & self._penalised[following]
+                sums = sums + overruled * (discount * np.float32(self.overruled_value))
+                terminals = np.where(overruled, np.float32(1.0), terminals)
+                going &= ~overruled
             lasts = np.where(going, following, lasts)
-            sums = sums + going * (np.float32(self.gamma**step) * self._rewards[following])
+            sums = sums + going * (discount * self._rewards[following])
+            terminals = np.where(going, self._terminals[lasts], terminals)
             spans += going
-        return sums.astype(np.float32), lasts, spans
+        return _Returns(sums.astype(np.float32), lasts, terminals, spans)
 
     def _probabilities(self, indices: Indices) -> NDArray[np.float64]:
         if len(self._trees) == 1:

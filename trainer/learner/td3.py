@@ -31,6 +31,11 @@ class Losses(NamedTuple):
     priorities: NDArray[np.float64]
 
 
+def charges_overruled(config: LearnerConfig, algorithm: Algorithm) -> bool:
+    """Whether an intervention costs the action that was overruled, and not the human's (eq. 17)."""
+    return algorithm.penalty and config.penalty_on == OVERRULED_ACTION
+
+
 class TD3Learner:
     """Actor, two critics, their targets and optimisers.
 
@@ -70,7 +75,7 @@ class TD3Learner:
         )
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
-        self._charges_overruled = algorithm.penalty and config.penalty_on == OVERRULED_ACTION
+        self._charges_overruled = charges_overruled(config, algorithm)
 
     def act(self, frames: NDArray[np.uint8], averaged: bool = False) -> NDArray[np.float32]:
         """pi(s) for one observation [2, 45, 80], or the target actor's: float32 [action size]."""

@@ -109,6 +109,33 @@ def test_n_step_returns_are_those_of_the_episode_written_out(episodes, capacity,
         assert bool(batch.human[row]) == ((round(rewards[0]) - 1) % 3 == 0)
 
 
+@pytest.mark.parametrize("overruled_value", [None, -10.0])
+def test_a_return_ends_at_an_overruled_action_with_what_that_is_worth(overruled_value):
+    """Steps 0 to 5 with rewards 1 to 6; the policy is overruled in step 3, and the human stays."""
+    buffer = ReplayBuffer(20, steps=4, gamma=0.5, overruled_value=overruled_value)
+    buffer.start_episode(np.stack([frame(0), frame(0)]))
+    for step in range(6):
+        pictures = np.stack([frame(step), frame(step + 1)])
+        taken_over = step == 3
+        buffer.add(
+            np.zeros(1, np.float32), step + 1.0, pictures, step == 5, step >= 3, None, taken_over
+        )
+    batch = buffer.sample(200, np.random.default_rng(0))
+    rows = {number(batch.frames[row, 1]): row for row in range(200)}
+    assert sorted(rows) == list(range(6))
+    before, own = rows[1], rows[3]
+    if overruled_value is None:
+        assert batch.rewards[before] == 2 + 3 / 2 + 4 / 4 + 5 / 8
+        assert (batch.spans[before], batch.terminals[before]) == (4, 0.0)
+    else:
+        assert batch.rewards[before] == 2 + 3 / 2 - 10 / 4
+        assert (batch.spans[before], batch.terminals[before]) == (2, 1.0)
+        assert number(batch.next_frames[before, 1]) == 3
+    # The human's own return knows nothing of it.
+    assert batch.rewards[own] == 4 + 5 / 2 + 6 / 4
+    assert (batch.spans[own], batch.terminals[own]) == (3, 1.0)
+
+
 def test_the_overruled_action_is_kept_beside_the_humans():
     buffer = ReplayBuffer(10)
     buffer.start_episode(np.stack([frame(0), frame(0)]))

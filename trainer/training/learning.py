@@ -23,7 +23,7 @@ from trainer.files import as_arrays, as_tensors
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
-from trainer.learner.td3 import Losses, TD3Learner
+from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.training.wheel import Store
 
 Observation = NDArray[np.uint8]
@@ -157,6 +157,7 @@ class LearningThread:
                 algorithm.separate_buffers,
                 config.return_steps,
                 config.gamma,
+                config.intervention_penalty if charges_overruled(config, algorithm) else None,
             )
         except MemoryError:
             raise UserError(

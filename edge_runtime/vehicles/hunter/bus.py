@@ -1,10 +1,12 @@
-"""The driver of a Hunter: two threads and a bus around core.py.
+"""A Hunter on its CAN bus: the bus, the gate that only lets our own frames out, and the driver.
+
+python-can is imported here and nowhere else in the runtime, and only when a bus is opened: a board
+without a CAN vehicle need not have it. Two threads are around the core (core.py):
 
 - The stream's thread sends what `tick` gives, 50 times a second at absolute deadlines, and at
   once when somebody brakes, no command came in time, or the chassis says what stops it. It is
   the only one that sends, until `close` has joined it.
 - The listener's thread hands every frame to `hear`.
-Both inherit the priority that `realtime` gave the process.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import socket
 import struct
 import threading
 import time
-from typing import Any, ClassVar, Dict, NamedTuple, Optional, Tuple
+from typing import Any, ClassVar, Dict, NamedTuple, Optional
 
 from edge_runtime import log
 from edge_runtime.controller import ActionLimit
@@ -32,6 +34,194 @@ from edge_runtime.vehicles.stream import PERIOD_S, StreamedVehicle
 
 _LISTEN_S = 0.1
 _JOIN_S = 0.5
+
+_SYNTAX = "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0"
+# Without a bit rate: the first has it from `ip link`, the others know none.
+_WITHOUT_BITRATE = ("socketcan", "virtual")
+_ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
+
+GROUP, PORT = "239.74.163.2", 43113  # python-can's own
+# Two buses need two ports: Linux hands what comes for any group to every socket of its port.
+MULTICAST_BUS = f"udp_multicast:{GROUP}:{PORT}"
+# Pinned to the loopback device as well: no neighbour hears it either way.
+_OPTIONS: Dict[str, Dict[str, Any]] = {"udp_multicast": {"hop_limit": 0, "fd": False}}
+_LOOPBACK = "lo"
+_ANY = bytes(4)
+_GROUP_AND_PORT = re.compile(r"([0-9.]+)(?::([0-9]{1,5}))?")
+
+
+class BusName(NamedTuple):
+    """What to open. `bitrate` is None where the interface has none to set."""
+
+    interface: str
+    channel: str
+    bitrate: Optional[int]
+    port: Optional[int] = None  # of udp_multicast
+
+    @property
+    def hears_itself(self) -> bool:
+        """Whether our own frames come back: then a command need not be somebody else's."""
+        return self.interface == "udp_multicast"
+
+
+def parse_bus(text: str) -> BusName:
+    """The bus of INTERFACE:CHANNEL[:BITRATE]. Raises UserError for anything else."""
+    interface, _, channel = text.partition(":")
+    if interface == "udp_multicast":
+        return _parse_multicast(text, channel)
+    if interface == "socketcan" and ":" in channel:
+        raise UserError(
+            f"bus {text!r} has its bit rate from `ip link`:"
+            f" write {interface}:{channel.partition(':')[0]}"
+        )
+    if interface in _WITHOUT_BITRATE:
+        if interface and channel:
+            return BusName(interface, channel, None)
+    elif interface and channel:
+        channel, _, rate = channel.partition(":")
+        if channel and (not rate or (rate.isdecimal() and int(rate) > 0)):
+            return BusName(interface, channel, int(rate) if rate else BITRATE)
+    raise UserError(f"bus {text!r} is no CAN bus: write it as {_SYNTAX}")
+
+
+def _parse_multicast(text: str, channel: str) -> BusName:
+    """GROUP and PORT of an IPv4 group, GROUP:PORT or nothing."""
+    found = _GROUP_AND_PORT.fullmatch(channel or GROUP)
+    group, port = (found[1], int(found[2] or PORT)) if found else ("", 0)
+    if not (_is_group(group) and 1 <= port <= 65535):
+        raise UserError(
+            f"bus {text!r} is no IPv4 multicast group and port: write it as {MULTICAST_BUS}"
+        )
+    return BusName("udp_multicast", group, None, port)
+
+
+def _is_group(text: str) -> bool:
+    try:
+        return ipaddress.IPv4Address(text).is_multicast
+    except ValueError:
+        return False
+
+
+def open_bus(name: BusName) -> Any:
+    """An open python-can bus; nothing is sent. Raises UserError, one line that says what to do."""
+    can = import_can()
+    options = dict(_OPTIONS.get(name.interface, {}))
+    if name.bitrate is not None:
+        options["bitrate"] = name.bitrate
+    if name.port is not None:
+        options["port"] = name.port
+    try:
+        bus = can.Bus(interface=name.interface, channel=name.channel, **options)
+    except Exception as error:  # each backend raises what its library raises, NameError included
+        raise UserError(_explain(name, error)) from None
+    if name.interface == "udp_multicast":
+        _pin(name, bus)
+    return bus
+
+
+def _pin(name: BusName, bus: Any) -> None:
+    try:
+        pin_to_loopback(bus, name.channel)
+    except OSError as error:
+        bus.shutdown()
+        raise UserError(_explain(name, error)) from None
+
+
+def pin_to_loopback(bus: Any, group: str) -> None:
+    """Let the python-can bus speak and hear on the loopback device only. Raises OSError.
+
+    It sends to whatever network the machine has. Pinned, no frame leaves the machine and none comes
+    in from outside, whoever sends it to the group or to the port; that needs no privilege (Linux
+    5.7 or newer), only a route for multicast, which any machine with a network has.
+    """
+    device = socket.if_nametoindex(_LOOPBACK)
+    member = struct.pack("=4s4si", socket.inet_aton(group), _ANY, device)  # struct ip_mreqn
+    sender = struct.pack("=4s4si", _ANY, _ANY, device)
+    with socket.socket(fileno=os.dup(bus.fileno())) as same:
+        same.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK.encode() + b"\0")
+        _join(same, member)
+        same.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, sender)
+    while bus.recv(0.0) is not None:
+        pass  # from before
+
+
+def _join(bus_socket: socket.socket, member: bytes) -> None:
+    try:
+        bus_socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:  # python-can joined there: it is the only device
+            raise
+
+
+def import_can() -> Any:
+    """The python-can package. Raises UserError where it is not installed."""
+    # Its backends say on stderr what they miss; our error says it in its one line.
+    logging.getLogger("can").setLevel(logging.CRITICAL)
+    try:
+        import can
+    except ImportError:
+        raise UserError(
+            "the hunter needs python-can, which is not installed:"
+            " pip install 'phil-edge-runtime[can]'"
+        ) from None
+    return can
+
+
+def _explain(name: BusName, error: Exception) -> str:
+    where = f"the CAN bus {name.interface}:{name.channel} cannot be opened"
+    cause = " ".join(str(error).split()) or type(error).__name__
+    number = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    if name.interface == "socketcan":
+        if isinstance(error, PermissionError) or number == 1:
+            return f"{where}: {cause}; this user may not open a CAN socket"
+        if number == 97:
+            return f"{where}: {cause}; this kernel has no SocketCAN (modprobe can_raw)"
+        return (
+            f"{where}: {cause}; bring it up with"
+            f" `ip link set {name.channel} up type can bitrate {BITRATE}`, `ip link` lists them"
+        )
+    if "Unknown interface" in cause:
+        can = import_can()
+        return f"{where}: choose from {', '.join(sorted(can.VALID_INTERFACES))}"
+    if name.interface == "udp_multicast":
+        return f"{where}: {cause}; it needs msgpack, and a route for multicast (`ip route`)"
+    return f"{where}: {cause}; python-can's manual says what its {name.interface} needs"
+
+
+class Gate:
+    """The only way out to the bus: closed until `open`, and then for our commands only."""
+
+    def __init__(self, bus: Any) -> None:
+        self._bus = bus
+        self._can = import_can()
+        self._is_open = False
+
+    def open(self) -> None:
+        """From now on our commands may pass."""
+        self._is_open = True
+
+    def send(self, frame: Frame, data: bytes) -> None:
+        """Put a frame on the bus without waiting.
+
+        Raises can.CanError or OSError where the bus does not take it, and RuntimeError, before
+        anything is sent, for a frame that must not leave.
+        """
+        if not self._is_open:
+            raise RuntimeError("nothing is sent before the vehicle is enabled")
+        if frame not in COMMANDS or len(data) != frame.length:
+            raise RuntimeError(
+                f"0x{frame.can_id:x} with {len(data)} bytes is not on the allow-list"
+            )
+        message = self._can.Message(
+            arbitration_id=frame.can_id, data=data, is_extended_id=False, check=True
+        )
+        # Not None: the virtual bus would then wait for ever where a receiver's queue is full.
+        self._bus.send(message, timeout=0.0)
+
+
+def is_bus_off(message: Any) -> bool:
+    """Whether a received message is the controller's word that it has left the bus."""
+    return bool(message.is_error_frame and message.arbitration_id & _ERROR_BUS_OFF)
 
 
 class HunterVehicle(StreamedVehicle):
@@ -152,196 +342,3 @@ class HunterVehicle(StreamedVehicle):
         words = " ".join(str(error).split()) or type(error).__name__
         with self._lock:
             self._core.bus_failed(words, time.monotonic(), fatal)
-
-
-DEFAULT_BUS = "socketcan:can0"
-SYNTAX = "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0"
-# Without a bit rate: the first has it from `ip link`, the others know none.
-_WITHOUT_BITRATE = ("socketcan", "virtual")
-# Pinned to the loopback device as well: no neighbour hears it either way.
-_OPTIONS: Dict[str, Dict[str, Any]] = {"udp_multicast": {"hop_limit": 0, "fd": False}}
-_ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
-
-
-class BusName(NamedTuple):
-    """What to open. `bitrate` is None where the interface has none to set."""
-
-    interface: str
-    channel: str
-    bitrate: Optional[int]
-    port: Optional[int] = None  # of udp_multicast
-
-    @property
-    def hears_itself(self) -> bool:
-        """Whether our own frames come back: then a command need not be somebody else's."""
-        return self.interface == "udp_multicast"
-
-
-def parse_bus(text: str) -> BusName:
-    """The bus of INTERFACE:CHANNEL[:BITRATE]. Raises UserError for anything else."""
-    interface, _, channel = text.partition(":")
-    if interface == "udp_multicast":
-        return _parse_multicast(text, channel)
-    if interface == "socketcan" and ":" in channel:
-        raise UserError(
-            f"bus {text!r} has its bit rate from `ip link`:"
-            f" write {interface}:{channel.partition(':')[0]}"
-        )
-    if interface in _WITHOUT_BITRATE:
-        if interface and channel:
-            return BusName(interface, channel, None)
-    elif interface and channel:
-        channel, _, rate = channel.partition(":")
-        if channel and (not rate or (rate.isdecimal() and int(rate) > 0)):
-            return BusName(interface, channel, int(rate) if rate else BITRATE)
-    raise UserError(f"bus {text!r} is no CAN bus: write it as {SYNTAX}")
-
-
-def _parse_multicast(text: str, channel: str) -> BusName:
-    found = parse_channel(channel)
-    if found is None:
-        raise UserError(
-            f"bus {text!r} is no IPv4 multicast group and port: write it as {MULTICAST_SYNTAX}"
-        )
-    return BusName("udp_multicast", found[0], None, found[1])
-
-
-def open_bus(name: BusName) -> Any:
-    """An open python-can bus; nothing is sent. Raises UserError, one line that says what to do."""
-    can = import_can()
-    options = dict(_OPTIONS.get(name.interface, {}))
-    if name.bitrate is not None:
-        options["bitrate"] = name.bitrate
-    if name.port is not None:
-        options["port"] = name.port
-    try:
-        bus = can.Bus(interface=name.interface, channel=name.channel, **options)
-    except Exception as error:  # each backend raises what its library raises, NameError included
-        raise UserError(_explain(name, error)) from None
-    if name.interface == "udp_multicast":
-        _pin(name, bus)
-    return bus
-
-
-def _pin(name: BusName, bus: Any) -> None:
-    try:
-        pin_to_loopback(bus, name.channel)
-    except OSError as error:
-        bus.shutdown()
-        raise UserError(_explain(name, error)) from None
-
-
-def import_can() -> Any:
-    """The python-can package. Raises UserError where it is not installed."""
-    # Its backends say on stderr what they miss; our error says it in its one line.
-    logging.getLogger("can").setLevel(logging.CRITICAL)
-    try:
-        import can
-    except ImportError:
-        raise UserError(
-            "the hunter needs python-can, which is not installed:"
-            " pip install 'phil-edge-runtime[can]'"
-        ) from None
-    return can
-
-
-def _explain(name: BusName, error: Exception) -> str:
-    where = f"the CAN bus {name.interface}:{name.channel} cannot be opened"
-    cause = " ".join(str(error).split()) or type(error).__name__
-    number = getattr(error, "errno", None) or getattr(error, "error_code", None)
-    if name.interface == "socketcan":
-        if isinstance(error, PermissionError) or number == 1:
-            return f"{where}: {cause}; this user may not open a CAN socket"
-        if number == 97:
-            return f"{where}: {cause}; this kernel has no SocketCAN (modprobe can_raw)"
-        return (
-            f"{where}: {cause}; bring it up with"
-            f" `ip link set {name.channel} up type can bitrate {BITRATE}`, `ip link` lists them"
-        )
-    if "Unknown interface" in cause:
-        can = import_can()
-        return f"{where}: choose from {', '.join(sorted(can.VALID_INTERFACES))}"
-    if name.interface == "udp_multicast":
-        return f"{where}: {cause}; it needs msgpack, and a route for multicast (`ip route`)"
-    return f"{where}: {cause}; python-can's manual says what its {name.interface} needs"
-
-
-class Gate:
-    """The only way out to the bus: closed until `open`, and then for our commands only."""
-
-    def __init__(self, bus: Any) -> None:
-        self._bus = bus
-        self._can = import_can()
-        self._is_open = False
-
-    def open(self) -> None:
-        """From now on our commands may pass."""
-        self._is_open = True
-
-    def send(self, frame: Frame, data: bytes) -> None:
-        """Put a frame on the bus without waiting.
-
-        Raises can.CanError or OSError where the bus does not take it, and RuntimeError, before
-        anything is sent, for a frame that must not leave.
-        """
-        if not self._is_open:
-            raise RuntimeError("nothing is sent before the vehicle is enabled")
-        if frame not in COMMANDS or len(data) != frame.length:
-            raise RuntimeError(
-                f"0x{frame.can_id:x} with {len(data)} bytes is not on the allow-list"
-            )
-        message = self._can.Message(
-            arbitration_id=frame.can_id, data=data, is_extended_id=False, check=True
-        )
-        # Not None: the virtual bus would then wait for ever where a receiver's queue is full.
-        self._bus.send(message, timeout=0.0)
-
-
-def is_bus_off(message: Any) -> bool:
-    """Whether a received message is the controller's word that it has left the bus."""
-    return bool(message.is_error_frame and message.arbitration_id & _ERROR_BUS_OFF)
-
-
-GROUP, PORT = "239.74.163.2", 43113  # python-can's own
-# Two buses need two ports: Linux hands what comes for any group to every socket of its port.
-MULTICAST_SYNTAX = f"udp_multicast:{GROUP}:{PORT}"
-_LOOPBACK = "lo"
-_ANY = bytes(4)
-_GROUP_AND_PORT = re.compile(r"([0-9.]+)(?::([0-9]{1,5}))?")
-
-
-def parse_channel(channel: str) -> Optional[Tuple[str, int]]:
-    """GROUP and PORT of an IPv4 group, GROUP:PORT or nothing; None for what is neither."""
-    found = _GROUP_AND_PORT.fullmatch(channel or GROUP)
-    if found is None:
-        return None
-    group, port = found[1], int(found[2] or PORT)
-    return (group, port) if _is_group(group) and 1 <= port <= 65535 else None
-
-
-def pin_to_loopback(bus: Any, group: str) -> None:
-    """Let the python-can bus speak and hear on the loopback device only. Raises OSError."""
-    device = socket.if_nametoindex(_LOOPBACK)
-    member = struct.pack("=4s4si", socket.inet_aton(group), _ANY, device)  # struct ip_mreqn
-    sender = struct.pack("=4s4si", _ANY, _ANY, device)
-    with socket.socket(fileno=os.dup(bus.fileno())) as same:
-        same.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK.encode() + b"\0")
-        _join(same, member)
-        same.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, sender)
-    while bus.recv(0.0) is not None:
-        pass  # from before
-
-
-def _join(bus_socket: socket.socket, member: bytes) -> None:
-    try:
-        bus_socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE:  # python-can joined there: it is the only device
-            raise
-
-
-def _is_group(text: str) -> bool:
-    try:
-        return ipaddress.IPv4Address(text).is_multicast
-    except ValueError:
-        return False

@@ -1,4 +1,11 @@
-"""What a ROS 2 vehicle's driver takes and gives: the table [ros2] of the runtime's settings."""
+"""What a ROS 2 vehicle is called: topics, keys and liveliness tokens, and where a bridge is met.
+
+Keys and tokens are as zenoh-bridge-ros2dds 1.1 and later has them. A topic `/hunter01/odom` has the
+key `hunter01/odom`. A token on `@/<zid>/@ros2_lv/MP/<key>/<type>/<qos>` (MS for a subscriber) makes
+every bridge create the reader or writer on its DDS side; without it a bridge would carry only what
+a ROS node beside it already wants. README.md says what else of the bridge's convention we keep, and
+what not. No pycdr2 here: settings are checked where it is not installed, too.
+"""
 
 from __future__ import annotations
 
@@ -12,37 +19,14 @@ from edge_runtime.transport import check_endpoint, is_tls, open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import SPECS
 
-YAW_RATE, STEERING = "yaw_rate", "steering"
-_ANGULAR = (YAW_RATE, STEERING)
-
-
-def check_settings(settings: Ros2Settings) -> None:
-    """Raise UserError where the settings are not valid, or name nothing to be driven by."""
-    check_choice("ros2.model", settings.model, tuple(SPECS))
-    check_choice("ros2.twist_angular", settings.twist_angular, _ANGULAR)
-    check_choice("ros2.odometry_angular", settings.odometry_angular, _ANGULAR)
-    if settings.listen is not None and settings.connect is not None:
-        raise UserError("ros2 has both listen and connect: give one of them")
-    for endpoint in (settings.listen, settings.connect):
-        check_ros2_endpoint(endpoint)
-    _check_topics(settings)
-
-
-def _check_topics(settings: Ros2Settings) -> None:
-    if not settings.twist_topic and not settings.ackermann_topic:
-        raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
-    if not settings.odometry_topic:
-        raise UserError("ros2 has no odometry_topic: without feedback nothing may drive")
-    topics = [settings.twist_topic, settings.ackermann_topic, settings.odometry_topic]
-    keys = [key(settings.namespace, topic) for topic in topics if topic]
-    if len(set(keys)) < len(keys):
-        raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")
-
-
 PUBLISHER, SUBSCRIBER = "MP", "MS"
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _MAX_CHARS = 200
 _SLASH = "\u00a7"  # The bridge's replacement for a slash inside one chunk of a token.
+# Beside our own 7447, where a bridge listens by default, too; and of this machine only.
+DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
+YAW_RATE, STEERING = "yaw_rate", "steering"
+_ANGULAR = (YAW_RATE, STEERING)
 
 
 class Qos(NamedTuple):
@@ -116,10 +100,6 @@ def _qos_chunk(qos: Qos, type_hash: str) -> str:
     return f":{int(qos.reliable)}:{int(qos.transient_local)}:{history}:typehash=RIHS01_{type_hash};"
 
 
-# Beside our own 7447, where a bridge listens by default, too; and of this machine only.
-DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
-
-
 def check_ros2_endpoint(endpoint: Optional[str]) -> None:
     """Raise UserError for an endpoint (None is one that was not given) that cannot be used."""
     if endpoint is not None and is_tls(check_endpoint(endpoint)):
@@ -145,3 +125,26 @@ def open_ros2_session(
         return open_session(listen=listen or DEFAULT_ROS2_ENDPOINT, mode="router")
     except UserError as error:
         raise UserError(str(error).replace("--listen", option)) from None
+
+
+def check_settings(settings: Ros2Settings) -> None:
+    """Raise UserError where the settings are not valid, or name nothing to be driven by."""
+    check_choice("ros2.model", settings.model, tuple(SPECS))
+    check_choice("ros2.twist_angular", settings.twist_angular, _ANGULAR)
+    check_choice("ros2.odometry_angular", settings.odometry_angular, _ANGULAR)
+    if settings.listen is not None and settings.connect is not None:
+        raise UserError("ros2 has both listen and connect: give one of them")
+    for endpoint in (settings.listen, settings.connect):
+        check_ros2_endpoint(endpoint)
+    _check_topics(settings)
+
+
+def _check_topics(settings: Ros2Settings) -> None:
+    if not settings.twist_topic and not settings.ackermann_topic:
+        raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
+    if not settings.odometry_topic:
+        raise UserError("ros2 has no odometry_topic: without feedback nothing may drive")
+    topics = [settings.twist_topic, settings.ackermann_topic, settings.odometry_topic]
+    keys = [key(settings.namespace, topic) for topic in topics if topic]
+    if len(set(keys)) < len(keys):
+        raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")

@@ -1,4 +1,14 @@
-"""The one place that imports pycdr2: a board without ROS 2 need not have it."""
+"""ROS 2 on Zenoh without ROS 2: the standard messages that we speak, in CDR, and who speaks them.
+
+Field names, order and types are those of the packages' .msg files (common_interfaces and
+ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
+the left, positive steering and yaw to the left (REP 103). On the wire they are CDR behind a header
+of four bytes that says plain CDR (XCDR version 1), little-endian: `00 01 00 00`; a big-endian one
+is read, too. Safe with several threads: pycdr2's own buffer, one for each type, is not used.
+
+The one file that imports pycdr2: a board without ROS 2 need not have it. No `from __future__ import
+annotations` here: pycdr2 reads the annotations, also on Python 3.8.
+"""
 
 import contextlib
 import math
@@ -26,6 +36,12 @@ except ImportError:
     ) from None
 
 
+HEADER_BYTES = 4
+CDR_BIG_ENDIAN, CDR_LITTLE_ENDIAN = 0, 1
+MAX_PAYLOAD_BYTES = 1024 * 1024
+_ALIGNMENT = 4  # DDS fills a message up to this.
+# What hostile bytes make pycdr2 raise: the end too early, bad UTF-8, absurd lengths.
+_DECODE_ERRORS = (struct.error, ValueError, OverflowError, MemoryError, IndexError)
 COVARIANCE_SIZE = 36
 if TYPE_CHECKING:
     Covariance = List[float]
@@ -38,7 +54,6 @@ def no_covariance() -> List[float]:
     return [0.0] * COVARIANCE_SIZE
 
 
-# No `from __future__ import annotations` here: pycdr2 reads the annotations, also on Python 3.8.
 @dataclass
 class Time(IdlStruct, typename="builtin_interfaces/msg/Time"):
     """Seconds and nanoseconds since 1970."""
@@ -155,13 +170,6 @@ def stamp_of(time_ns: int) -> Time:
     """The wall clock's nanoseconds as a ROS time."""
     return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
 
-
-HEADER_BYTES = 4
-CDR_BIG_ENDIAN, CDR_LITTLE_ENDIAN = 0, 1
-MAX_PAYLOAD_BYTES = 1024 * 1024
-_ALIGNMENT = 4  # DDS fills a message up to this.
-# What hostile bytes make pycdr2 raise: the end too early, bad UTF-8, absurd lengths.
-_DECODE_ERRORS = (struct.error, ValueError, OverflowError, MemoryError, IndexError)
 
 RosMessage = Union[AckermannDriveStamped, Twist, Odometry, Image]
 _M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry, Image)
