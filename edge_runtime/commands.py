@@ -5,25 +5,27 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-from typing import Any, Callable, Dict, List, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
 
-import msgspec
-import onnxruntime
-
-from edge_runtime.policy import Policy, infer, load_policy, probe_frames
-from edge_runtime.service import LatencyWindow
 from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
 from edge_runtime.transport import check_endpoint, open_session
 from edge_runtime.util import UserError, check_writable, parse_json, printable, write_json
 from edge_runtime.wire import CONTROL_PERIOD_S, key
 
+if TYPE_CHECKING:
+    from edge_runtime.policy import Policy
+
 _RUNS = 300
+_TIMEOUT_S = 2.0
+_STRANGER = "what answers for {} is no edge runtime of this kind"
 
 
 def check(arguments: argparse.Namespace) -> int:
     """Print the report as JSON. Raises UserError where the policy may not drive."""
     if arguments.out is not None:
         check_writable(arguments.out)
+    from edge_runtime.policy import load_policy  # Here: an operator's commands need no onnxruntime.
+
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
     report = _report(policy)
     limit_ms = CONTROL_PERIOD_S * 1000
@@ -39,26 +41,28 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _report(policy: Policy) -> Dict[str, Any]:
+    import msgspec
+    import onnxruntime
+
     return {
         "policy_id": policy.policy_id,
         "trust": policy.trust,
         "manifest": msgspec.to_builtins(policy.manifest),
-        "inference_ms": measure_latency(policy),
+        "inference_ms": _measure_latency(policy),
         "inference_runs": _RUNS,
         "onnxruntime": onnxruntime.__version__,
     }
 
 
-def measure_latency(policy: Policy) -> Dict[str, float]:
+def _measure_latency(policy: Policy) -> Dict[str, float]:
     """p50, p99 and max of the inference on this machine, in milliseconds."""
+    from edge_runtime.policy import infer, probe_frames
+    from edge_runtime.service import LatencyWindow
+
     window = LatencyWindow()
     for frames in itertools.islice(itertools.cycle(probe_frames()), _RUNS):
         window.add(infer(policy, frames).duration_ns)
     return window.summary_ms()
-
-
-_TIMEOUT_S = 2.0
-_STRANGER = "what answers for {} is no edge runtime of this kind"
 
 
 def status(arguments: argparse.Namespace) -> int:

@@ -91,7 +91,7 @@ class Link:
         ]
 
     def appear(self, open_client: OpenClient, give_way: Callable[[], None]) -> None:
-        """Show that it is alive, and look for others with this vehicle id (presence.py)."""
+        """Show that it is alive, and look for others with this vehicle id."""
         alive = key(self.vehicle_id, "alive")
         self._presence = Presence(self._session, alive, open_client, give_way)
         self._declared.append(self._presence)

@@ -8,11 +8,10 @@ import gc
 import math
 import os
 import signal
-import sys
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Optional
+from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Tuple
 
 import zenoh
 
@@ -62,29 +61,110 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(config: Config) -> int:
     stop = StopSignal()
-    tls = _certificate(config)
-    if config.realtime_priority or config.cpus or config.lock_memory:
-        from edge_runtime import realtime
-
-        realtime.configure(config.realtime_priority, config.cpus, config.lock_memory)
-    policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
-    vehicle = _make_vehicle(config, policy)
-    with _closed_on_error(vehicle):
-        rows = limit_rows(policy.manifest.action, vehicle.limits if vehicle else {})
-    task = policy.manifest.task
-    controller = Controller(rows, vehicle is not None, config.armed_at_start, task)
-    return _serve(config, tls, policy, controller, vehicle, stop)
+    runtime = _Runtime(config)
+    stop.on_stop = runtime.loop.stop
+    if not runtime.drive(stop):
+        # The policy's thread hangs in native code, and would hold the interpreter's exit.
+        log.close()
+        os._exit(0)
+    return 0
 
 
-@contextlib.contextmanager
-def _closed_on_error(vehicle: Optional[Vehicle]) -> Iterator[None]:
-    """For what may fail while the vehicle has no runner yet, who would close it."""
-    try:
-        yield
-    except BaseException:
-        if vehicle is not None:
-            vehicle.close()
-        raise
+class _Runtime:
+    """All that one run is made of. UserError, and nothing left open, where it cannot be made."""
+
+    def __init__(self, config: Config) -> None:
+        tls, access = _certificate(config)
+        if config.realtime_priority or config.cpus or config.lock_memory:
+            from edge_runtime import realtime
+
+            realtime.configure(config.realtime_priority, config.cpus, config.lock_memory)
+        self._config = config
+        self._policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
+        # Both of its sessions hear only whom this vehicle's edge may hear.
+        connected = partial(open_session, connect=config.connect, tls=tls, access=access)
+        self._open_client = partial(connected, mode="client")
+        self._notifier = service.Notifier()
+        self._rival: Optional[UserError] = None
+        with contextlib.ExitStack() as undo:
+            vehicle = _make_vehicle(config, self._policy)
+            if vehicle is not None:
+                undo.callback(vehicle.close)
+            self._controller = _make_controller(config, self._policy, vehicle)
+            alive = key(config.vehicle_id, "alive")
+            self._has_router = require_free(self._open_client, alive, config.vehicle_id)
+            self._session = connected(mode="peer")
+            undo.callback(self._session.close)  # An open one would hang the process at its exit.
+            self._link = Link(self._session, config.vehicle_id, self._policy.manifest)
+            self._runner = _make_runner(vehicle, self._policy, self._link)
+            self.loop = ControlLoop(
+                self._policy,
+                self._controller,
+                self._link,
+                self._runner,
+                self._notifier,
+                Hold(config.hold),
+                rearm_command(config.connect, config.vehicle_id),
+            )
+            undo.pop_all()
+        why = partial(why_no_state, self._session, config.connect, config.vehicle_id, tls)
+        self._waiting = Waiting(self.loop.has_heard, why)
+        # What is loaded stays: the collector need not look at it again in the middle of a drive.
+        gc.collect()
+        gc.freeze()
+
+    def drive(self, stop: StopSignal) -> bool:
+        """Until it is told to stop; False where a thread hangs. UserError where it gave way."""
+        try:
+            if self._runner is not None:
+                self._runner.start(self._config.armed_at_start)
+            self.loop.start()
+            if self._has_router:
+                wait_for_router(self._session)
+            self._link.appear(self._open_client, self._give_way)
+            self._say_ready()
+            self._waiting.start(bool(self._session.info.routers_zid()))
+            self._notifier.ready(self._controller.safety.mode.value)
+            if not stop.came:
+                self.loop.run()
+        finally:
+            self._waiting.stop()
+            self._notifier.stopping()
+            ended = self.loop.close()
+            if self._runner is not None:
+                self._runner.close()
+            self._link.close()
+            log.event("info", "ended", **_totals(self.loop))
+        if self._rival is not None:
+            raise self._rival
+        return ended
+
+    def _give_way(self) -> None:
+        self._rival = taken(self._config.vehicle_id)
+        self._link.mute()
+        self.loop.stop()
+
+    def _say_ready(self) -> None:
+        config, policy = self._config, self._policy
+        if policy.trust != "verified":
+            log.event("warning", "policy_not_verified", trust=policy.trust)
+        print(
+            f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
+            f" connect={config.connect} policy_id={policy.policy_id}",
+            flush=True,
+        )
+
+
+def _certificate(config: Config) -> Tuple[Optional[TlsFiles], Optional[Dict[str, Any]]]:
+    """The files of --tls, and Zenoh's access control for their party; None each without it."""
+    if config.tls is None:
+        return None, None
+    from edge_runtime import tls
+
+    files = tls.load_tls(config.tls)
+    tls.check_name(files.name, tls.common_name(tls.EDGE, config.vehicle_id))
+    log.event("info", "certificate", of=files.name, expires=f"{files.expires:%Y-%m-%dT%H:%MZ}")
+    return files, tls.rules_for_edge(config.vehicle_id)
 
 
 def _make_vehicle(config: Config, policy: Policy) -> Optional[Vehicle]:
@@ -95,110 +175,19 @@ def _make_vehicle(config: Config, policy: Policy) -> Optional[Vehicle]:
     return make_vehicle(config.vehicle, config.vehicle_setup(policy.manifest.scenario))
 
 
-def _certificate(config: Config) -> Optional[TlsFiles]:
-    if config.tls is None:
-        return None
-    from edge_runtime import tls
-
-    files = tls.load_tls(config.tls)
-    tls.check_name(files.name, tls.common_name(tls.EDGE, config.vehicle_id))
-    return files
+def _make_controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> Controller:
+    manifest = policy.manifest
+    rows = limit_rows(manifest.action, vehicle.limits if vehicle else {})
+    return Controller(rows, vehicle is not None, config.armed_at_start, manifest.task)
 
 
-def _serve(
-    config: Config,
-    tls: Optional[TlsFiles],
-    policy: Policy,
-    controller: Controller,
-    vehicle: Optional[Vehicle],
-    stop: StopSignal,
-) -> int:
-    # Both of its sessions hear only whom this vehicle's edge may hear.
-    connected = partial(open_session, connect=config.connect, tls=tls, access=_rules(config, tls))
-    open_client = partial(connected, mode="client")
-    notifier = service.Notifier()
-    with _closed_on_error(vehicle):
-        alive = key(config.vehicle_id, "alive")
-        router_is_there = require_free(open_client, alive, config.vehicle_id)
-        session = connected(mode="peer")
-        try:
-            link = Link(session, config.vehicle_id, policy.manifest)
-            runner = _attach(vehicle, policy, link)
-            rearm = rearm_command(config.connect, config.vehicle_id)
-            loop = ControlLoop(policy, controller, link, runner, notifier, Hold(config.hold), rearm)
-        except BaseException:
-            session.close()  # An open session would hang the process at its exit.
-            raise
-    rivals: List[UserError] = []
-
-    def give_way() -> None:
-        rivals.append(taken(config.vehicle_id))
-        link.mute()
-        loop.stop()
-
-    stop.on_stop = loop.stop
-    why = partial(why_no_state, session, config.connect, config.vehicle_id, tls)
-    waiting = Waiting(loop.has_heard, why)
-    # What is loaded stays: the collector need not look at it again in the middle of a drive.
-    gc.collect()
-    gc.freeze()
-    try:
-        if runner is not None:
-            runner.start(config.armed_at_start)
-        loop.start()
-        if router_is_there:
-            wait_for_router(session)
-        link.appear(open_client, give_way)
-        _say_ready(config, policy, tls)
-        waiting.start(bool(session.info.routers_zid()))
-        notifier.ready(controller.safety.mode.value)
-        if not stop.came:
-            loop.run()
-    finally:
-        waiting.stop()
-        notifier.stopping()
-        ended = loop.close()
-        if runner is not None:
-            runner.close()
-        link.close()
-        log.event("info", "ended", **_totals(loop))
-    if rivals:
-        raise rivals[0]
-    if not ended:
-        # The policy's thread hangs in native code, and would hold the interpreter's exit.
-        log.close()
-        os._exit(0)
-    return 0
-
-
-def _rules(config: Config, tls: Optional[TlsFiles]) -> Optional[Dict[str, Any]]:
-    if tls is None:
-        return None
-    from edge_runtime.tls import rules_for_edge
-
-    return rules_for_edge(config.vehicle_id)
-
-
-def _attach(vehicle: Optional[Vehicle], policy: Policy, link: Link) -> Optional[VehicleRunner]:
+def _make_runner(vehicle: Optional[Vehicle], policy: Policy, link: Link) -> Optional[VehicleRunner]:
     if vehicle is None:
         return None
     from edge_runtime.vehicles.base import VehicleRunner
 
     names = [action.name for action in policy.manifest.action]
     return VehicleRunner(vehicle, names, lambda feedback: link.send("feedback", feedback))
-
-
-def _say_ready(config: Config, policy: Policy, tls: Optional[TlsFiles]) -> None:
-    if policy.trust != "verified":
-        log.event("warning", "policy_not_verified", trust=policy.trust)
-    if tls is not None:
-        log.event("info", "certificate", of=tls.name, expires=f"{tls.expires:%Y-%m-%dT%H:%MZ}")
-    print(
-        f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
-        f" connect={config.connect} policy_id={policy.policy_id}",
-        flush=True,
-    )
-    sys.stdout.flush()
 
 
 def rearm_command(connect: str, vehicle_id: str) -> str:

@@ -7,10 +7,8 @@ Behind a router of its own the simulator is a `client`, too: two peers would not
 
 from __future__ import annotations
 
-import errno
 import json
 import re
-import socket
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
@@ -71,7 +69,7 @@ def open_session(
 ) -> zenoh.Session:
     """Open a session that listens, connects, or both. Close it before the process ends.
 
-    `tls` is what `tls_for` gave; `access` is Zenoh's `access_control`, of access.py, and whoever
+    `tls` is what `tls_for` gave; `access` is Zenoh's `access_control`, of tls.py, and whoever
     listens with TLS must have it.
     Raises UserError for a malformed endpoint, one that does not go with `tls`, a busy port, a
     link that either end refuses, and, in client mode, nobody there.
@@ -85,12 +83,18 @@ def open_session(
         )
     for endpoint in [*listens, *_listed(connect)]:
         check_fits(check_endpoint(endpoint), tls is not None)
-    for endpoint in listens:
-        _check_port_is_free(endpoint)
+    if listens:
+        from edge_runtime import link_probe  # No board listens.
+
+        link_probe.check_ports_are_free(listens)
     try:
         session = zenoh.open(_config(session_rows(listens, connect, mode, tls, access)))
     except zenoh.ZError as error:
-        raise UserError(_explain(str(error), listens, connect, tls)) from None
+        if connect is None or listens:
+            raise UserError(f"Zenoh cannot open {', '.join(listens) or connect}: {error}") from None
+        from edge_runtime import link_probe  # Only for who does not get a link.
+
+        raise UserError(link_probe.why_nobody_answers(connect, tls)) from None
     if connect is not None and tls is not None and not session.info.routers_zid():
         _check_refusal(session, connect, tls)
     return session
@@ -98,7 +102,7 @@ def open_session(
 
 def _check_refusal(session: zenoh.Session, connect: str, tls: TlsFiles) -> None:
     """A peer goes on trying for ever, also where it will never be let in: say so now."""
-    from edge_runtime import link_probe  # Only for who does not get a link.
+    from edge_runtime import link_probe  # As above.
 
     refusal = link_probe.why_refused(connect, tls)
     if refusal and not session.info.routers_zid():
@@ -148,48 +152,6 @@ def _listed(endpoint: Optional[str]) -> List[str]:
     return [] if endpoint is None else [endpoint]
 
 
-def _check_port_is_free(endpoint: str) -> None:
-    """Zenoh's own message for a busy port names neither the port nor the cause."""
-    from edge_runtime import link_probe  # As above; and no board listens.
-
-    protocol, address = endpoint.split("/", 1)
-    host, port = address.rsplit(":", 1)
-    kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
-    try:
-        family, _, _, _, target = link_probe.addresses(endpoint)[0]
-    except OSError:
-        raise UserError(f"host {host!r} of endpoint {endpoint} cannot be resolved") from None
-    with socket.socket(family, kind) as probe:
-        if kind == socket.SOCK_STREAM:
-            # As the listener does: the last run's closed links are no bar.
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(target)
-        except OSError as error:
-            raise UserError(_explain_bind(error, host, port)) from None
-
-
-def _explain_bind(error: OSError, host: str, port: str) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return f"port {port} on {host} is in use; choose another with --listen"
-    return f"cannot listen on port {port} of {host}: {error.strerror}"
-
-
-def _explain(text: str, listens: List[str], connect: Optional[str], tls: Optional[TlsFiles]) -> str:
-    from edge_runtime import link_probe  # As above.
-
-    if connect is None or listens:
-        return f"Zenoh cannot open {', '.join(listens) or connect}: {text}"
-    why = link_probe.why_unreachable(connect)
-    refusal = "" if why else link_probe.why_refused(connect, tls)
-    if connect.startswith("quic/"):  # such a link does not say why it fails
-        why = why or "or one end does not believe the other's certificate"
-    return refusal or (
-        f"nobody answers at {connect}{why and f': {why}'}; start the simulator first, or name its"
-        " address with --connect"
-    )
-
-
 def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
     """A subscriber's callback that takes only what was put to this very key.
 
@@ -201,11 +163,3 @@ def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.
             hear(sample)
 
     return take
-
-
-def free_endpoint(protocol: str = "tcp") -> str:
-    """A Zenoh endpoint on loopback that nobody listens on, for demos and tests."""
-    kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"

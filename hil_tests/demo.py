@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, positive_number
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
 from hil_tests.commands import BackgroundCommand, run_command
 from hil_tests.drives_table import drives_table

@@ -9,7 +9,7 @@ import textwrap
 import pytest
 
 from bridge.tests.processes import BridgeProcess, make_policy, read, start_edge
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
 
 PROJECT = """
 [build-system]

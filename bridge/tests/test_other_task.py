@@ -15,9 +15,10 @@ from bridge.tests.processes import (
     start_simulate,
     wait_until_driving,
 )
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import PEDAL, STEERING, write_policy
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, decode_command
 
 HALF_PEDAL = type(PEDAL)(name="pedal", meaning="m", unit="u", low=-1.0, high=0.5)

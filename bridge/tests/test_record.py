@@ -29,8 +29,9 @@ from bridge.tests.processes import (
     start_edge,
     start_simulate,
 )
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, wait_until
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.transport import open_session
 from edge_runtime.wire import State, decode_state
 
 

@@ -20,8 +20,8 @@ from bridge.tests.processes import (
 )
 from edge_runtime.commands import ask
 from edge_runtime.latency.model import parse_spec
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import make_state, wait_until
-from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import encode
 
 SPEC = "40ms+-5ms,loss=10%,duplicate=10%"

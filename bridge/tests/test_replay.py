@@ -12,8 +12,8 @@ from bridge.recording.writer import RecordingWriter
 from bridge.tests.commands import make_command
 from bridge.tests.processes import BridgeProcess, bridge_status, make_policy, start_edge
 from bridge.tests.test_edge_counts import health
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import BLACK, WHITE, make_state
-from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import FRAMES_BYTES, encode
 
 EPOCH_NS = 1_700_000_000 * 10**9

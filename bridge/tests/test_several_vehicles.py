@@ -14,7 +14,8 @@ from bridge.tests.processes import (
     read,
     start_edge,
 )
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import open_session
 
 PAIRS = {"car-a": ("mean", 0.0, 40), "car-b": ("constant", 0.25, 60)}
 """Vehicle id -> kind and value of its policy, and its seed."""

@@ -23,8 +23,8 @@ from bridge.tests.processes import (
 )
 from bridge.vehicle_clock import VehicleClock
 from edge_runtime.latency.model import parse_spec
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
-from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import (
     CONTROL_PERIOD_S,

@@ -27,8 +27,8 @@ from bridge.tests.processes import (
 )
 from bridge.tests.toy import ToyEnv
 from bridge.viewer.wire_log import WireLog
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import make_state, wait_until
-from edge_runtime.transport import free_endpoint
 
 
 def verify(recording):

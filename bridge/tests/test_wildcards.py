@@ -8,7 +8,8 @@ import pytest
 
 from bridge.feed import ANY_VEHICLE, open_feed
 from bridge.port import SimulatorPort
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import open_session
 from edge_runtime.wire import TOPICS
 
 HEARS_S = 0.3

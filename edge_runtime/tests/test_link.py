@@ -14,9 +14,9 @@ from edge_runtime import log, run
 from edge_runtime import run as waiting
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
-from edge_runtime.link_probe import why_no_link
+from edge_runtime.link_probe import free_endpoint, why_no_link
 from edge_runtime.run import Waiting
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.wire import Health
 
@@ -177,16 +177,17 @@ def test_the_session_is_closed_even_where_nothing_can_be_undeclared():
 
 
 def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
-    session, unused = FakeSession(), SimpleNamespace(manifest=None)
+    session = FakeSession()
+    policy = SimpleNamespace(manifest=SimpleNamespace(action=[], task=""))
 
     def fail(*_: Any) -> None:
         raise OSError("no link")
 
+    monkeypatch.setattr(run, "load_policy", lambda *_: policy)
     monkeypatch.setattr(run, "open_session", lambda **_: session)
     monkeypatch.setattr(run, "Link", fail)
-    arguments: List[Any] = [Config(), None, unused, None, None, None]
     with pytest.raises(OSError, match="no link"):
-        run._serve(*arguments)
+        run._Runtime(Config())
     assert session.events == ["close"] * 2  # the one that asked for other runtimes, and its own
 
 

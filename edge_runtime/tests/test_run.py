@@ -10,6 +10,7 @@ import time
 import pytest
 
 from edge_runtime.commands import ask
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.loop import Hold
 from edge_runtime.tests.harness import (
     BLACK,
@@ -21,7 +22,6 @@ from edge_runtime.tests.harness import (
     run_command,
     wait_until,
 )
-from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
 

@@ -21,7 +21,8 @@ _CAN_DEVICE = "280"
 
 def zenoh_loopback() -> str:
     """A message from one Zenoh session to another, over TCP on loopback."""
-    from edge_runtime.transport import free_endpoint, open_session
+    from edge_runtime.link_probe import free_endpoint
+    from edge_runtime.transport import open_session
 
     came = threading.Event()
     endpoint = free_endpoint()

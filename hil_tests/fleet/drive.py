@@ -13,7 +13,7 @@ import numpy as np
 
 from deploy.__main__ import main as deploy
 from edge_runtime import tls
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
 from hil_tests.faults.campaign import POLICY, PUBLIC_KEY
 from hil_tests.faults.processes import Process, wait_until
 from hil_tests.fleet.usage import Carried, Usage, carried, usage, why_not_counted

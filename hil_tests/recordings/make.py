@@ -16,7 +16,7 @@ from typing import Any
 
 from bridge.recording.reader import Recording
 from edge_runtime.cli import ArgumentParser, examples, run_cli
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, check_writable, read_bytes, write_atomic
 from hil_tests.commands import BackgroundCommand, run_command
 

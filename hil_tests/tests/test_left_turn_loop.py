@@ -14,8 +14,8 @@ from bridge.tests.processes import (
     start_simulate,
     wait_until_driving,
 )
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess
-from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.evaluation import drive_episodes

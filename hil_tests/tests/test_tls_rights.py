@@ -10,9 +10,9 @@ import pytest
 
 from bridge.tests.processes import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
 from edge_runtime.commands import ask
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, run_command
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
-from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests.tests.tls_parties import SETTLE_S, Intruder, listener, make_certificates, session
 
