@@ -16,7 +16,7 @@ from bridge.environments import scene_of
 from bridge.feed import connect_client
 from bridge.scene import Stamps, encode_scene, scene_key
 from edge_runtime import tls as access
-from edge_runtime.policy import Manifest
+from edge_runtime.policy_file import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import only_own, open_session
 from edge_runtime.util import UserError

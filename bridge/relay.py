@@ -13,10 +13,11 @@ from typing import Any
 from bridge.arguments import add_vehicle_id
 from bridge.relay_ends import Relay, open_relay
 from bridge.signals import sigterm_as_interrupt, wait_to_be_told
-from edge_runtime.cli import ArgumentParser, examples, not_negative, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, not_negative
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.transport import check_endpoint, is_tls
-from edge_runtime.util import UserError, check_writable
+from edge_runtime.util import UserError
 from edge_runtime.wire import check_vehicle_id
 
 EXAMPLE = examples(

@@ -15,14 +15,8 @@ from bridge.recording.flushed_file import check_new
 from bridge.recording.reader import Recording
 from bridge.recording.writer import CHUNK_BYTES, METADATA
 from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.util import (
-    UserError,
-    behind_link,
-    check_writable,
-    counted,
-    try_to_lock_file,
-    write_atomic,
-)
+from edge_runtime.files import behind_link, check_writable, try_to_lock_file, write_atomic
+from edge_runtime.util import UserError, counted
 
 KEPT = ".damaged"
 """Ends the name under which a damaged recording is kept beside the repaired one."""

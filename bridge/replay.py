@@ -13,18 +13,13 @@ from bridge.replaying.comparison import compare
 from bridge.replaying.in_process import Answers, replay_in_process
 from bridge.replaying.live import replay_live
 from bridge.replaying.recorded import RecordedDrive, key_of
-from edge_runtime.cli import (
-    ArgumentParser,
-    add_public_key,
-    examples,
-    not_negative_number,
-    write_json_out,
-)
+from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
 from edge_runtime.config import load_config
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
-from edge_runtime.util import UserError, check_writable, printable
+from edge_runtime.util import UserError, printable
 from edge_runtime.wire import check_vehicle_id
 
 DEFAULT_TOLERANCE = 1e-5

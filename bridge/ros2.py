@@ -16,11 +16,11 @@ from bridge.feed import Feed, open_feed
 from bridge.signals import sigterm_as_interrupt
 from bridge.to_ros2.outlet import Outlet
 from bridge.to_ros2.policies import Policies
-from edge_runtime.cli import ArgumentParser, examples, number, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, number
 from edge_runtime.commands import ask
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import check_endpoint
-from edge_runtime.util import check_writable
 from edge_runtime.vehicles.ros2.names import (
     DEFAULT_ROS2_ENDPOINT,
     check_ros2_endpoint,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import NoReturn
 
-from edge_runtime.util import sigterm_as_interrupt
+from edge_runtime.cli import sigterm_as_interrupt
 
 __all__ = ["sigterm_as_interrupt", "wait_to_be_told"]
 

@@ -30,12 +30,13 @@ from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.signals import sigterm_as_interrupt
 from bridge.vehicle_clock import VehicleClock
 from bridge.vehicle_loop import VehicleInLoop
-from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.latency.command_hold import Decision
 from edge_runtime.latency.model import GRAMMAR, LatencySpec, parse_spec
 from edge_runtime.run import rearm_command
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.util import UserError, check_writable
+from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, check_vehicle_id
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")

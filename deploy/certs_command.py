@@ -28,8 +28,9 @@ from deploy.certs import (
     read_authority,
 )
 from edge_runtime.cli import examples, whole_number
+from edge_runtime.files import write_atomic
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
-from edge_runtime.util import UserError, write_atomic
+from edge_runtime.util import UserError
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
 CA_FOLDER = "ca"

@@ -1,18 +1,21 @@
 """What every command of the repository shares: a parser whose errors are one line and whose help
-has defaults and examples, types of options with limits, and exit statuses.
+has defaults and examples, types of options with limits, exit statuses, and signals as ^C.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import math
 import os
+import signal
 import sys
+import threading
 from importlib import import_module
-from typing import Any, Callable, Dict, List, NoReturn, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, List, NoReturn, Optional, Tuple
 
-from edge_runtime.util import PathLike, UserError, printable, write_json
+from edge_runtime.util import UserError, ending_signals, printable
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -151,12 +154,6 @@ def _drop_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def write_json_out(path: Optional[PathLike], value: Any) -> None:
-    """Write the result of a command to `--out`; nothing where no file was asked for."""
-    if path is not None:
-        write_json(path, value)
-
-
 def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
     """A type: a whole number between two limits, both included."""
     limits = f", at least {least}" if most == _LARGEST else f" from {least} to {most}"
@@ -196,3 +193,24 @@ positive_number = number("a finite number above 0", lambda value: value > 0.0)
 not_negative_number = number("a finite number, at least 0", lambda value: value >= 0.0)
 seconds = number("a finite number of seconds, at least 0", lambda value: value >= 0.0)
 share = number("a share above 0 and at most 1", lambda value: 0.0 < value <= 1.0)
+
+
+@contextlib.contextmanager
+def sigterm_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM, and all else that would end this process, raise KeyboardInterrupt in the block.
+
+    So sessions are closed and files are finished. Outside of the main thread it does nothing.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in ending_signals()} if in_main else {}
+    for number in before:
+        signal.signal(number, _interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(number: int, frame: Any) -> NoReturn:
+    raise KeyboardInterrupt

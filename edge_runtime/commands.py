@@ -7,9 +7,10 @@ import itertools
 import json
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
 
+from edge_runtime.files import check_writable, write_json
 from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
 from edge_runtime.transport import check_endpoint, open_session
-from edge_runtime.util import UserError, check_writable, parse_json, printable, write_json
+from edge_runtime.util import UserError, parse_json, printable
 from edge_runtime.wire import CONTROL_PERIOD_S, key
 
 if TYPE_CHECKING:

@@ -21,14 +21,14 @@ MAX_PRIORITY = 99  # of SCHED_FIFO
 
 
 class HunterSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which chassis it is: a row of hunter/specs.py, and one of hunter/faults.py."""
+    """Which chassis it is: a row of mapping.SPECS, and one of hunter/protocol.PROFILES."""
 
     model: str = "2.0"
     profile: str = "v2"
 
 
 class CarSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The car of a scenario that is not this repository's; the fields of similarity.ScenarioCar."""
+    """The car of a scenario that is not this repository's; the fields of mapping.ScenarioCar."""
 
     throttle_mps2: float
     brake_mps2: float
@@ -119,7 +119,7 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
         if path is None or not _is_wrong(from_file):
             raise  # the flag is wrong, not the file
         raise UserError(f"config file {path}: {error}") from None
-    # Who types a bus means a vehicle to move; a file may hold the bus of one that is off.
+    # `--bus` on the command line needs a vehicle; in the file it may be set while that is off.
     if "bus" in given and config.vehicle != "hunter":
         raise UserError(f"--bus needs --vehicle hunter; the vehicle is {config.vehicle}")
     return config

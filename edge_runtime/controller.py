@@ -7,16 +7,18 @@ seconds. The caller serialises the calls (loop.py holds one lock). Contract, sec
 from __future__ import annotations
 
 import math
-from typing import Dict, List, NamedTuple, Optional, Sequence
+from typing import TYPE_CHECKING, Dict, List, NamedTuple, Optional, Sequence
 
 import numpy as np
 from msgspec import UNSET
 
 from edge_runtime import safety as rules
-from edge_runtime.policy import Action
 from edge_runtime.safety import Event, Mode, Safety
 from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP, State
+
+if TYPE_CHECKING:
+    from edge_runtime.policy_file import Action
 
 
 class ActionLimit(NamedTuple):

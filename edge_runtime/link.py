@@ -13,16 +13,18 @@ import json
 import os
 import threading
 import time
-from typing import Any, Callable, Dict, List, Optional, Set
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Set
 
 import msgspec
 import zenoh
 
 from edge_runtime import __version__, log
-from edge_runtime.policy import Manifest
 from edge_runtime.transport import LEASE_MS, only_own
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
+
+if TYPE_CHECKING:
+    from edge_runtime.policy_file import Manifest
 
 OpenClient = Callable[[], zenoh.Session]
 
@@ -33,9 +35,6 @@ _LOOK_S = 1.0
 _CONNECT_S = 0.2
 _JOIN_S = 0.5
 _LEFTOVER_S = 1.5 * LEASE_MS / 1000.0
-_PUBLISHED = ("command", "feedback", "health")
-
-_thread = threading.local()
 
 
 class Link:
@@ -49,7 +48,7 @@ class Link:
         self._publishers: Dict[str, Any] = {}
         self._presence: Optional[Presence] = None
         self._muted = False
-        for topic in _PUBLISHED:
+        for topic in ("command", "feedback", "health"):
             # DROP: a full queue must never hold the control loop, and the next message is better.
             self._publishers[topic] = session.declare_publisher(
                 key(vehicle_id, topic),
@@ -68,9 +67,8 @@ class Link:
 
         def state_came(sample: zenoh.Sample) -> None:
             # One byte too many is enough to be rejected; a huge message is not copied.
-            payload = sample.payload
-            size = len(payload)
-            on_state(bytes(MAX_PAYLOAD_BYTES + 1) if size > MAX_PAYLOAD_BYTES else bytes(payload))
+            is_huge = len(sample.payload) > MAX_PAYLOAD_BYTES
+            on_state(bytes(MAX_PAYLOAD_BYTES + 1) if is_huge else bytes(sample.payload))
 
         def status_asked(query: zenoh.Query) -> None:
             _reply(query, self._status(health()))
@@ -124,35 +122,27 @@ class Link:
             self._session.close()
 
     def _status(self, health: Health) -> Dict[str, Any]:
-        status: Dict[str, Any] = msgspec.to_builtins(health)
-        status["version"] = __version__
-        status["manifest"] = msgspec.to_builtins(self._manifest)
-        return status
+        manifest = msgspec.to_builtins(self._manifest)
+        return {**msgspec.to_builtins(health), "version": __version__, "manifest": manifest}
 
 
 def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
     """Zenoh's own thread calls it: no second thread to wake, and no queue of old states between.
 
-    The callback must be quick, for nothing else is received meanwhile.
+    The callback must be quick, for nothing else is received meanwhile. A native thread that calls
+    into Python is given a new Python state, which is taken down when the call returns: tens of
+    microseconds of each call. One PyGILState_Ensure that is never released keeps it. These threads
+    live as long as the session, so nothing piles up.
     """
+    thread = threading.local()
 
     def call(sample: zenoh.Sample) -> None:
-        keep_state()
+        if not hasattr(thread, "keeps_its_state"):
+            ctypes.pythonapi.PyGILState_Ensure()
+            thread.keeps_its_state = True
         callback(sample)
 
     return zenoh.handlers.Callback(call, indirect=False)
-
-
-def keep_state() -> None:
-    """Let this thread keep its Python state until it ends.
-
-    A native thread that calls into Python is given a new state by PyGILState_Ensure, and it is
-    taken down when the call returns: tens of microseconds of each call. One Ensure that is never
-    released keeps it. These threads live as long as the session, so nothing piles up.
-    """
-    if not getattr(_thread, "kept", False):
-        ctypes.pythonapi.PyGILState_Ensure()
-        _thread.kept = True
 
 
 def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
@@ -209,11 +199,10 @@ class Presence:
         self._tokens: List[Any] = []
         self._declare()
         self._stopping = threading.Event()
-        self._thread: Optional[threading.Thread] = None
+        self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
 
     def start(self) -> None:
         """Begin to look for changes."""
-        self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
         self._thread.start()
 
     def refresh(self) -> bool:
@@ -244,7 +233,7 @@ class Presence:
     def undeclare(self) -> None:
         """Stop looking and take the tokens away."""
         self._stopping.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(_JOIN_S)
         self._undeclare_tokens()
 
@@ -273,9 +262,8 @@ class Presence:
                     next_look_s = time.monotonic() + _FIRST_LOOKS_S
                 if self._routers and time.monotonic() >= next_look_s:
                     self.look()
-                    next_look_s = time.monotonic() + (
-                        _LOOK_S if self._looks > 1 else _FIRST_LOOKS_S
-                    )
+                    pause_s = _LOOK_S if self._looks > 1 else _FIRST_LOOKS_S
+                    next_look_s = time.monotonic() + pause_s
             except zenoh.ZError as error:
                 log.event("error", "token_not_declared", detail=error)
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import queue
 import threading
 import time
-from typing import Any, Dict, NamedTuple, Optional
+from typing import Any, Dict, Optional
 
 LEVELS = ("debug", "info", "warning", "error")
 FORMATS = ("text", "json")
@@ -79,11 +80,8 @@ class _TextFormatter(logging.Formatter):
 
 class _JsonFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        line = {
-            "time": _time(record),
-            "level": record.levelname.lower(),
-            "event": record.getMessage(),
-        }
+        level, event = record.levelname.lower(), record.getMessage()
+        line = {"time": _time(record), "level": level, "event": event}
         # Twice, so that the line begins with them and no field can take their place.
         return json.dumps({**line, **_fields(record), **line}, default=str)
 
@@ -105,25 +103,20 @@ def _quoted(value: Any) -> str:
     return text if is_plain else repr(text)
 
 
-class _Said(NamedTuple):
-    at_s: float
-    unsaid: int
-
-
 class Flood:
-    """Lets the first of each kind through, then one a second. Kinds must be few: all are kept."""
+    """Lets the first of each kind through, then one a second. Kinds must be few: all are kept.
+
+    Pure: time is passed in.
+    """
 
     def __init__(self) -> None:
-        self._said: Dict[str, _Said] = {}
+        self._next_s: Dict[str, float] = {}
+        self._unsaid: Dict[str, int] = {}
 
     def admit(self, kind: str, now_s: float) -> Optional[int]:
         """How many of this kind went unsaid since the last line, or None: so does this one."""
-        said = self._said.get(kind)
-        if said is None:
-            self._said[kind] = _Said(now_s, 0)
-            return 0
-        if now_s - said.at_s < _FLOOD_PERIOD_S:
-            self._said[kind] = said._replace(unsaid=said.unsaid + 1)
+        if now_s < self._next_s.get(kind, -math.inf):
+            self._unsaid[kind] = self._unsaid.get(kind, 0) + 1
             return None
-        self._said[kind] = _Said(now_s, 0)
-        return said.unsaid
+        self._next_s[kind] = now_s + _FLOOD_PERIOD_S
+        return self._unsaid.pop(kind, 0)

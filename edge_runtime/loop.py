@@ -231,9 +231,8 @@ class ControlLoop:
                 self._busy_since_s = None
                 self._inference_window.add(inference.duration_ns)
                 self._look_at_vehicle(time.monotonic())
-                order = self._controller.finish(
-                    inference.output, inference.duration_ns, time.monotonic()
-                )
+                now_s = time.monotonic()
+                order = self._controller.finish(*inference, now_s)
                 self._send(order)
                 if order is not None:
                     took_s = time.monotonic() - received.arrived_s
@@ -312,13 +311,8 @@ class ControlLoop:
         safety = self._controller.safety
         if (safety.mode, safety.reason) != (self._logged.mode, self._logged.reason):
             level = "warning" if safety.mode is Mode.SAFE_STOP else "info"
-            log.event(
-                level,
-                "mode",
-                was=self._logged.mode.value,
-                now=safety.mode.value,
-                reason=safety.reason,
-            )
+            was, now = self._logged.mode.value, safety.mode.value
+            log.event(level, "mode", was=was, now=now, reason=safety.reason)
             self._logged = safety
             self._notifier.status(f"{safety.mode.value} {safety.reason}".rstrip())
         waits = self._controller.waits_for_rearm

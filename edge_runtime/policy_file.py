@@ -1,20 +1,31 @@
-"""What a policy file must be before onnxruntime loads it: signed, and whole in itself.
+"""A policy file before onnxruntime loads it: signed, whole in itself, with a manifest that fits us.
 
 The signature is Ed25519 over the whole file: `POLICY.onnx.sig`, 64 raw bytes; keys are PEM. The
 file itself is walked field by field, without the onnx package: whatever could keep weights where
-nobody looks is refused. Pure but for the files of the signature. Contract, section 4.
+nobody looks is refused. The manifest is JSON in its metadata under MANIFEST_KEY: what the policy
+sees, does, and where it comes from. Contract, section 4.
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Dict, Iterator, List, NamedTuple, Optional, Tuple, Union
+from typing import (
+    Any,
+    Dict,
+    Iterator,
+    List,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Tuple,
+    Union,
+)
 
-from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-from cryptography.hazmat.primitives.serialization import load_pem_public_key
+import msgspec
 
 from edge_runtime.util import PathLike, UserError, read_bytes
+from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE, MAX_TEXT_CHARS
 
 SIGNATURE_SUFFIX = ".sig"
 SIGNATURE_BYTES = 64
@@ -25,6 +36,12 @@ BESIDE = "signed by the key beside it"
 UNVERIFIED = "signed, not verified"
 UNSIGNED = "unsigned"
 
+MANIFEST_KEY = "phil.manifest"
+MANIFEST_SCHEMA = 1
+# The runtime must know how to stop each action safely (controller.py), so it takes only these.
+ACTION_NAMES = ("pedal", "steering")
+FULL_BRAKE = -1.0
+
 
 class OnnxFile(NamedTuple):
     """What the runtime must know of a model that onnxruntime does not tell."""
@@ -32,10 +49,6 @@ class OnnxFile(NamedTuple):
     ir_version: int
     opset: int
     metadata: Dict[str, str]
-
-
-class ProtobufError(Exception):
-    """The bytes are not the message that was expected."""
 
 
 class _Kind(NamedTuple):
@@ -78,7 +91,17 @@ _Fields = List[Tuple[int, _Value]]
 
 def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None:
     """Raise UserError unless `signature` is the key owner's over exactly these bytes."""
-    key = _load_key(public_key_pem)
+    # Here: who reads a manifest, and verifies nothing, need not wait for it.
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+    from cryptography.hazmat.primitives.serialization import load_pem_public_key
+
+    try:
+        key = load_pem_public_key(public_key_pem)
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        raise UserError("the public key is not a PEM public key") from None
+    if not isinstance(key, Ed25519PublicKey):
+        raise UserError("the public key is not an Ed25519 key")
     if len(signature) != SIGNATURE_BYTES:
         raise UserError(f"the signature holds {len(signature)} bytes, not {SIGNATURE_BYTES}")
     try:
@@ -111,7 +134,9 @@ def check_trust(
     signature = read_bytes(signature_path, "signature")
     beside = Path(path).with_name(DEFAULT_PUBLIC_KEY.name)
     is_beside = allow_unsigned and public_key is None and beside.exists()
-    key_path = beside if is_beside else _find_public_key(public_key)
+    key_path = beside if is_beside else public_key
+    if key_path is None and DEFAULT_PUBLIC_KEY.exists():
+        key_path = DEFAULT_PUBLIC_KEY
     if key_path is not None:
         key_pem = read_bytes(key_path, "public key")
         try:
@@ -130,22 +155,6 @@ def check_trust(
     )
 
 
-def _find_public_key(public_key: Optional[PathLike]) -> Optional[PathLike]:
-    if public_key is not None:
-        return public_key
-    return DEFAULT_PUBLIC_KEY if DEFAULT_PUBLIC_KEY.exists() else None
-
-
-def _load_key(public_key_pem: bytes) -> Ed25519PublicKey:
-    try:
-        key = load_pem_public_key(public_key_pem)
-    except (ValueError, TypeError, UnsupportedAlgorithm):
-        raise UserError("the public key is not a PEM public key") from None
-    if not isinstance(key, Ed25519PublicKey):
-        raise UserError("the public key is not an Ed25519 key")
-    return key
-
-
 def read_onnx(data: bytes) -> OnnxFile:
     """Check the bytes of a whole ONNX file.
 
@@ -154,7 +163,7 @@ def read_onnx(data: bytes) -> OnnxFile:
     """
     try:
         return _read_model(_checked(memoryview(data), "model"))
-    except ProtobufError as error:
+    except ValueError as error:
         raise UserError(f"not a whole ONNX file: {error}") from None
 
 
@@ -163,13 +172,13 @@ def _read_model(fields: _Fields) -> OnnxFile:
     graphs = sum(number == 7 for number, _ in fields)
     versions = [value for number, value in fields if number == 1 and isinstance(value, int)]
     if graphs != 1 or not versions:
-        raise ProtobufError(f"it holds {graphs} graphs, not one")
+        raise ValueError(f"it holds {graphs} graphs, not one")
     opsets = [dict(_fields(_bytes(value))) for number, value in fields if number == 8]
     entries = [dict(_fields(_bytes(value))) for number, value in fields if number == 14]
     known = [opset.get(2, 0) for opset in opsets if _text(opset.get(1)) in ("", "ai.onnx")]
     numbers = [value for value in known if isinstance(value, int)]
     if not numbers:
-        raise ProtobufError("it names no operator set")
+        raise ValueError("it names no operator set")
     metadata = {_text(entry.get(1)): _text(entry.get(2)) for entry in entries}
     return OnnxFile(versions[-1], max(numbers), metadata)
 
@@ -177,7 +186,7 @@ def _read_model(fields: _Fields) -> OnnxFile:
 def _checked(message: memoryview, kind: str, depth: int = 0) -> _Fields:
     """The fields of a message, when it and all within it hold nothing that is refused."""
     if depth > _MAX_DEPTH:
-        raise ProtobufError(f"messages nest deeper than {_MAX_DEPTH}")
+        raise ValueError(f"messages nest deeper than {_MAX_DEPTH}")
     plain, nested, refused = _KINDS[kind]
     fields = list(_fields(message))
     for number, value in fields:
@@ -201,7 +210,7 @@ def _fields(message: memoryview) -> Iterator[Tuple[int, _Value]]:
         tag, position = _varint(message, position)
         number, wire_type = tag >> 3, tag & 7
         if number == 0:
-            raise ProtobufError("a field has number 0")
+            raise ValueError("a field has number 0")
         length = _FIXED_BYTES.get(wire_type)
         if wire_type == _VARINT:
             value, position = _varint(message, position)
@@ -210,9 +219,9 @@ def _fields(message: memoryview) -> Iterator[Tuple[int, _Value]]:
         if wire_type == _BYTES:
             length, position = _varint(message, position)
         if length is None:
-            raise ProtobufError(f"unknown wire type {wire_type}")
+            raise ValueError(f"unknown wire type {wire_type}")
         if position + length > len(message):
-            raise ProtobufError("it ends within a field")
+            raise ValueError("it ends within a field")
         yield number, message[position : position + length]
         position += length
 
@@ -224,17 +233,118 @@ def _varint(message: memoryview, position: int) -> Tuple[int, int]:
         result |= (byte & 0x7F) << (7 * index)
         if byte < 0x80:
             return result, position + index + 1
-    raise ProtobufError("it ends within a number, or one is longer than 10 bytes")
+    raise ValueError("it ends within a number, or one is longer than 10 bytes")
 
 
 def _bytes(value: _Value) -> memoryview:
     if isinstance(value, int):
-        raise ProtobufError("a number where bytes were expected")
+        raise ValueError("a number where bytes were expected")
     return value
 
 
 def _text(value: Optional[_Value]) -> str:
+    return "" if value is None else bytes(_bytes(value)).decode("utf-8")
+
+
+class Observation(msgspec.Struct, frozen=True, kw_only=True):
+    """The network's input. `order` says which frame is the newer one."""
+
+    name: str = "frames"
+    shape: List[int] = msgspec.field(default_factory=lambda: list(FRAMES_SHAPE))
+    dtype: str = "uint8"
+    order: str = "[t-1, t]"
+
+
+class Action(msgspec.Struct, frozen=True, kw_only=True):
+    """One number of the network's output, its physical meaning, unit and range."""
+
+    name: str
+    meaning: str
+    unit: str
+    low: float
+    high: float
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True):
+    """All of it. `training` holds at least seed, episodes, config and source revision.
+
+    `created` is ISO 8601 in UTC. A field that is not listed, like an earlier version's `policy_id`,
+    is not looked at.
+    """
+
+    scenario: str
+    algorithm: str
+    observation: Observation
+    action: List[Action]
+    training: Dict[str, Any]
+    created: str
+    control_period_s: float = CONTROL_PERIOD_S
+    schema: int = MANIFEST_SCHEMA
+
+    @property
+    def task(self) -> str:
+        """What the policy is for: what it is compared by when it meets a simulator."""
+        return task_text(self.scenario, [(row.name, row.low, row.high) for row in self.action])
+
+
+def task_text(scenario: str, actions: Sequence[Tuple[str, float, float]]) -> str:
+    """Scenario, and each action's name, low and high: `left_turn, pedal -1 to 1`."""
+    rows = (f"{name} {low:g} to {high:g}" for name, low, high in actions)
+    return ", ".join((scenario, *rows))[:MAX_TEXT_CHARS]
+
+
+def encode_manifest(manifest: Manifest) -> str:
+    """The JSON text that goes into the file."""
+    return msgspec.json.encode(manifest).decode()
+
+
+def decode_manifest(text: str) -> Manifest:
+    """The manifest of a policy file. Raises UserError where it is none, or none we can drive."""
     try:
-        return "" if value is None else bytes(_bytes(value)).decode("utf-8")
-    except UnicodeDecodeError:
-        raise ProtobufError("a text is not UTF-8") from None
+        manifest = msgspec.json.decode(text.encode(), type=Manifest)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise UserError(f"the manifest in the policy file is not valid: {error}") from None
+    _check_manifest(manifest)
+    return manifest
+
+
+def _check_manifest(manifest: Manifest) -> None:
+    if manifest.schema != MANIFEST_SCHEMA:
+        raise UserError(
+            f"the manifest has schema {manifest.schema}, this runtime reads {MANIFEST_SCHEMA}"
+        )
+    if manifest.control_period_s != CONTROL_PERIOD_S:
+        raise UserError(
+            f"the policy was made for a control period of {manifest.control_period_s} s,"
+            f" this runtime runs at {CONTROL_PERIOD_S} s"
+        )
+    if manifest.observation != Observation():
+        raise UserError(
+            "the manifest's observation is not the wire's:"
+            f" {Observation()} is needed, {manifest.observation} was found"
+        )
+    if not manifest.action:
+        raise UserError("the manifest names no action")
+    for action in manifest.action:
+        _check_action(action)
+    names = [action.name for action in manifest.action]
+    if len(set(names)) != len(names):
+        raise UserError(f"the manifest names an action twice: {', '.join(names)}")
+
+
+def _check_action(action: Action) -> None:
+    if action.name not in ACTION_NAMES:
+        raise UserError(
+            f"the runtime does not know how to stop the action {action.name!r} safely;"
+            f" it knows {', '.join(ACTION_NAMES)}"
+        )
+    finite = math.isfinite(action.low) and math.isfinite(action.high)
+    if not (finite and -1.0 <= action.low < action.high <= 1.0):
+        raise UserError(
+            f"the range of {action.name} is {action.low} to {action.high}; it must lie in -1 to 1"
+        )
+    if action.name == "pedal" and action.low != FULL_BRAKE:
+        raise UserError(
+            f"the range of pedal begins at {action.low}, not {FULL_BRAKE}: it could not brake"
+            " fully in a safe stop"
+        )

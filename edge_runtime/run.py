@@ -34,7 +34,7 @@ _WAITING_PERIOD_S = 5.0
 _POLL_S = 0.1
 
 
-class StopSignal:
+class _StopSignal:
     """Whatever would end it: remembered from the start, handed on once there is a loop to stop."""
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(config: Config) -> int:
-    stop = StopSignal()
+    stop = _StopSignal()
     runtime = _Runtime(config)
     stop.on_stop = runtime.loop.stop
     if not runtime.drive(stop):
@@ -113,7 +113,7 @@ class _Runtime:
         gc.collect()
         gc.freeze()
 
-    def drive(self, stop: StopSignal) -> bool:
+    def drive(self, stop: _StopSignal) -> bool:
         """Until it is told to stop; False where a thread hangs. UserError where it gave way."""
         try:
             if self._runner is not None:
@@ -134,7 +134,16 @@ class _Runtime:
             if self._runner is not None:
                 self._runner.close()
             self._link.close()
-            log.event("info", "ended", **_totals(self.loop))
+            health = self.loop.health()
+            log.event(
+                "info",
+                "ended",
+                accepted=health.accepted,
+                rejected=sum(health.rejected.values()),
+                deadline_misses=health.deadline_misses,
+                safe_stops=health.safe_stops,
+                uptime_s=round(health.uptime_s, 1),
+            )
         if self._rival is not None:
             raise self._rival
         return ended
@@ -194,17 +203,6 @@ def rearm_command(connect: str, vehicle_id: str) -> str:
     """What an operator types to let a vehicle drive again."""
     tls = f" --tls certs/operator-{vehicle_id}" if is_tls(connect) else ""
     return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"
-
-
-def _totals(loop: ControlLoop) -> dict:
-    health = loop.health()
-    return {
-        "accepted": health.accepted,
-        "rejected": sum(health.rejected.values()),
-        "deadline_misses": health.deadline_misses,
-        "safe_stops": health.safe_stops,
-        "uptime_s": round(health.uptime_s, 1),
-    }
 
 
 class Waiting:

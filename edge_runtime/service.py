@@ -5,6 +5,7 @@ The board's sensors are Linux's; elsewhere they are unknown.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import threading
@@ -96,14 +97,12 @@ def look(thermal: Path = _THERMAL, statm: Path = _STATM) -> Board:
 
 
 def _hottest_c(thermal: Path) -> Optional[float]:
-    hottest: Optional[float] = None
+    values_c = []
     for sensor in thermal.glob("thermal_zone*/temp"):
-        try:
-            value_c = int(sensor.read_text()) / 1000.0
-        except (OSError, ValueError):  # a sensor that is switched off answers with an error
-            continue
-        hottest = value_c if hottest is None else max(hottest, value_c)
-    return hottest
+        # A sensor that is switched off answers with an error.
+        with contextlib.suppress(OSError, ValueError):
+            values_c.append(int(sensor.read_text()) / 1000.0)
+    return max(values_c, default=None)
 
 
 def _rss_mb(statm: Path) -> float:

@@ -14,7 +14,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
-from edge_runtime.transport import check_fits
 from edge_runtime.util import PathLike, UserError, read_bytes
 from edge_runtime.wire import check_vehicle_id
 
@@ -65,6 +64,8 @@ class TlsFiles(NamedTuple):
 
 def tls_for(directory: Optional[PathLike], *endpoints: Optional[str]) -> Optional[TlsFiles]:
     """The files of `--tls DIR`, None without it; UserError where endpoints do not go with that."""
+    from edge_runtime.transport import check_fits  # Here: who makes certificates opens no session.
+
     for endpoint in endpoints:
         if endpoint is not None:
             check_fits(endpoint, directory is not None)

@@ -81,7 +81,7 @@ def open_session(
         raise ValueError(
             "who listens with TLS needs access control: every certificate could say all"
         )
-    for endpoint in [*listens, *_listed(connect)]:
+    for endpoint in [*listens, *([] if connect is None else [connect])]:
         check_fits(check_endpoint(endpoint), tls is not None)
     if listens:
         from edge_runtime import link_probe  # No board listens.
@@ -122,7 +122,7 @@ def session_rows(
         "mode": mode,
         # Explicitly none: a peer would otherwise listen on every interface.
         "listen/endpoints": listens,
-        "connect/endpoints": _listed(connect),
+        "connect/endpoints": [] if connect is None else [connect],
         "connect/retry": RETRY,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -146,10 +146,6 @@ def _config(rows: Dict[str, Any]) -> zenoh.Config:
     for name, value in rows.items():
         config.insert_json5(name, json.dumps(value))
     return config
-
-
-def _listed(endpoint: Optional[str]) -> List[str]:
-    return [] if endpoint is None else [endpoint]
 
 
 def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:

@@ -215,9 +215,8 @@ def decode_state(payload: bytes) -> Union[State, Rejection]:
     """A State whose frames have the right size and whose numbers are finite, or why not."""
     state = _decode(payload, State)
     if isinstance(state, State) and len(state.frames) != FRAMES_BYTES:
-        return Rejection(
-            Reason.FRAMES_SIZE, f"frames hold {len(state.frames)} bytes, not {FRAMES_BYTES}"
-        )
+        detail = f"frames hold {len(state.frames)} bytes, not {FRAMES_BYTES}"
+        return Rejection(Reason.FRAMES_SIZE, detail)
     return state
 
 
@@ -245,9 +244,8 @@ def decode_health(payload: bytes) -> Union[Health, Rejection]:
 
 def _decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
     if len(payload) > MAX_PAYLOAD_BYTES:
-        return Rejection(
-            Reason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
-        )
+        detail = f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
+        return Rejection(Reason.OVERSIZED, detail)
     try:
         # The schema first: another schema's fields need not fit, and that is no malformed message.
         schema = _ENVELOPE.decode(payload).schema

@@ -14,13 +14,9 @@ from urllib.parse import quote
 import rerun as rr
 import rerun.blueprint as rrb
 
-from edge_runtime.util import (
-    UserError,
-    behind_link,
-    check_writable,
-    make_directory,
-    sigterm_as_interrupt,
-)
+from edge_runtime.cli import sigterm_as_interrupt
+from edge_runtime.files import behind_link, check_writable, make_directory
+from edge_runtime.util import UserError
 from viewing.viewer import END_S, LOOPBACK, Viewer, ViewerGone, flush, free_port
 
 GRPC_PORT = 9876

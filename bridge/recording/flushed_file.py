@@ -6,7 +6,8 @@ import contextlib
 import os
 from pathlib import Path
 
-from edge_runtime.util import UserError, check_writable, lock_file, make_directory
+from edge_runtime.files import check_writable, lock_file, make_directory
+from edge_runtime.util import UserError
 
 MAX_PENDING_BYTES = 4 << 20
 NEVER_OVER = "choose another name: no recording is lost"

@@ -16,7 +16,8 @@ from onnx import helper
 
 import edge_runtime
 from edge_runtime import policy_file
-from edge_runtime.policy import infer, load_policy, task_text
+from edge_runtime.policy import infer, load_policy
+from edge_runtime.policy_file import task_text
 from edge_runtime.tests.policies import PEDAL, STEERING, public_pem, write_policy
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_TEXT_CHARS

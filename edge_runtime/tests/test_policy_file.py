@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from edge_runtime.policy import MANIFEST_KEY, decode_manifest
-from edge_runtime.policy_file import read_onnx, verify
+from edge_runtime.policy_file import MANIFEST_KEY, decode_manifest, read_onnx, verify
 from edge_runtime.tests.harness import run_command
 from edge_runtime.tests.policies import public_pem, write_policy
 from edge_runtime.util import UserError

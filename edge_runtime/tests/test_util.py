@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
 from edge_runtime.episode_report import EpisodeResult, summarise
+from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.loop import Hold
 from edge_runtime.policy import load_policy
 from edge_runtime.service import WINDOW, LatencyWindow
@@ -21,15 +22,12 @@ from edge_runtime.tests.harness import run_command
 from edge_runtime.util import (
     MAX_FILE_MIB,
     UserError,
-    check_writable,
     counted,
     ending_signals,
     printable,
     read_bytes,
     read_json,
     read_toml,
-    sigterm_as_interrupt,
-    write_atomic,
 )
 
 

@@ -20,7 +20,8 @@ import numpy as np
 
 from deploy.certs_command import add_arguments, certs
 from edge_runtime import wire
-from edge_runtime.cli import ArgumentParser, examples, positive, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, positive, run_cli
+from edge_runtime.files import write_json_out
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tls import load_tls, rules_for_listener
 from edge_runtime.transport import open_session

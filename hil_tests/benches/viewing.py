@@ -22,9 +22,9 @@ import numpy as np
 from bridge.environments import make_environment
 from bridge.port import SimulatorPort, open_port
 from bridge.scene import Stamps
-from edge_runtime.cli import ArgumentParser, examples, positive, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_probe import free_endpoint
-from edge_runtime.util import check_writable
 from edge_runtime.wire import State, encode
 from hil_tests.commands import BackgroundCommand
 from trainer.benches.machine import processor_model

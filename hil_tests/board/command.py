@@ -12,8 +12,9 @@ from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
 from deploy.wheelhouse import DEFAULT_FOLDER
-from edge_runtime.cli import ArgumentParser, examples, write_json_out
-from edge_runtime.util import UserError, check_writable
+from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 from hil_tests.board import emulation
 from hil_tests.board.proof import prove_emulated, prove_twin
 from hil_tests.board.rootfs import DEFAULT_CACHE

@@ -10,7 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from edge_runtime.util import write_atomic
+from edge_runtime.files import write_atomic
 
 FIGURES = {
     "success": ("success", "success", "Wilson's 95 % interval"),

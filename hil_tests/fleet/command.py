@@ -12,8 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.signals import sigterm_as_interrupt
-from edge_runtime.cli import ArgumentParser, examples, positive, write_json_out
-from edge_runtime.util import UserError, check_writable, counted
+from edge_runtime.cli import ArgumentParser, examples, positive
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError, counted
 from hil_tests.fleet.drive import measure
 from hil_tests.fleet.rules import certificates_ms, measure_rules
 from hil_tests.fleet.scale import per_vehicle, project

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.util import write_atomic
+from edge_runtime.files import write_atomic
 
 NAMES = {
     "tcp": "Zenoh on TCP",

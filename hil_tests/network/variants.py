@@ -15,16 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bridge.report import quantiles
-from edge_runtime.cli import (
-    ArgumentParser,
-    examples,
-    not_negative,
-    positive,
-    run_cli,
-    write_json_out,
-)
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.latency.model import parse_spec
-from edge_runtime.util import UserError, check_writable
+from edge_runtime.util import UserError
 from hil_tests.commands import BackgroundCommand
 from hil_tests.network.cells import JUMBO_MTU, PORT
 from hil_tests.network.echo import READY, zenoh_config

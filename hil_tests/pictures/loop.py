@@ -14,7 +14,7 @@ from bridge.recording.reader import Recording
 from bridge.scene import Scene, decode_scene
 from bridge.viewer.recorded import read_heard
 from edge_runtime import wire
-from edge_runtime.util import write_atomic
+from edge_runtime.files import write_atomic
 from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.pictures.drive import LATENCY, VEHICLE, recorded_drive
 from viewing.timeline import Timeline

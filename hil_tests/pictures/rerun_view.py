@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from edge_runtime.util import write_atomic
+from edge_runtime.files import write_atomic
 from hil_tests.commands import run_command
 from hil_tests.pictures.drive import VEHICLE, recorded_drive
 from hil_tests.pictures.headless import headless_viewer

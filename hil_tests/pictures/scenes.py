@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from edge_runtime.util import write_atomic
+from edge_runtime.files import write_atomic
 from hil_tests.commands import run_command
 from trainer.drivers import load_driver, make_environment
 from trainer.scenarios import SCENARIOS

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from edge_runtime.util import write_atomic
+from edge_runtime.files import write_atomic
 from hil_tests.campaign.figures import write_figures as write_lines
 
 

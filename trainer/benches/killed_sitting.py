@@ -27,9 +27,9 @@ from edge_runtime.cli import (
     positive,
     positive_number,
     run_cli,
-    write_json_out,
 )
-from edge_runtime.util import UserError, check_writable
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.drivers import CHECKPOINT_FILE

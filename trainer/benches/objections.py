@@ -9,9 +9,9 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from edge_runtime.cli import ArgumentParser, positive, run_cli, write_json_out
+from edge_runtime.cli import ArgumentParser, positive, run_cli
 from edge_runtime.episode_report import GOAL
-from edge_runtime.util import check_writable
+from edge_runtime.files import check_writable, write_json_out
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver
 from trainer.revision import source_revision

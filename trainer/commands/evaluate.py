@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 
-from edge_runtime.cli import add_public_key, examples, not_negative, positive, write_json_out
+from edge_runtime.cli import add_public_key, examples, not_negative, positive
 from edge_runtime.episode_report import GOAL, EpisodeResult, summarise
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.latency.model import parse_spec
-from edge_runtime.util import check_writable, counted
+from edge_runtime.util import counted
 from trainer.commands.options import add_latency, add_scenario, set_threads
 from trainer.conditions import CONDITIONS
 from trainer.drivers import load_driver, make_environment

@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 
 from edge_runtime.cli import examples, not_negative, whole_number
-from edge_runtime.util import UserError, make_directory, write_atomic
+from edge_runtime.files import make_directory, write_atomic
+from edge_runtime.util import UserError
 from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.experiments import run as running
 from trainer.experiments.plan import (

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from edge_runtime.util import write_atomic
+from edge_runtime.files import write_atomic
 from trainer.experiments.data import (
     ALONE,
     DISTANCE,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.util import make_directory
+from edge_runtime.files import make_directory
 from trainer.benches.machine import about
 from trainer.experiments.plan import FOUR, NORMAL, TIME, Unit, run_config, training_id
 from trainer.experiments.run import Store, one_thread

@@ -22,7 +22,8 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from numpy.typing import NDArray
 
 from edge_runtime import __version__
-from edge_runtime.util import UserError, lock_file, make_directory, open_regular
+from edge_runtime.files import lock_file, make_directory
+from edge_runtime.util import UserError, open_regular
 from trainer.person.interface import Control
 from viewing.records import Records
 

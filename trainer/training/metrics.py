@@ -14,7 +14,8 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter
 
 from edge_runtime.episode_report import GOAL
-from edge_runtime.util import UserError, read_bytes, write_atomic
+from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError, read_bytes
 
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
 ALWAYS = (

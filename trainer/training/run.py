@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_runtime.files import write_json
 from edge_runtime.latency.model import parse_spec
-from edge_runtime.util import UserError, write_json
+from edge_runtime.util import UserError
 from trainer import seeds
 from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.files import load_torch, save_torch

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from edge_runtime.util import sigterm_as_interrupt
+from edge_runtime.cli import sigterm_as_interrupt
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 from trainer.viewer.background import Background, Draw

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from bridge.tests.test_recording_damage import MIB, crafted, zeros
-from edge_runtime.util import UserError, try_to_lock_file
+from edge_runtime.files import try_to_lock_file
+from edge_runtime.util import UserError
 from trainer.person.recording import Recorder, Step, find_recordings, read_steps, sittings
 from trainer.person.tests.steps import recorded_step
 from viewing import records

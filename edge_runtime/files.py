@@ -1,0 +1,129 @@
+"""Files that are either whole or absent, never half-written, and held by who writes them.
+
+Who writes a file can hold the kernel's lock on it, which ends with the process, however it ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import stat
+import tempfile
+from pathlib import Path
+from typing import Any, Optional
+
+from edge_runtime.util import PathLike, UserError
+
+
+def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
+    """Write `data` so that a reader or a crash sees the old file or the new one, nothing between.
+
+    A symbolic link stays, and the file behind it is written. Its directory is made. Raises
+    UserError when that cannot be made or written, and for a path that is there and is no regular
+    file.
+    """
+    target = _checked(path)
+    make_directory(target.parent)
+    try:
+        descriptor, temporary = tempfile.mkstemp(dir=str(target.parent), prefix=f".{target.name}.")
+    except OSError as error:
+        raise UserError(f"cannot write {target}: {error.strerror}") from None
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp gives 0600, open() would not
+        os.replace(temporary, target)
+    except BaseException as error:
+        os.unlink(temporary)
+        if isinstance(error, OSError):
+            raise UserError(f"cannot write {target}: {error.strerror}") from None
+        raise
+
+
+def behind_link(path: PathLike) -> Path:
+    """The file that a symbolic link leads to, there or not; any other path as it is."""
+    return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+
+
+def check_writable(path: PathLike) -> None:
+    """Raise UserError now if `write_atomic(path)` would fail later, after the long work.
+
+    It makes nothing: whatever else is wrong with the command leaves no empty directory behind.
+    """
+    target = _checked(path)
+    directory = next(place for place in target.absolute().parents if os.path.exists(place))
+    if not directory.is_dir():
+        raise UserError(f"cannot write {target}: {directory} is no directory")
+    if not os.access(str(directory), os.W_OK | os.X_OK):
+        raise UserError(f"cannot write {target}: the directory {directory} is read-only")
+
+
+def make_directory(path: PathLike) -> None:
+    """Make a directory, and those above it, where it is not there; UserError where it cannot be."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot create the directory {path}: {error.strerror}") from None
+
+
+def write_json(path: PathLike, value: Any) -> None:
+    """`write_atomic` of indented JSON. NaN and infinity are refused (they are not JSON)."""
+    write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_json_out(path: Optional[PathLike], value: Any) -> None:
+    """Write the result of a command to `--out`; nothing where no file was asked for."""
+    if path is not None:
+        write_json(path, value)
+
+
+def _checked(path: PathLike) -> Path:
+    """What to replace. A rename would put a plain file in the place of a device or a pipe."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        target = behind_link(path)
+        if os.path.islink(path) and not target.parent.is_dir():  # a disk that is not there?
+            raise UserError(
+                f"cannot write {path}: it leads to {target.parent}, which does not exist"
+            ) from None
+        return target
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from None
+    except ValueError as error:  # a NUL inside the name
+        raise UserError(f"cannot write {path!r}: {error}") from None
+    if stat.S_ISDIR(mode):
+        raise UserError(f"{path} is a directory, not a file")
+    if not stat.S_ISREG(mode):
+        raise UserError(f"cannot write {path}: it is no regular file")
+    return behind_link(path)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def lock_file(descriptor: int) -> None:
+    """Hold a file that was just made, until the descriptor is closed.
+
+    Waits for one who looks at it in this moment. Without a word where the file system has no locks.
+    """
+    with contextlib.suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+
+
+def try_to_lock_file(descriptor: int) -> bool:
+    """The same without waiting; False where another process holds the file."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # No locks here: then nobody can hold one.
+        pass
+    return True
