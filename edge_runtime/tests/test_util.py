@@ -13,7 +13,6 @@ import pytest
 
 from edge_runtime.cli import ArgumentParser, run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
-from edge_runtime.episode_report import EpisodeResult, summarise
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.loop import Hold
 from edge_runtime.policy import load_policy
@@ -155,29 +154,6 @@ def test_a_parser_error_is_one_line_and_help_shows_defaults(capsys):
     assert caught.value.code == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert "how many (default: 50)" in parser.format_help()
-
-
-def episode(outcome, distance_m):
-    return EpisodeResult(
-        seed=1, outcome=outcome, distance_m=distance_m, reward=2.0, time_s=3.0,
-        lateral_acceleration_mps2=0.0, longitudinal_acceleration_mps2=1.0, steps=30,
-    )  # fmt: skip
-
-
-def test_summarise_by_hand():
-    report = summarise(
-        [episode("goal", 10.0), episode("collision", 20.0)], "left_turn", "nominal", "id", 7
-    )
-    assert report["success_rate"] == report["collision_rate"] == 0.5
-    assert report["surviving_distance_m"] == {"mean": 15.0, "std": 5.0}
-    assert set(report) == {
-        "scenario", "condition", "episodes", "success_rate", "collision_rate",
-        "surviving_distance_m", "episode_reward", "episode_time_s", "lateral_acceleration_mps2",
-        "longitudinal_acceleration_mps2", "policy_id", "seed",
-    }  # fmt: skip
-    json.dumps(report, allow_nan=False)
-    with pytest.raises(ValueError, match="no episode"):
-        summarise([], "left_turn", "nominal", "id", 7)
 
 
 def test_the_latency_window_forgets():

@@ -50,7 +50,7 @@ class ClearCommand(NamedTuple):
 
 
 class SystemStatus(NamedTuple):
-    """0x211. `faults` are bytes 4 (high) and 5 (low); faults.py says what the bits mean."""
+    """0x211. `faults` are bytes 4 (high) and 5 (low); PROFILES says what the bits mean."""
 
     state: int
     mode: int
