@@ -158,8 +158,8 @@ def _check(config: Config) -> None:
     check_vehicle_id(config.vehicle_id)
     check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
     setup = config.vehicle_setup("")
-    if config.vehicle != NONE or setup != VehicleSetup():
-        from edge_runtime.vehicles.registry import check_setup  # Only where there is one.
+    if setup != VehicleSetup():
+        from edge_runtime.vehicles.registry import check_setup  # The defaults need no check.
 
         check_setup(setup)
     check_choice("log_level", config.log_level, log.LEVELS)

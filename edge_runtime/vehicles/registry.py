@@ -1,4 +1,4 @@
-"""The vehicles that `--vehicle` knows."""
+"""The vehicles that `--vehicle` knows. What one of them needs is imported for that one only."""
 
 from __future__ import annotations
 
@@ -6,12 +6,19 @@ from typing import Callable, Dict, Optional, Tuple
 
 import msgspec
 
-from edge_runtime.config import NONE, VEHICLE_NAMES, SimilaritySettings, VehicleSetup, check_choice
+from edge_runtime.config import (
+    DEFAULT_BUS,
+    NONE,
+    VEHICLE_NAMES,
+    HunterSettings,
+    Ros2Settings,
+    SimilaritySettings,
+    VehicleSetup,
+    check_choice,
+)
 from edge_runtime.controller import ActionLimit
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import Vehicle
-from edge_runtime.vehicles.hunter.bus import parse_bus
-from edge_runtime.vehicles.hunter.protocol import PROFILES
 from edge_runtime.vehicles.mapping import (
     CARS,
     SPECS,
@@ -23,7 +30,6 @@ from edge_runtime.vehicles.mapping import (
     similarity_to,
 )
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
-from edge_runtime.vehicles.ros2.names import check_settings
 
 
 def _mock(setup: VehicleSetup) -> Vehicle:
@@ -47,15 +53,14 @@ def _robot(name: str, setup: VehicleSetup) -> Tuple[HunterSpec, Similarity]:
 
 
 def _hunter(setup: VehicleSetup) -> Vehicle:
-    # Imported here: its thread and its bus are for those who have one.
-    from edge_runtime.vehicles.hunter.bus import HunterVehicle
+    from edge_runtime.vehicles.hunter.bus import HunterVehicle, parse_bus
 
     spec, similarity = _robot("hunter", setup)
     return HunterVehicle(parse_bus(setup.bus), spec, setup.hunter.profile, similarity)
 
 
 def _ros2(setup: VehicleSetup) -> Vehicle:
-    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle  # As above; and it needs pycdr2.
+    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
 
     spec, similarity = _robot("ros2", setup)
     return Ros2Vehicle(setup.ros2, spec, similarity)
@@ -74,9 +79,9 @@ def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Optional[Ve
     Raises UserError for any other name, for a scenario that the vehicle cannot follow, and where
     what it hangs on cannot be opened.
     """
+    check_choice("vehicle", name, VEHICLE_NAMES)
     if name == NONE:
         return None
-    _check_known(name)
     return _MAKERS[name](setup or VehicleSetup())
 
 
@@ -85,21 +90,30 @@ def vehicle_limits(name: str, setup: VehicleSetup) -> Dict[str, ActionLimit]:
 
     Raises UserError for any other name, and for a scenario that the vehicle cannot follow.
     """
+    check_choice("vehicle", name, VEHICLE_NAMES)
     if name == NONE:
         return {}
-    _check_known(name)
     if name == MockVehicle.name:
         return MockVehicle.limits
     return limits_of(*_robot(name, setup))
 
 
 def check_setup(setup: VehicleSetup) -> None:
-    """Raise UserError for settings of a vehicle that are not valid, whichever vehicle is chosen."""
-    parse_bus(setup.bus)
-    check_choice("hunter.model", setup.hunter.model, tuple(SPECS))
-    check_choice("hunter.profile", setup.hunter.profile, tuple(PROFILES))
+    """Raise UserError for settings that are not valid, whichever vehicle is chosen.
+
+    The defaults are valid (a test), and load nothing.
+    """
+    if (setup.bus, setup.hunter) != (DEFAULT_BUS, HunterSettings()):
+        from edge_runtime.vehicles.hunter import bus, protocol
+
+        bus.parse_bus(setup.bus)
+        check_choice("hunter.model", setup.hunter.model, tuple(SPECS))
+        check_choice("hunter.profile", setup.hunter.profile, tuple(protocol.PROFILES))
     _check_similarity(setup.similarity)
-    check_settings(setup.ros2)
+    if setup.ros2 != Ros2Settings():
+        from edge_runtime.vehicles.ros2.names import check_settings
+
+        check_settings(setup.ros2)
 
 
 def _check_similarity(settings: SimilaritySettings) -> None:
@@ -116,11 +130,6 @@ def _check_similarity(settings: SimilaritySettings) -> None:
 def _range(name: str) -> str:
     angle = name == "full_steering_rad"
     return "above 0 and below 1.5 rad, or below 0 and above -1.5" if angle else "above 0"
-
-
-def _check_known(name: str) -> None:
-    if name not in _MAKERS:
-        raise UserError(f"vehicle {name!r} is not known; choose from {', '.join(VEHICLE_NAMES)}")
 
 
 def make_similarity(setup: VehicleSetup, name: str, max_speed_mps: float) -> Similarity:
