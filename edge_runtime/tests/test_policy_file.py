@@ -163,6 +163,18 @@ def test_a_field_whose_number_protobuf_would_cut_to_a_known_one_is_refused(writt
         read_onnx(written.read_bytes() + data)
 
 
+def test_a_graph_that_is_a_number_is_refused(written):
+    with pytest.raises(UserError, match="a number where bytes were expected"):
+        read_onnx(written.read_bytes() + b"\x38\x01")  # field 7, a varint
+
+
+def test_a_model_without_an_operator_set_is_refused(written):
+    model = onnx.load(str(written))
+    model.ClearField("opset_import")
+    with pytest.raises(UserError, match="names no operator set"):
+        read_onnx(model.SerializeToString())
+
+
 def test_endless_nesting_ends():
     data = b""
     for _ in range(300):
