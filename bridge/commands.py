@@ -12,9 +12,9 @@ from typing import Any, NoReturn
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from edge_runtime.option_types import seconds
-from edge_runtime.topics import DEFAULT_VEHICLE_ID
+from edge_runtime.cli import seconds
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint
+from edge_runtime.wire import DEFAULT_VEHICLE_ID
 
 
 def add_connect(parser: ArgumentParser) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 from gymnasium.envs.registration import namespace
 from gymnasium.spaces import Box
 
-from edge_runtime.cli import UserError
-from edge_runtime.manifest import Manifest, task_text
+from edge_runtime.policy_file import Manifest, task_text
+from edge_runtime.util import UserError
 from edge_runtime.wire import FRAMES_SHAPE
 
 SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"}

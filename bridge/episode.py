@@ -19,8 +19,8 @@ from bridge.inbound import VehicleDecision
 from bridge.messages import Stamps
 from bridge.report import EpisodeResult, SafeStopLog
 from bridge.virtual_link import Decision
-from edge_runtime.cli import UserError
 from edge_runtime.safety import Event
+from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, Feedback, State
 
 Environment = gymnasium.Env[Any, Any]

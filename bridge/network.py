@@ -20,7 +20,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 DIRECTIONS = ("up", "down")
 """State to edge runtime, and command to simulator."""

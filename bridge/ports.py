@@ -21,11 +21,11 @@ import zenoh
 from bridge.environments import scene_of
 from bridge.inbound import EdgeCounts
 from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Stamps, encode_scene, scene_key
-from edge_runtime import access
-from edge_runtime.cli import UserError
-from edge_runtime.manifest import Manifest
+from edge_runtime import tls as access
+from edge_runtime.policy_file import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import only_own, open_session
+from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, check_vehicle_id, key
 
 ANY_VEHICLE = "*"

@@ -37,16 +37,12 @@ from bridge.messages import MESSAGES, TOKEN_TOPICS, Heard
 from bridge.ports import ANY_VEHICLE, POLL_S, QUEUE_MESSAGES, Feed, open_feed
 from bridge.recording import METADATA, WIRE_ENCODING
 from edge_runtime import __version__, wire
-from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.errors import UserError
-from edge_runtime.file_lock import hold
-from edge_runtime.files import check_writable, make_directory
-from edge_runtime.option_types import seconds
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, seconds, sigterm_as_interrupt
+from edge_runtime.files import check_writable, lock_file, make_directory
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
+from edge_runtime.util import UserError, counted
 from edge_runtime.wire import check_vehicle_id
-from edge_runtime.words import counted
 
 FLUSH_S = 0.5
 """A kill loses at most this much, and what waits in the queue."""
@@ -264,7 +260,7 @@ class FlushedFile:
             raise UserError(f"{path} exists; {NEVER_OVER}") from None
         except OSError as error:
             raise UserError(f"cannot write {path}: {error.strerror}") from None
-        hold(self._descriptor)
+        lock_file(self._descriptor)
         self.flushed_bytes = 0
         self._pending = bytearray()
 

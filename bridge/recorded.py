@@ -14,8 +14,8 @@ from typing import NamedTuple
 from bridge.messages import Heard
 from bridge.recording import Recording, choose_vehicle, heard_of
 from edge_runtime.controller import Order
-from edge_runtime.errors import UserError
 from edge_runtime.safety import MAX_INFERENCE_S, Event
+from edge_runtime.util import UserError
 from edge_runtime.wire import (
     Command,
     Health,

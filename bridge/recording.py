@@ -32,9 +32,7 @@ from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from bridge.messages import Heard
-from edge_runtime.errors import UserError
-from edge_runtime.files import open_regular
-from edge_runtime.words import counted
+from edge_runtime.util import UserError, counted, open_regular
 
 WIRE_ENCODING = "msgpack"
 METADATA = "phil"

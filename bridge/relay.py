@@ -23,14 +23,11 @@ from bridge.commands import add_vehicle_id, wait_to_be_told
 from bridge.network import GRAMMAR, LatencyModel, LatencySpec, make_link, parse_spec
 from bridge.ports import simulator_key
 from bridge.report import quantiles
-from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import not_negative
-from edge_runtime.signals import sigterm_as_interrupt
-from edge_runtime.tls import is_tls
-from edge_runtime.topics import key
-from edge_runtime.transport import check_endpoint, only_own, open_session
-from edge_runtime.wire import State, check_vehicle_id, decode_state
+from edge_runtime.cli import ArgumentParser, examples, not_negative, sigterm_as_interrupt
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.transport import check_endpoint, is_tls, only_own, open_session
+from edge_runtime.util import UserError
+from edge_runtime.wire import State, check_vehicle_id, decode_state, key
 
 UP = ("state",)
 DOWN = ("command", "feedback", "health")

@@ -11,10 +11,9 @@ from typing import Any
 
 from bridge.record import check_new, start_mcap
 from bridge.recording import METADATA, Recording
-from edge_runtime.cli import ArgumentParser, UserError, examples
-from edge_runtime.file_lock import try_to_hold
-from edge_runtime.files import behind_link, check_writable, open_regular, write_atomic
-from edge_runtime.words import counted
+from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.files import behind_link, check_writable, try_to_lock_file, write_atomic
+from edge_runtime.util import UserError, counted, open_regular
 
 KEPT = ".damaged"
 """Ends the name under which a damaged recording is kept beside the repaired one."""
@@ -79,7 +78,7 @@ def _held(source: Path) -> Iterator[None]:
     except OSError as error:
         raise UserError(f"recording {source} cannot be read: {error.strerror}") from None
     with stream:
-        if not try_to_hold(stream.fileno()):
+        if not try_to_lock_file(stream.fileno()):
             raise UserError(f"{source} is being written; repair it when its writer has ended")
         yield
 

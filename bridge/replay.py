@@ -29,21 +29,17 @@ from bridge.recorded import (
     key_of,
     note,
 )
-from edge_runtime.cli import ArgumentParser, UserError, add_public_key, examples, write_json_out
-from edge_runtime.config import Config, load_config
-from edge_runtime.controller import Controller, Order, Received
-from edge_runtime.files import check_writable
-from edge_runtime.inference import infer
-from edge_runtime.limiter import LimitRow, limit_rows
-from edge_runtime.messages import SAFE_STOP
-from edge_runtime.option_types import not_negative_number
-from edge_runtime.policy import Policy, load_policy
+from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
+from edge_runtime.config import NONE, Config, load_config
+from edge_runtime.controller import Controller, LimitRow, Order, Received, limit_rows
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.safety import SILENCE_S, Event
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import check_endpoint
-from edge_runtime.vehicles.registry import NONE, vehicle_limits
-from edge_runtime.wire import Command, check_vehicle_id, decode_command, encode
-from edge_runtime.words import printable
+from edge_runtime.util import UserError, printable
+from edge_runtime.vehicles.registry import vehicle_limits
+from edge_runtime.wire import SAFE_STOP, Command, check_vehicle_id, decode_command, encode
 
 DEFAULT_TOLERANCE = 1e-5
 """Two processors round differently; a graph of the same weights stays far below this."""

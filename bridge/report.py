@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bridge.virtual_link import Decision
-from edge_runtime.words import counted, printable
+from edge_runtime.util import counted, printable
 
 GOAL = "goal"
 COLLISION = "collision"

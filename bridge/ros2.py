@@ -22,18 +22,22 @@ from bridge.commands import add_connect, add_span, add_tls, add_vehicle_id
 from bridge.messages import Heard
 from bridge.ports import Feed, open_feed
 from edge_runtime import wire
-from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.operator_commands import ask
-from edge_runtime.option_types import number
-from edge_runtime.ros2 import messages as ros
-from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT, check_ros2_endpoint, open_ros2_session
-from edge_runtime.ros2.names import check_ros_name, namespace_of
-from edge_runtime.ros2.node import Ros2Node, open_node
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, number, sigterm_as_interrupt
+from edge_runtime.commands import ask
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import check_endpoint
-from edge_runtime.vehicles.similarity import CARS, ScenarioCar, Similarity
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.mapping import CARS, ScenarioCar, Similarity
+from edge_runtime.vehicles.ros2 import node as ros
+from edge_runtime.vehicles.ros2.names import (
+    DEFAULT_ROS2_ENDPOINT,
+    check_ros2_endpoint,
+    check_ros_name,
+    namespace_of,
+    open_ros2_session,
+)
+from edge_runtime.vehicles.ros2.node import Ros2Node, open_node
 from edge_runtime.wire import (
     CONTROL_PERIOD_S,
     FRAMES_SHAPE,

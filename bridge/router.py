@@ -8,14 +8,12 @@ from typing import Any
 import zenoh
 
 from bridge.commands import add_tls, wait_to_be_told
-from edge_runtime import access
-from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime import tls as access
+from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.tls import tls_for
-from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, open_session
+from edge_runtime.util import UserError, read_bytes
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
 EXAMPLE = examples(
     "python -m bridge router --listen tcp/127.0.0.1:7447",

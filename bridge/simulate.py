@@ -36,14 +36,12 @@ from bridge.ports import SimulatorPort, open_port
 from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.vehicle import VehicleClock, VehicleInLoop
 from bridge.virtual_link import Decision
-from edge_runtime.cli import ArgumentParser, UserError, examples, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.operator_commands import rearm_command
-from edge_runtime.option_types import not_negative, positive
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, sigterm_as_interrupt
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.run import rearm_command
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.topics import CONTROL_PERIOD_S, check_vehicle_id
-from edge_runtime.words import printable
+from edge_runtime.util import UserError, printable
+from edge_runtime.wire import CONTROL_PERIOD_S, check_vehicle_id
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
 

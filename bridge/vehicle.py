@@ -21,7 +21,7 @@ from bridge.ports import SimulatorPort
 from bridge.report import STANDSTILL_MPS, quantiles
 from bridge.tracking import TrackingLog
 from bridge.virtual_link import SILENCE_LIMIT_S
-from edge_runtime.cli import UserError
+from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, Command, Feedback, State
 
 POLL_S = 0.02

@@ -21,14 +21,11 @@ from deploy.installer.archive import CONTEXT, END, MANIFEST, SIGNATURE, header, 
 from deploy.installer.manifest import FileEntry, Manifest, Target, to_json
 from deploy.installer.release import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.pyz import NAME, build_installer
-from edge_runtime import access
-from edge_runtime.config import Config, load_config
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime import tls as access
+from edge_runtime.config import NONE, Config, load_config
 from edge_runtime.policy import Policy, load_policy
-from edge_runtime.private_keys import read_signing_key
-from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE, load_tls
-from edge_runtime.vehicles.registry import NONE
+from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE, load_tls, read_signing_key
+from edge_runtime.util import UserError, read_bytes
 
 UNITS = Path(__file__).parent / "systemd"
 _DIGITS = 8

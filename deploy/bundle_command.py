@@ -12,8 +12,8 @@ from deploy.installer.release import WHEELS
 from deploy.targets import TARGETS, find_target, lock_path
 from deploy.wheelhouse import DEFAULT_FOLDER, build_edge_wheel, gather
 from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
-from edge_runtime.signature import DEFAULT_PUBLIC_KEY
+from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
+from edge_runtime.util import UserError
 
 DEFAULT_OUT = "build/bundles"
 DEFAULT_KEY = f"{keys.DEFAULT_DIRECTORY}/policy.key"

@@ -1,6 +1,6 @@
 """An authority of one's own, and a certificate for each party on the wire.
 
-Who is who goes by the common name; what a name may say and hear is `edge_runtime.access`.
+Who is who goes by the common name; what a name may say and hear is `edge_runtime.tls`.
 Only listeners' certificates are servers', so that no viewer or operator can pose as a simulator.
 """
 
@@ -17,11 +17,8 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from edge_runtime.access import ROLES, common_name
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
-from edge_runtime.private_keys import read_private_key
-from edge_runtime.tls import CA_FILE
+from edge_runtime.tls import CA_FILE, ROLES, common_name, read_private_key
+from edge_runtime.util import UserError, read_bytes
 
 CA_KEY_FILE = "ca.key.pem"
 CA_DAYS = 3650

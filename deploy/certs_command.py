@@ -27,12 +27,11 @@ from deploy.certs import (
     party_roles,
     read_authority,
 )
-from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
+from edge_runtime.cli import examples, whole_number
 from edge_runtime.files import write_atomic
-from edge_runtime.option_types import whole_number
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
-from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
+from edge_runtime.util import UserError
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
 CA_FOLDER = "ca"
 DEFAULT_OUT = "certs"

@@ -13,9 +13,9 @@ from cryptography.hazmat.primitives.serialization import (
     PublicFormat,
 )
 
-from edge_runtime.errors import UserError
 from edge_runtime.files import make_directory, write_atomic
-from edge_runtime.signature import DEFAULT_PUBLIC_KEY
+from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
+from edge_runtime.util import UserError
 
 DEFAULT_DIRECTORY = str(DEFAULT_PUBLIC_KEY.parent)
 

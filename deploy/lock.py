@@ -10,7 +10,8 @@ from pathlib import Path
 from deploy.targets import TARGETS, find_target, lock_path
 from deploy.wheelhouse import download
 from edge_runtime.cli import ArgumentParser, examples, run_cli
-from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.files import write_atomic
+from edge_runtime.util import read_bytes
 
 
 def main(argv: list[str]) -> int:

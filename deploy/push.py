@@ -21,9 +21,8 @@ from deploy.installer.layout import DEFAULT_ROOT
 from deploy.installer.manifest import Manifest
 from deploy.pyz import NAME, build_installer
 from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
-from edge_runtime.signature import DEFAULT_PUBLIC_KEY
+from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
+from edge_runtime.util import UserError, read_bytes
 
 _UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 """A password asked for in the middle would hang a script, and so would a board without power."""

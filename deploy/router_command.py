@@ -7,10 +7,10 @@ from pathlib import Path
 
 from deploy.router_config import router_config
 from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable, read_bytes, write_json
-from edge_runtime.tls import check_fits, load_tls
-from edge_runtime.transport import check_endpoint
+from edge_runtime.files import check_writable, write_json
+from edge_runtime.tls import load_tls
+from edge_runtime.transport import check_endpoint, check_fits
+from edge_runtime.util import UserError, read_bytes
 
 EXAMPLE = examples(
     "python -m deploy router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"

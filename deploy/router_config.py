@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from edge_runtime.access import ROUTER, check_name, rules_for_listener
-from edge_runtime.errors import UserError
-from edge_runtime.tls import TlsFiles
-from edge_runtime.topics import check_vehicle_id
+from edge_runtime.tls import ROUTER, TlsFiles, check_name, rules_for_listener
 from edge_runtime.transport import session_rows
+from edge_runtime.util import UserError
+from edge_runtime.wire import check_vehicle_id
 
 SESSIONS_PER_VEHICLE = 4
 """Edge runtime, simulator, an operator's command, and the edge runtime's look at its start."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from deploy.installer.manifest import Target
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 ROOT = Path(__file__).parents[1]
 LOCKS = ROOT / "requirements"

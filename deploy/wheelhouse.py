@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 from deploy.installer.manifest import Target
 from deploy.targets import ROOT
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime.util import UserError, read_bytes
 
 DEFAULT_FOLDER = "build/wheels"
 _MANYLINUX = (5, 12, 17, 24, 26, 27, 28, 31)

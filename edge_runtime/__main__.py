@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import List
+from typing import Callable, List
 
 from edge_runtime import __version__, log
 from edge_runtime.cli import ArgumentParser, add_public_key, examples, run_cli
-from edge_runtime.config import Config
-from edge_runtime.vehicles.registry import VEHICLE_NAMES
+from edge_runtime.config import VEHICLE_NAMES, Config
 
 _DEFAULTS = Config()
 _TRUSTED = "results/policies/left_turn.onnx \\\n    --public-key results/policies/policy.pub"
@@ -37,6 +36,19 @@ _EXAMPLES = {
 """Of each command; the first one works in a fresh clone."""
 
 
+# The options of `run`: flag, metavar, help.
+_RUN_OPTIONS = (
+    ("--policy", "POLICY.onnx", "the policy file"),
+    ("--connect", "PROTOCOL/HOST:PORT", "where the simulator listens"),
+    ("--vehicle-id", "ID", "the vehicle's part of the Zenoh keys"),
+    ("--vehicle", "|".join(VEHICLE_NAMES), "the vehicle to move besides"),
+    ("--bus", "INTERFACE:CHANNEL", "with --vehicle hunter: its CAN bus, as python-can names it"),
+    ("--config", "FILE.toml", "settings; flags on the command line win over it"),
+    ("--log-level", "|".join(log.LEVELS), "least level that goes to stderr"),
+    ("--log-format", "|".join(log.FORMATS), "a line of words, or a JSON object a line"),
+)
+
+
 def main() -> None:
     """The entry point of `phil-edge`."""
     sys.exit(run_cli(dispatch))
@@ -45,14 +57,13 @@ def main() -> None:
 def dispatch(argv: List[str]) -> int:
     """Parse and run one command; each is imported only when it is asked for."""
     arguments = build_parser().parse_args(argv)
-    if arguments.command == "check":
-        from edge_runtime.check_command import check as command
-    elif arguments.command == "run":
-        from edge_runtime.run_command import run as command
-    elif arguments.command == "status":
-        from edge_runtime.operator_commands import status as command
-    else:
-        from edge_runtime.operator_commands import rearm as command
+    if arguments.command == "run":
+        from edge_runtime.run import run
+
+        return run(arguments)
+    from edge_runtime import commands
+
+    command: Callable[[argparse.Namespace], int] = getattr(commands, arguments.command)
     return command(arguments)
 
 
@@ -85,42 +96,13 @@ def _add_check(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--policy", metavar="POLICY.onnx", help="the policy file")
-    parser.add_argument(
-        "--connect",
-        metavar="PROTOCOL/HOST:PORT",
-        help=f"where the simulator listens (default: {_DEFAULTS.connect})",
-    )
-    _add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        help=f"the vehicle's part of the Zenoh keys (default: {_DEFAULTS.vehicle_id})",
-    )
-    parser.add_argument(
-        "--vehicle",
-        metavar="|".join(VEHICLE_NAMES),
-        help=f"the vehicle to move besides (default: {_DEFAULTS.vehicle})",
-    )
-    parser.add_argument(
-        "--bus",
-        metavar="INTERFACE:CHANNEL",
-        help="with --vehicle hunter: its CAN bus, as python-can names it"
-        f" (default: {_DEFAULTS.bus})",
-    )
-    parser.add_argument(
-        "--config", metavar="FILE.toml", help="settings; flags on the command line win over it"
-    )
-    parser.add_argument(
-        "--log-level",
-        metavar="|".join(log.LEVELS),
-        help=f"least level that goes to stderr (default: {_DEFAULTS.log_level})",
-    )
-    parser.add_argument(
-        "--log-format",
-        metavar="|".join(log.FORMATS),
-        help=f"a line of words, or a JSON object a line (default: {_DEFAULTS.log_format})",
-    )
+    for flag, metavar, text in _RUN_OPTIONS:
+        # Shown only: a flag that is not given leaves the file's setting as it is.
+        default = getattr(_DEFAULTS, flag[2:].replace("-", "_"), None)
+        shown = f"{text} (default: {default})" if default else text
+        parser.add_argument(flag, metavar=metavar, help=shown)
+        if flag == "--connect":
+            _add_tls(parser)
     _add_trust(parser)
 
 
@@ -143,16 +125,11 @@ def _add_tls(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_operator(parser: argparse.ArgumentParser, with_out: bool) -> None:
-    parser.add_argument(
-        "--connect",
-        metavar="PROTOCOL/HOST:PORT",
-        default=_DEFAULTS.connect,
-        help="where the simulator listens",
-    )
+    connect, vehicle_id = _DEFAULTS.connect, _DEFAULTS.vehicle_id
+    where = "where the simulator listens"
+    parser.add_argument("--connect", metavar="PROTOCOL/HOST:PORT", default=connect, help=where)
     _add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id", metavar="ID", default=_DEFAULTS.vehicle_id, help="which vehicle"
-    )
+    parser.add_argument("--vehicle-id", metavar="ID", default=vehicle_id, help="which vehicle")
     if with_out:
         parser.add_argument("--out", metavar="FILE.json", help="write all of it here, as JSON")
         parser.add_argument("--json", action="store_true", help="print JSON instead of a table")

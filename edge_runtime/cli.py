@@ -1,37 +1,25 @@
-"""What every command of the repository shares: one-line errors, `--help` with defaults and
-examples, JSON out.
-
-UserError is re-exported here, so that a command needs this module only.
+"""What every command of the repository shares: a parser whose errors are one line and whose help
+has defaults and examples, types of options with limits, exit statuses, and signals as ^C.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
+import math
 import os
+import signal
 import sys
+import threading
 from importlib import import_module
-from typing import Any, Callable, Dict, List, NoReturn, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, List, NoReturn, Optional, Tuple
 
-from edge_runtime import files
-from edge_runtime.errors import UserError
-from edge_runtime.words import printable
-
-__all__ = [
-    "BAD_INPUT",
-    "INTERRUPTED",
-    "ArgumentParser",
-    "HelpFormatter",
-    "UserError",
-    "add_public_key",
-    "dispatch",
-    "examples",
-    "run_cli",
-    "write_json_out",
-]
+from edge_runtime.util import UserError, ending_signals, printable
 
 BAD_INPUT = 2
 INTERRUPTED = 130
+_LARGEST = 2**63 - 1  # as the seeds of numpy and torch must be
 _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _WITHOUT_DEFAULT = (None, False, argparse.SUPPRESS)
 
@@ -166,7 +154,63 @@ def _drop_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def write_json_out(path: Optional[files.PathLike], value: Any) -> None:
-    """Write the result of a command to `--out`; nothing where no file was asked for."""
-    if path is not None:
-        files.write_json(path, value)
+def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
+    """A type: a whole number between two limits, both included."""
+    limits = f", at least {least}" if most == _LARGEST else f" from {least} to {most}"
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value > _LARGEST:
+            raise argparse.ArgumentTypeError(f"{text!r} is larger than 2**63 - 1")
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number{limits}")
+        return value
+
+    return read
+
+
+def number(limits: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
+    """A type: a finite number that ``fits``; ``limits`` says in words which do."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and fits(value)):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {limits}")
+        return value
+
+    return read
+
+
+positive = whole_number(1)
+not_negative = whole_number(0)
+positive_number = number("a finite number above 0", lambda value: value > 0.0)
+not_negative_number = number("a finite number, at least 0", lambda value: value >= 0.0)
+seconds = number("a finite number of seconds, at least 0", lambda value: value >= 0.0)
+share = number("a share above 0 and at most 1", lambda value: 0.0 < value <= 1.0)
+
+
+@contextlib.contextmanager
+def sigterm_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM, and all else that would end this process, raise KeyboardInterrupt in the block.
+
+    So sessions are closed and files are finished. Outside of the main thread it does nothing.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in ending_signals()} if in_main else {}
+    for number in before:
+        signal.signal(number, _interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(number: int, frame: Any) -> NoReturn:
+    raise KeyboardInterrupt

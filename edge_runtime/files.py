@@ -1,86 +1,20 @@
-"""Files that are either whole or absent, never half-written."""
+"""Files that are either whole or absent, never half-written, and held by who writes them.
+
+Who writes a file can hold the kernel's lock on it, which ends with the process, however it ends.
+"""
 
 from __future__ import annotations
 
-import errno
+import contextlib
+import fcntl
 import json
 import os
 import stat
 import tempfile
 from pathlib import Path
-from typing import Any, BinaryIO, Dict, Union
+from typing import Any, Optional
 
-from edge_runtime.errors import UserError
-
-PathLike = Union[str, "os.PathLike[str]"]
-
-
-MAX_FILE_MIB = 64
-"""More than any policy, certificate, configuration or report needs."""
-
-
-def open_regular(path: PathLike) -> BinaryIO:
-    """Open an existing file to read; OSError where it cannot be, or is no regular file.
-
-    A pipe would be waited for, and a device may have no end.
-    """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    mode = os.fstat(descriptor).st_mode
-    if stat.S_ISREG(mode):
-        return os.fdopen(descriptor, "rb")
-    os.close(descriptor)
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    raise OSError(errno.EINVAL, "it is no regular file", str(path))
-
-
-def read_bytes(path: PathLike, what: str) -> bytes:
-    """The bytes of an existing regular file. `what` names it in the error, as in "policy file".
-
-    Raises UserError where it cannot be read, or holds more than MAX_FILE_MIB.
-    """
-    limit = MAX_FILE_MIB << 20
-    try:
-        with open_regular(path) as stream:
-            # The size first; and no more than that, for a file of /proc has none.
-            is_small = os.fstat(stream.fileno()).st_size <= limit
-            data = stream.read(limit + 1) if is_small else b""
-    except FileNotFoundError:
-        raise UserError(f"{what} {path} does not exist") from None
-    except IsADirectoryError:
-        raise UserError(f"{what} {path} is a directory, not a file") from None
-    except OSError as error:
-        raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
-    except ValueError as error:  # a NUL inside the name
-        raise UserError(f"{what} {path!r} is not a file name: {error}") from None
-    if not is_small or len(data) > limit:
-        raise UserError(f"{what} {path} is larger than {MAX_FILE_MIB} MiB")
-    return data
-
-
-def read_json(path: PathLike, what: str) -> Any:
-    """The value in a JSON file. Raises UserError where there is none."""
-    return parse_json(read_bytes(path, what), f"{what} {path}")
-
-
-def parse_json(data: bytes, what: str) -> Any:
-    """The value of a JSON text. Raises UserError where it is none, or nested too deep."""
-    try:
-        return json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{what} is not JSON: {error}") from None
-
-
-def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
-    """The tables of a TOML file. Raises UserError where it is none, or nested too deep."""
-    import msgspec  # here: `hil_tests doctor` runs before anything is installed
-
-    data = read_bytes(path, what)
-    try:
-        tables: Dict[str, Any] = msgspec.toml.decode(data)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise UserError(f"{what} {path} is no TOML: {error}") from None
-    return tables
+from edge_runtime.util import PathLike, UserError
 
 
 def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
@@ -141,6 +75,12 @@ def write_json(path: PathLike, value: Any) -> None:
     write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
+def write_json_out(path: Optional[PathLike], value: Any) -> None:
+    """Write the result of a command to `--out`; nothing where no file was asked for."""
+    if path is not None:
+        write_json(path, value)
+
+
 def _checked(path: PathLike) -> Path:
     """What to replace. A rename would put a plain file in the place of a device or a pipe."""
     try:
@@ -167,3 +107,23 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def lock_file(descriptor: int) -> None:
+    """Hold a file that was just made, until the descriptor is closed.
+
+    Waits for one who looks at it in this moment. Without a word where the file system has no locks.
+    """
+    with contextlib.suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+
+
+def try_to_lock_file(descriptor: int) -> bool:
+    """The same without waiting; False where another process holds the file."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # No locks here: then nobody can hold one.
+        pass
+    return True

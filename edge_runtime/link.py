@@ -1,21 +1,40 @@
-"""The edge runtime's end of the wire: its publishers, subscriber, queryables and token."""
+"""The edge runtime's end of the wire: what it publishes and answers, and that it is the only one.
+
+Besides `phil/<id>/alive` each runtime declares `phil/<id>/alive/<claim>`, because Zenoh shows
+equal tokens of two sessions as one. Of two runtimes with one vehicle id the younger claim gives
+way; a claim is as old as the connection to the router, so a runtime that reconnects loses its
+seniority.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import json
-from typing import Any, Callable, Dict, List, Optional
+import os
+import threading
+import time
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Set
 
 import msgspec
 import zenoh
 
 from edge_runtime import __version__, log
-from edge_runtime.manifest import Manifest
-from edge_runtime.native_thread import keep_state
-from edge_runtime.presence import OpenClient, Presence
-from edge_runtime.transport import only_own
+from edge_runtime.transport import LEASE_MS, only_own
+from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
-_PUBLISHED = ("command", "feedback", "health")
+if TYPE_CHECKING:
+    from edge_runtime.policy_file import Manifest
+
+OpenClient = Callable[[], zenoh.Session]
+
+_POLL_S = 0.1
+# Two looks so far apart: a claim that is seen in both is no leftover of a lost connection.
+_FIRST_LOOKS_S = 0.3
+_LOOK_S = 1.0
+_CONNECT_S = 0.2
+_JOIN_S = 0.5
+_LEFTOVER_S = 1.5 * LEASE_MS / 1000.0
 
 
 class Link:
@@ -29,7 +48,7 @@ class Link:
         self._publishers: Dict[str, Any] = {}
         self._presence: Optional[Presence] = None
         self._muted = False
-        for topic in _PUBLISHED:
+        for topic in ("command", "feedback", "health"):
             # DROP: a full queue must never hold the control loop, and the next message is better.
             self._publishers[topic] = session.declare_publisher(
                 key(vehicle_id, topic),
@@ -48,9 +67,8 @@ class Link:
 
         def state_came(sample: zenoh.Sample) -> None:
             # One byte too many is enough to be rejected; a huge message is not copied.
-            payload = sample.payload
-            size = len(payload)
-            on_state(bytes(MAX_PAYLOAD_BYTES + 1) if size > MAX_PAYLOAD_BYTES else bytes(payload))
+            is_huge = len(sample.payload) > MAX_PAYLOAD_BYTES
+            on_state(bytes(MAX_PAYLOAD_BYTES + 1) if is_huge else bytes(sample.payload))
 
         def status_asked(query: zenoh.Query) -> None:
             _reply(query, self._status(health()))
@@ -71,7 +89,7 @@ class Link:
         ]
 
     def appear(self, open_client: OpenClient, give_way: Callable[[], None]) -> None:
-        """Show that it is alive, and look for others with this vehicle id (presence.py)."""
+        """Show that it is alive, and look for others with this vehicle id."""
         alive = key(self.vehicle_id, "alive")
         self._presence = Presence(self._session, alive, open_client, give_way)
         self._declared.append(self._presence)
@@ -104,20 +122,24 @@ class Link:
             self._session.close()
 
     def _status(self, health: Health) -> Dict[str, Any]:
-        status: Dict[str, Any] = msgspec.to_builtins(health)
-        status["version"] = __version__
-        status["manifest"] = msgspec.to_builtins(self._manifest)
-        return status
+        manifest = msgspec.to_builtins(self._manifest)
+        return {**msgspec.to_builtins(health), "version": __version__, "manifest": manifest}
 
 
 def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
     """Zenoh's own thread calls it: no second thread to wake, and no queue of old states between.
 
-    The callback must be quick, for nothing else is received meanwhile.
+    The callback must be quick, for nothing else is received meanwhile. A native thread that calls
+    into Python is given a new Python state, which is taken down when the call returns: tens of
+    microseconds of each call. One PyGILState_Ensure that is never released keeps it. These threads
+    live as long as the session, so nothing piles up.
     """
+    thread = threading.local()
 
     def call(sample: zenoh.Sample) -> None:
-        keep_state()
+        if not hasattr(thread, "keeps_its_state"):
+            ctypes.pythonapi.PyGILState_Ensure()
+            thread.keeps_its_state = True
         callback(sample)
 
     return zenoh.handlers.Callback(call, indirect=False)
@@ -125,3 +147,142 @@ def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
 
 def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
     query.reply(query.key_expr, json.dumps(value).encode(), encoding="application/json")
+
+
+def require_free(open_client: OpenClient, alive_key: str, vehicle_id: str) -> bool:
+    """Whether a router answers. Raises UserError where another runtime has this vehicle id.
+
+    Two peers do not hear each other through a router, so a client asks it. The token of a process
+    that was just killed may stay for a lease: one that is found must outlast it.
+    """
+    found = _ask(open_client, f"{alive_key}/**")
+    if found:
+        time.sleep(_LEFTOVER_S)
+        found = _ask(open_client, f"{alive_key}/**")
+    if found:
+        raise taken(vehicle_id)
+    return found is not None
+
+
+def taken(vehicle_id: str) -> UserError:
+    """The error of a runtime that must give way."""
+    return UserError(
+        f"another edge runtime is connected with vehicle id {vehicle_id};"
+        " end that one first, or name this one with another --vehicle-id"
+    )
+
+
+class Presence:
+    """Declares the tokens, and again whenever the routers that this session sees have changed.
+
+    Zenoh 1.5 (the board's) does not tell a router that comes later of a token declared before.
+    It has a thread of its own, because all of this may wait for the network and the watchdog
+    must not. `give_way` is called, once, where an elder claim than this one's is found.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        alive_key: str,
+        open_client: OpenClient,
+        give_way: Callable[[], None],
+    ) -> None:
+        self.rivals = 0
+        self._session = session
+        self._key = alive_key
+        self._open_client = open_client
+        self._give_way: Optional[Callable[[], None]] = give_way
+        self._known: Set[str] = set()
+        self._seen_before: Set[str] = set()
+        self._looks = 0
+        self._routers = self._seen_routers()
+        self._tokens: List[Any] = []
+        self._declare()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
+
+    def start(self) -> None:
+        """Begin to look for changes."""
+        self._thread.start()
+
+    def refresh(self) -> bool:
+        """Declare the tokens again if other routers are there than the last time."""
+        routers = self._seen_routers()
+        changed, self._routers = routers != self._routers, routers
+        if not changed or not routers:
+            return False
+        self._undeclare_tokens()
+        self._declare()
+        return True
+
+    def look(self) -> None:
+        """Look for other claims; give way to an elder one that is seen for the second time."""
+        found = _ask(self._open_client, f"{self._key}/*") or []
+        claims = {key.rsplit("/", 1)[1] for key in found} - {self.claim}
+        for claim in sorted((claims & self._seen_before) - self._known):
+            self._known.add(claim)
+            self.rivals += 1
+            log.event("error", "another_edge", claim=claim, elder=claim < self.claim)
+        elders = {claim for claim in claims & self._seen_before if claim < self.claim}
+        self._seen_before = claims
+        self._looks += 1
+        if elders and self._give_way is not None:
+            give_way, self._give_way = self._give_way, None
+            give_way()
+
+    def undeclare(self) -> None:
+        """Stop looking and take the tokens away."""
+        self._stopping.set()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(_JOIN_S)
+        self._undeclare_tokens()
+
+    def _declare(self) -> None:
+        # Wall clock, because two boards compare it; the rest tells two of one moment apart.
+        self.claim = f"{time.time_ns():016x}-{os.urandom(4).hex()}"
+        self._seen_before = set()
+        self._looks = 0
+        self._tokens = [
+            self._session.liveliness().declare_token(key)
+            for key in (self._key, f"{self._key}/{self.claim}")
+        ]
+
+    def _undeclare_tokens(self) -> None:
+        for token in self._tokens:
+            token.undeclare()
+
+    def _seen_routers(self) -> List[str]:
+        return sorted(map(str, self._session.info.routers_zid()))
+
+    def _run(self) -> None:
+        next_look_s = time.monotonic() + _FIRST_LOOKS_S
+        while not self._stopping.wait(_POLL_S):
+            try:
+                if self.refresh():
+                    next_look_s = time.monotonic() + _FIRST_LOOKS_S
+                if self._routers and time.monotonic() >= next_look_s:
+                    self.look()
+                    pause_s = _LOOK_S if self._looks > 1 else _FIRST_LOOKS_S
+                    next_look_s = time.monotonic() + pause_s
+            except zenoh.ZError as error:
+                log.event("error", "token_not_declared", detail=error)
+
+
+def wait_for_router(session: zenoh.Session) -> None:
+    """For 0.2 s at most, so that the tokens are not declared twice. One is known to answer."""
+    end_s = time.monotonic() + _CONNECT_S
+    while not session.info.routers_zid() and time.monotonic() < end_s:
+        time.sleep(0.002)
+
+
+def _ask(open_client: OpenClient, selector: str) -> Optional[List[str]]:
+    """The tokens that a router knows, None where none answers."""
+    try:
+        session = open_client()
+    except UserError:
+        return None
+    try:
+        replies = session.liveliness().get(selector, timeout=1.0)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+    finally:
+        session.close()

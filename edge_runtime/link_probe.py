@@ -1,4 +1,4 @@
-"""Why a link does not come about: one look at its address by Python's own socket and ssl.
+"""Why a link does not come about, or a port cannot be had: one look by Python's own socket and ssl.
 
 Zenoh says "Unable to connect" whether nobody is there, the other end refuses us, or we refuse it.
 An endpoint of udp or quic is only resolved: there is nothing to connect to, and Python has no QUIC.
@@ -7,11 +7,15 @@ An endpoint of udp or quic is only resolved: there is nothing to connect to, and
 from __future__ import annotations
 
 import contextlib
+import errno
 import socket
 import ssl
-from typing import Any, List, Optional, Tuple
+from typing import TYPE_CHECKING, Any, List, Optional, Sequence, Tuple
 
-from edge_runtime.tls import TlsFiles
+from edge_runtime.util import UserError
+
+if TYPE_CHECKING:
+    from edge_runtime.tls import TlsFiles
 
 _TIMEOUT_S = 1.0
 # A server that refuses a client's certificate says so after the handshake (TLS 1.3).
@@ -27,12 +31,23 @@ def why_no_link(endpoint: str, files: Optional[TlsFiles]) -> str:
     return why_unreachable(endpoint) or why_refused(endpoint, files)
 
 
-def addresses(endpoint: str) -> List[Any]:
+def why_nobody_answers(endpoint: str, files: Optional[TlsFiles]) -> str:
+    """Why a client that must have a link at once gets none, on one line."""
+    why = why_unreachable(endpoint)
+    refusal = "" if why else why_refused(endpoint, files)
+    if endpoint.startswith("quic/"):  # such a link does not say why it fails
+        why = why or "or one end does not believe the other's certificate"
+    return refusal or (
+        f"nobody answers at {endpoint}{why and f': {why}'}; start the simulator first, or name its"
+        " address with --connect"
+    )
+
+
+def _addresses(endpoint: str) -> List[Any]:
     """What `socket.getaddrinfo` gives for an endpoint; OSError where it cannot be resolved."""
     protocol, host, port = _parts(endpoint)
-    kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
     try:
-        return socket.getaddrinfo(host, port, type=kind)
+        return socket.getaddrinfo(host, port, type=_kind(protocol))
     except UnicodeError as error:  # no host can have such a name
         raise OSError(None, str(error)) from None
 
@@ -41,7 +56,7 @@ def why_unreachable(endpoint: str) -> str:
     """Why nobody answers at that address, on one line; empty where somebody does."""
     protocol, host, port = _parts(endpoint)
     try:
-        addresses(endpoint)
+        _addresses(endpoint)
     except OSError as error:
         return f"host {host!r} cannot be resolved ({error.strerror})"
     if protocol not in ("tcp", "tls"):
@@ -70,6 +85,41 @@ def why_refused(endpoint: str, files: Optional[TlsFiles]) -> str:
         if files is None:
             return _why_not_plain(plain, endpoint)
         return _why_not_tls(plain, endpoint, host, files)
+
+
+def check_ports_are_free(endpoints: Sequence[str]) -> None:
+    """Raise UserError for one that cannot be had: Zenoh names neither the port nor the cause."""
+    for endpoint in endpoints:
+        _, host, port = _parts(endpoint)
+        try:
+            family, kind, _, _, target = _addresses(endpoint)[0]
+        except OSError:
+            raise UserError(f"host {host!r} of endpoint {endpoint} cannot be resolved") from None
+        with socket.socket(family, kind) as probe:
+            if kind == socket.SOCK_STREAM:
+                # As the listener does: the last run's closed links are no bar.
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(target)
+            except OSError as error:
+                raise UserError(_explain_bind(error, host, port)) from None
+
+
+def _explain_bind(error: OSError, host: str, port: int) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return f"port {port} on {host} is in use; choose another with --listen"
+    return f"cannot listen on port {port} of {host}: {error.strerror}"
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
+    """A Zenoh endpoint on loopback that nobody listens on, for demos and tests."""
+    with socket.socket(type=_kind(protocol)) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _kind(protocol: str) -> int:
+    return socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
 
 
 def _parts(endpoint: str) -> Tuple[str, str, int]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import queue
 import threading
 import time
@@ -19,6 +20,7 @@ FORMATS = ("text", "json")
 _LOGGER = logging.getLogger("edge_runtime")
 _WAITING_LINES = 1000
 _FLUSH_S = 0.5
+_FLOOD_PERIOD_S = 1.0
 
 
 def configure(level: str, log_format: str = "text") -> None:
@@ -78,11 +80,8 @@ class _TextFormatter(logging.Formatter):
 
 class _JsonFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        line = {
-            "time": _time(record),
-            "level": record.levelname.lower(),
-            "event": record.getMessage(),
-        }
+        level, event = record.levelname.lower(), record.getMessage()
+        line = {"time": _time(record), "level": level, "event": event}
         # Twice, so that the line begins with them and no field can take their place.
         return json.dumps({**line, **_fields(record), **line}, default=str)
 
@@ -102,3 +101,22 @@ def _quoted(value: Any) -> str:
     # Other parties' words may hold what a terminal would act upon: repr writes it as escapes.
     is_plain = text and text.isprintable() and not any(c in " \"'=" for c in text)
     return text if is_plain else repr(text)
+
+
+class Flood:
+    """Lets the first of each kind through, then one a second. Kinds must be few: all are kept.
+
+    Pure: time is passed in.
+    """
+
+    def __init__(self) -> None:
+        self._next_s: Dict[str, float] = {}
+        self._unsaid: Dict[str, int] = {}
+
+    def admit(self, kind: str, now_s: float) -> Optional[int]:
+        """How many of this kind went unsaid since the last line, or None: so does this one."""
+        if now_s < self._next_s.get(kind, -math.inf):
+            self._unsaid[kind] = self._unsaid.get(kind, 0) + 1
+            return None
+        self._next_s[kind] = now_s + _FLOOD_PERIOD_S
+        return self._unsaid.pop(kind, 0)

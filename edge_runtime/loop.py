@@ -12,33 +12,69 @@ A command is sent under the lock, so that no late answer can follow a safe stop.
 
 from __future__ import annotations
 
+import fcntl
 import math
 import queue
 import threading
 import time
 import traceback
-from typing import Optional
+from typing import TYPE_CHECKING, BinaryIO, Optional
 
 from edge_runtime import log
-from edge_runtime.board import BoardWatch
 from edge_runtime.controller import Controller, Order, Received
-from edge_runtime.flood import Flood
-from edge_runtime.hold import Hold
-from edge_runtime.inference import infer
-from edge_runtime.latency_window import LatencyWindow
 from edge_runtime.latest import LatestState
 from edge_runtime.link import Link
-from edge_runtime.policy import Policy
+from edge_runtime.log import Flood
+from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import MAX_INFERENCE_S, Event, Mode, Safety
-from edge_runtime.sd_notify import Notifier
-from edge_runtime.vehicles.runner import VehicleRunner
+from edge_runtime.service import BoardWatch, LatencyWindow, Notifier
+from edge_runtime.util import UserError, open_regular
 from edge_runtime.wire import MAX_TEXT_CHARS, TOPICS, Command, Health, Rejection, decode_state
+
+if TYPE_CHECKING:  # Only who has a vehicle loads it.
+    from edge_runtime.vehicles.base import VehicleRunner
 
 _HEALTH_PERIOD_S = 1.0 / TOPICS["health"].rate_hz
 _JOIN_S = 0.5
 _RETRY_S = 0.1
 # A policy that computes so long will not end: only a new process helps.
 _HUNG_S = 2.0
+
+
+class Hold:
+    """No command while an installer tries this release: neither on the wire nor to the vehicle.
+
+    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
+    process, so an installer that dies leaves nobody silent. Once free, this process never asks
+    again. None, or a file that is not there, holds nothing; UserError for one that cannot be read:
+    nobody could say whether it holds.
+    """
+
+    def __init__(self, path: Optional[str] = None) -> None:
+        self._stream: Optional[BinaryIO] = None
+        if path is not None:
+            try:
+                self._stream = open_regular(path)  # kept until it is free
+            except FileNotFoundError:
+                return
+            except OSError as error:
+                raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
+
+    def is_on(self) -> bool:
+        """Whether commands must stay here. Never waits."""
+        if self._stream is None:
+            return False
+        try:
+            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        self._stream.close()
+        self._stream = None
+        return False
+
+    def refusal(self) -> str:
+        """Why nobody may re-arm now; empty when free."""
+        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""
 
 
 class ControlLoop:
@@ -195,9 +231,8 @@ class ControlLoop:
                 self._busy_since_s = None
                 self._inference_window.add(inference.duration_ns)
                 self._look_at_vehicle(time.monotonic())
-                order = self._controller.finish(
-                    inference.output, inference.duration_ns, time.monotonic()
-                )
+                now_s = time.monotonic()
+                order = self._controller.finish(*inference, now_s)
                 self._send(order)
                 if order is not None:
                     took_s = time.monotonic() - received.arrived_s
@@ -276,13 +311,8 @@ class ControlLoop:
         safety = self._controller.safety
         if (safety.mode, safety.reason) != (self._logged.mode, self._logged.reason):
             level = "warning" if safety.mode is Mode.SAFE_STOP else "info"
-            log.event(
-                level,
-                "mode",
-                was=self._logged.mode.value,
-                now=safety.mode.value,
-                reason=safety.reason,
-            )
+            was, now = self._logged.mode.value, safety.mode.value
+            log.event(level, "mode", was=was, now=now, reason=safety.reason)
             self._logged = safety
             self._notifier.status(f"{safety.mode.value} {safety.reason}".rstrip())
         waits = self._controller.waits_for_rearm

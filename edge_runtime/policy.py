@@ -5,17 +5,23 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import time
 from pathlib import Path
-from typing import Iterator, List, Optional, Tuple
+from typing import Iterator, List, NamedTuple, Optional, Sequence
 
 import numpy as np
 import onnxruntime
 
-from edge_runtime import signature
-from edge_runtime.errors import UserError
-from edge_runtime.files import PathLike, read_bytes
-from edge_runtime.manifest import MANIFEST_KEY, Manifest, decode_manifest
-from edge_runtime.onnx_file import FLOAT32, UINT8, OnnxFile, read_onnx
+from edge_runtime import log
+from edge_runtime.policy_file import (
+    MANIFEST_KEY,
+    Manifest,
+    OnnxFile,
+    check_trust,
+    decode_manifest,
+    read_onnx,
+)
+from edge_runtime.util import PathLike, UserError, read_bytes
 from edge_runtime.wire import FRAMES_SHAPE
 
 OPSET = 17
@@ -59,12 +65,14 @@ def load_policy(
     """
     # Read once: what is verified is what is loaded, even if the file is replaced meanwhile.
     data = read_bytes(path, "policy file")
-    trust = signature.check_trust(path, data, public_key, allow_unsigned)
+    trust = check_trust(path, data, public_key, allow_unsigned)
     try:
-        model = read_onnx(data)
-        manifest = _read_manifest(model)
-        _compare(manifest, model)
-        policy = Policy(_open(data), manifest, trust, policy_id_of(data))
+        manifest = _read_manifest(read_onnx(data))
+        session = _open(data)
+        _check_tensor("input", session.get_inputs(), INPUT, "tensor(uint8)", FRAMES_SHAPE)
+        actions = (len(manifest.action),)
+        _check_tensor("output", session.get_outputs(), OUTPUT, "tensor(float)", actions)
+        policy = Policy(session, manifest, trust, policy_id_of(data))
         _probe(policy)
     except UserError as error:
         raise UserError(f"policy {Path(path)} may not drive: {error}") from None
@@ -77,38 +85,29 @@ def policy_id_of(data: bytes) -> str:
 
 
 def _read_manifest(model: OnnxFile) -> Manifest:
-    if MANIFEST_KEY not in model.metadata:
-        raise UserError(f"it holds no manifest (metadata {MANIFEST_KEY}); export it again")
-    return decode_manifest(model.metadata[MANIFEST_KEY])
-
-
-def _compare(manifest: Manifest, model: OnnxFile) -> None:
-    """Raise UserError where the graph is not what the manifest says."""
     if model.opset != OPSET or model.ir_version > MAX_IR_VERSION:
         raise UserError(
             f"it has opset {model.opset} and IR version {model.ir_version};"
             f" opset {OPSET} and IR version {MAX_IR_VERSION} or lower are needed"
         )
-    _compare_tensor("input", model.inputs, (INPUT, UINT8, FRAMES_SHAPE))
-    _compare_tensor("output", model.outputs, (OUTPUT, FLOAT32, (len(manifest.action),)))
+    if MANIFEST_KEY not in model.metadata:
+        raise UserError(f"it holds no manifest (metadata {MANIFEST_KEY}); export it again")
+    return decode_manifest(model.metadata[MANIFEST_KEY])
 
 
-def _compare_tensor(what: str, found: List, wanted: Tuple[str, int, Tuple[int, ...]]) -> None:
-    """One tensor of this name, type and shape behind a batch dimension that is 1 or open."""
-    name, element_type, shape = wanted
+def _check_tensor(what: str, found: List, name: str, kind: str, shape: Sequence[int]) -> None:
+    """Raise UserError unless it is one tensor like this behind a batch that is 1 or open."""
     fits = (
         len(found) == 1
-        and found[0].name == name
-        and found[0].element_type == element_type
-        and found[0].dims[1:] == shape
-        and (found[0].dims[0] == 1 or not isinstance(found[0].dims[0], int))
+        and (found[0].name, found[0].type) == (name, kind)
+        and list(found[0].shape[1:]) == list(shape)
+        and (found[0].shape[0] == 1 or not isinstance(found[0].shape[0], int))
     )
     if not fits:
-        shown = ", ".join(f"{t.name} type {t.element_type} {list(t.dims)}" for t in found)
-        dims = ", ".join(str(size) for size in shape)
+        shown = ", ".join(f"{each.name} {each.type} {each.shape}" for each in found)
+        dims = ", ".join(map(str, shape))
         raise UserError(
-            f"its {what} must be {name} type {element_type} [batch, {dims}],"
-            f" it is {shown or 'none'}"
+            f"its {what} must be {name} {kind} [batch, {dims}], it is {shown or 'none'}"
         )
 
 
@@ -138,7 +137,10 @@ def probe_frames() -> Iterator[np.ndarray]:
 def _probe(policy: Policy) -> None:
     """Run it on the probe pictures and warm it up. Raises UserError for an unfit answer."""
     for frames in probe_frames():
-        action = _try(policy, frames)
+        try:
+            action = policy.act(frames)
+        except Exception as error:  # as in _open
+            raise UserError(f"onnxruntime does not run it: {error}") from None
         if not np.all(np.isfinite(action)):
             raise UserError(f"it answers a probe picture with {action.tolist()}, not finite")
         for row, value in zip(policy.manifest.action, action.tolist()):
@@ -151,8 +153,22 @@ def _probe(policy: Policy) -> None:
         policy.act(frames)
 
 
-def _try(policy: Policy, frames: np.ndarray) -> np.ndarray:
+class Inference(NamedTuple):
+    """An answer of the policy, float32 [n] or None where it failed, and how long it took."""
+
+    output: Optional[np.ndarray]
+    duration_ns: int
+
+
+def infer(policy: Policy, frames: np.ndarray) -> Inference:
+    """Run the policy on frames, uint8 [2, 45, 80]. Where it raises, there is no answer.
+
+    Called by the policy's own thread: the watchdog runs on while it computes.
+    """
+    begun_ns = time.perf_counter_ns()
+    output: Optional[np.ndarray] = None
     try:
-        return policy.act(frames)
-    except Exception as error:  # as in _open
-        raise UserError(f"onnxruntime does not run it: {error}") from None
+        output = policy.act(frames)
+    except Exception as error:  # onnxruntime's exceptions share no narrower base
+        log.event("error", "inference_failed", detail=error)
+    return Inference(output, time.perf_counter_ns() - begun_ns)

@@ -14,6 +14,8 @@ from typing import Callable, List, Sequence
 from edge_runtime import log
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_PRIORITY_HELP = "allow it with LimitRTPRIO=99 in the service, CAP_SYS_NICE, or ulimit -r 99"
+_MEMORY_HELP = "allow it with LimitMEMLOCK=infinity in the service, CAP_IPC_LOCK, or ulimit -l"
 
 
 def configure(priority: int, cpus: Sequence[int], lock_memory: bool) -> List[str]:
@@ -29,10 +31,6 @@ def configure(priority: int, cpus: Sequence[int], lock_memory: bool) -> List[str
     if lock_memory and not _try("lock_memory", _lock_memory, True, _MEMORY_HELP):
         refused.append("lock_memory")
     return refused
-
-
-_PRIORITY_HELP = "allow it with LimitRTPRIO=99 in the service, CAP_SYS_NICE, or ulimit -r 99"
-_MEMORY_HELP = "allow it with LimitMEMLOCK=infinity in the service, CAP_IPC_LOCK, or ulimit -l"
 
 
 def _try(key: str, apply: Callable, value: object, help_text: str) -> bool:

@@ -50,62 +50,28 @@ class Event(str, Enum):
 
 _S, _D, _X = Mode.STANDBY, Mode.DRIVE, Mode.SAFE_STOP
 
-TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
-    (_S, Event.FRESH): _D,
-    (_S, Event.RECOVERED): _D,
-    (_S, Event.FINAL): _S,
-    (_S, Event.SILENT): _S,  # between two episodes nothing is due
-    (_S, Event.NOT_FINITE): _X,
-    (_S, Event.FAILED): _X,
-    (_S, Event.DEAD): _X,
-    (_S, Event.TOO_LONG): _X,
-    (_S, Event.PAUSED): _X,
-    (_S, Event.OTHER_SESSION): _X,
-    (_S, Event.OTHER_TASK): _X,
-    (_S, Event.NOT_ARMED): _X,
-    (_S, Event.VEHICLE): _X,
-    (_S, Event.REARM): _S,
-    (_D, Event.FRESH): _D,
-    (_D, Event.RECOVERED): _D,
-    (_D, Event.FINAL): _S,
-    (_D, Event.SILENT): _X,
-    (_D, Event.NOT_FINITE): _X,
-    (_D, Event.FAILED): _X,
-    (_D, Event.DEAD): _X,
-    (_D, Event.TOO_LONG): _X,
-    (_D, Event.PAUSED): _X,
-    (_D, Event.OTHER_SESSION): _X,
-    (_D, Event.OTHER_TASK): _X,
-    (_D, Event.NOT_ARMED): _X,
-    (_D, Event.VEHICLE): _X,
-    (_D, Event.REARM): _D,
-    (_X, Event.FRESH): _X,
-    (_X, Event.RECOVERED): _D,
-    (_X, Event.FINAL): _X,  # the end of an episode is no way around the condition
-    (_X, Event.SILENT): _X,
-    (_X, Event.NOT_FINITE): _X,
-    (_X, Event.FAILED): _X,
-    (_X, Event.DEAD): _X,
-    (_X, Event.TOO_LONG): _X,
-    (_X, Event.PAUSED): _X,
-    (_X, Event.OTHER_SESSION): _X,
-    (_X, Event.OTHER_TASK): _X,
-    (_X, Event.NOT_ARMED): _X,
-    (_X, Event.VEHICLE): _X,
-    (_X, Event.REARM): _X,  # a fresh state must follow
+# The mode after the event, by the mode before: in STANDBY, in DRIVE, in SAFE_STOP.
+_ROWS: Dict[Event, Tuple[Mode, Mode, Mode]] = {
+    Event.FRESH: (_D, _D, _X),
+    Event.RECOVERED: (_D, _D, _D),
+    Event.FINAL: (_S, _S, _X),  # the end of an episode is no way around the condition
+    Event.SILENT: (_S, _X, _X),  # between two episodes nothing is due
+    Event.NOT_FINITE: (_X, _X, _X),
+    Event.FAILED: (_X, _X, _X),
+    Event.DEAD: (_X, _X, _X),
+    Event.TOO_LONG: (_X, _X, _X),
+    Event.PAUSED: (_X, _X, _X),
+    Event.OTHER_SESSION: (_X, _X, _X),
+    Event.OTHER_TASK: (_X, _X, _X),
+    Event.NOT_ARMED: (_X, _X, _X),
+    Event.VEHICLE: (_X, _X, _X),
+    Event.REARM: (_S, _D, _X),  # a fresh state must follow
 }
-FAULTS = (
-    Event.SILENT,
-    Event.NOT_FINITE,
-    Event.FAILED,
-    Event.DEAD,
-    Event.TOO_LONG,
-    Event.PAUSED,
-    Event.OTHER_SESSION,
-    Event.OTHER_TASK,
-    Event.NOT_ARMED,
-    Event.VEHICLE,
-)
+TRANSITIONS: Dict[Tuple[Mode, Event], Mode] = {
+    (before, event): after for event, row in _ROWS.items() for before, after in zip(Mode, row)
+}
+# What stops a drive is a fault.
+FAULTS = tuple(event for event in Event if TRANSITIONS[_D, event] is _X)
 FRESH_EVENTS = (Event.FRESH, Event.RECOVERED, Event.FINAL)
 
 
@@ -193,15 +159,3 @@ def _count_fresh(safety: Safety, event: Event) -> int:
     if event in FAULTS:
         return 0
     return safety.fresh_in_a_row + int(event in FRESH_EVENTS)
-
-
-def render_table() -> str:
-    """TRANSITIONS as a Markdown table: a row for each event, a column for each mode."""
-    lines = [
-        "| event | " + " | ".join(f"in {mode.value}" for mode in Mode) + " |",
-        "|---" * (len(Mode) + 1) + "|",
-    ]
-    for event in Event:
-        cells = (TRANSITIONS[mode, event].value for mode in Mode)
-        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)

@@ -1,7 +1,10 @@
-"""The three files with which a party shows who it is: `ca.pem`, `cert.pem`, `key.pem`.
+"""Who a party is, and what it may say and hear: certificates, private keys, access rights.
 
-All of them are read and held against one another before a session is opened, because Zenoh's own
-message for any fault in them is "Unable to connect".
+`ca.pem`, `cert.pem` and `key.pem` are read and held against one another before a session is opened,
+because Zenoh's own message for any fault in them is "Unable to connect". ROLES is the table of
+rights, by the common name of the certificate. Zenoh filters only in the process that holds the
+configuration. That is whoever listens, the simulator or the router, and each edge runtime for what
+comes to it. A refused message is dropped without a word to its sender.
 """
 
 from __future__ import annotations
@@ -9,14 +12,12 @@ from __future__ import annotations
 import datetime
 import os
 from pathlib import Path
-from typing import Any, Dict, NamedTuple, Optional
+from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
-from edge_runtime.errors import UserError
-from edge_runtime.files import PathLike, read_bytes
-from edge_runtime.private_keys import read_private_key
+from edge_runtime.util import PathLike, UserError, read_bytes
+from edge_runtime.wire import check_vehicle_id
 
 CA_FILE, CERTIFICATE_FILE, KEY_FILE = "ca.pem", "cert.pem", "key.pem"
-TLS_PROTOCOLS = ("tls", "quic")
 
 # Nothing for others, and no writing for the group. A group may read: systemd hands a service its
 # credentials so.
@@ -47,32 +48,28 @@ class TlsFiles(NamedTuple):
         """The private key of that certificate."""
         return str(self.directory / KEY_FILE)
 
-
-def is_tls(endpoint: str) -> bool:
-    """Is it an endpoint of a protocol that asks for certificates?"""
-    return endpoint.split("/", 1)[0] in TLS_PROTOCOLS
+    def zenoh_rows(self) -> Dict[str, Any]:
+        """Zenoh's `transport/link/tls`: mutual, names verified, links closed when they expire."""
+        return {
+            "root_ca_certificate": self.ca,
+            "listen_private_key": self.key,
+            "listen_certificate": self.certificate,
+            "connect_private_key": self.key,
+            "connect_certificate": self.certificate,
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
 
 
 def tls_for(directory: Optional[PathLike], *endpoints: Optional[str]) -> Optional[TlsFiles]:
     """The files of `--tls DIR`, None without it; UserError where endpoints do not go with that."""
+    from edge_runtime.transport import check_fits  # Here: who makes certificates opens no session.
+
     for endpoint in endpoints:
         if endpoint is not None:
             check_fits(endpoint, directory is not None)
     return None if directory is None else load_tls(directory)
-
-
-def check_fits(endpoint: str, with_tls: bool) -> None:
-    """Raise UserError for a TLS endpoint without files, and for files with a plain endpoint."""
-    address = endpoint.split("/", 1)[1]
-    if with_tls and not is_tls(endpoint):
-        raise UserError(
-            f"endpoint {endpoint} would send plain text despite --tls: write tls/{address}"
-        )
-    if not with_tls and is_tls(endpoint):
-        raise UserError(
-            f"endpoint {endpoint} needs certificates: name a directory of"
-            " `python -m deploy certs` with --tls"
-        )
 
 
 def load_tls(directory: PathLike) -> TlsFiles:
@@ -95,20 +92,6 @@ def load_tls(directory: PathLike) -> TlsFiles:
     names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
     name = str(names[0].value) if names else ""
     return TlsFiles(folder, name, _utc(certificate, "not_valid_after"))
-
-
-def zenoh_rows(files: TlsFiles) -> Dict[str, Any]:
-    """Zenoh's `transport/link/tls`: mutual, names verified, links closed when they expire."""
-    return {
-        "root_ca_certificate": files.ca,
-        "listen_private_key": files.key,
-        "listen_certificate": files.certificate,
-        "connect_private_key": files.key,
-        "connect_certificate": files.certificate,
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        "close_link_on_expiration": True,
-    }
 
 
 def _certificate(path: Path, x509: Any) -> Any:
@@ -156,3 +139,167 @@ def _utc(certificate: Any, field: str) -> datetime.datetime:
     if aware is None:
         aware = getattr(certificate, field).replace(tzinfo=datetime.timezone.utc)
     return aware
+
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+
+def read_private_key(path: PathLike) -> Any:
+    """A private key of any kind, without a password. Raises UserError where the file holds none."""
+    # Only who has a key pays for these, in memory and at the start.
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    pem = read_bytes(path, "private key")
+    try:
+        return load_pem_private_key(pem, password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        raise UserError(f"{path} is not a private key in PEM without a password") from None
+
+
+def read_signing_key(path: PathLike) -> Ed25519PrivateKey:
+    """The Ed25519 key that signs policies and bundles. Raises UserError for anything else."""
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    if not os.path.exists(path):
+        raise UserError(f"private key {path} does not exist; `python -m deploy keys` makes one")
+    key = read_private_key(path)
+    if not isinstance(key, Ed25519PrivateKey):
+        raise UserError(f"{path} is not an Ed25519 key; `python -m deploy keys` makes one")
+    return key
+
+
+EDGE, SIMULATOR, OPERATOR, VIEWER, ROUTER = "edge", "simulator", "operator", "viewer", "router"
+
+
+class Rights(NamedTuple):
+    """One row of ROLES: the last parts of the keys under `phil/<vehicle_id>/`."""
+
+    publishes: Tuple[str, ...] = ()
+    reads: Tuple[str, ...] = ()
+    answers: Tuple[str, ...] = ()
+    """Queries that it replies to."""
+    asks: Tuple[str, ...] = ()
+    shows: Tuple[str, ...] = ()
+    """Liveliness tokens of its own."""
+    watches: Tuple[str, ...] = ()
+    """Liveliness tokens of others."""
+    all_vehicles: bool = False
+    """Of every vehicle, not of its own alone."""
+    listens: bool = False
+    """Others connect to it: its certificate is a server's, too."""
+
+
+# `scene` and `simulator` are the bridge's: the picture for viewers, and its own token. `alive/**`
+# is `alive` and whatever stands below it.
+ROLES: Dict[str, Rights] = {
+    EDGE: Rights(
+        publishes=("command", "feedback", "health"),
+        reads=("state",),
+        answers=("status", "rearm"),
+        shows=("alive/**",),
+        watches=("alive/**",),  # Is there another one with this id?
+    ),
+    SIMULATOR: Rights(
+        publishes=("state", "scene"),
+        reads=("command", "feedback", "health"),
+        asks=("status",),
+        shows=("simulator",),
+        watches=("alive/**",),
+        listens=True,
+    ),
+    OPERATOR: Rights(asks=("status", "rearm")),
+    VIEWER: Rights(reads=("*",), asks=("status",), watches=("**",), all_vehicles=True),
+    # Only others connect to it; as somebody's peer it has no rights.
+    ROUTER: Rights(all_vehicles=True, listens=True),
+}
+
+# For each right: what comes from its owner, and what goes to it in return.
+_MESSAGES: Dict[str, Tuple[List[str], List[str]]] = {
+    "publishes": (["put"], ["declare_subscriber"]),
+    "reads": (["declare_subscriber"], ["put"]),
+    "answers": (["declare_queryable", "reply"], ["query"]),
+    "asks": (["query"], ["declare_queryable", "reply"]),
+    "shows": (["liveliness_token"], ["declare_liveliness_subscriber", "liveliness_query"]),
+    "watches": (["declare_liveliness_subscriber", "liveliness_query"], ["liveliness_token"]),
+}
+
+
+def common_name(role: str, vehicle_id: Optional[str] = None) -> str:
+    """The name in a certificate: `edge-hunter01`, or `viewer` for a role of all vehicles."""
+    if ROLES[role].all_vehicles:
+        return role
+    return f"{role}-{check_vehicle_id(str(vehicle_id))}"
+
+
+def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
+    """Zenoh's `access_control` for who listens: the rights of every party of these vehicles.
+
+    All else is denied: other names, other keys, and `delete` for everybody.
+    """
+    parties: List[Tuple[str, Optional[str]]] = [
+        (role, None) for role in ROLES if ROLES[role].all_vehicles
+    ]
+    for vehicle_id in dict.fromkeys(vehicle_ids):
+        parties += [(role, vehicle_id) for role in ROLES if not ROLES[role].all_vehicles]
+    return _access_control(
+        {common_name(role, vehicle_id): _rules(role, vehicle_id) for role, vehicle_id in parties}
+    )
+
+
+def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
+    """Zenoh's `access_control` for an edge runtime: what its simulator or a router may hand it.
+
+    Without it, the simulator of another vehicle could pose as the one that this edge looks for:
+    its certificate is a server's, too, and of the same authority.
+    """
+    rules = [_turned(rule) for rule in _rules(EDGE, vehicle_id)]
+    return _access_control({common_name(SIMULATOR, vehicle_id): rules, ROUTER: rules})
+
+
+def check_name(name: str, *able: str) -> None:
+    """Raise UserError where a certificate's name is not one of those that are able to do this.
+
+    Zenoh would not say so: the messages would go nowhere.
+    """
+    if name not in able:
+        one_vehicles = any(each not in ROLES for each in able)
+        raise UserError(
+            f"--tls names the certificate of {name}, and this takes that of {' or '.join(able)};"
+            f" choose another directory{', or another --vehicle-id' if one_vehicles else ''}"
+        )
+
+
+def _rules(role: str, vehicle_id: Optional[str]) -> List[Dict[str, Any]]:
+    """The rows of one party, as its neighbour applies them."""
+    rights, rows = ROLES[role], []
+    for right, (from_it, to_it) in _MESSAGES.items():
+        keys = [f"phil/{vehicle_id or '*'}/{suffix}" for suffix in getattr(rights, right)]
+        if keys:
+            rows.append({"messages": from_it, "flows": ["ingress"], "key_exprs": keys})
+            rows.append({"messages": to_it, "flows": ["egress"], "key_exprs": keys})
+    return rows
+
+
+def _turned(rule: Dict[str, Any]) -> Dict[str, Any]:
+    """The same rule as the party itself applies it: what it may send leaves here."""
+    return {**rule, "flows": ["egress" if rule["flows"] == ["ingress"] else "ingress"]}
+
+
+def _access_control(rules_by_name: Dict[str, List[Dict[str, Any]]]) -> Dict[str, Any]:
+    rules, subjects, policies = [], [], []
+    for name, rows in rules_by_name.items():
+        if not rows:
+            continue
+        named = [{"id": f"{name}-{i}", "permission": "allow", **row} for i, row in enumerate(rows)]
+        rules += named
+        subjects.append({"id": name, "cert_common_names": [name]})
+        policies.append({"rules": [row["id"] for row in named], "subjects": [name]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }

@@ -7,19 +7,19 @@ Behind a router of its own the simulator is a `client`, too: two peers would not
 
 from __future__ import annotations
 
-import errno
 import json
 import re
-import socket
-from typing import Any, Callable, Dict, List, Optional, Sequence, Union
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Sequence, Union
 
 import zenoh
 
-from edge_runtime.errors import UserError
-from edge_runtime.link_probe import addresses, why_refused, why_unreachable
-from edge_runtime.tls import TLS_PROTOCOLS, TlsFiles, check_fits, zenoh_rows
+from edge_runtime.util import UserError
+
+if TYPE_CHECKING:
+    from edge_runtime.tls import TlsFiles
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+TLS_PROTOCOLS = ("tls", "quic")
 MODES = ("router", "peer", "client")
 
 # At Zenoh's default lease a peer that was stopped, or whose cable was cut, lives on for 10 s.
@@ -41,6 +41,25 @@ def check_endpoint(endpoint: str) -> str:
     return endpoint
 
 
+def is_tls(endpoint: str) -> bool:
+    """Is it an endpoint of a protocol that asks for certificates?"""
+    return endpoint.split("/", 1)[0] in TLS_PROTOCOLS
+
+
+def check_fits(endpoint: str, with_tls: bool) -> None:
+    """Raise UserError for a TLS endpoint without files, and for files with a plain endpoint."""
+    address = endpoint.split("/", 1)[1]
+    if with_tls and not is_tls(endpoint):
+        raise UserError(
+            f"endpoint {endpoint} would send plain text despite --tls: write tls/{address}"
+        )
+    if not with_tls and is_tls(endpoint):
+        raise UserError(
+            f"endpoint {endpoint} needs certificates: name a directory of"
+            " `python -m deploy certs` with --tls"
+        )
+
+
 def open_session(
     listen: Union[str, Sequence[str], None] = None,
     connect: Optional[str] = None,
@@ -50,7 +69,7 @@ def open_session(
 ) -> zenoh.Session:
     """Open a session that listens, connects, or both. Close it before the process ends.
 
-    `tls` is what `tls_for` gave; `access` is Zenoh's `access_control`, of access.py, and whoever
+    `tls` is what `tls_for` gave; `access` is Zenoh's `access_control`, of tls.py, and whoever
     listens with TLS must have it.
     Raises UserError for a malformed endpoint, one that does not go with `tls`, a busy port, a
     link that either end refuses, and, in client mode, nobody there.
@@ -62,14 +81,20 @@ def open_session(
         raise ValueError(
             "who listens with TLS needs access control: every certificate could say all"
         )
-    for endpoint in [*listens, *_listed(connect)]:
+    for endpoint in [*listens, *([] if connect is None else [connect])]:
         check_fits(check_endpoint(endpoint), tls is not None)
-    for endpoint in listens:
-        _check_port_is_free(endpoint)
+    if listens:
+        from edge_runtime import link_probe  # No board listens.
+
+        link_probe.check_ports_are_free(listens)
     try:
         session = zenoh.open(_config(session_rows(listens, connect, mode, tls, access)))
     except zenoh.ZError as error:
-        raise UserError(_explain(str(error), listens, connect, tls)) from None
+        if connect is None or listens:
+            raise UserError(f"Zenoh cannot open {', '.join(listens) or connect}: {error}") from None
+        from edge_runtime import link_probe  # Only for who does not get a link.
+
+        raise UserError(link_probe.why_nobody_answers(connect, tls)) from None
     if connect is not None and tls is not None and not session.info.routers_zid():
         _check_refusal(session, connect, tls)
     return session
@@ -77,7 +102,9 @@ def open_session(
 
 def _check_refusal(session: zenoh.Session, connect: str, tls: TlsFiles) -> None:
     """A peer goes on trying for ever, also where it will never be let in: say so now."""
-    refusal = why_refused(connect, tls)
+    from edge_runtime import link_probe  # As above.
+
+    refusal = link_probe.why_refused(connect, tls)
     if refusal and not session.info.routers_zid():
         session.close()
         raise UserError(refusal)
@@ -95,7 +122,7 @@ def session_rows(
         "mode": mode,
         # Explicitly none: a peer would otherwise listen on every interface.
         "listen/endpoints": listens,
-        "connect/endpoints": _listed(connect),
+        "connect/endpoints": [] if connect is None else [connect],
         "connect/retry": RETRY,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -106,7 +133,7 @@ def session_rows(
         "transport/shared_memory/enabled": False,
     }
     if tls is not None:
-        rows["transport/link/tls"] = zenoh_rows(tls)
+        rows["transport/link/tls"] = tls.zenoh_rows()
         # A port that speaks TLS only, whatever an endpoint's metadata may ask for.
         rows["transport/link/protocols"] = list(TLS_PROTOCOLS)
     if access is not None:
@@ -121,49 +148,6 @@ def _config(rows: Dict[str, Any]) -> zenoh.Config:
     return config
 
 
-def _listed(endpoint: Optional[str]) -> List[str]:
-    return [] if endpoint is None else [endpoint]
-
-
-def _check_port_is_free(endpoint: str) -> None:
-    """Zenoh's own message for a busy port names neither the port nor the cause."""
-    protocol, address = endpoint.split("/", 1)
-    host, port = address.rsplit(":", 1)
-    kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
-    try:
-        family, _, _, _, target = addresses(endpoint)[0]
-    except OSError:
-        raise UserError(f"host {host!r} of endpoint {endpoint} cannot be resolved") from None
-    with socket.socket(family, kind) as probe:
-        if (
-            kind == socket.SOCK_STREAM
-        ):  # as the listener does: the last run's closed links are no bar
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(target)
-        except OSError as error:
-            raise UserError(_explain_bind(error, host, port)) from None
-
-
-def _explain_bind(error: OSError, host: str, port: str) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return f"port {port} on {host} is in use; choose another with --listen"
-    return f"cannot listen on port {port} of {host}: {error.strerror}"
-
-
-def _explain(text: str, listens: List[str], connect: Optional[str], tls: Optional[TlsFiles]) -> str:
-    if connect is None or listens:
-        return f"Zenoh cannot open {', '.join(listens) or connect}: {text}"
-    why = why_unreachable(connect)
-    refusal = "" if why else why_refused(connect, tls)
-    if connect.startswith("quic/"):  # such a link does not say why it fails
-        why = why or "or one end does not believe the other's certificate"
-    return refusal or (
-        f"nobody answers at {connect}{why and f': {why}'}; start the simulator first, or name its"
-        " address with --connect"
-    )
-
-
 def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
     """A subscriber's callback that takes only what was put to this very key.
 
@@ -175,11 +159,3 @@ def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.
             hear(sample)
 
     return take
-
-
-def free_endpoint(protocol: str = "tcp") -> str:
-    """A Zenoh endpoint on loopback that nobody listens on, for demos and tests."""
-    kind = socket.SOCK_STREAM if protocol in ("tcp", "tls") else socket.SOCK_DGRAM
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"

@@ -1,64 +1,193 @@
-"""The messages on the wire: MessagePack maps, validated on arrival. Contract, section 3.
+"""The wire: its keys, and its messages as MessagePack maps that are validated on arrival.
 
-Pure: no clock and no socket. A decoder never raises: it returns the message, or a Rejection
-that says why it never reaches the policy. The keys stand in topics.py, the messages in
-messages.py; both are re-exported here.
+Pure: no clock and no socket. A decoder never raises: it returns the message, or a Rejection that
+says why it never reaches the policy. A field that came after schema 1 was first spoken has a
+default, so that both sides of a mixed pair go on understanding each other. Contract, section 3.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Dict, Iterator, Tuple, Type, TypeVar, Union
+import re
+from enum import Enum
+from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Tuple, Type, TypeVar, Union
 
 import msgspec
+import numpy as np
 
-from edge_runtime.messages import (
-    COMMAND_MODES,
-    DRIVE,
-    FRAMES_BYTES,
-    FRAMES_SHAPE,
-    SAFE_STOP,
-    SCHEMA,
-    Command,
-    Feedback,
-    Health,
-    Message,
-    Reason,
-    Rejection,
-    State,
-)
-from edge_runtime.topics import CONTROL_PERIOD_S, TOPICS, Topic, check_vehicle_id, key
+from edge_runtime.util import UserError
 
-__all__ = [
-    "COMMAND_MODES",
-    "CONTROL_PERIOD_S",
-    "DRIVE",
-    "FRAMES_BYTES",
-    "FRAMES_SHAPE",
-    "MAX_PAYLOAD_BYTES",
-    "MAX_TEXT_CHARS",
-    "SAFE_STOP",
-    "SCHEMA",
-    "TOPICS",
-    "Command",
-    "Feedback",
-    "Health",
-    "Message",
-    "Reason",
-    "Rejection",
-    "State",
-    "Topic",
-    "check_vehicle_id",
-    "decode_command",
-    "decode_feedback",
-    "decode_health",
-    "decode_state",
-    "encode",
-    "key",
-]
+CONTROL_PERIOD_S = 0.1
+SCHEMA = 1
+FRAMES_SHAPE = (2, 45, 80)
+FRAMES_BYTES = 2 * 45 * 80
+
+DRIVE = "drive"
+SAFE_STOP = "safe_stop"
+COMMAND_MODES = (DRIVE, SAFE_STOP)
 
 MAX_PAYLOAD_BYTES = 64 * 1024
 MAX_TEXT_CHARS = 256
+
+DEFAULT_VEHICLE_ID = "hunter01"  # of both ends, so that a single vehicle needs no option
+
+
+class Topic(NamedTuple):
+    """A row of TOPICS."""
+
+    rate_hz: float
+    direction: str
+
+
+TOPICS: Dict[str, Topic] = {
+    "state": Topic(1 / CONTROL_PERIOD_S, "simulator to edge"),
+    "command": Topic(1 / CONTROL_PERIOD_S, "edge to simulator and vehicle"),
+    "feedback": Topic(20.0, "vehicle to all"),
+    "health": Topic(2.0, "edge to all"),
+    "alive": Topic(0.0, "liveliness token of the edge"),
+    "status": Topic(0.0, "queryable of the edge: JSON"),
+    "rearm": Topic(0.0, "queryable of the edge: an operator lets it drive again"),
+}
+_VEHICLE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+def check_vehicle_id(vehicle_id: str) -> str:
+    """The id itself; UserError if it could not be part of a key."""
+    if not _VEHICLE_ID.fullmatch(vehicle_id):
+        raise UserError(
+            f"vehicle id {vehicle_id!r} is not valid: use 1 to 64 of A-Z a-z 0-9 _ -, like hunter1"
+        )
+    return vehicle_id
+
+
+def key(vehicle_id: str, topic: str) -> str:
+    """The Zenoh key of a row of TOPICS, as in `phil/hunter01/state`."""
+    assert topic in TOPICS, topic
+    return f"phil/{check_vehicle_id(vehicle_id)}/{topic}"
+
+
+class Reason(str, Enum):
+    """Why a message was rejected. The newest-state logic (latest.py) adds the last four."""
+
+    OVERSIZED = "oversized"
+    MALFORMED = "malformed"
+    SCHEMA = "schema"
+    FRAMES_SIZE = "frames_size"
+    NOT_FINITE = "not_finite"
+    STALE = "stale"
+    DUPLICATE = "duplicate"
+    FOREIGN_SESSION = "foreign_session"
+    FUTURE = "future"
+
+
+class Rejection(NamedTuple):
+    """A message that was not accepted: the reason that is counted, and a sentence for the log."""
+
+    reason: Reason
+    detail: str
+
+
+class State(msgspec.Struct, frozen=True, kw_only=True):
+    """What the simulator sees at one step. `frames`: 2x45x80 uint8 in C order, [t-1, t].
+
+    `task` is what its environment is for, as `manifest.task_text` says it; left out where unknown.
+    """
+
+    session: str
+    episode: int
+    step: int
+    sim_time_s: float
+    sent_ns: int
+    frames: bytes
+    speed_mps: float
+    final: bool
+    task: Union[str, msgspec.UnsetType] = msgspec.UNSET
+    schema: int = SCHEMA
+
+    def frames_array(self) -> np.ndarray:
+        """The frames as a read-only uint8 array of shape [2, 45, 80], not copied."""
+        return np.frombuffer(self.frames, dtype=np.uint8).reshape(FRAMES_SHAPE)
+
+
+class Command(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to the state (session, episode, step); it is its own heartbeat.
+
+    `received_ns` and `sent_ns` are the edge's wall clock, `inference_ns` is a duration.
+    """
+
+    session: str
+    episode: int
+    step: int
+    mode: str
+    action: List[float]
+    policy_id: str
+    received_ns: int
+    inference_ns: int
+    sent_ns: int
+    reason: str = ""
+    schema: int = SCHEMA
+
+
+class Feedback(msgspec.Struct, frozen=True, kw_only=True):
+    """What the vehicle does. `action` is what the actuators have reached, not what was asked.
+
+    `episode` and `step` are those of the last command taken (-1 before the first one).
+    `speed_mps` and `commanded_speed_mps` (what a vehicle that takes a speed is asked for now) are
+    the vehicle's own; `scenario_speed_mps` is the speed of the scenario's car by the similarity.
+    These two and `battery_v` are None where the driver does not know them.
+    """
+
+    vehicle: str
+    session: str
+    episode: int
+    step: int
+    mode: str
+    action: List[float]
+    speed_mps: float
+    self_braking: bool
+    faults: List[str]
+    sent_ns: int
+    scenario_speed_mps: Optional[float] = None
+    commanded_speed_mps: Optional[float] = None
+    battery_v: Optional[float] = None
+    schema: int = SCHEMA
+
+
+class Health(msgspec.Struct, frozen=True, kw_only=True):
+    """How the edge runtime is, twice a second.
+
+    `inference_ms` and `command_ms` (from a state's arrival to its command's sending) hold p50,
+    p99 and max over the last 1,024 (0 before the first). `superseded` counts accepted states that
+    a newer one replaced before the policy took them, `rivals` other runtimes that were seen under
+    this vehicle id. `temperature_c` is the board's hottest sensor, None where it has none.
+    `vehicle_fault` is what is wrong with the vehicle in words, or what has stopped it and waits for
+    a re-arm; empty if nothing.
+    """
+
+    vehicle_id: str
+    vehicle: str
+    mode: str
+    reason: str
+    needs_rearm: bool
+    accepted: int
+    superseded: int
+    rejected: Dict[str, int]
+    deadline_misses: int
+    safe_stops: int
+    policy_id: str
+    inference_ms: Dict[str, float]
+    uptime_s: float
+    sent_ns: int
+    command_ms: Dict[str, float] = msgspec.field(default_factory=dict)
+    temperature_c: Optional[float] = None
+    load_1min: float = 0.0
+    rss_mb: float = 0.0
+    rivals: int = 0
+    vehicle_fault: str = ""
+    schema: int = SCHEMA
+
+
+Message = Union[State, Command, Feedback, Health]
 
 
 class _Envelope(msgspec.Struct):
@@ -66,6 +195,8 @@ class _Envelope(msgspec.Struct):
 
 
 _M = TypeVar("_M", State, Command, Feedback, Health)
+# A vehicle that has not yet had a command reports step -1.
+_LEAST: Dict[Any, int] = {Feedback: -1}
 _ENVELOPE = msgspec.msgpack.Decoder(_Envelope)
 _DECODERS: Dict[Any, Any] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in (State, Command, Feedback, Health)
@@ -84,9 +215,8 @@ def decode_state(payload: bytes) -> Union[State, Rejection]:
     """A State whose frames have the right size and whose numbers are finite, or why not."""
     state = _decode(payload, State)
     if isinstance(state, State) and len(state.frames) != FRAMES_BYTES:
-        return Rejection(
-            Reason.FRAMES_SIZE, f"frames hold {len(state.frames)} bytes, not {FRAMES_BYTES}"
-        )
+        detail = f"frames hold {len(state.frames)} bytes, not {FRAMES_BYTES}"
+        return Rejection(Reason.FRAMES_SIZE, detail)
     return state
 
 
@@ -114,9 +244,8 @@ def decode_health(payload: bytes) -> Union[Health, Rejection]:
 
 def _decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
     if len(payload) > MAX_PAYLOAD_BYTES:
-        return Rejection(
-            Reason.OVERSIZED, f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
-        )
+        detail = f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
+        return Rejection(Reason.OVERSIZED, detail)
     try:
         # The schema first: another schema's fields need not fit, and that is no malformed message.
         schema = _ENVELOPE.decode(payload).schema
@@ -142,10 +271,6 @@ def _check_fields(message: _M) -> Union[_M, Rejection]:
         elif isinstance(value, int) and value < least:
             return Rejection(Reason.MALFORMED, f"{name} is {value}, below the least value")
     return message
-
-
-# A vehicle that has not yet had a command reports step -1.
-_LEAST: Dict[Any, int] = {Feedback: -1}
 
 
 def _leaves(message: Message) -> Iterator[Tuple[str, Any]]:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 START_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 10.0

@@ -11,11 +11,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_json
-from edge_runtime.option_types import not_negative, positive, positive_number
-from edge_runtime.transport import free_endpoint
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, positive_number
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.util import UserError, read_json
 from hil_tests.commands import BackgroundCommand, run_command
 from hil_tests.drives_table import drives_table
 from hil_tests.operator import Operator

@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.errors import UserError
-from edge_runtime.files import make_directory, read_json, write_json
+from edge_runtime.files import make_directory, write_json
+from edge_runtime.util import UserError, read_json
 from trainer.drivers import make_environment
 from trainer.experiments.plan import digest
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import contextlib
 import threading
 
-from edge_runtime.errors import UserError
-from edge_runtime.operator_commands import ask
+from edge_runtime.commands import ask
+from edge_runtime.util import UserError
 
 POLL_INTERVAL_S = 0.5
 

@@ -6,7 +6,7 @@ import argparse
 import shlex
 import sys
 
-from edge_runtime.option_types import positive
+from edge_runtime.cli import positive
 
 
 def several(text: str) -> int:

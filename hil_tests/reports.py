@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.cli import write_json_out
-from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.files import check_writable, write_atomic, write_json_out
+from edge_runtime.util import UserError
 
 MARKDOWN = ".md"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from edge_runtime.manifest import Action
+from edge_runtime.policy_file import Action
 from trainer.scenarios.congestion import CongestionConfig
 
 ACTIONS = {

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.actions import ACTIONS
 from trainer.conditions import CONDITIONS
 from trainer.files import load_torch

@@ -15,12 +15,17 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
-from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.manifest import MANIFEST_KEY, Manifest, Observation, encode_manifest
 from edge_runtime.policy import policy_id_of
-from edge_runtime.private_keys import read_signing_key
-from edge_runtime.signature import SIGNATURE_SUFFIX
+from edge_runtime.policy_file import (
+    MANIFEST_KEY,
+    SIGNATURE_SUFFIX,
+    Manifest,
+    Observation,
+    encode_manifest,
+)
+from edge_runtime.tls import read_signing_key
+from edge_runtime.util import UserError
 from trainer.actions import ACTIONS
 from trainer.drivers import make_environment
 from trainer.learner.networks import Actor

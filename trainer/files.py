@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from edge_runtime.errors import UserError
-from edge_runtime.files import open_regular, write_atomic
+from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError, open_regular
 
 
 def save_torch(path: Path, state: Any) -> None:

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from edge_runtime.errors import UserError
 from edge_runtime.files import make_directory
+from edge_runtime.util import UserError
 
 LOCK_FILE = ".lock"
 """In a directory that is claimed, for as long as it is."""

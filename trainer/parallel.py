@@ -18,7 +18,7 @@ import torch
 
 from bridge.network import LatencySpec
 from bridge.report import EpisodeResult
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.drivers import load_driver, make_environment
 from trainer.evaluation import NO_NETWORK, drive_episodes
 from trainer.human.guide import Driver

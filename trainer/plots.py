@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bridge.report import GOAL
-from edge_runtime.errors import UserError
 from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError
 from trainer.training.metrics import read_metrics
 
 CURVE_FILE = "learning_curve.png"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)

@@ -21,9 +21,9 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
-from edge_runtime.errors import UserError
+from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import behind_link, check_writable, make_directory
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.util import UserError
 
 if TYPE_CHECKING:  # rerun takes a second to load; options and checks go without it
     import rerun as rr

@@ -41,12 +41,10 @@ from bridge.rerun.draw import (
 from bridge.rerun.sinks import SERVE, Sink, add_sink, check_sink, chosen_sink, flush, open_sink
 from bridge.virtual_link import SILENCE_LIMIT_S
 from edge_runtime import wire
-from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.topics import DEFAULT_VEHICLE_ID
 from edge_runtime.transport import check_endpoint
-from edge_runtime.wire import CONTROL_PERIOD_S, Command, Feedback, Health, State
+from edge_runtime.wire import CONTROL_PERIOD_S, DEFAULT_VEHICLE_ID, Command, Feedback, Health, State
 
 APPLICATION = "phil_hil"
 EXAMPLE = examples(

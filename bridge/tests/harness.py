@@ -19,8 +19,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from bridge.__main__ import main
 from edge_runtime.policy import load_policy
-from edge_runtime.tests.commands import exit_status
-from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, wait_until
+from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, exit_status, wait_until
 from edge_runtime.tests.policies import write_policy
 from edge_runtime.wire import Command, Feedback
 

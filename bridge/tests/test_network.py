@@ -21,7 +21,7 @@ from bridge.network import (
     make_link,
     parse_spec,
 )
-from edge_runtime.cli import UserError
+from edge_runtime.util import UserError
 
 milliseconds = st.floats(0.0, 10_000.0, allow_nan=False)
 percent = st.floats(0.0, 100.0)

@@ -18,8 +18,8 @@ from bridge.messages import Heard
 from bridge.record import RecordingWriter
 from bridge.recording import Recording
 from bridge.tests.harness import bridge_status, make_command
-from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
+from edge_runtime.util import UserError
 from edge_runtime.wire import encode
 
 OVERWRITTEN = 10

@@ -19,9 +19,9 @@ from bridge.tests.harness import (
     simulate,
     start_edge,
 )
-from edge_runtime.operator_commands import ask
+from edge_runtime.commands import ask
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import make_state, wait_until
-from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import encode
 
 SPEC = "40ms+-5ms,loss=10%,duplicate=10%"

@@ -21,7 +21,7 @@ from bridge.rerun.draw import Pace, outline, view_bounds
 from bridge.rerun.sinks import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.wire_view import Timeline
 from bridge.tests.viewers import NO_GPU, in_place, listens
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 
 def test_a_car_that_heads_down_the_picture_is_long_in_y():

@@ -25,9 +25,9 @@ from bridge.tests.harness import (
 )
 from bridge.tracking import LAG_STEP_S, TrackingLog
 from bridge.vehicle import VehicleClock
-from edge_runtime.cli import UserError
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
-from edge_runtime.transport import free_endpoint
+from edge_runtime.util import UserError
 from edge_runtime.wire import (
     CONTROL_PERIOD_S,
     Feedback,

@@ -20,9 +20,9 @@ from pathlib import Path
 from deploy.campaigns.rig import Board, Kit, kit_of, make_kit, unless_busy
 from deploy.installer.archive import MANIFEST
 from deploy.installer.manifest import parse_manifest
-from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import not_negative, positive
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 
 SLACK = 1.1
 """Some tries come after the end: a whole run must survive a power cut, too."""

@@ -20,8 +20,8 @@ from deploy.keys import write_key_pair
 from deploy.pyz import NAME, build_installer
 from deploy.targets import ROOT
 from deploy.wheelhouse import build_edge_wheel
-from edge_runtime.errors import UserError
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.util import UserError
 
 _POLICY = ROOT / "results/policies/left_turn.onnx"
 _GONE_LIMIT_S = 20.0

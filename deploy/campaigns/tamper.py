@@ -18,9 +18,9 @@ from pathlib import Path
 
 from deploy.campaigns.rig import Board, Kit, kit_of, make_kit
 from deploy.installer.archive import BLOCK
-from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, run_cli
 from edge_runtime.files import check_writable, write_json
-from edge_runtime.option_types import not_negative, positive
+from edge_runtime.util import UserError
 
 REFUSED = 2
 

@@ -16,9 +16,9 @@ import time
 from pathlib import Path
 
 from deploy.campaigns.rig import Board, kit_of
-from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import positive
+from edge_runtime.cli import ArgumentParser, examples, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 
 
 def main(argv: list[str]) -> int:

@@ -18,8 +18,8 @@ from deploy.bundle import Inputs, Made, make_bundle
 from deploy.campaigns.light import HERE, host_wheel
 from deploy.keys import write_key_pair
 from deploy.pyz import NAME, build_installer
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.policies import public_pem, write_policy
-from edge_runtime.transport import free_endpoint
 
 QUICK = ("--settle", "0.2")
 

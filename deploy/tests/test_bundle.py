@@ -15,8 +15,8 @@ from deploy.campaigns.light import HERE
 from deploy.pyz import build_installer
 from deploy.wheelhouse import build_edge_wheel
 from edge_runtime.config import load_config
-from edge_runtime.errors import UserError
-from edge_runtime.tests.commands import exit_status
+from edge_runtime.tests.harness import exit_status
+from edge_runtime.util import UserError
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from deploy.__main__ import main
 from deploy.certs import issue, read_authority
-from edge_runtime.errors import UserError
-from edge_runtime.tests.commands import exit_status
+from edge_runtime.tests.harness import exit_status
 from edge_runtime.tls import load_tls, tls_for
+from edge_runtime.util import UserError
 
 PARTIES = {"router", "viewer", "edge-hunter01", "simulator-hunter01", "operator-hunter01"}
 

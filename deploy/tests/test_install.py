@@ -15,8 +15,8 @@ import pytest
 from deploy.tests.boards import Board, changed_wheel
 from edge_runtime.tests.harness import Simulator, make_state, wait_until
 
-NOTIFY, RUN = "edge_runtime/sd_notify.py", "edge_runtime/run_command.py"
-MOCK = "edge_runtime/vehicles/mock/vehicle.py"
+NOTIFY, RUN = "edge_runtime/service.py", "edge_runtime/run.py"
+MOCK = "edge_runtime/vehicles/mock.py"
 WITH_VEHICLE = """\
             if config.vehicle != "none":
                 import threading

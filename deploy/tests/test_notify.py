@@ -6,7 +6,7 @@ import os
 import time
 
 from deploy.installer.notify import NotifySocket
-from edge_runtime.sd_notify import Notifier
+from edge_runtime.service import Notifier
 
 
 def test_a_slow_start_is_no_silence(tmp_path):

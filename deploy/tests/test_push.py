@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from deploy.__main__ import main
-from edge_runtime.tests.commands import exit_status
+from edge_runtime.tests.harness import exit_status
 
 SSH = """\
 #!{python}

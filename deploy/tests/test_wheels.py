@@ -14,7 +14,7 @@ from deploy.installer.errors import UserError as InstallerError
 from deploy.installer.wheels import unpack_wheel
 from deploy.targets import TARGETS, lock_path
 from deploy.wheelhouse import Pin, gather, read_lock
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 
 def wheel(*members: str) -> bytes:

@@ -15,10 +15,10 @@ from deploy.keys import write_key_pair
 from deploy.pyz import NAME, build_installer
 from deploy.targets import ROOT, TARGETS, lock_path
 from deploy.wheelhouse import DEFAULT_FOLDER, build_edge_wheel, gather
-from edge_runtime.errors import UserError
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import Simulator, make_state
 from edge_runtime.tests.test_wheel import find_python38
-from edge_runtime.transport import free_endpoint
+from edge_runtime.util import UserError
 
 pytestmark = [pytest.mark.board, pytest.mark.timeout(900)]
 POLICY = ROOT / "results/policies/left_turn.onnx"

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from edge_runtime.vehicles.hunter import frames
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
-from edge_runtime.vehicles.hunter.frames import Sent
-from edge_runtime.vehicles.hunter.specs import SPECS
-from edge_runtime.vehicles.hunter.states import State
-from edge_runtime.vehicles.similarity import CARS, similarity_to
+from edge_runtime.vehicles.hunter.protocol import Sent
+from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 
 SPEC = SPECS["2.0"]
-OK = frames.SystemStatus(0, frames.CAN_CONTROL, 24.0, 0, 0, 0)
+OK = protocol.SystemStatus(0, protocol.CAN_CONTROL, 24.0, 0, 0, 0)
 STREAM_S, STATUS_EVERY = 0.02, 5
 
 
@@ -44,20 +43,20 @@ class Bench:
     def _answer(self, parts):
         for frame, data in parts:
             message = told_by(Sent(frame, data))
-            if isinstance(message, frames.MotionCommand) and self.obeys:
+            if isinstance(message, protocol.MotionCommand) and self.obeys:
                 self.speed_mps, self.inner_rad = message
         if not self.hears:
             return
-        motion = frames.MotionStatus(self.speed_mps, self.inner_rad)
-        self.tell(frames.MOTION_STATUS, motion)
+        motion = protocol.MotionStatus(self.speed_mps, self.inner_rad)
+        self.tell(protocol.MOTION_STATUS, motion)
         if self.ticks % STATUS_EVERY == 0:
-            self.tell(frames.SYSTEM_STATUS, self.status)
+            self.tell(protocol.SYSTEM_STATUS, self.status)
 
     def tell(self, frame, message):
-        if isinstance(message, frames.SystemStatus) and self.counter is not None:
+        if isinstance(message, protocol.SystemStatus) and self.counter is not None:
             self.counter = (self.counter + 1) % 256
             message = message._replace(counter=self.counter)
-        self.core.hear(frame.can_id, frames.encode(frame, message), self.now_s)
+        self.core.hear(frame.can_id, protocol.encode(frame, message), self.now_s)
 
     def enabled(self):
         self.core.enable(self.now_s)
@@ -79,7 +78,7 @@ class Bench:
 
 
 def told_by(part):
-    decoded = frames.decode(part.frame.can_id, part.data)
+    decoded = protocol.decode(part.frame.can_id, part.data)
     assert decoded is not None
     return decoded.message
 

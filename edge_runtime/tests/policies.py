@@ -11,8 +11,8 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from onnx import TensorProto, helper, numpy_helper
 
-from edge_runtime.manifest import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
 from edge_runtime.policy import policy_id_of
+from edge_runtime.policy_file import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
 
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.

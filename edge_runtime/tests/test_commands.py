@@ -4,16 +4,36 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import os
+import subprocess
+import sys
+from argparse import ArgumentTypeError
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import edge_runtime
+from edge_runtime import log
+from edge_runtime.cli import (
+    ArgumentParser,
+    not_negative,
+    not_negative_number,
+    positive,
+    positive_number,
+    seconds,
+    share,
+    whole_number,
+)
+from edge_runtime.commands import render_status
 from edge_runtime.config import Config, load_config
-from edge_runtime.errors import UserError
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import Simulator, run_command
 from edge_runtime.tests.policies import write_policy
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.transport import open_session
+from edge_runtime.util import UserError
 
 
 def fails_with_one_line(result, *words):
@@ -189,3 +209,132 @@ def test_a_stranger_that_answers_for_the_runtime_is_one_line(answer):
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
         queryable.undeclare()
     session.close()
+
+
+def test_help_shows_every_default_that_says_something() -> None:
+    parser = ArgumentParser(prog="x")
+    parser.add_argument("--seed", type=int, default=0, help="of everything")
+    parser.add_argument("--rate", default=1.5, help="in Hz")
+    parser.add_argument("--out", default=None, help="file")
+    parser.add_argument("--set", action="append", default=[], help="a setting")
+    parser.add_argument("--only", default=["a", "b"], help="these parts (default: all)")
+    parser.add_argument("--quiet", action="store_true", help="say less")
+    text = " ".join(parser.format_help().split())
+    assert "of everything (default: 0)" in text
+    assert "in Hz (default: 1.5)" in text
+    assert text.count("(default: ") == 3
+    assert "these parts (default: all)" in text
+    assert "None" not in text
+    assert "False" not in text
+
+
+HOSTILE = "\x1b[2J\x1b]0;owned\x07\x9b31m\u202e"
+
+
+@pytest.mark.parametrize("log_format", log.FORMATS)
+def test_a_log_line_holds_nothing_that_a_terminal_acts_upon(capsys, log_format):
+    before = logging.getLogger("edge_runtime").handlers
+    log.configure("info", log_format)
+    log.event("info", "rejected", reason="malformed", detail=HOSTILE, name=HOSTILE.strip())
+    log.close()
+    logging.getLogger("edge_runtime").handlers = before
+    line = capsys.readouterr().err
+    assert line.endswith("\n")
+    assert line[:-1].isprintable()
+    assert "x1b" in line or "u001b" in line
+
+
+def test_nor_does_an_error_or_a_status():
+    assert str(UserError(f"no file {HOSTILE}")).isprintable()
+    status = dict.fromkeys(("vehicle_id", "vehicle", "mode", "reason", "policy_id"), HOSTILE)
+    counts = dict.fromkeys(("accepted", "superseded", "safe_stops", "deadline_misses"), 0)
+    more = {"rejected": {HOSTILE: 1}, "inference_ms": {}, "needs_rearm": False, "uptime_s": 1.0}
+    reply = {**status, **counts, **more, "manifest": {"scenario": HOSTILE}, "version": HOSTILE}
+    table = render_status({**reply, "vehicle_fault": HOSTILE})
+    assert all(line.isprintable() for line in table.splitlines())
+
+
+def into_a_full_disk(*command, unbuffered=""):
+    """Run with a stdout that takes nothing; ``unbuffered`` as PYTHONUNBUFFERED has it."""
+    with open("/dev/full", "w") as full:
+        return subprocess.run(
+            [sys.executable, "-m", *command],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        )
+
+
+@pytest.mark.parametrize("package", ["edge_runtime", "deploy.installer", "deploy", "bridge"])
+def test_a_full_disk_behind_stdout_is_one_line(package):
+    done = into_a_full_disk(package, "--help")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "No space left on device" in done.stderr
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_command_that_cannot_print_its_result_ends_with_one_line(make_policy, unbuffered):
+    flags = make_policy().flags
+    done = into_a_full_disk("edge_runtime", "check", *flags[1:], unbuffered=unbuffered)
+    assert done.returncode == 2
+    assert done.stderr == "error: cannot write: No space left on device\n"
+    run = ["edge_runtime", "run", *flags, "--connect", "tcp/127.0.0.1:1"]
+    done = into_a_full_disk(*run, unbuffered=unbuffered)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert done.stderr.endswith("error: cannot write: No space left on device\n")
+    assert " ended " in done.stderr  # in order
+
+
+def test_a_process_without_stdout_is_no_error():
+    shell = f"{sys.executable} -m edge_runtime --version >&-"
+    assert subprocess.run(shell, shell=True, stderr=subprocess.DEVNULL, check=False).returncode == 0
+
+
+@given(st.integers(-5, 20), st.integers(-3, 3), st.integers(0, 10))
+def test_a_whole_number_is_taken_within_its_limits_only(value, least, width):
+    kind = whole_number(least, least + width)
+    if least <= value <= least + width:
+        assert kind(str(value)) == value
+    else:
+        with pytest.raises(ArgumentTypeError, match=f"from {least} to {least + width}"):
+            kind(str(value))
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "value"),
+    [
+        (positive, "1", 1),
+        (not_negative, "0", 0),
+        (not_negative, str(2**63 - 1), 2**63 - 1),
+        (positive_number, "1e-9", 1e-9),
+        (not_negative_number, "0", 0.0),
+        (seconds, "0.5", 0.5),
+        (share, "1", 1.0),
+    ],
+)
+def test_the_limits_themselves_are_taken(kind, text, value):
+    assert kind(text) == value
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "line"),
+    [
+        (positive, "0", "'0' is not a whole number, at least 1"),
+        (positive, "1.5", "'1.5' is not a whole number, at least 1"),
+        (not_negative, "-1", "'-1' is not a whole number, at least 0"),
+        (not_negative, "many", "'many' is not a whole number, at least 0"),
+        (not_negative, str(2**63), f"'{2**63}' is larger than 2**63 - 1"),
+        (positive_number, "0", "'0' is not a finite number above 0"),
+        (positive_number, "inf", "'inf' is not a finite number above 0"),
+        (not_negative_number, "nan", "'nan' is not a finite number, at least 0"),
+        (seconds, "-0.1", "'-0.1' is not a finite number of seconds, at least 0"),
+        (share, "1.01", "'1.01' is not a share above 0 and at most 1"),
+        (share, "half", "'half' is not a share above 0 and at most 1"),
+    ],
+)
+def test_what_is_wrong_is_said_in_words(kind, text, line):
+    with pytest.raises(ArgumentTypeError) as refusal:
+        kind(text)
+    assert str(refusal.value) == line

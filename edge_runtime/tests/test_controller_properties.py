@@ -15,11 +15,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
-from edge_runtime.controller import Controller, Order, Received
-from edge_runtime.limiter import LimitRow, limit_rows
+from edge_runtime.controller import ActionLimit, Controller, LimitRow, Order, Received, limit_rows
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import PEDAL, STEERING
-from edge_runtime.vehicles.interface import ActionLimit
 
 T = 0.1
 SILENT_S = 2 * T + 0.02  # a grace within the contract's 50 ms

@@ -6,8 +6,7 @@ import pytest
 
 from edge_runtime.controller import Received
 from edge_runtime.safety import Mode
-from edge_runtime.tests.controllers import GOOD, QUICK_NS, answer, make, stop
-from edge_runtime.tests.harness import make_state
+from edge_runtime.tests.harness import GOOD, QUICK_NS, answer, make, make_state, stop
 
 
 def test_a_vehicle_stands_at_the_end_of_an_episode_and_drives_in_the_next():

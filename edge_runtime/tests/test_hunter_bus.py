@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import itertools
+import socket
 import threading
 import time
+from pathlib import Path
 
 import can
 import pytest
+from can.interfaces.udp_multicast.utils import pack_message
 
-from edge_runtime.errors import UserError
+from edge_runtime.config import DEFAULT_BUS, CarSettings, SimilaritySettings, VehicleSetup
 from edge_runtime.tests.harness import wait_until
+from edge_runtime.util import UserError
 from edge_runtime.vehicles import stream
-from edge_runtime.vehicles.hunter import bus as buses
-from edge_runtime.vehicles.hunter import frames
-from edge_runtime.vehicles.hunter.bus import BusName, Gate, open_bus, parse_bus
-from edge_runtime.vehicles.hunter.specs import SPECS
-from edge_runtime.vehicles.hunter.states import State
-from edge_runtime.vehicles.hunter.vehicle import HunterVehicle
-from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle, vehicle_limits
-from edge_runtime.vehicles.settings import CarSettings, SimilaritySettings
-from edge_runtime.vehicles.similarity import CARS, similarity_to
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.hunter import protocol
+from edge_runtime.vehicles.hunter.bus import (
+    GROUP,
+    PORT,
+    BusName,
+    Gate,
+    HunterVehicle,
+    open_bus,
+    parse_bus,
+)
+from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
+from edge_runtime.vehicles.registry import make_vehicle, vehicle_limits
 
 SPEC = SPECS["2.0"]
 LEFT_TURN = similarity_to(CARS["left_turn"], SPEC.max_speed_mps)
@@ -28,7 +36,7 @@ _numbers = itertools.count()
 
 
 def told_by(can_id, data):
-    decoded = frames.decode(can_id, data)
+    decoded = protocol.decode(can_id, data)
     assert decoded is not None
     return decoded.message
 
@@ -40,7 +48,7 @@ class Chassis:
         self.bus = can.Bus(interface="virtual", channel=channel)
         self.heard: list = []
         self.answers = True
-        self.status = frames.SystemStatus(0, frames.STANDBY, 24.0, 0, 1, 0)
+        self.status = protocol.SystemStatus(0, protocol.STANDBY, 24.0, 0, 1, 0)
         self._stopping = False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -51,19 +59,19 @@ class Chassis:
             if message is None:
                 continue
             self.heard.append((message.arbitration_id, bytes(message.data)))
-            decoded = frames.decode(*self.heard[-1])
+            decoded = protocol.decode(*self.heard[-1])
             told = decoded.message if decoded is not None else None
-            if isinstance(told, frames.ModeCommand):
+            if isinstance(told, protocol.ModeCommand):
                 self.status = self.status._replace(mode=told.mode)
-            elif isinstance(told, frames.BrakeCommand):
+            elif isinstance(told, protocol.BrakeCommand):
                 self.status = self.status._replace(brake=told.locked)
-            elif isinstance(told, frames.MotionCommand) and self.answers:
-                self.send(frames.MOTION_STATUS, frames.MotionStatus(*told))
+            elif isinstance(told, protocol.MotionCommand) and self.answers:
+                self.send(protocol.MOTION_STATUS, protocol.MotionStatus(*told))
                 self.status = self.status._replace(counter=(self.status.counter + 1) % 256)
-                self.send(frames.SYSTEM_STATUS, self.status)
+                self.send(protocol.SYSTEM_STATUS, self.status)
 
     def send(self, frame, message):
-        data = frames.encode(frame, message)
+        data = protocol.encode(frame, message)
         message = can.Message(arbitration_id=frame.can_id, data=data, is_extended_id=False)
         self.bus.send(message, timeout=0.1)
 
@@ -111,7 +119,7 @@ def is_enabled(vehicle):
 
 
 def test_the_stream_keeps_the_manuals_period():
-    assert frames.MOTION_COMMAND.period_s == stream.PERIOD_S
+    assert protocol.MOTION_COMMAND.period_s == stream.PERIOD_S
 
 
 def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
@@ -166,11 +174,11 @@ def test_the_remote_control_is_reported_and_the_chassis_that_comes_back_is_not_b
 ):
     vehicle.enable(time.monotonic())
     wait_until(lambda: is_enabled(vehicle), "the confirmation")
-    chassis.status = chassis.status._replace(mode=frames.REMOTE_CONTROL)
+    chassis.status = chassis.status._replace(mode=protocol.REMOTE_CONTROL)
     wait_until(lambda: vehicle.state is State.STOPPED, "its stop")
     report = vehicle.feedback(time.monotonic())
     assert report.faults == ["the remote control drives"] == list(report.standing)
-    chassis.status = chassis.status._replace(mode=frames.CAN_CONTROL)
+    chassis.status = chassis.status._replace(mode=protocol.CAN_CONTROL)
     wait_until(lambda: not vehicle.feedback(time.monotonic()).standing, "control back")
     drive(vehicle, lambda: len(chassis.speeds) > 30, "the stream")
     assert set(chassis.speeds[-10:]) == {0.0}
@@ -225,11 +233,11 @@ def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle
 
 def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle):
     for _ in range(100):
-        chassis.send(frames.MOTION_STATUS, frames.MotionStatus(1.0, 0.0))
+        chassis.send(protocol.MOTION_STATUS, protocol.MotionStatus(1.0, 0.0))
     vehicle.feedback(time.monotonic())  # from now on it listens
     time.sleep(0.2)
     assert vehicle.feedback(time.monotonic()).speed_mps == 0.0
-    chassis.send(frames.MOTION_STATUS, frames.MotionStatus(0.5, 0.0))
+    chassis.send(protocol.MOTION_STATUS, protocol.MotionStatus(0.5, 0.0))
     wait_until(lambda: vehicle.feedback(time.monotonic()).speed_mps == 0.5, "what comes now")
 
 
@@ -260,15 +268,15 @@ def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(ch
     gate = Gate(sender)
     try:
         with pytest.raises(RuntimeError, match="before the vehicle is enabled"):
-            gate.send(frames.MOTION_COMMAND, bytes(8))
+            gate.send(protocol.MOTION_COMMAND, bytes(8))
         gate.open()
-        for frame in frames.FEEDBACK:
+        for frame in protocol.FEEDBACK:
             with pytest.raises(RuntimeError, match="allow-list"):
                 gate.send(frame, bytes(frame.length))
         with pytest.raises(RuntimeError, match="allow-list"):
-            gate.send(frames.MOTION_COMMAND, bytes(7))
+            gate.send(protocol.MOTION_COMMAND, bytes(7))
         assert receiver.recv(0.0) is None
-        for frame in frames.COMMANDS:
+        for frame in protocol.COMMANDS:
             gate.send(frame, bytes(frame.length))
             message = receiver.recv(1.0)
             assert message is not None
@@ -318,7 +326,7 @@ def test_buses_that_cannot_be_opened_are_one_line(caplog):
 def test_python_can_is_asked_for_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "can", None)
     with pytest.raises(UserError, match=r"pip install 'phil-edge-runtime\[can\]'"):
-        open_bus(parse_bus(buses.DEFAULT_BUS))
+        open_bus(parse_bus(DEFAULT_BUS))
 
 
 def test_the_registry_makes_it_for_a_known_scenario_only(channel):
@@ -339,3 +347,78 @@ def test_the_registry_makes_it_for_a_known_scenario_only(channel):
     assert isinstance(vehicle, HunterVehicle)
     assert vehicle._core._similarity.scale == 0.1
     vehicle.close()
+
+
+@pytest.mark.parametrize(
+    ("channel", "group", "port"),
+    [("", GROUP, PORT), ("239.1.2.3", "239.1.2.3", PORT), ("239.1.2.3:7", "239.1.2.3", 7)],
+)
+def test_a_group_and_a_port_are_read(channel, group, port):
+    name = parse_bus(f"udp_multicast:{channel}")
+    assert (name.interface, name.channel, name.port) == ("udp_multicast", group, port)
+
+
+@pytest.mark.parametrize(
+    "channel",
+    ["10.0.0.1", "239.1.2.3:0", "239.1.2.3:70000", "239.1.2:3", "ff15::1", "any", "239.1.2.3:"],
+)
+def test_what_is_no_group_is_refused_in_one_line(channel):
+    with pytest.raises(UserError, match="write it as udp_multicast:239") as refused:
+        parse_bus(f"udp_multicast:{channel}")
+    assert "\n" not in str(refused.value)
+
+
+def free_udp_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", 0))
+        return one.getsockname()[1]
+
+
+def sent_packets():
+    """Packets sent by each interface but the loopback's own."""
+    lines = Path("/proc/net/dev").read_text().splitlines()[2:]
+    fields = {line.split(":")[0].strip(): line.split(":")[1].split() for line in lines}
+    return sum(int(values[9]) for name, values in fields.items() if name != "lo")
+
+
+def test_frames_reach_the_other_end_and_no_network():
+    name = f"udp_multicast:{GROUP}:{free_udp_port()}"
+    near, far = open_bus(parse_bus(name)), open_bus(parse_bus(name))
+    count = 300
+    try:
+        before = sent_packets()
+        for number in range(count):
+            data = number.to_bytes(8, "big")
+            near.send(can.Message(arbitration_id=0x111, data=data, is_extended_id=False))
+            received = far.recv(1.0)
+            assert received is not None
+            assert (received.arbitration_id, bytes(received.data)) == (0x111, data)
+        time.sleep(0.02)
+        # The machine's own traffic goes on beside us; a frame each would be 300 and more.
+        assert sent_packets() - before < count / 2
+    finally:
+        near.shutdown()
+        far.shutdown()
+
+
+def address_on_a_network():
+    """Ours on a network, by what the kernel would take for a datagram; nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.connect(("192.0.2.1", 9))
+        return one.getsockname()[0]
+
+
+def test_what_is_sent_through_a_networks_device_is_not_heard():
+    """As a neighbour's frames come: the kernel loops them back from the device they leave by."""
+    port = free_udp_port()
+    far = open_bus(parse_bus(f"udp_multicast:{GROUP}:{port}"))
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+            device = socket.inet_aton(address_on_a_network())
+            stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, device)
+            frame = can.Message(arbitration_id=0x111, data=bytes(8), is_extended_id=False)
+            stranger.sendto(pack_message(frame), (GROUP, port))
+        assert far.recv(0.2) is None
+    finally:
+        far.shutdown()

@@ -10,20 +10,20 @@ from edge_runtime.tests.hunter_bench import (
     Bench,
     sent_ids,
 )
-from edge_runtime.vehicles.hunter import frames
-from edge_runtime.vehicles.hunter.states import Event, State
+from edge_runtime.vehicles.core import Event, State
+from edge_runtime.vehicles.hunter import protocol
 
 
 @pytest.mark.parametrize(
     ("change", "words", "stands"),
     [
-        ({"mode": frames.REMOTE_CONTROL}, "the remote control drives", True),
-        ({"state": frames.STATE_ESTOP}, "the emergency stop is pressed", True),
-        ({"mode": frames.STANDBY}, "the chassis is in standby, not under CAN control", False),
+        ({"mode": protocol.REMOTE_CONTROL}, "the remote control drives", True),
+        ({"state": protocol.STATE_ESTOP}, "the emergency stop is pressed", True),
+        ({"mode": protocol.STANDBY}, "the chassis is in standby, not under CAN control", False),
         ({"brake": 1}, "the chassis has locked its brake", False),
         ({"faults": 0x1000}, "link to the upper computer lost", False),
         ({"faults": 0x0241}, "steering encoder, battery undervoltage, overtemperature", False),
-        ({"state": frames.STATE_EXCEPTION}, "the chassis is in state 2 (exception)", False),
+        ({"state": protocol.STATE_EXCEPTION}, "the chassis is in state 2 (exception)", False),
     ],
 )
 def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(change, words, stands):
@@ -46,8 +46,8 @@ def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(change, words,
 
 def test_a_motors_fault_stops_it():
     bench = Bench().driving()
-    hot = frames.MotorSlow(24.0, 30, 90, 0b10)
-    bench.tell(frames.REAR_LEFT_SLOW, hot)
+    hot = protocol.MotorSlow(24.0, 30, 90, 0b10)
+    bench.tell(protocol.REAR_LEFT_SLOW, hot)
     assert bench.words == ["rear left motor: motor overtemperature"]
     assert bench.core.cause is Event.FAULT
     bench.core.enable(bench.now_s)
@@ -70,7 +70,7 @@ def test_a_status_that_falls_silent_alone():
     original, bench.tell = bench.tell, lambda frame, message: None
     for _ in range(20):
         bench.step(1, {"pedal": 1.0})
-        original(frames.MOTION_STATUS, frames.MotionStatus(bench.speed_mps, 0.0))
+        original(protocol.MOTION_STATUS, protocol.MotionStatus(bench.speed_mps, 0.0))
     assert bench.words == ["the chassis sends no 0x211"]
 
 
@@ -130,7 +130,7 @@ def test_a_chassis_that_was_switched_off_may_count_from_0_again():
 )
 def test_feedback_that_cannot_be_stops_it_before_the_next_tick(motion, words):
     bench = Bench().driving()
-    bench.tell(frames.MOTION_STATUS, frames.MotionStatus(*motion))
+    bench.tell(protocol.MOTION_STATUS, protocol.MotionStatus(*motion))
     assert bench.core.state is State.STOPPED
     assert words in bench.words[0]
 
@@ -139,9 +139,9 @@ def test_feedback_that_could_not_be_while_it_is_enabled_stops_it_then():
     bench = Bench()
     bench.core.enable(bench.now_s)
     bench.step(1)
-    bench.tell(frames.MOTION_STATUS, frames.MotionStatus(3.0, 0.0))
+    bench.tell(protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0))
     assert bench.core.state is State.ENABLING
-    bench.tell(frames.SYSTEM_STATUS, OK)
+    bench.tell(protocol.SYSTEM_STATUS, OK)
     bench.step(1)
     assert bench.core.state is State.STOPPED
 

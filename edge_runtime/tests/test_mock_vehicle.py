@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.errors import UserError
+from edge_runtime.config import CarSettings, SimilaritySettings, VehicleSetup
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.mapping import CARS
 from edge_runtime.vehicles.mock import MockParameters, MockState, MockVehicle, advance
-from edge_runtime.vehicles.registry import VehicleSetup, make_vehicle, vehicle_limits
-from edge_runtime.vehicles.settings import CarSettings, SimilaritySettings
-from edge_runtime.vehicles.similarity import CARS
+from edge_runtime.vehicles.registry import make_vehicle, vehicle_limits
 
 
 def enabled(**parameters):

@@ -15,12 +15,11 @@ from hypothesis import strategies as st
 from onnx import helper
 
 import edge_runtime
-from edge_runtime import signature
-from edge_runtime.errors import UserError
-from edge_runtime.inference import infer
-from edge_runtime.manifest import task_text
-from edge_runtime.policy import load_policy
+from edge_runtime import policy_file
+from edge_runtime.policy import infer, load_policy
+from edge_runtime.policy_file import task_text
 from edge_runtime.tests.policies import PEDAL, STEERING, public_pem, write_policy
+from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_TEXT_CHARS
 
 KEY = Ed25519PrivateKey.generate()
@@ -35,7 +34,7 @@ def refused(path, match, **options):
 def test_a_signed_policy_drives(make_policy):
     signed = make_policy("mean")
     policy = load_policy(signed.path, signed.public_key)
-    assert policy.trust == signature.VERIFIED
+    assert policy.trust == policy_file.VERIFIED
     assert policy.policy_id == signed.policy_id
     for level in (0, 51, 255):
         action = policy.act(np.full((2, 45, 80), level, np.uint8))
@@ -76,7 +75,7 @@ def test_a_policy_from_before_with_an_id_in_its_manifest_still_drives(scenario):
     path = root / f"{scenario}.onnx"
     assert b'"policy_id":' in path.read_bytes()
     policy = load_policy(path, root / "policy.pub")
-    assert policy.trust == signature.VERIFIED
+    assert policy.trust == policy_file.VERIFIED
     assert policy.policy_id == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -143,10 +142,10 @@ def test_trust_without_a_key_or_signature(make_policy, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     signed = make_policy()
     refused(signed.path, "no public key")
-    assert load_policy(signed.path, allow_unsigned=True).trust == signature.UNVERIFIED
+    assert load_policy(signed.path, allow_unsigned=True).trust == policy_file.UNVERIFIED
     write_policy(tmp_path / "plain.onnx")
     refused(tmp_path / "plain.onnx", "not signed")
-    assert load_policy(tmp_path / "plain.onnx", allow_unsigned=True).trust == signature.UNSIGNED
+    assert load_policy(tmp_path / "plain.onnx", allow_unsigned=True).trust == policy_file.UNSIGNED
 
 
 def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path, monkeypatch):
@@ -154,7 +153,7 @@ def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path,
     signed = make_policy()
     (tmp_path / "keys").mkdir()
     signed.public_key.rename(tmp_path / "keys" / "policy.pub")
-    assert load_policy(signed.path).trust == signature.VERIFIED
+    assert load_policy(signed.path).trust == policy_file.VERIFIED
 
 
 def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
@@ -168,8 +167,8 @@ def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
     signed = make_policy()
     refused(signed.path, f"public key {mine}: .* --public-key", allow_unsigned=True)
     beside = signed.public_key.rename(tmp_path / "policy.pub")
-    assert load_policy(signed.path, allow_unsigned=True).trust == signature.BESIDE
-    assert load_policy(signed.path, beside).trust == signature.VERIFIED
+    assert load_policy(signed.path, allow_unsigned=True).trust == policy_file.BESIDE
+    assert load_policy(signed.path, beside).trust == policy_file.VERIFIED
     for options in ({}, {"public_key": mine, "allow_unsigned": True}):
         refused(signed.path, f"public key {mine}: .* --public-key", **options)
     mine.unlink()
@@ -192,6 +191,32 @@ def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
 def test_manifest_and_graph_must_agree(tmp_path, options, match):
     write_policy(tmp_path / "p.onnx", **options)
     refused(tmp_path / "p.onnx", match, allow_unsigned=True)
+
+
+def _rename(graph):
+    graph.input[0].name = graph.node[0].input[0] = "pictures"
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (_rename, r"pictures tensor\(uint8\) \['batch', 2, 45, 80\]"),
+        (lambda g: setattr(_input(g), "elem_type", onnx.TensorProto.FLOAT), r"tensor\(float\)"),
+        (lambda g: setattr(_input(g).shape.dim[2], "dim_value", 46), "'batch', 2, 46, 80"),
+        (lambda g: setattr(_input(g).shape.dim[0], "dim_value", 2), "2, 2, 45, 80"),
+        (lambda g: g.input.append(helper.make_tensor_value_info("more", 1, [1])), "more tensor"),
+    ],
+)
+def test_a_graph_of_another_input_is_refused(tmp_path, change, found):
+    write_policy(tmp_path / "p.onnx")
+    model = onnx.load(str(tmp_path / "p.onnx"))
+    change(model.graph)
+    onnx.save(model, str(tmp_path / "p.onnx"))
+    refused(tmp_path / "p.onnx", rf"its input must be frames .*{found}", allow_unsigned=True)
+
+
+def _input(graph):
+    return graph.input[0].type.tensor_type
 
 
 def test_an_action_that_nobody_can_stop_is_refused(tmp_path):

@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
+import signal
+import socket
+import sys
 import threading
-from typing import Any
+import time
+from types import SimpleNamespace
+from typing import Any, List
 
-from edge_runtime import log, realtime
-from edge_runtime.board import look
-from edge_runtime.flood import Flood
+import numpy as np
+import pytest
+
+from edge_runtime import log, loop, realtime
+from edge_runtime.controller import Controller, limit_rows
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.log import Flood
+from edge_runtime.loop import ControlLoop
+from edge_runtime.service import Notifier, look
+from edge_runtime.tests.harness import EdgeProcess, make_state, wait_until
+from edge_runtime.tests.policies import PEDAL
+from edge_runtime.tests.test_vehicle_base import BrokenVehicle
+from edge_runtime.vehicles.base import VehicleRunner
+from edge_runtime.wire import encode
 
 
 def test_a_flood_is_one_line_a_second_for_each_kind():
@@ -70,3 +87,257 @@ def test_a_reader_of_the_log_that_stands_still_holds_nobody(monkeypatch):
         log.event("info", "line")
     log.close()
     written.set()
+
+
+class Systemd:
+    """The other end of NOTIFY_SOCKET."""
+
+    def __init__(self, address: str) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(address)
+        self.socket.settimeout(10.0)
+
+    def next(self) -> str:
+        return self.socket.recv(4096).decode()
+
+    def until(self, start: str) -> List[str]:
+        """The messages up to the first that begins so, which is the last of them."""
+        found = [self.next()]
+        while not found[-1].startswith(start):
+            found.append(self.next())
+        return found
+
+    def count(self, wait_s: float) -> int:
+        """How many messages come within this time."""
+        while self._take(0.0):
+            pass
+        count = 0
+        while self._take(wait_s):
+            count += 1
+        return count
+
+    def _take(self, wait_s: float) -> bool:
+        self.socket.settimeout(wait_s or 0.001)
+        try:
+            self.socket.recv(4096)
+        except socket.timeout:
+            return False
+        finally:
+            self.socket.settimeout(10.0)
+        return True
+
+
+@pytest.fixture
+def systemd():
+    """Listens at an abstract address, which Linux frees by itself."""
+    name = f"phil-test-{os.getpid()}"
+    end = Systemd(f"\0{name}")
+    end.name = f"@{name}"  # type: ignore[attr-defined]
+    yield end
+    end.socket.close()
+
+
+def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
+    settings = tmp_path / "edge.toml"
+    settings.write_text("log_format = 'json'\ncpus = [4095]\n")
+    environment = {"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "400000"}
+    flags = [*make_policy().flags, "--connect", free_endpoint(), "--config", str(settings)]
+    with EdgeProcess(*flags, environment=environment) as edge:
+        assert edge.ready_line.startswith("ready ")
+        assert systemd.next() == "READY=1\nSTATUS=standby"
+        assert [systemd.next() for _ in range(3)] == ["WATCHDOG=1"] * 3
+        edge.process.send_signal(signal.SIGSTOP)
+        assert systemd.count(0.6) == 0
+        edge.process.send_signal(signal.SIGCONT)
+        assert systemd.next() == "WATCHDOG=1"
+        edge.process.terminate()
+        assert systemd.until("STOPPING")[-1] == "STOPPING=1"
+        assert edge.end() == 0
+    lines = [json.loads(line) for line in edge.log.splitlines()]
+    assert [line["event"] for line in lines] == ["not_permitted", "waiting", "ended"]
+    assert list(lines[0])[:3] == ["time", "level", "event"]
+    assert (lines[0]["level"], lines[0]["key"], lines[0]["value"]) == ("warning", "cpus", [4095])
+    assert "this process may use" in lines[0]["help"]
+    assert "connection refused" in lines[1]["why"]
+    assert lines[2]["accepted"] == 0
+
+
+class FakePolicy:
+    """Answers 0.5 at once, or waits while it is told to hang."""
+
+    policy_id = "p"
+    manifest = SimpleNamespace(action=[PEDAL])
+
+    def __init__(self) -> None:
+        self.free = threading.Event()
+        self.free.set()
+
+    def act(self, frames: np.ndarray) -> np.ndarray:
+        self.free.wait(20.0)
+        return np.array([0.5], np.float32)
+
+
+class FakeLink:
+    """Keeps the handler of states; counts what is sent."""
+
+    vehicle_id = "hunter01"
+    rivals = 0
+
+    def __init__(self) -> None:
+        self.sent = {"command": 0, "health": 0}
+        self.commands: list = []
+
+    def declare(self, on_state: Any, *_: Any) -> None:
+        self.state_comes = on_state
+
+    def send(self, topic: str, message: Any) -> None:
+        self.sent[topic] += 1
+        if topic == "command":
+            self.commands = [message]
+
+
+@pytest.fixture
+def running():
+    """A loop with its real threads between a fake policy and a fake link."""
+    started: list = []
+
+    def start(notifier: Any, vehicle: Any = None) -> Any:
+        policy: Any = FakePolicy()
+        link: Any = FakeLink()
+        controller = Controller(limit_rows([PEDAL], {}), needs_rearm=False)
+        control = ControlLoop(policy, controller, link, vehicle, notifier)
+        control.start()
+        main = threading.Thread(target=control.run)
+        main.start()
+        started.append((control, main, policy))
+        return control, link, policy
+
+    yield start
+    for control, main, policy in started:
+        policy.free.set()
+        assert control.close()
+        main.join(5.0)
+        assert not main.is_alive()
+
+
+def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):
+    monkeypatch.setattr(loop, "_HUNG_S", 0.2)
+    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
+    _, link, policy = running(notifier)
+    assert systemd.next() == "WATCHDOG=1"
+    policy.free.clear()
+    link.state_comes(encode(make_state(0)))
+    assert systemd.until("STATUS")[-1] == "STATUS=safe_stop inference_too_long"
+    before = link.sent["command"]
+    wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message for a while")
+    assert link.sent["command"] > before  # the safe stops go on
+    policy.free.set()
+    assert systemd.next() == "WATCHDOG=1"
+
+
+def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running, systemd):
+    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
+    control, link, policy = running(notifier)
+    link.state_comes(encode(make_state(0)))
+    assert systemd.until("STATUS")[-1] == "STATUS=drive"
+    policy.act = lambda frames: sys.exit("no exception that inference catches")
+    link.state_comes(encode(make_state(1)))
+    assert systemd.until("STATUS")[-1] == "STATUS=safe_stop policy_thread_dead"
+    wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message any more")
+    before = link.sent["command"]
+    for step in range(2, 8):  # a simulator that lives on changes nothing
+        link.state_comes(encode(make_state(step)))
+        time.sleep(0.1)
+    assert link.sent["command"] > before  # the safe stops go on
+    health = control.health()
+    assert (health.mode, health.reason) == ("safe_stop", "policy_thread_dead")
+    assert health.deadline_misses == 0
+    assert link.commands[-1].reason == "policy_thread_dead"
+    assert "restart" in control._rearm()
+
+
+def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):
+    monkeypatch.setattr(loop, "_HUNG_S", 0.2)
+    vehicle = BrokenVehicle()
+    runner = VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
+    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
+    running(notifier, runner)
+    runner.start()
+    try:
+        assert systemd.next() == "WATCHDOG=1"
+        vehicle.broken = "hang"
+        wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message for a while")
+        vehicle.broken = ""
+        vehicle.released.set()
+        assert systemd.until("WATCHDOG")[-1] == "WATCHDOG=1"
+    finally:
+        vehicle.released.set()
+        runner.close()
+
+
+def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
+    vehicle = BrokenVehicle()
+    runner = VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
+    control, link, _ = running(Notifier({}), runner)
+    runner.start()
+    link.state_comes(encode(make_state(0)))
+    vehicle.says = ["the battery is hot"]
+    wait_until(lambda: control.health().reason == "vehicle_fault", "the safe stop")
+    vehicle.says = []
+    wait_until(lambda: not runner.fault(time.monotonic()), "the end of the fault")
+    time.sleep(0.2)
+    assert control.health().vehicle_fault == "the battery is hot"
+    runner.close()
+
+
+def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):
+    control, link, _ = running(Notifier({}))
+
+    def send(steps: range) -> int:
+        for step in steps:
+            link.state_comes(encode(make_state(step)))
+            if step % 10 == 0:
+                link.state_comes(b"no message")
+                link.state_comes(encode(make_state(step)))
+        gc.collect()
+        return sys.getallocatedblocks()
+
+    settled = send(range(5_000))
+    # The windows of latencies may still fill; one object kept for each state would be 95,000.
+    assert send(range(5_000, 100_000)) - settled < 10_000
+    health = control.health()
+    assert health.accepted == 100_000
+    assert health.rejected == {"malformed": 10_000, "duplicate": 10_000}
+    assert health.superseded > 0
+
+
+def test_without_systemd_nothing_is_said():
+    for environment in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2"}):
+        notifier = Notifier(environment)
+        notifier.ready("standby")
+        assert notifier.watchdog_period_s is None
+
+
+def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
+    path = tmp_path / "notify"
+    end = Systemd(str(path))
+    notifier = Notifier({"NOTIFY_SOCKET": str(path)})
+    for _ in range(2000):  # more than the socket takes
+        notifier.watchdog()
+    end.socket.close()
+    notifier.stopping()
+    notifier.stopping()
+
+
+@pytest.mark.parametrize(
+    ("environment", "period_s"),
+    [
+        ({"WATCHDOG_USEC": "3000000"}, 1.5),
+        ({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())}, 1.5),
+        ({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"}, None),
+        ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "soon"}, None),
+    ],
+)
+def test_the_watchdog_period_is_half_of_systemds(environment, period_s):
+    assert Notifier(environment).watchdog_period_s == period_s

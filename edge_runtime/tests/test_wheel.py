@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import edge_runtime
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state
-from edge_runtime.transport import free_endpoint
 
 SOURCE = Path(edge_runtime.__file__).parent
 LOCK = SOURCE.parent / "requirements" / "edge-py38.txt"
@@ -67,7 +67,7 @@ def test_the_wheel_holds_only_the_runtime(wheel):
         "phil_edge_runtime",
     }
     assert not [name for name in names if "/tests/" in name or "conftest" in name]
-    assert {"edge_runtime/__main__.py", "edge_runtime/vehicles/mock/vehicle.py"} <= set(names)
+    assert {"edge_runtime/__main__.py", "edge_runtime/vehicles/mock.py"} <= set(names)
     assert "edge_runtime/config.example.toml" in names
     assert "edge_runtime/py.typed" in names
 
@@ -95,8 +95,8 @@ def test_the_boards_python_and_versions(wheel, make_policy, tmp_path):
     # The optional ROS 2 messages, too, in the same bytes.
     twist = "Twist(Vector3(1.5), Vector3(0.0, 0.0, 0.5))"
     code = (
-        "from edge_runtime.ros2 import cdr; from edge_runtime.ros2.messages import *;"
-        f" m = {twist}; b = cdr.encode(m); assert cdr.decode(b, Twist) == m; print(b.hex())"
+        "from edge_runtime.vehicles.ros2.node import *;"
+        f" m = {twist}; b = encode(m); assert decode(b, Twist) == m; print(b.hex())"
     )
     written = subprocess.run(
         [python, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False

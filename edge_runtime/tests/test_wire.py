@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime import wire
-from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
+from edge_runtime.util import UserError
 from edge_runtime.wire import Command, Feedback, Health, Reason, Rejection, State
 
 HEALTH = Health(

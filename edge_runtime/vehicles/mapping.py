@@ -1,21 +1,121 @@
-"""From a policy's actions to the units of a vehicle that takes a speed and a steering angle.
+"""From a policy's actions to the units of a small robot, and back for its feedback. Pure.
 
-One function for each step, and its inverse for the feedback. Pure; angles are positive to the
-left, and similarity.py has the scenario's half of the way.
+A robot that covers `scale` of the scenario car's way in the same time has `scale` of its speed and
+of its acceleration, and 1/`scale` of its path's curvature; so the policy's pictures stay true, and
+its control period too. Steering is converted by equal path, through each vehicle's own geometry.
+Angles are positive to the left.
 
-    pedal     -> acceleration of the scenario's car -> the vehicle's -> integrated: its speed
-    steering  -> curvature of the car's path -> the vehicle's -> centre angle -> inner wheel
+    pedal     -> acceleration of the scenario's car -> the robot's -> integrated: its speed
+    steering  -> curvature of the car's path -> the robot's -> centre angle -> inner wheel
 """
 
 from __future__ import annotations
 
 import math
+from typing import Dict, NamedTuple, Optional
 
-from edge_runtime.vehicles.similarity import Similarity
+from edge_runtime.controller import ActionLimit
+from edge_runtime.util import UserError
+from edge_runtime.wire import CONTROL_PERIOD_S
 
 # The set-point runs ahead of the speed by what full acceleration gives in this time, and no
 # further: a vehicle that was held up must not leap when it comes free (anti-windup).
 LEAD_S = 0.5
+_LONGEST_STEP_S = CONTROL_PERIOD_S  # after a pause of the process the pedal was not held for it
+# A pedal is integrated to a speed, so that any leap of it is a ramp.
+_PEDAL_SLEW_PER_S = math.inf
+
+
+class HunterSpec(NamedTuple):
+    """A model's limits and geometry. Angles are those of the inner front wheel, as it is told.
+
+    Speed, angle, wheelbase and track: the maker's data sheets. The steering rate is in none of
+    them: it is how fast this runtime lets the request change, and the chassis may be slower.
+    """
+
+    max_speed_mps: float
+    max_inner_steering_rad: float
+    wheelbase_m: float
+    track_m: float
+    max_steering_rate_radps: float
+
+
+SPECS: Dict[str, HunterSpec] = {
+    "2.0": HunterSpec(1.5, 0.576, 0.650, 0.605, 1.0),
+    # The track is given as 0.46 to 0.52 m, by position of the measurement: measure it.
+    "se": HunterSpec(4.8, 0.400, 0.550, 0.490, 1.0),
+}
+
+
+class ScenarioCar(NamedTuple):
+    """The car that a policy was trained on.
+
+    `full_steering_rad` is the front-wheel angle at action +1, positive to the left.
+    `wheelbase_m` is the length that highway-env's bicycle model turns by.
+    """
+
+    throttle_mps2: float
+    brake_mps2: float
+    max_speed_mps: float
+    full_steering_rad: float
+    wheelbase_m: float
+
+
+# The numbers of trainer/scenarios, which holds them equal by a test. Congestion's throttle is its
+# IDM's: no action of its policy reaches it; its action +1 turns right. No action of the left turn
+# steers: the angle there is where its path tracker ends.
+CARS: Dict[str, ScenarioCar] = {
+    "left_turn": ScenarioCar(3.0, 4.0, 6.0, math.pi / 4, 5.0),
+    "congestion": ScenarioCar(3.0, 4.0, 6.0, -0.15, 5.0),
+}
+
+
+def car_of(scenario: str, vehicle: str) -> ScenarioCar:
+    """The car of a manifest's scenario. Raises UserError for one that this runtime cannot know."""
+    if scenario not in CARS:
+        raise UserError(
+            f"the {vehicle} cannot follow a policy of the scenario {scenario!r}: which car it was"
+            f" trained on is known for {', '.join(sorted(CARS))};"
+            " set [similarity.car] in --config, or use --vehicle none"
+        )
+    return CARS[scenario]
+
+
+class Similarity(NamedTuple):
+    """`scale`: metres of the vehicle for one metre of the scenario; the same for speeds."""
+
+    car: ScenarioCar
+    scale: float
+
+    def vehicle_mps(self, scenario_mps: float) -> float:
+        """A speed (or an acceleration) of the scenario, at the vehicle."""
+        return scenario_mps * self.scale
+
+    def scenario_mps(self, vehicle_mps: float) -> float:
+        """A speed (or an acceleration) of the vehicle, in the scenario."""
+        return vehicle_mps / self.scale
+
+    def vehicle_curvature(self, steering: float) -> float:
+        """Path curvature (1/m, positive to the left) that a steering action in -1 to 1 asks for.
+
+        highway-env's bicycle turns about its centre: slip b = atan(tan(angle) / 2), and a heading
+        rate of v sin(b) / (wheelbase / 2).
+        """
+        slip_rad = math.atan(0.5 * math.tan(steering * self.car.full_steering_rad))
+        return math.sin(slip_rad) / (0.5 * self.car.wheelbase_m) / self.scale
+
+    def steering(self, vehicle_curvature: float) -> float:
+        """The steering action whose path is the vehicle's; not clamped. Inverse of the above."""
+        sine = 0.5 * self.car.wheelbase_m * vehicle_curvature * self.scale
+        slip_rad = math.asin(min(max(sine, -1.0), 1.0))
+        return math.atan(2.0 * math.tan(slip_rad)) / self.car.full_steering_rad
+
+
+def similarity_to(
+    car: ScenarioCar, max_speed_mps: float, scale: Optional[float] = None
+) -> Similarity:
+    """The similarity of a vehicle; by default its top speed is the car's top speed."""
+    return Similarity(car, max_speed_mps / car.max_speed_mps if scale is None else scale)
 
 
 def pedal_to_acceleration(pedal: float, similarity: Similarity) -> float:
@@ -100,6 +200,90 @@ def inner_to_centre(inner_rad: float, wheelbase_m: float, track_m: float) -> flo
     slope = math.tan(abs(inner_rad))
     centre_rad = math.atan2(wheelbase_m * slope, wheelbase_m + 0.5 * track_m * slope)
     return math.copysign(centre_rad, inner_rad)
+
+
+class Wish(NamedTuple):
+    """A command: the pedal, or the speed of the scenario's car; the steering stays where None."""
+
+    pedal: Optional[float]
+    scenario_speed_mps: Optional[float]
+    steering: Optional[float]
+
+
+def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wish:
+    """The command of an action, within -1 to 1.
+
+    Raises ValueError for what is not finite, and for what leaves out how fast to drive.
+    """
+    wish = Wish(action.get("pedal"), scenario_speed_mps, action.get("steering"))
+    if not all(math.isfinite(value) for value in wish if value is not None):
+        raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
+    if not action or (wish.pedal is None and scenario_speed_mps is None):
+        raise ValueError(f"a command that lacks an action: {action}, {scenario_speed_mps} m/s")
+    return Wish(_within(wish.pedal), scenario_speed_mps, _within(wish.steering))
+
+
+def _within(action: Optional[float]) -> Optional[float]:
+    """A pedal of 1e308 times a step of 0 s is no number."""
+    return None if action is None else min(max(action, -1.0), 1.0)
+
+
+class SetPoint:
+    """`speed_mps` and `inner_rad` are within the model's limits at all times."""
+
+    def __init__(self, spec: HunterSpec, similarity: Similarity) -> None:
+        self.speed_mps = 0.0
+        self.inner_rad = 0.0
+        self._spec, self._similarity = spec, similarity
+
+    def stand(self) -> None:
+        """Speed 0 at once, the angle held."""
+        self.speed_mps = 0.0
+
+    def follow(self, wish: Wish, step_s: float, measured_mps: float) -> None:
+        """One step of time towards what is wished for."""
+        spec, similarity = self._spec, self._similarity
+        step_s = min(max(step_s, 0.0), _LONGEST_STEP_S)
+        if wish.pedal is not None:
+            self.speed_mps = pedal_to_speed(
+                self.speed_mps, wish.pedal, step_s, measured_mps, spec.max_speed_mps, similarity
+            )
+        else:
+            self.speed_mps = follow_speed(
+                self.speed_mps,
+                wish.scenario_speed_mps or 0.0,
+                step_s,
+                spec.max_speed_mps,
+                similarity,
+            )
+        if wish.steering is not None:
+            self._turn(inner_of(wish.steering, spec, similarity), step_s)
+
+    def _turn(self, wanted_rad: float, step_s: float) -> None:
+        most_rad = self._spec.max_steering_rate_radps * step_s
+        change_rad = min(max(wanted_rad - self.inner_rad, -most_rad), most_rad)
+        self.inner_rad += change_rad
+
+
+def inner_of(steering: float, spec: HunterSpec, similarity: Similarity) -> float:
+    """The inner wheel's angle for a steering in -1 to 1: all the steps of the"""
+    centre_rad = steering_to_centre(steering, spec.wheelbase_m, similarity)
+    return centre_to_inner(centre_rad, spec.wheelbase_m, spec.track_m, spec.max_inner_steering_rad)
+
+
+def limits_of(spec: HunterSpec, similarity: Similarity) -> Dict[str, ActionLimit]:
+    """Ranges and slew rates of the actions: the steering's is that of the wheels."""
+    full_rad = abs(inner_of(1.0, spec, similarity))
+    return {
+        "pedal": ActionLimit(-1.0, 1.0, _PEDAL_SLEW_PER_S),
+        "steering": ActionLimit(-1.0, 1.0, spec.max_steering_rate_radps / full_rad),
+    }
+
+
+def steering_of(inner_rad: float, spec: HunterSpec, similarity: Similarity) -> float:
+    """The steering in -1 to 1 for an inner wheel's angle, as the feedback says it."""
+    centre_rad = inner_to_centre(inner_rad, spec.wheelbase_m, spec.track_m)
+    return centre_to_steering(centre_rad, spec.wheelbase_m, similarity)
 
 
 def _clamp(value: float, most: float) -> float:

@@ -1,32 +1,35 @@
-"""The vehicles that `--vehicle` knows."""
+"""The vehicles that `--vehicle` knows. What one of them needs is imported for that one only."""
 
 from __future__ import annotations
 
-from typing import Callable, Dict, NamedTuple, Optional, Tuple
+from typing import Callable, Dict, Optional, Tuple
 
 import msgspec
 
-from edge_runtime.errors import UserError
-from edge_runtime.vehicles.hunter.bus import DEFAULT_BUS, parse_bus
-from edge_runtime.vehicles.hunter.set_point import limits_of
-from edge_runtime.vehicles.hunter.specs import SPECS, HunterSpec
-from edge_runtime.vehicles.interface import ActionLimit, Vehicle
+from edge_runtime.config import (
+    DEFAULT_BUS,
+    NONE,
+    VEHICLE_NAMES,
+    HunterSettings,
+    Ros2Settings,
+    SimilaritySettings,
+    VehicleSetup,
+    check_choice,
+)
+from edge_runtime.controller import ActionLimit
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.base import Vehicle
+from edge_runtime.vehicles.mapping import (
+    CARS,
+    SPECS,
+    HunterSpec,
+    ScenarioCar,
+    Similarity,
+    car_of,
+    limits_of,
+    similarity_to,
+)
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
-from edge_runtime.vehicles.ros2.settings import Ros2Settings
-from edge_runtime.vehicles.settings import HunterSettings, SimilaritySettings
-from edge_runtime.vehicles.similarity import CARS, ScenarioCar, Similarity, car_of, similarity_to
-
-NONE = "none"
-
-
-class VehicleSetup(NamedTuple):
-    """What a driver is made from: the policy's scenario, and the settings of all vehicles."""
-
-    scenario: str = ""
-    bus: str = DEFAULT_BUS
-    hunter: HunterSettings = HunterSettings()
-    similarity: SimilaritySettings = SimilaritySettings()
-    ros2: Ros2Settings = Ros2Settings()
 
 
 def _mock(setup: VehicleSetup) -> Vehicle:
@@ -50,15 +53,14 @@ def _robot(name: str, setup: VehicleSetup) -> Tuple[HunterSpec, Similarity]:
 
 
 def _hunter(setup: VehicleSetup) -> Vehicle:
-    # Imported here: its thread and its bus are for those who have one.
-    from edge_runtime.vehicles.hunter.vehicle import HunterVehicle
+    from edge_runtime.vehicles.hunter.bus import HunterVehicle, parse_bus
 
     spec, similarity = _robot("hunter", setup)
     return HunterVehicle(parse_bus(setup.bus), spec, setup.hunter.profile, similarity)
 
 
 def _ros2(setup: VehicleSetup) -> Vehicle:
-    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle  # As above; and it needs pycdr2.
+    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
 
     spec, similarity = _robot("ros2", setup)
     return Ros2Vehicle(setup.ros2, spec, similarity)
@@ -69,7 +71,6 @@ _MAKERS: Dict[str, Callable[[VehicleSetup], Vehicle]] = {
     "hunter": _hunter,
     "ros2": _ros2,
 }
-VEHICLE_NAMES = (NONE, *_MAKERS)
 
 
 def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Optional[Vehicle]:
@@ -78,9 +79,9 @@ def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Optional[Ve
     Raises UserError for any other name, for a scenario that the vehicle cannot follow, and where
     what it hangs on cannot be opened.
     """
+    check_choice("vehicle", name, VEHICLE_NAMES)
     if name == NONE:
         return None
-    _check_known(name)
     return _MAKERS[name](setup or VehicleSetup())
 
 
@@ -89,17 +90,46 @@ def vehicle_limits(name: str, setup: VehicleSetup) -> Dict[str, ActionLimit]:
 
     Raises UserError for any other name, and for a scenario that the vehicle cannot follow.
     """
+    check_choice("vehicle", name, VEHICLE_NAMES)
     if name == NONE:
         return {}
-    _check_known(name)
     if name == MockVehicle.name:
         return MockVehicle.limits
     return limits_of(*_robot(name, setup))
 
 
-def _check_known(name: str) -> None:
-    if name not in _MAKERS:
-        raise UserError(f"vehicle {name!r} is not known; choose from {', '.join(VEHICLE_NAMES)}")
+def check_setup(setup: VehicleSetup) -> None:
+    """Raise UserError for settings that are not valid, whichever vehicle is chosen.
+
+    The defaults are valid (a test), and load nothing.
+    """
+    if (setup.bus, setup.hunter) != (DEFAULT_BUS, HunterSettings()):
+        from edge_runtime.vehicles.hunter import bus, protocol
+
+        bus.parse_bus(setup.bus)
+        check_choice("hunter.model", setup.hunter.model, tuple(SPECS))
+        check_choice("hunter.profile", setup.hunter.profile, tuple(protocol.PROFILES))
+    _check_similarity(setup.similarity)
+    if setup.ros2 != Ros2Settings():
+        from edge_runtime.vehicles.ros2.names import check_settings
+
+        check_settings(setup.ros2)
+
+
+def _check_similarity(settings: SimilaritySettings) -> None:
+    numbers = {} if settings.car is None else msgspec.structs.asdict(settings.car)
+    if settings.scale is not None:
+        numbers["scale"] = settings.scale
+    for name, value in numbers.items():
+        # To the right, the full angle is below 0.
+        size = abs(value) if name == "full_steering_rad" else value
+        if not 0.0 < size < float("inf") or (name == "full_steering_rad" and size >= 1.5):
+            raise UserError(f"similarity: {name} {value} is not valid: it must be {_range(name)}")
+
+
+def _range(name: str) -> str:
+    angle = name == "full_steering_rad"
+    return "above 0 and below 1.5 rad, or below 0 and above -1.5" if angle else "above 0"
 
 
 def make_similarity(setup: VehicleSetup, name: str, max_speed_mps: float) -> Similarity:

@@ -1,19 +1,87 @@
-"""Sends 50 times a second from a thread of its own, and at once when it is woken.
+"""The shell of a vehicle that must hear from us 50 times a second: a thread, a lock, and its core.
 
-A chassis takes a stream that pauses for a lost link, so its deadlines are absolute and its thread
-does nothing else. The thread inherits the priority that `realtime` gave the process.
+The stream sends what the core (core.py) asks for, and a lock is around every call of the core.
+Whatever it is sent through is called outside of the lock, so that nobody waits for a bus or a
+network. A chassis takes a stream that pauses for a lost link: the deadlines are absolute, and the
+thread does nothing else. It inherits the priority that the runtime gave the process.
 """
 
 from __future__ import annotations
 
+import abc
 import threading
 import time
 from typing import Callable, Dict, Optional
 
-from edge_runtime.latency_window import LatencyWindow
+from edge_runtime import log
+from edge_runtime.service import LatencyWindow
+from edge_runtime.vehicles.base import Vehicle, VehicleReport
+from edge_runtime.vehicles.core import STOP_TAKES_S, StreamedCore
 
 PERIOD_S = 0.02
 _JOIN_S = 0.5
+
+
+class StreamedVehicle(Vehicle):
+    """A core behind a lock, and the stream that sends what it asks for."""
+
+    def __init__(self, core: StreamedCore) -> None:
+        self._core = core
+        self._lock = threading.Lock()
+        self._closed = False
+        self._logged = ""
+        self._stream = Stream(f"{self.name}-stream", self._send_due, self._late_at_s)
+
+    def command(
+        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+    ) -> None:
+        """A pedal, or the speed of the scenario's car; and a steering, which else stays."""
+        with self._lock:
+            self._core.command(action, now_s, scenario_speed_mps)
+
+    def brake(self, now_s: float, latch: bool = True) -> None:
+        """Speed 0 leaves at once, not with the next period."""
+        with self._lock:
+            self._core.brake(now_s, latch)
+        self._stream.wake()
+
+    def feedback(self, now_s: float) -> VehicleReport:
+        """From the newest that was heard of the vehicle."""
+        with self._lock:
+            report = self._core.report(now_s)
+            self._log_state()
+        return report
+
+    @abc.abstractmethod
+    def _send_due(self) -> bool:
+        """Send what the core's `tick` gives; whether anything was. Never raises."""
+
+    def _end_stream(self) -> None:
+        """Stand, and send no more."""
+        self.brake(time.monotonic())
+        self._stream.run_until(self._is_at_rest, STOP_TAKES_S)
+        self._stream.stop()
+
+    def _log_gaps(self) -> None:
+        gaps_ms = self._stream.gaps_ms()
+        if gaps_ms:
+            log.event("info", f"{self.name}_stream", **gaps_ms)
+
+    def _is_at_rest(self) -> bool:
+        with self._lock:
+            return self._core.is_at_rest(time.monotonic())
+
+    def _late_at_s(self) -> float:
+        with self._lock:
+            return self._core.late_at_s
+
+    def _log_state(self) -> None:
+        """Each state once, when feedback is asked for: never from the stream's thread."""
+        state, words = self._core.state.value, self._core.words
+        line = f"{state} {words}".strip()
+        if line != self._logged:
+            self._logged = line
+            log.event("warning" if words else "info", self.name, state=state, why=words)
 
 
 class Stream:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from edge_runtime import wire
-from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import positive
+from edge_runtime.cli import ArgumentParser, examples, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.policy import load_policy
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.transport import open_session
 from hil_tests.benches.contenders import Floor, Ours, answer, rouse, start_floor, start_ours
 from hil_tests.benches.footprint import first_command_s, idle_load, memory_mb
 from hil_tests.benches.latency import alternate

@@ -21,10 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
-from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import not_negative, positive
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 from edge_runtime.wire import SAFE_STOP
 from hil_tests.benches.can_floor import CAN_ID
 from hil_tests.faults.can_ears import CanEars

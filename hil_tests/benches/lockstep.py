@@ -9,7 +9,8 @@ from typing import Any
 import zenoh
 
 from edge_runtime import wire
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import open_session
 from hil_tests.benches.contenders import OURS, start_ours
 from hil_tests.faults.processes import Process
 

@@ -20,11 +20,12 @@ import numpy as np
 
 from deploy.certs_command import add_arguments, certs
 from edge_runtime import wire
-from edge_runtime.access import rules_for_listener
-from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
-from edge_runtime.option_types import positive
-from edge_runtime.tls import load_tls
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.cli import ArgumentParser, examples, positive, run_cli
+from edge_runtime.files import write_json_out
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.tls import load_tls, rules_for_listener
+from edge_runtime.transport import open_session
+from edge_runtime.util import UserError
 from hil_tests.options import trusting
 
 VEHICLE_ID = "hunter01"

@@ -23,10 +23,9 @@ from bridge.environments import make_environment
 from bridge.messages import Stamps
 from bridge.ports import SimulatorPort, open_port
 from bridge.rerun.sinks import Sink
-from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import positive
-from edge_runtime.transport import free_endpoint
+from edge_runtime.cli import ArgumentParser, examples, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.wire import State, encode
 from hil_tests.commands import BackgroundCommand
 from trainer.benches.machine import processor_model

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from deploy.wheelhouse import DEFAULT_FOLDER
-from edge_runtime.cli import ArgumentParser, examples, write_json_out
-from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 from hil_tests.board import emulation
 from hil_tests.board.proof import prove_emulated, prove_twin
 from hil_tests.board.rootfs import DEFAULT_CACHE

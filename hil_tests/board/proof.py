@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from deploy.__main__ import main as deploy
 from deploy.pyz import NAME, build_installer
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.board.emulation import emulated
 from hil_tests.board.place import Place
 from hil_tests.board.rootfs import AARCH64, fresh_root

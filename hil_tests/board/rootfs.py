@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 DEFAULT_CACHE = Path("build/board")
 _LIMIT_S = 1800.0

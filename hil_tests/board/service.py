@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from deploy.installer.systemctl import MAIN_UNIT
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.board.booted import BootedPlace, control_group
 from hil_tests.board.proof import Site, pack, prove, remove
 from hil_tests.board.rootfs import BOOTABLE, fresh_root

@@ -8,9 +8,9 @@ import time
 from typing import Any
 
 from edge_runtime import wire
-from edge_runtime.errors import UserError
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import open_session
+from edge_runtime.util import UserError
 
 _RETRY_S = 0.05
 _PATIENCE_S = 120.0

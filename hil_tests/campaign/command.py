@@ -8,11 +8,16 @@ from typing import Any
 
 from bridge.environments import CONDITIONS, NOMINAL
 from bridge.network import parse_spec
-from edge_runtime.cli import ArgumentParser, add_public_key, examples
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_json
-from edge_runtime.option_types import not_negative, positive, share
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.cli import (
+    ArgumentParser,
+    add_public_key,
+    examples,
+    not_negative,
+    positive,
+    share,
+    sigterm_as_interrupt,
+)
+from edge_runtime.util import UserError, read_json
 from hil_tests.campaign.axes import AXES, Axis
 from hil_tests.campaign.figures import write_figures
 from hil_tests.campaign.latency import run_latency

@@ -12,9 +12,8 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_json
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.util import UserError, read_json
 from hil_tests.campaign.chunks import Chunk, Task, halve, join_reports
 from hil_tests.commands import BackgroundCommand, CommandTimeoutError
 from hil_tests.options import trusting

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 
 from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.doctor.check import Finding, examine
 from hil_tests.doctor.table import CHECKS
 

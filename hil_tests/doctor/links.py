@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.doctor.check import MissingError, output_of
 
 ARRIVAL_S = 5.0
@@ -21,7 +21,8 @@ _CAN_DEVICE = "280"
 
 def zenoh_loopback() -> str:
     """A message from one Zenoh session to another, over TCP on loopback."""
-    from edge_runtime.transport import free_endpoint, open_session
+    from edge_runtime.link_probe import free_endpoint
+    from edge_runtime.transport import open_session
 
     came = threading.Event()
     endpoint = free_endpoint()

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.doctor.check import MissingError, output_of_python
 
 _EVENTS = Path("/dev/input")

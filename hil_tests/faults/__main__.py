@@ -5,9 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from edge_runtime.cli import ArgumentParser, add_public_key, examples, run_cli, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import positive
+from edge_runtime.cli import ArgumentParser, add_public_key, examples, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
 from hil_tests.faults import render_faults, run_faults
 
 

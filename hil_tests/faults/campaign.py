@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.row import Row, Try

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import can
 
 from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
-from edge_runtime.vehicles.hunter.frames import FRAMES
+from edge_runtime.vehicles.hunter.protocol import FRAMES
 
 _POLL_S = 0.1
 

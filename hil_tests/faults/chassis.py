@@ -6,7 +6,7 @@ import re
 import socket
 from typing import NamedTuple
 
-from edge_runtime.vehicles.hunter import multicast
+from edge_runtime.vehicles.hunter import bus as multicast
 from hil_tests.faults.processes import Process, wait_until
 
 _TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(\w+)")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from edge_runtime.vehicles.interface import VehicleReport
+from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mock import MockVehicle
 
 _STUCK_AT = -1.0

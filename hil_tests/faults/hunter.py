@@ -19,8 +19,8 @@ from functools import partial
 from typing import NamedTuple
 
 from edge_runtime.safety import Event
-from edge_runtime.vehicles.hunter.reports import STATUS_SILENCE_S
-from edge_runtime.vehicles.hunter.set_point import DEVIATES_S, FOLLOWS_S
+from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S
+from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
 from edge_runtime.wire import DRIVE
 from hil_tests.faults.can_ears import CanEars, Heard
 from hil_tests.faults.chassis import ChassisProcess

@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
 
 _CHUNK = 65536
 _STATE_BYTES = 20

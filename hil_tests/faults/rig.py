@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.errors import UserError
-from edge_runtime.operator_commands import ask
-from edge_runtime.transport import free_endpoint
+from edge_runtime.commands import ask
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.util import UserError
 from hil_tests.faults.can_ears import CanEars
 from hil_tests.faults.chassis import ChassisProcess, free_bus
 from hil_tests.faults.endless import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT

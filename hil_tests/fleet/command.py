@@ -11,12 +11,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from edge_runtime.cli import ArgumentParser, examples, write_json_out
-from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import positive
-from edge_runtime.signals import sigterm_as_interrupt
-from edge_runtime.words import counted
+from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError, counted
 from hil_tests.fleet.drive import measure
 from hil_tests.fleet.rules import certificates_ms, measure_rules
 from hil_tests.fleet.scale import per_vehicle, project

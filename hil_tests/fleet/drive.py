@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from deploy.__main__ import main as deploy
-from edge_runtime import access
-from edge_runtime.transport import free_endpoint
+from edge_runtime import tls
+from edge_runtime.link_probe import free_endpoint
 from hil_tests.faults.campaign import POLICY, PUBLIC_KEY
 from hil_tests.faults.processes import Process, wait_until
 from hil_tests.fleet.usage import Carried, Usage, carried, usage, why_not_counted
@@ -83,7 +83,7 @@ def write_certificates(vehicle_ids: list[str], folder: Path) -> Path:
 def write_router_config(vehicle_ids: list[str], endpoint: str, folder: Path) -> Path:
     """Certificates of all parties, and the router's file."""
     certificates, config = write_certificates(vehicle_ids, folder), folder / "router.json5"
-    router = str(certificates / access.ROUTER)
+    router = str(certificates / tls.ROUTER)
     _deploy(
         ["router", "--listen", endpoint, "--tls", router, "--out", str(config),
          *_named(vehicle_ids)]
@@ -119,7 +119,7 @@ def _start(stack: contextlib.ExitStack, vehicle_ids: list[str], folder: Path) ->
                 "--vehicle-id",
                 each,
                 "--tls",
-                str(folder / "certs" / access.common_name(access.EDGE, each)),
+                str(folder / "certs" / tls.common_name(tls.EDGE, each)),
             )
         )
         for each in vehicle_ids

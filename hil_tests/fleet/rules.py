@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from deploy.router_config import router_config
-from edge_runtime import access
+from edge_runtime import tls as access
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tls import load_tls
-from edge_runtime.transport import free_endpoint
 from hil_tests.faults.processes import Process
 from hil_tests.fleet.drive import write_certificates, write_router_config
 from hil_tests.fleet.usage import usage

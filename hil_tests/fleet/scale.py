@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.topics import TOPICS
+from edge_runtime.wire import TOPICS
 
 FLEETS = (10, 1_000, 100_000)
 CORE_SHARE = 0.5

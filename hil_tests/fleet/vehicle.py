@@ -9,7 +9,8 @@ from typing import Any
 
 import zenoh
 
-from edge_runtime import access, wire
+from edge_runtime import tls as access
+from edge_runtime import wire
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import open_session
 from hil_tests.faults.sender import make_state

@@ -9,12 +9,11 @@ import sys
 import time
 from typing import Any
 
-from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
-from edge_runtime.option_types import seconds
-from edge_runtime.vehicles.hunter import multicast
+from edge_runtime.cli import examples, seconds
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.hunter import bus as multicast
 from edge_runtime.vehicles.hunter.bus import BusName, open_bus, parse_bus
-from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE, PROFILES
+from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.faults import FAULTS, check_fault
 from hil_tests.mock_hunter.hunter import MockHunter
 from hil_tests.mock_hunter.parameters import MODELS, SOURCES, make_parameters, read_changes
@@ -44,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
     )
     parser.add_argument(
-        "--bus", default=multicast.SYNTAX, metavar="INTERFACE:CHANNEL", help="where it is"
+        "--bus", default=multicast.MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is"
     )
     parser.add_argument("--model", default="hunter-2.0", choices=list(MODELS))
     parser.add_argument(
@@ -84,7 +83,7 @@ def _check_reachable(text: str) -> BusName:
     if bus.interface == "virtual":
         raise UserError(
             f"--bus {text}: a virtual bus ends with its process, and nobody could reach the mock;"
-            f" use {multicast.SYNTAX} or socketcan:vcan0"
+            f" use {multicast.MULTICAST_BUS} or socketcan:vcan0"
         )
     return bus
 

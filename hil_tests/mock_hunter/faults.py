@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from edge_runtime.errors import UserError
-from edge_runtime.vehicles.hunter import faults as words
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.hunter import protocol as words
 
 STEERING, REAR_RIGHT, REAR_LEFT = range(3)
 _LOW_SUPPLY, _MOTOR_HOT, _OVERCURRENT = 1 << 0, 1 << 1, 1 << 2

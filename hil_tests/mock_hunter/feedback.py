@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from edge_runtime.vehicles.hunter import frames as codec
-from edge_runtime.vehicles.hunter.faults import LINK_LOST, fault_bits
+from edge_runtime.vehicles.hunter import protocol as codec
+from edge_runtime.vehicles.hunter.protocol import LINK_LOST, fault_bits
 from hil_tests.mock_hunter.body import Body, curvature
 from hil_tests.mock_hunter.chassis import Chassis, Condition, Control
 from hil_tests.mock_hunter.faults import BITS, LIE_MPS, REAR_LEFT, REAR_RIGHT, STEERING

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from edge_runtime.vehicles.hunter import frames as codec
+from edge_runtime.vehicles.hunter import protocol as codec
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.battery import Battery
 from hil_tests.mock_hunter.body import Body, Setpoint, advance, roll

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 ASSUMED = "assumed"
 _MANUAL = "AgileX user manual (HARDWARE_FACTS.md)"

@@ -11,7 +11,7 @@ from typing import TextIO
 
 import can
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.mock_hunter.faults import check_fault
 from hil_tests.mock_hunter.hunter import MockHunter
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli
-from edge_runtime.errors import UserError
+from edge_runtime.cli import ArgumentParser, examples, positive, run_cli
 from edge_runtime.files import make_directory, write_atomic, write_json
-from edge_runtime.option_types import positive
+from edge_runtime.util import UserError
 from hil_tests.mutation.report import judge, read_accepted, render
 from hil_tests.mutation.session import TARGETS, run_targets
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import edge_runtime
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 _ROOT = Path(edge_runtime.__file__).parent.parent
 _HERE = Path(__file__).parent

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bridge.network import LatencySpec
-from edge_runtime.files import read_json
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.util import read_json
 from hil_tests.commands import BackgroundCommand
 from hil_tests.network.kernel import MTU, kernel_network
 

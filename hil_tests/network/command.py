@@ -14,12 +14,10 @@ from rich.console import Console
 from rich.progress import Progress
 
 from bridge.network import parse_spec
-from edge_runtime.cli import ArgumentParser, examples, write_json_out
-from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import not_negative, positive
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, sigterm_as_interrupt
+from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.policy import load_policy
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.util import UserError
 from hil_tests.commands import end_children
 from hil_tests.network.cells import KERNEL, TRANSPORTS, Cell, Drive, run_cell
 from hil_tests.network.namespaces import why_not

@@ -20,9 +20,9 @@ from typing import Any
 import zenoh
 
 from bridge.commands import wait_to_be_told
-from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
-from edge_runtime.signals import sigterm_as_interrupt
-from edge_runtime.topics import CONTROL_PERIOD_S
+from edge_runtime.cli import ArgumentParser, examples, run_cli, sigterm_as_interrupt
+from edge_runtime.util import UserError
+from edge_runtime.wire import CONTROL_PERIOD_S
 
 STATE_BYTES, COMMAND_BYTES = 7_322, 217
 """As long as the loop's own messages."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from bridge.network import DirectionSpec, LatencySpec
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.commands import BackgroundCommand
 from hil_tests.network.namespaces import Pair, inside, ip, namespaces, why_not
 from hil_tests.network.netem import has_netem, netem_arguments

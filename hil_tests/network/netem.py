@@ -8,7 +8,7 @@ from __future__ import annotations
 import subprocess
 
 from bridge.network import DirectionSpec, bad_share
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.network.namespaces import inside
 
 _PROBE = ("tc", "qdisc", "add", "dev", "lo", "root", "netem", "delay", "1ms")

@@ -21,8 +21,7 @@ import time
 from typing import NamedTuple
 
 from bridge.network import EventHeap, LatencyModel, make_link, parse_spec
-from edge_runtime.cli import ArgumentParser, examples, run_cli
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, run_cli, sigterm_as_interrupt
 from hil_tests.network.namespaces import TUN_DEVICE, ip
 
 SIMULATOR_ADDRESS, EDGE_ADDRESS = "10.77.0.1", "10.77.0.2"

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 from bridge.network import parse_spec
 from bridge.report import quantiles
-from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import not_negative, positive
+from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 from hil_tests.commands import BackgroundCommand
 from hil_tests.network.cells import JUMBO_MTU, PORT
 from hil_tests.network.echo import READY, zenoh_config

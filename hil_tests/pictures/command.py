@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, make_directory
+from edge_runtime.util import UserError
 from hil_tests.pictures import curves, loop, rerun_view, scenes
 
 PICTURES: dict[str, Callable[[Path, Path], None]] = {

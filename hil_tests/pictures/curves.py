@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from edge_runtime.files import read_json
+from edge_runtime.util import read_json
 from hil_tests.campaign.figures import write_figures
 from hil_tests.commands import run_command
 

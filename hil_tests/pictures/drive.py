@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from pathlib import Path
 
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
 from hil_tests.commands import BackgroundCommand, run_command
 from hil_tests.operator import Operator
 

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 SIZE = "1400x900"
 START_S, LOOK_S = 60.0, 0.5

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from bridge.recording import Recording
-from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
-from edge_runtime.files import check_writable, read_bytes, write_atomic
-from edge_runtime.transport import free_endpoint
+from edge_runtime.cli import ArgumentParser, examples, run_cli
+from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.util import UserError, read_bytes
 from hil_tests.commands import BackgroundCommand, run_command
 
 LEFT_TURN = Path("hil_tests/recordings/left_turn.mcap")

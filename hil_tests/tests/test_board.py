@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.__main__ import main
 from hil_tests.board import command
 from hil_tests.board.place import Place

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from edge_runtime.cli import UserError, run_cli
+from edge_runtime.cli import run_cli
+from edge_runtime.util import UserError
 from hil_tests.__main__ import main
 from hil_tests.campaign import command, latency, workers
 from hil_tests.campaign.axes import AXES, Axis

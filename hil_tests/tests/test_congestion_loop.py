@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from bridge.tests.harness import simulate_undisturbed
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess
-from edge_runtime.transport import free_endpoint
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.evaluation import drive_episodes
 from trainer.export import export_policy, write_policy

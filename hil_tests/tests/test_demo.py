@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from edge_runtime.errors import UserError
-from edge_runtime.tests.commands import exit_status
+from edge_runtime.tests.harness import exit_status
+from edge_runtime.util import UserError
 from hil_tests.__main__ import main
 from hil_tests.commands import BackgroundCommand
 from hil_tests.demo import Demo

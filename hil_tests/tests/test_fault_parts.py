@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edge_runtime import wire
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.faults import render_faults, run_faults
 from hil_tests.faults.campaign import Outcome, _choose, _report_row
 from hil_tests.faults.payloads import mutated, with_fields, without

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from deploy.__main__ import main as deploy
-from edge_runtime.errors import UserError
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.util import UserError
 from hil_tests.__main__ import main
 from hil_tests.fleet import drive
 from hil_tests.fleet.scale import per_vehicle, project

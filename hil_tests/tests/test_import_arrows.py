@@ -21,7 +21,7 @@ EDGE_LIBRARIES = {
 }  # fmt: skip
 DOORS = {
     "can": ROOT / "edge_runtime/vehicles/hunter/bus.py",
-    "pycdr2": ROOT / "edge_runtime/ros2/library.py",
+    "pycdr2": ROOT / "edge_runtime/vehicles/ros2/node.py",
 }
 """Where alone the edge runtime may load a library that only one kind of vehicle needs."""
 ONLY_IN = {"torch": {"trainer"}, "highway_env": {"trainer"}, "onnx": {"trainer"}}
@@ -62,7 +62,7 @@ def test_the_edge_runtime_uses_only_libraries_that_a_board_has():
 
 @pytest.mark.parametrize("library", DOORS)
 def test_a_vehicles_library_is_loaded_only_with_the_vehicle(library):
-    code = f"import sys, edge_runtime.run_command; assert {library!r} not in sys.modules"
+    code = f"import sys, edge_runtime.run; assert {library!r} not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from bridge.tests.harness import read, simulate_undisturbed, start_simulate, wait_until_driving
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess
-from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.evaluation import drive_episodes

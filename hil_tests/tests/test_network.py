@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from bridge.network import parse_spec
-from edge_runtime.cli import UserError
+from edge_runtime.util import UserError
 from hil_tests.commands import BackgroundCommand
 from hil_tests.network import cells
 from hil_tests.network.cells import Cell, Drive, run_cell, summary

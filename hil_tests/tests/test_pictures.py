@@ -10,8 +10,8 @@ from PIL import Image, ImageSequence
 from bridge.messages import Scene
 from bridge.tests.harness import make_command
 from edge_runtime.cli import run_cli
-from edge_runtime.errors import UserError
 from edge_runtime.tests.harness import make_state
+from edge_runtime.util import UserError
 from hil_tests.__main__ import main
 from hil_tests.pictures import command, headless
 from hil_tests.pictures.curves import success_against_latency

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from deploy.targets import TARGETS
-from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT
+from edge_runtime.vehicles.ros2.names import DEFAULT_ROS2_ENDPOINT
 
 ROOT = Path(__file__).parents[2]
 READMES = sorted(

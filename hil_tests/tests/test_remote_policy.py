@@ -6,8 +6,8 @@ import pytest
 
 from bridge.network import parse_spec
 from bridge.tests.harness import simulate_undisturbed
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess
-from edge_runtime.transport import free_endpoint
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.evaluation import drive_episodes
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.reports import check_report, write_report
 
 

@@ -17,13 +17,12 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from bridge.ports import SimulatorPort, open_feed
 from deploy.certs import CLOCK_SLACK, issue, read_authority
 from edge_runtime import wire
-from edge_runtime.access import rules_for_edge, rules_for_listener
-from edge_runtime.errors import UserError
-from edge_runtime.link_probe import why_no_link
+from edge_runtime.link_probe import free_endpoint, why_no_link
 from edge_runtime.tests.harness import EdgeProcess, make_state, run_command, wait_until
 from edge_runtime.tests.policies import write_policy
-from edge_runtime.tls import load_tls
-from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
+from edge_runtime.transport import open_session
+from edge_runtime.util import UserError
 from hil_tests.tests.tls_parties import listener, make_certificates, session
 
 LIFE_S = 2.0

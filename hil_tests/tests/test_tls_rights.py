@@ -9,12 +9,11 @@ import time
 import pytest
 
 from bridge.tests.harness import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
-from edge_runtime.access import rules_for_edge, rules_for_listener
-from edge_runtime.errors import UserError
-from edge_runtime.operator_commands import ask
+from edge_runtime.commands import ask
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, run_command
-from edge_runtime.tls import load_tls
-from edge_runtime.transport import free_endpoint
+from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
+from edge_runtime.util import UserError
 from hil_tests.tests.tls_parties import SETTLE_S, Intruder, listener, make_certificates, session
 
 STRANGERS = ("edge-hunter02", "simulator-hunter02", "operator-hunter02", "viewer")

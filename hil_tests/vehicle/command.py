@@ -8,11 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from bridge.environments import CONDITIONS, NOMINAL
-from edge_runtime.cli import ArgumentParser, add_public_key, examples
-from edge_runtime.errors import UserError
-from edge_runtime.option_types import not_negative, positive, share
+from edge_runtime.cli import (
+    ArgumentParser,
+    add_public_key,
+    examples,
+    not_negative,
+    positive,
+    share,
+    sigterm_as_interrupt,
+)
 from edge_runtime.policy import load_policy
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.util import UserError
 from hil_tests.commands import end_children
 from hil_tests.mock_hunter.parameters import make_parameters, read_changes
 from hil_tests.options import several, this_command

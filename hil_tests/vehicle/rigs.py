@@ -9,8 +9,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from edge_runtime.files import read_json
-from edge_runtime.transport import free_endpoint
+from edge_runtime.link_probe import free_endpoint
+from edge_runtime.util import read_json
 from hil_tests.commands import BackgroundCommand
 from hil_tests.faults.chassis import free_bus
 from hil_tests.operator import Operator

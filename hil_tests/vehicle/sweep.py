@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bridge.report import GOAL
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.campaign.axes import Axis
 from hil_tests.campaign.budget import budget
 from hil_tests.kept import KeptResults

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 from bridge.episode import vehicle_action
 from bridge.inbound import VehicleDecision
 from bridge.tracking import TrackingLog
-from edge_runtime.vehicles.hunter.states import State
-from edge_runtime.vehicles.interface import VehicleReport
+from edge_runtime.vehicles.base import VehicleReport
+from edge_runtime.vehicles.core import State
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command, Feedback
 from hil_tests.mock_hunter.parameters import Parameters
 from hil_tests.vehicle.virtual_hunter import VirtualHunter
@@ -81,7 +81,7 @@ class VirtualDrive:
 
 
 def _feedback(step: int, names: list[str], report: VehicleReport, now_ms: int) -> Feedback:
-    """As `edge_runtime/vehicles/runner.py` makes it."""
+    """As `edge_runtime/vehicles/base.py` makes it."""
     return Feedback(
         vehicle=VEHICLE, session=SESSION, episode=0, step=step, mode=DRIVE,
         action=[report.action.get(name, 0.0) for name in names], speed_mps=report.speed_mps,

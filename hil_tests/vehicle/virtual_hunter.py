@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from edge_runtime.vehicles.base import VehicleReport
+from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter.core import HunterCore
-from edge_runtime.vehicles.hunter.faults import DEFAULT_PROFILE
-from edge_runtime.vehicles.hunter.specs import SPECS
-from edge_runtime.vehicles.hunter.states import State
-from edge_runtime.vehicles.interface import VehicleReport
-from edge_runtime.vehicles.similarity import Similarity, car_of, similarity_to
+from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE
+from edge_runtime.vehicles.mapping import SPECS, Similarity, car_of, similarity_to
 from edge_runtime.wire import TOPICS
 from hil_tests.mock_hunter.hunter import MockHunter
 from hil_tests.mock_hunter.parameters import Parameters

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.cli import ArgumentParser, UserError, run_cli, write_json_out
-from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.option_types import not_negative, positive
+from edge_runtime.cli import ArgumentParser, not_negative, positive, run_cli
+from edge_runtime.files import check_writable, write_atomic, write_json_out
+from edge_runtime.util import UserError
 from trainer.benches.chromium import Browser, find_chromium, open_browser
 from trainer.benches.cockpit_run import CockpitRun, cockpit_run
 from trainer.benches.machine import about

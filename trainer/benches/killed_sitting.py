@@ -20,10 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
-from edge_runtime.errors import UserError
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import not_negative, positive, positive_number
+from edge_runtime.cli import (
+    ArgumentParser,
+    examples,
+    not_negative,
+    positive,
+    positive_number,
+    run_cli,
+)
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.drivers import CHECKPOINT_FILE

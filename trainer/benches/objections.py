@@ -10,9 +10,8 @@ import sys
 from typing import Any
 
 from bridge.report import GOAL
-from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import positive
+from edge_runtime.cli import ArgumentParser, positive, run_cli
+from edge_runtime.files import check_writable, write_json_out
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver
 from trainer.revision import source_revision

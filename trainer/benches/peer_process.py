@@ -16,7 +16,7 @@ import threading
 from types import TracebackType
 from typing import Any
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 SILENCE_S = 300.0
 """No peer takes that long for a few updates."""

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.cli import UserError, examples, write_json_out
-from edge_runtime.files import check_writable
+from edge_runtime.cli import examples
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
 from trainer.benches.effort import FULL, QUICK, Effort
 from trainer.benches.environment import measure_environment
 from trainer.benches.learner import measure_learner

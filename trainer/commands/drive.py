@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from edge_runtime.cli import add_public_key, examples
-from edge_runtime.errors import UserError
-from edge_runtime.option_types import not_negative, positive
-from edge_runtime.words import counted
+from edge_runtime.cli import add_public_key, examples, not_negative, positive
+from edge_runtime.util import UserError, counted
 from trainer.commands.options import add_scenario, add_threads, set_threads
 from trainer.drivers import load_driver, make_environment
 from trainer.person.options import add_person, person_options

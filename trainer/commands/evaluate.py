@@ -7,10 +7,9 @@ import json
 
 from bridge.network import parse_spec
 from bridge.report import GOAL, EpisodeResult, summarise
-from edge_runtime.cli import add_public_key, examples, write_json_out
-from edge_runtime.files import check_writable
-from edge_runtime.option_types import not_negative, positive
-from edge_runtime.words import counted
+from edge_runtime.cli import add_public_key, examples, not_negative, positive
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import counted
 from trainer.commands.options import add_latency, add_scenario, set_threads
 from trainer.conditions import CONDITIONS
 from trainer.drivers import load_driver, make_environment

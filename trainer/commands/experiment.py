@@ -7,10 +7,9 @@ import json
 import time
 from pathlib import Path
 
-from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
+from edge_runtime.cli import examples, not_negative, whole_number
 from edge_runtime.files import make_directory, write_atomic
-from edge_runtime.option_types import not_negative, whole_number
+from edge_runtime.util import UserError
 from trainer.commands.time_limit import add_time_limit, deadline_s
 from trainer.experiments import run as running
 from trainer.experiments.plan import (

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 
 from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
-from edge_runtime.private_keys import read_signing_key
+from edge_runtime.tls import read_signing_key
+from edge_runtime.util import UserError
 from trainer.commands.options import existing_directory, read_json
 from trainer.drivers import load_actor
 from trainer.export import export_policy, write_policy

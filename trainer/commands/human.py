@@ -9,8 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.cli import UserError, examples, write_json_out
-from edge_runtime.option_types import not_negative, positive
+from edge_runtime.cli import examples, not_negative, positive
+from edge_runtime.files import write_json_out
+from edge_runtime.util import UserError
 from trainer.commands.options import add_scenario, add_threads, set_threads
 from trainer.commands.time_limit import add_time_limit, deadline_s, until
 from trainer.drivers import make_environment

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from bridge.network import GRAMMAR
-from edge_runtime import files
-from edge_runtime.errors import UserError
-from edge_runtime.option_types import whole_number
+from edge_runtime import util
+from edge_runtime.cli import whole_number
+from edge_runtime.util import UserError
 from trainer.scenarios import SCENARIOS
 from trainer.training.config import MOST_THREADS
 
@@ -70,7 +70,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     Raises:
         UserError: no file, or something else in it.
     """
-    value = files.read_json(path, what)
+    value = util.read_json(path, what)
     if not isinstance(value, dict):
         raise UserError(f"{what} {path} holds no JSON object")
     return value

@@ -8,10 +8,9 @@ from typing import Any
 
 from PIL import Image
 
-from edge_runtime.cli import add_public_key, examples
-from edge_runtime.errors import UserError
+from edge_runtime.cli import add_public_key, examples, not_negative, positive_number
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.option_types import not_negative, positive_number
+from edge_runtime.util import UserError
 from trainer.actions import ACTIONS
 from trainer.animation import draw_moment, drive_moments, encode_gif
 from trainer.commands.options import add_scenario, check_picture

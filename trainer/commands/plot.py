@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from edge_runtime.cli import examples
-from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
+from edge_runtime.util import UserError
 from trainer.commands.options import check_picture, existing_directory
 from trainer.plots import CURVE_FILE, write_learning_curves
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.commands.options import read_json
 from trainer.commands.settings import settings
 from trainer.drivers import CHECKPOINT_FILE

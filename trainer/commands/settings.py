@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.learner.config import LearnerConfig
 from trainer.training.config import RunConfig
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
-from edge_runtime.option_types import positive_number
+from edge_runtime.cli import positive_number
 
 Part = TypeVar("Part")
 

@@ -17,10 +17,8 @@ import torch
 
 from bridge.network import parse_spec
 from bridge.report import GOAL
-from edge_runtime.cli import INTERRUPTED, examples
-from edge_runtime.errors import UserError
-from edge_runtime.option_types import not_negative, positive
-from edge_runtime.words import counted
+from edge_runtime.cli import INTERRUPTED, examples, not_negative, positive
+from edge_runtime.util import UserError, counted
 from trainer.commands.options import add_latency, add_scenario, add_threads, set_threads
 from trainer.commands.resuming import check_directory
 from trainer.commands.settings import DEFAULTS, settings, with_setting

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bridge.rerun.sinks import add_sink, chosen_sink
 from edge_runtime.cli import examples
-from edge_runtime.words import counted
+from edge_runtime.util import counted
 from trainer.person.recording import find_recordings, read_steps
 
 EXAMPLE = examples(

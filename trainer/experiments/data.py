@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.report import GOAL
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.conditions import CONDITIONS
 from trainer.experiments.plan import (
     FULL_PATH_M,

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime.util import UserError, read_bytes
 from trainer.conditions import COMMAND_NOISE, CONDITIONS
 from trainer.drivers import EXPERTS, TRIGGERS, make_environment
 from trainer.human.guide import HumanGuide

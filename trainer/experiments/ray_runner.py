@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from edge_runtime.errors import UserError
 from edge_runtime.files import make_directory, write_atomic
+from edge_runtime.util import UserError
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.experiments.run import (
     BUSY,

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError, read_bytes
 from trainer.experiments.claims import Judged, judge, judge_bars
 from trainer.experiments.data import (
     ALONE,

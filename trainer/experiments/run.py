@@ -28,8 +28,8 @@ import numpy as np
 import torch
 
 from bridge.report import GOAL, EpisodeResult
-from edge_runtime.errors import UserError
-from edge_runtime.files import make_directory, read_bytes, write_atomic
+from edge_runtime.files import make_directory, write_atomic
+from edge_runtime.util import UserError, read_bytes
 from trainer import seeds
 from trainer.benches.machine import processor_model
 from trainer.conditions import CONDITIONS

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.util import UserError
 
 MOVED = 0.2
 """How far an axis must go to be the one that was asked for."""

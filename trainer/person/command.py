@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from edge_runtime.files import make_directory
-from edge_runtime.words import counted
+from edge_runtime.util import counted
 from trainer.person.options import person_options
 from trainer.person.registry import HUMANS
 from trainer.person.run import PersonRun, check_settings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 
 # Before SDL starts: no greeting on stdout, its signal handlers would eat ^C, and a wheel must work
 # while another window has the focus.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.human.model import HumanModel
 from trainer.person.recording import Step, read_episodes, read_steps
 

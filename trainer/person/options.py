@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from edge_runtime.errors import UserError
-from edge_runtime.option_types import positive_number, whole_number
+from edge_runtime.cli import positive_number, whole_number
+from edge_runtime.util import UserError
 from trainer.person.registry import PersonOptions
 
 PERSON = "person"

@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_toml
+from edge_runtime.util import UserError, read_toml
 from trainer.person.interface import Moving
 
 SHIPPED = Path(__file__).parent / "profiles"

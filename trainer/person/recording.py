@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from bridge.recording import Records
 from edge_runtime import __version__
-from edge_runtime.errors import UserError
-from edge_runtime.file_lock import hold
-from edge_runtime.files import make_directory, open_regular
+from edge_runtime.files import lock_file, make_directory
+from edge_runtime.util import UserError, open_regular
 from trainer.person.interface import Control
 
 TOPIC = "person/step"
@@ -106,7 +105,7 @@ class Recorder:
             self._file: IO[bytes] = self.path.open("xb")
         except OSError as error:
             raise UserError(f"cannot write {self.path}: {error.strerror}") from None
-        hold(self._file.fileno())  # `bridge repair` keeps away meanwhile.
+        lock_file(self._file.fileno())  # `bridge repair` keeps away meanwhile.
         self._mcap = Writer(self._file, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._mcap.start(profile="", library=f"phil-hil {__version__}")
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)

@@ -9,8 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.errors import UserError
-from edge_runtime.words import counted
+from edge_runtime.util import UserError, counted
 from trainer.human.guide import Guide
 from trainer.learner.config import ALGORITHMS
 from trainer.person.episode import KeptBack

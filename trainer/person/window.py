@@ -10,7 +10,7 @@ import pygame
 from numpy.typing import NDArray
 
 from bridge.rerun import BY_NAME
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.person.interface import View
 from trainer.person.quiet import quiet_stderr
 from trainer.scenarios.scene import draw_scene

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.benches import learner
 from trainer.benches.environment import highway_drive, our_drive
 from trainer.benches.experience import gather

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from edge_runtime.errors import UserError
-from edge_runtime.tests.commands import exit_status
+from edge_runtime.tests.harness import exit_status
 from edge_runtime.tests.policies import public_pem
+from edge_runtime.util import UserError
 from trainer.__main__ import main
 from trainer.commands.settings import with_setting
 from trainer.files import save_torch

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.learner.td3 import Losses
 from trainer.tests.scripted import BATCH, CONFIG, scripted_run

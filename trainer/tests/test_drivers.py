@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver, make_environment
 from trainer.files import save_torch
 from trainer.learner.networks import Actor

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.cli import run_cli
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.__main__ import main
 from trainer.experiments import judges
 from trainer.experiments.claims import BARS, CLAIMS, judge, judge_bars

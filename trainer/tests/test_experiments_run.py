@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.evaluation import CONDITIONS
 from trainer.experiments import plan as planned

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from deploy.keys import write_key_pair
-from edge_runtime.errors import UserError
-from edge_runtime.onnx_file import read_onnx
 from edge_runtime.policy import load_policy
-from edge_runtime.private_keys import read_signing_key
+from edge_runtime.policy_file import read_onnx
+from edge_runtime.tls import read_signing_key
+from edge_runtime.util import UserError
 from trainer import export as export_module
 from trainer.export import (
     Export,

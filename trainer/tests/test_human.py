@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.drivers import load_driver
 from trainer.human.dagger import HumanTraining
 from trainer.human.model import HumanModel, HumanModelConfig, load_human_model

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.locks import LOCK_FILE, claimed, held, holder
 from trainer.tests.test_commands import call
 

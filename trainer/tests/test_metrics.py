@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.tests.test_commands import call
 from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics, totals
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.__main__ import main
 from trainer.drivers import load_driver, make_environment
 from trainer.evaluation import drive_episodes

@@ -1,6 +1,6 @@
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.learner.config import LearnerConfig
 
 

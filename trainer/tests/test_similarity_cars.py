@@ -5,7 +5,7 @@ import math
 import pytest
 from highway_env.vehicle.kinematics import Vehicle
 
-from edge_runtime.vehicles.similarity import CARS, similarity_to
+from edge_runtime.vehicles.mapping import CARS, similarity_to
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.congestion import CongestionConfig
 from trainer.scenarios.ego import EgoVehicle

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.benches import killed_sitting, pace
 from trainer.benches.killed_sitting import KilledRun
 

@@ -15,7 +15,7 @@ import torch
 
 from bridge.report import COLLISION
 from edge_runtime.cli import INTERRUPTED
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer import seeds
 from trainer.commands.train import _quit as ask_to_quit
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor

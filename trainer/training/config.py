@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
 from trainer.ranges import FROM_ONE, FROM_ZERO, SHARE, check_ranges
 

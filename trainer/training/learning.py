@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer import seeds
 from trainer.files import as_arrays, as_tensors
 from trainer.learner.config import Algorithm, LearnerConfig

@@ -14,8 +14,8 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter
 
 from bridge.report import GOAL
-from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.files import write_atomic
+from edge_runtime.util import UserError, read_bytes
 from trainer.training.learning import EpisodeLearning
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bridge.network import parse_spec
-from edge_runtime.errors import UserError
 from edge_runtime.files import write_json
+from edge_runtime.util import UserError
 from trainer import seeds
 from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.files import load_torch, save_torch

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bridge.rerun.sinks import Sink, check_sink, flush, open_sink, read_sink
-from edge_runtime.signals import sigterm_as_interrupt
+from edge_runtime.cli import sigterm_as_interrupt
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 from trainer.viewer.background import Background, Draw

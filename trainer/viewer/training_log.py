@@ -22,7 +22,7 @@ from bridge.rerun.draw import (
     style_points,
 )
 from bridge.rerun.sinks import flush
-from edge_runtime.words import counted
+from edge_runtime.util import counted
 from trainer.human.guide import Reason
 from trainer.training.metrics import EpisodeMetrics
 from trainer.viewer.advantage import q_advantage

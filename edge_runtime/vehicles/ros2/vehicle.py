@@ -7,22 +7,51 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Callable, ClassVar, Dict, List
 
 from edge_runtime import log
-from edge_runtime.ros2 import messages as ros
-from edge_runtime.ros2.endpoint import open_ros2_session
-from edge_runtime.ros2.node import Ros2Node
-from edge_runtime.vehicles.hunter.set_point import limits_of
-from edge_runtime.vehicles.hunter.specs import HunterSpec
-from edge_runtime.vehicles.interface import ActionLimit
-from edge_runtime.vehicles.ros2.convert import drive_of, measured_of, twist_of
-from edge_runtime.vehicles.ros2.core import Motion, Ros2Core
-from edge_runtime.vehicles.ros2.settings import Ros2Settings, check_settings
-from edge_runtime.vehicles.ros2.states import State
-from edge_runtime.vehicles.similarity import Similarity
-from edge_runtime.vehicles.streamed import StreamedVehicle
+from edge_runtime.config import Ros2Settings
+from edge_runtime.controller import ActionLimit
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.mapping import HunterSpec, Similarity, limits_of
+from edge_runtime.vehicles.ros2 import node as ros
+from edge_runtime.vehicles.ros2.core import Measured, Motion, Ros2Core
+from edge_runtime.vehicles.ros2.names import STEERING, check_settings, open_ros2_session
+from edge_runtime.vehicles.ros2.node import Ros2Node
+from edge_runtime.vehicles.stream import StreamedVehicle
+
+BASE_FRAME = "base_link"
+
+
+def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> ros.Twist:
+    """`linear.x` in m/s; `angular.z` is the yaw rate (rad/s), or the steering angle (rad).
+
+    A yaw rate of 0 says nothing of the wheels of a vehicle that stands: they go straight.
+    """
+    z = motion.centre_rad
+    if angular != STEERING:
+        z = motion.speed_mps * math.tan(motion.centre_rad) / wheelbase_m
+    return ros.Twist(linear=ros.Vector3(x=motion.speed_mps), angular=ros.Vector3(z=z))
+
+
+def drive_of(motion: Motion, time_ns: int) -> ros.AckermannDriveStamped:
+    """Speed and centre angle; no acceleration is given, because the speed is a ramp already."""
+    return ros.AckermannDriveStamped(
+        header=ros.Header(ros.stamp_of(time_ns), BASE_FRAME),
+        drive=ros.AckermannDrive(speed=motion.speed_mps, steering_angle=motion.centre_rad),
+    )
+
+
+def measured_of(odometry: ros.Odometry) -> Measured:
+    """The velocity along the vehicle, and the rotation, of an odometry."""
+    stamp, twist = odometry.header.stamp, odometry.twist.twist
+    return Measured(
+        stamp_ns=stamp.sec * 10**9 + stamp.nanosec,
+        speed_mps=twist.linear.x,
+        angular=twist.angular.z,
+    )
 
 
 class Ros2Vehicle(StreamedVehicle):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.errors import UserError
-from edge_runtime.vehicles.hunter.specs import SPECS
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.mapping import SPECS
 from hil_tests.mock_hunter.battery import Battery
 from hil_tests.mock_hunter.body import Body, Setpoint, advance, curvature
 from hil_tests.mock_hunter.parameters import MODELS, SOURCES, Parameters, make_parameters

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from hil_tests.mock_hunter.chassis import obeys
 from hil_tests.mock_hunter.faults import BITS, FAULTS, LATE_S
 from hil_tests.mock_hunter.hunter import MockHunter

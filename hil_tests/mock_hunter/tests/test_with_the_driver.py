@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import pytest
 
-from edge_runtime.vehicles.hunter import frames
+from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S, State
+from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
-from edge_runtime.vehicles.hunter.set_point import DEVIATES_S, FOLLOWS_S
-from edge_runtime.vehicles.hunter.specs import SPECS
-from edge_runtime.vehicles.hunter.states import State
-from edge_runtime.vehicles.similarity import CARS, similarity_to
+from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 from hil_tests.mock_hunter.faults import BITS, FAULTS
 from hil_tests.mock_hunter.hunter import MockHunter
 from hil_tests.mock_hunter.parameters import make_parameters
@@ -70,7 +68,7 @@ class Pair:
     def _send(self):
         for frame, data in self.core.tick(self.now_s):
             self.mock.receive(frame.can_id, data, self.now_s)
-            if frame is frames.MOTION_COMMAND:
+            if frame is protocol.MOTION_COMMAND:
                 self.asked_mps = int.from_bytes(data[:2], "big", signed=True) / 1000
                 if self.asked_mps:
                     self.moving_set_point_s = self.now_s

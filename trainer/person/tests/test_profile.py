@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.person.profile import SHIPPED, SHORTEST, Pedal, Steering, read_profile
 
 PLACE = st.floats(-1.0, 1.0)

@@ -12,8 +12,8 @@ import pytest
 
 from bridge import recording
 from bridge.tests.test_recording_damage import MIB, crafted, zeros
-from edge_runtime.errors import UserError
-from edge_runtime.file_lock import try_to_hold
+from edge_runtime.files import try_to_lock_file
+from edge_runtime.util import UserError
 from trainer.person.recording import Recorder, Step, find_recordings, read_steps, sittings
 from trainer.person.tests.steps import recorded_step
 
@@ -74,9 +74,9 @@ def test_a_sitting_is_held_until_it_is_closed(tmp_path):
     recorder = Recorder(tmp_path)
     recorder.write(recorded_step(1, 0))
     with recorder.path.open("rb") as other:
-        assert not try_to_hold(other.fileno())
+        assert not try_to_lock_file(other.fileno())
         recorder.close()
-        assert try_to_hold(other.fileno())
+        assert try_to_lock_file(other.fileno())
 
 
 def test_every_step_is_there_before_the_next_is_taken(tmp_path):

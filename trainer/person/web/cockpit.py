@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.person.interface import KEY_HELP, Person, Reading, View
 from trainer.person.web.seat import Seat
 from trainer.person.web.server import CLOSING_S, LOOPBACK, Server

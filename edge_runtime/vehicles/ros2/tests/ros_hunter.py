@@ -12,8 +12,12 @@ import threading
 import time
 from typing import Any, Dict, List, Optional, Tuple
 
-from edge_runtime.ros2.tests import second
+from edge_runtime.config import Ros2Settings
 from edge_runtime.transport import open_session
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
+from edge_runtime.vehicles.ros2.core import Measured, Ros2Core
+from edge_runtime.vehicles.ros2.tests import second
 
 WHEELBASE_M, TRACK_M, MAX_INNER_RAD = 0.650, 0.605, 0.576
 PERIOD_S = 0.02
@@ -111,3 +115,44 @@ class RosHunter:
             "pose": {"pose": pose, "covariance": [0.0] * 36},
             "twist": {"twist": twist, "covariance": [0.0] * 36},
         }
+
+
+SPEC = SPECS["2.0"]
+LEFT_TURN = similarity_to(CARS["left_turn"], SPEC.max_speed_mps)
+CONGESTION = similarity_to(CARS["congestion"], SPEC.max_speed_mps)
+TICK_S = 0.02
+
+
+class Drive:
+    """A core with its time, and a vehicle that does at once what it is told (or not)."""
+
+    def __init__(self, similarity=LEFT_TURN, **changes):
+        self.core = Ros2Core(Ros2Settings(**changes), SPEC, similarity)
+        self.now_s = 100.0
+        self.speed_mps = self.angular = 0.0
+        self.sends_odometry = self.obeys = True
+        self.motion = None
+
+    def run(self, duration_s, action=None, scenario_speed_mps=None):
+        """Ticks at 50 Hz with odometry at each, and the action (if any) at 10 Hz."""
+        for tick in range(round(duration_s / TICK_S)):
+            self.now_s += TICK_S
+            if self.sends_odometry:
+                stamp_ns = round(self.now_s * 1e9)
+                self.core.hear(Measured(stamp_ns, self.speed_mps, self.angular), self.now_s)
+            if action is not None and tick % 5 == 0:
+                self.core.command(action, self.now_s, scenario_speed_mps)
+            self.motion = self.core.tick(self.now_s)
+            if self.obeys and self.motion is not None:
+                self.speed_mps = self.motion.speed_mps
+        return self.motion
+
+    def start(self):
+        self.core.enable(self.now_s)
+        self.run(0.1)
+        assert self.core.state is State.ENABLED
+        return self
+
+    @property
+    def report(self):
+        return self.core.report(self.now_s)

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from edge_runtime.vehicles.ros2.convert import drive_of, twist_of
-from edge_runtime.vehicles.ros2.core import COMMAND_TIMEOUT_S, ENABLE_TIMEOUT_S, Motion, Ros2Core
-from edge_runtime.vehicles.ros2.odometry import Measured
-from edge_runtime.vehicles.ros2.settings import STEERING, YAW_RATE, Ros2Settings
-from edge_runtime.vehicles.ros2.states import LEADS_TO, Event, State
-from edge_runtime.vehicles.ros2.tests.drive import CONGESTION, LEFT_TURN, SPEC, TICK_S, Drive
+from edge_runtime.config import Ros2Settings
+from edge_runtime.vehicles.core import COMMAND_TIMEOUT_S, ENABLE_TIMEOUT_S, Event, State
+from edge_runtime.vehicles.ros2.core import ROS2_LEADS_TO, Measured, Motion, Ros2Core
+from edge_runtime.vehicles.ros2.names import STEERING, YAW_RATE
+from edge_runtime.vehicles.ros2.tests.ros_hunter import CONGESTION, LEFT_TURN, SPEC, TICK_S, Drive
+from edge_runtime.vehicles.ros2.vehicle import drive_of, twist_of
 
 
 def test_nothing_is_sent_before_enable():
@@ -195,11 +195,11 @@ def test_a_twist_by_hand():
 
 
 def test_every_event_names_states_only_where_it_changes_something():
-    assert set(LEADS_TO) == set(Event)
-    for leads in LEADS_TO.values():
+    assert set(ROS2_LEADS_TO) == set(Event)
+    for leads in ROS2_LEADS_TO.values():
         assert all(before is not after for before, after in leads.items())
-    into_enabled = {event for event in Event if State.ENABLED in LEADS_TO[event].values()}
-    out_of_stopped = {event for event in Event if State.STOPPED in LEADS_TO[event]}
+    into_enabled = {event for event in Event if State.ENABLED in ROS2_LEADS_TO[event].values()}
+    out_of_stopped = {event for event in Event if State.STOPPED in ROS2_LEADS_TO[event]}
     assert into_enabled == {Event.CONFIRMED}
     assert out_of_stopped == {Event.ENABLE, Event.CLOSE}
 

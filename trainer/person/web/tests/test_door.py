@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 import aiohttp
 import pytest
 
-from edge_runtime.errors import UserError
+from edge_runtime.util import UserError
 from trainer.person.registry import HUMANS, PersonOptions
 from trainer.person.web import door
 from trainer.person.web.cockpit import Cockpit

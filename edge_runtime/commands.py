@@ -1,0 +1,167 @@
+"""The commands that do not drive: `check` of a policy, and an operator's `status` and `rearm`."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
+
+from edge_runtime.files import check_writable, write_json
+from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
+from edge_runtime.transport import check_endpoint, open_session
+from edge_runtime.util import UserError, parse_json, printable
+from edge_runtime.wire import CONTROL_PERIOD_S, key
+
+if TYPE_CHECKING:
+    from edge_runtime.policy import Policy
+
+_RUNS = 300
+_TIMEOUT_S = 2.0
+_STRANGER = "what answers for {} is no edge runtime of this kind"
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """Print the report as JSON. Raises UserError where the policy may not drive."""
+    if arguments.out is not None:
+        check_writable(arguments.out)
+    from edge_runtime.policy import load_policy  # Here: an operator's commands need no onnxruntime.
+
+    policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
+    report = _report(policy)
+    limit_ms = CONTROL_PERIOD_S * 1000
+    if report["inference_ms"]["p99"] > limit_ms:
+        raise UserError(
+            f"policy {arguments.policy} may not drive: its inference takes"
+            f" {report['inference_ms']['p99']:.0f} ms (p99) here, {limit_ms:.0f} ms is the limit"
+        )
+    print(json.dumps(report, indent=2))
+    if arguments.out is not None:
+        write_json(arguments.out, report)
+    return 0
+
+
+def _report(policy: Policy) -> Dict[str, Any]:
+    import msgspec
+    import onnxruntime
+
+    return {
+        "policy_id": policy.policy_id,
+        "trust": policy.trust,
+        "manifest": msgspec.to_builtins(policy.manifest),
+        "inference_ms": _measure_latency(policy),
+        "inference_runs": _RUNS,
+        "onnxruntime": onnxruntime.__version__,
+    }
+
+
+def _measure_latency(policy: Policy) -> Dict[str, float]:
+    """p50, p99 and max of the inference on this machine, in milliseconds."""
+    from edge_runtime.policy import infer, probe_frames
+    from edge_runtime.service import LatencyWindow
+
+    window = LatencyWindow()
+    for frames in itertools.islice(itertools.cycle(probe_frames()), _RUNS):
+        window.add(infer(policy, frames).duration_ns)
+    return window.summary_ms()
+
+
+def status(arguments: argparse.Namespace) -> int:
+    """Print the runtime's status as a table, or as JSON."""
+    if arguments.out is not None:
+        check_writable(arguments.out)
+    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+    reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
+    try:
+        print(json.dumps(reply, indent=2) if arguments.json else render_status(reply))
+    except (LookupError, TypeError, ValueError, AttributeError):
+        raise UserError(_STRANGER.format(arguments.vehicle_id)) from None
+    if arguments.out is not None:
+        write_json(arguments.out, reply)
+    return 0
+
+
+def rearm(arguments: argparse.Namespace) -> int:
+    """Let the runtime drive again. Raises UserError where it refuses."""
+    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+    if tls is not None:
+        check_name(tls.name, common_name(OPERATOR, arguments.vehicle_id))
+    reply = ask(arguments.connect, arguments.vehicle_id, "rearm", tls)
+    if reply.get("accepted") is not True:
+        why = reply.get("detail", "it does not say why")
+        raise UserError(f"{arguments.vehicle_id} was not re-armed: {why}")
+    print(f"{arguments.vehicle_id} is re-armed; it drives after 5 fresh states in a row")
+    return 0
+
+
+def ask(
+    connect: str, vehicle_id: str, topic: str, tls: Optional[TlsFiles] = None
+) -> Dict[str, Any]:
+    """The JSON reply of a queryable of wire.TOPICS. Raises UserError where none comes in 2 s."""
+    selector = key(vehicle_id, topic)
+    session = open_session(connect=connect, mode="client", tls=tls)
+    try:
+        for reply in session.get(selector, timeout=_TIMEOUT_S):
+            if reply.ok is not None:
+                answer = parse_json(bytes(reply.ok.payload), f"the answer of {vehicle_id}")
+                if not isinstance(answer, dict):
+                    raise UserError(_STRANGER.format(vehicle_id))
+                return answer
+    finally:
+        session.close()
+    raise UserError(
+        f"no edge runtime with vehicle id {vehicle_id} is connected to {connect};"
+        " start one, or name it with --vehicle-id" + _hint(tls, topic)
+    )
+
+
+def _hint(tls: Optional[TlsFiles], topic: str) -> str:
+    """A query without the right to it looks the same from here as a runtime that is not there."""
+    return "" if tls is None else f"; or the certificate of {tls.name} may not ask for its {topic}"
+
+
+_Row = Tuple[str, Callable[[Dict[str, Any]], str]]
+
+# What a row says of a reply; a runtime of an earlier version may not tell all of it.
+_ROWS: List[_Row] = [
+    ("vehicle", lambda s: f"{s['vehicle_id']}, driver {s['vehicle']}"),
+    ("mode", lambda s: _mode(s)),
+    ("states", lambda s: f"{s['accepted']} accepted, {s['superseded']} superseded by newer ones"),
+    ("vehicle fault", lambda s: s.get("vehicle_fault") or "none"),
+    ("rejected", lambda s: _counts(s["rejected"])),
+    ("safe stops", lambda s: str(s["safe_stops"])),
+    ("deadline misses", lambda s: str(s["deadline_misses"])),
+    ("inference", lambda s: _quantiles(s["inference_ms"])),
+    ("state to command", lambda s: _quantiles(s.get("command_ms", {}))),
+    ("policy", lambda s: f"{s['policy_id'][:12]} ({s['manifest']['scenario']})"),
+    ("uptime", lambda s: f"{s['uptime_s']:.0f} s"),
+    ("temperature", lambda s: _temperature(s.get("temperature_c"))),
+    ("load", lambda s: f"{s.get('load_1min', 0.0):.2f} over 1 min"),
+    ("memory", lambda s: f"{s.get('rss_mb', 0.0):.0f} MB"),
+    ("other runtimes", lambda s: f"{s.get('rivals', 0)} seen with this vehicle id"),
+    ("version", lambda s: str(s["version"])),
+]
+
+
+def render_status(status: Dict[str, Any]) -> str:
+    """One line for each row; `status` is the reply of the queryable."""
+    width = max(len(label) for label, _ in _ROWS)
+    return "\n".join(f"{label:<{width}}  {printable(say(status))}" for label, say in _ROWS)
+
+
+def _mode(status: Dict[str, Any]) -> str:
+    reason = f", because of {status['reason']}" if status["reason"] else ""
+    rearm = "; waits for `rearm`" if status["needs_rearm"] else ""
+    return f"{status['mode']}{reason}{rearm}"
+
+
+def _counts(counts: Dict[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())) or "none"
+
+
+def _quantiles(summary: Dict[str, float]) -> str:
+    return ", ".join(f"{label} {value:.2f} ms" for label, value in summary.items()) or "unknown"
+
+
+def _temperature(value_c: Any) -> str:
+    return "no sensor" if value_c is None else f"{value_c:.0f} degC"

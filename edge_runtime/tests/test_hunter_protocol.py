@@ -1,0 +1,162 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge_runtime.vehicles.hunter import protocol
+from edge_runtime.vehicles.hunter.protocol import (
+    CLEAR_COMMAND,
+    FRAMES,
+    LINK_LOST,
+    MODE_COMMAND,
+    MOTION_COMMAND,
+    PROFILES,
+    SYSTEM_STATUS,
+    MotionCommand,
+    SystemStatus,
+    decode,
+    encode,
+    encode_motion,
+    fault_bits,
+    motor_faults,
+    status_faults,
+)
+from edge_runtime.vehicles.mapping import SPECS
+
+HUNTER_2, HUNTER_SE = SPECS["2.0"], SPECS["se"]
+
+
+def read(can_id, data):
+    decoded = decode(can_id, data)
+    assert decoded is not None
+    return decoded
+
+
+def hexed(data):
+    return data.hex(" ").upper()
+
+
+def test_golden_vectors():
+    assert hexed(encode_motion(0.15, 0.0, HUNTER_2)) == "00 96 00 00 00 00 00 00"
+    assert hexed(encode_motion(0.0, 0.2, HUNTER_2)) == "00 00 00 00 00 00 00 C8"
+    assert hexed(encode_motion(-0.15, -0.2, HUNTER_2)) == "FF 6A 00 00 00 00 FF 38"
+    assert encode(MODE_COMMAND, protocol.ModeCommand(protocol.CAN_CONTROL)) == b"\x01"
+    assert encode(CLEAR_COMMAND, protocol.ClearCommand()) == b"\x00"
+
+
+def test_feedback_by_hand():
+    status = read(0x211, bytes.fromhex("02 01 00 F5 02 C1 01 FF")).message
+    assert status._replace(battery_v=0.0) == SystemStatus(2, 1, 0.0, 0x02C1, 1, 255)
+    assert status.battery_v == pytest.approx(24.5)
+    moving = read(0x221, bytes.fromhex("FF 6A 00 00 00 00 00 C8")).message
+    assert moving == pytest.approx((-0.15, 0.2))
+    fast = read(0x253, bytes.fromhex("FF FF 00 0A FF FF FF FE")).message
+    assert (fast.speed_rpm, fast.pulses) == (-1, -2)
+    assert fast.current_a == pytest.approx(1.0)
+    slow = read(0x262, bytes.fromhex("00 F0 FF F6 E7 41 00 00")).message
+    assert slow == pytest.approx((24.0, -10, -25, 0x41))
+
+
+@pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
+@given(speed=st.floats(-1e308, 1e308), angle=st.floats(-1e308, 1e308))
+def test_no_command_leaves_the_models_limits(spec, speed, angle):
+    told = read(0x111, encode_motion(speed, angle, spec)).message
+    for value, wanted, most in zip(
+        told, (speed, angle), (spec.max_speed_mps, spec.max_inner_steering_rad)
+    ):
+        assert abs(value) <= most + 1e-12
+        assert value == pytest.approx(min(max(wanted, -most), most), abs=0.0005 + 1e-12)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_never_a_count(value):
+    for message in (MotionCommand(value, 0.0), MotionCommand(0.0, value)):
+        with pytest.raises(ValueError, match="no number for the bus"):
+            encode(MOTION_COMMAND, message)
+    with pytest.raises(ValueError, match="no number for the bus"):
+        encode_motion(math.nan, 0.0, HUNTER_2)
+
+
+@pytest.mark.parametrize("frame", FRAMES.values(), ids=lambda frame: hex(frame.can_id))
+@given(data=st.data())
+def test_every_count_survives_decoding_and_encoding(frame, data):
+    """Every byte of every field takes every value; the bytes between are written as zero."""
+    raw = bytearray(frame.length)
+    for field in frame.fields:
+        size = protocol._PACKERS[field.code].size
+        raw[field.offset : field.offset + size] = data.draw(st.binary(min_size=size, max_size=size))
+    decoded = read(frame.can_id, bytes(raw))
+    assert decoded.frame is frame
+    assert encode(frame, decoded.message) == bytes(raw)
+
+
+def test_every_motion_count_of_the_whole_range():
+    for count in range(-1500, 1501):
+        angle = count * 576 // 1500
+        told = read(0x111, encode_motion(count / 1000, angle / 1000, HUNTER_2)).message
+        assert told == pytest.approx((count / 1000, angle / 1000), abs=1e-12)
+
+
+def test_fields_do_not_overlap_and_fit_their_frame():
+    for frame in FRAMES.values():
+        taken = [
+            byte
+            for field in frame.fields
+            for byte in range(field.offset, field.offset + protocol._PACKERS[field.code].size)
+        ]
+        assert len(taken) == len(set(taken))
+        assert max(taken) < frame.length
+        assert len(frame.fields) == len(frame.message._fields)
+
+
+def test_a_hundred_thousand_random_frames_raise_nothing():
+    source = random.Random(6)
+    understood = 0
+    for _ in range(100_000):
+        can_id = source.choice((source.randrange(0x800), *FRAMES))
+        data = source.getrandbits(64).to_bytes(8, "big")[: source.randrange(9)]
+        decoded = decode(can_id, data)
+        assert (decoded is not None) == (can_id in FRAMES and len(data) == FRAMES[can_id].length)
+        understood += decoded is not None
+    assert understood > 5_000
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_fault_bit_has_words_and_back(profile):
+    ok = SystemStatus(0, 1, 24.0, 0, 0, 0)
+    assert status_faults(ok, profile) == []
+    for bit in range(16):
+        (words,) = status_faults(ok._replace(faults=1 << bit), profile)
+        known = fault_bits(words, profile)
+        assert known == (1 << bit) or (known == 0 and "unknown to profile" in words)
+    assert len({fault.mask for fault in PROFILES[profile]}) == len(PROFILES[profile])
+
+
+def test_profiles_place_bits_elsewhere():
+    assert status_faults(SystemStatus(0, 1, 24.0, 0x0100, 0, 0), "manual") == ["motor driver"]
+    assert status_faults(SystemStatus(0, 1, 24.0, 0x0100, 0, 0), "v2") == [
+        "unknown to profile v2: byte 4 bit 0"
+    ]
+    assert fault_bits(LINK_LOST, "v2") == 0x1000
+    assert status_faults(SystemStatus(0, 1, 24.0, 0x0001, 0, 0), "v2") == ["battery undervoltage"]
+
+
+def test_motor_faults_name_the_motor():
+    slow = protocol.MotorSlow(24.0, 30, 30, 0b1100_0101)
+    assert motor_faults(0x261, slow) == [
+        "steering motor: supply voltage low",
+        "steering motor: driver overcurrent",
+    ]
+    assert motor_faults(0x263, slow._replace(status=0b1100_0000)) == []
+
+
+def test_the_tables_rows():
+    assert {frame.can_id for frame in protocol.COMMANDS} == {0x111, 0x131, 0x421, 0x441}
+    assert SYSTEM_STATUS.period_s == 0.1
+    assert FRAMES[0x111].period_s == 0.02

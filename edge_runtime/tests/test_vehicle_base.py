@@ -1,0 +1,310 @@
+"""What the runner makes of a driver that raises or hangs: a fault, and nothing worse."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge_runtime.tests.harness import wait_until
+from edge_runtime.vehicles.base import (
+    DEVIATES_S,
+    LYING,
+    SILENCE_S,
+    SILENT,
+    STUCK,
+    VehicleReport,
+    VehicleRunner,
+    VehicleWatch,
+)
+from edge_runtime.vehicles.mock import MockVehicle
+from edge_runtime.wire import Command
+
+
+def make_command(mode="drive", step=0, action=(0.5,)):
+    return Command(
+        session="s", episode=0, step=step, mode=mode, action=list(action), policy_id="p",
+        received_ns=0, inference_ns=0, sent_ns=0,
+    )  # fmt: skip
+
+
+class BrokenVehicle(MockVehicle):
+    """Fails where it is told to, and notes what it was asked."""
+
+    def __init__(self):
+        super().__init__()
+        self.broken = ""
+        self.asked: list = []
+        self.says: list = []
+        self.stands: list = []
+        self.hangs = threading.Event()
+        self.released = threading.Event()
+
+    def feedback(self, now_s):
+        if self.broken == "feedback":
+            raise OSError("no such device")
+        if self.broken == "hang":
+            self.hangs.set()
+            self.released.wait()
+        report = super().feedback(now_s)
+        return report._replace(faults=list(self.says), standing=list(self.stands))
+
+    def enable(self, now_s):
+        self._ask("enable")
+        super().enable(now_s)
+
+    def command(self, action, now_s, scenario_speed_mps=None):
+        self._ask("command")
+        self.scenario_speed_mps = scenario_speed_mps
+        super().command(action, now_s, scenario_speed_mps)
+
+    def brake(self, now_s, latch=True):
+        self._ask("brake" if latch else "stand")
+        super().brake(now_s, latch)
+
+    def _ask(self, what):
+        self.asked.append(what)
+        if self.broken == "command":
+            raise OSError("bus off")
+
+
+class NotingRunner(VehicleRunner):
+    def __init__(self, vehicle):
+        self.heard: list = []
+        self.faults: list = []
+        super().__init__(vehicle, ["pedal"], self.heard.append)
+        self.on_fault = lambda: self.faults.append(True)
+
+
+@pytest.fixture
+def vehicle():
+    return BrokenVehicle()
+
+
+@pytest.fixture
+def runner(vehicle):
+    runner = NotingRunner(vehicle)
+    runner.start()
+    assert vehicle.asked == ["enable"]
+    vehicle.asked.clear()
+    yield runner
+    vehicle.released.set()
+    runner.close()
+
+
+def test_a_driver_that_raises_is_silent_and_its_thread_lives_on(vehicle, runner):
+    wait_until(lambda: runner.heard, "feedback")
+    vehicle.broken = "feedback"
+    wait_until(lambda: runner.faults, "the fault")
+    assert runner.fault(runner.silent_at_s + 0.001) == SILENT
+    vehicle.broken = ""
+    count = len(runner.heard)
+    wait_until(lambda: len(runner.heard) > count, "feedback again")
+
+
+def test_a_driver_that_takes_no_command_is_at_fault_until_it_takes_one(vehicle, runner):
+    vehicle.broken = "command"
+    runner.command(make_command())  # raises nothing here
+    wait_until(lambda: runner.faults, "the fault")
+    wait_until(lambda: runner.heard and runner.heard[-1].faults == [SILENT], "it in the feedback")
+    vehicle.broken = ""
+    runner.command(make_command("safe_stop", step=1))
+    wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
+    assert vehicle.asked == ["command", "brake"]
+
+
+@pytest.mark.parametrize("action", [[], [0.5, 0.5]])
+def test_a_command_without_just_the_policys_actions_is_a_fault(vehicle, runner, action):
+    runner.command(make_command(action=action))
+    wait_until(lambda: runner.faults, "the fault")
+    assert runner.fault(time.monotonic())
+    runner.command(make_command("safe_stop", step=1, action=action))
+    wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
+    assert vehicle.asked == ["brake"]  # a stop is one whatever stands beside it
+
+
+def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(vehicle, runner):
+    vehicle.broken = "hang"
+    assert vehicle.hangs.wait(10.0)
+    runner.command(make_command())
+    runner.command(make_command("safe_stop", step=1))
+    wait_until(lambda: runner.fault(time.monotonic()) == SILENT, "the fault")
+    assert vehicle.asked == []
+    vehicle.broken = ""
+    vehicle.released.set()
+    wait_until(lambda: vehicle.asked == ["brake"], "the brake alone")
+
+
+def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner):
+    vehicle.broken = "hang"
+    assert vehicle.hangs.wait(10.0)
+    runner.close()
+    assert vehicle.asked == []  # it may be in the middle of a call
+    vehicle.broken = "command"
+    vehicle.released.set()
+    runner._thread.join(10.0)
+    runner.close()
+    assert vehicle.asked == ["brake"]
+
+
+def test_a_drivers_words_are_a_fault_until_it_is_enabled_again(vehicle, runner):
+    vehicle.says = ["the remote control drives"]
+    vehicle.stands = ["the remote control drives"]
+    wait_until(lambda: runner.fault(time.monotonic()) == "the remote control drives", "the fault")
+    wait_until(lambda: runner.standing_fault(time.monotonic()), "its cause")
+    vehicle.stands = []
+    wait_until(lambda: not runner.standing_fault(time.monotonic()), "the end of its cause")
+    assert runner.fault(time.monotonic()) == "the remote control drives"
+    assert runner.heard[-1].faults == ["the remote control drives"]
+    vehicle.says = []
+    runner.enable()
+    assert runner.fault(time.monotonic()) == ""  # at once: the vehicle shall have its chance
+    wait_until(lambda: vehicle.asked == ["enable"], "the driver to be asked")
+
+
+def test_a_stop_from_before_the_rearm_does_not_undo_it(vehicle, runner):
+    vehicle.broken = "hang"
+    assert vehicle.hangs.wait(10.0)
+    runner.command(make_command("safe_stop"))
+    runner.enable()
+    runner.command(make_command("safe_stop", step=1), latch=False)
+    vehicle.broken = ""
+    vehicle.released.set()
+    wait_until(lambda: vehicle.asked == ["enable", "stand"], "the order of things")
+
+
+def test_a_stop_after_the_rearm_does_undo_it(vehicle, runner):
+    runner.enable()
+    runner.command(make_command("safe_stop"))
+    wait_until(lambda: vehicle.asked == ["enable", "brake"], "both")
+
+
+def test_a_command_that_waited_too_long_moves_nothing(vehicle, runner):
+    vehicle.broken = "hang"
+    assert vehicle.hangs.wait(10.0)
+    runner.command(make_command())
+    time.sleep(0.3)
+    vehicle.broken = ""
+    vehicle.released.set()
+    count = len(runner.heard)
+    wait_until(lambda: len(runner.heard) > count + 1, "feedback again")
+    assert vehicle.asked == []
+    runner.command(make_command(step=1), scenario_speed_mps=4.5)
+    wait_until(lambda: vehicle.asked == ["command"], "a fresh one to be obeyed")
+    assert vehicle.scenario_speed_mps == 4.5
+
+
+def test_a_vehicle_that_is_not_armed_is_not_enabled(vehicle):
+    runner = NotingRunner(vehicle)
+    runner.start(armed=False)
+    wait_until(lambda: runner.heard, "feedback")
+    assert vehicle.asked == []
+    runner.close()
+
+
+def test_words_that_are_too_long_for_the_wire_are_cut(vehicle, runner):
+    vehicle.says = ["x" * 1000]
+    wait_until(lambda: runner.heard and runner.heard[-1].faults == ["x" * 256], "feedback")
+
+
+TICK_S = 0.05
+
+
+def report(pedal=0.0, speed_mps=1.0, self_braking=False):
+    return VehicleReport({"pedal": pedal}, speed_mps, self_braking, [])
+
+
+def watched(seconds=1.0, asked=0.0, **reported):
+    """A watch that has seen a steady drive; and the time."""
+    watch, now_s = VehicleWatch(), 100.0
+    watch.begin(now_s)
+    for tick in range(round(seconds / TICK_S)):
+        now_s = 100.0 + tick * TICK_S
+        watch.command({"pedal": asked}, now_s)
+        watch.report(report(**reported), now_s)
+    return watch, now_s
+
+
+def test_nothing_is_wrong_with_a_vehicle_that_obeys():
+    watch, now_s = watched(asked=0.3, pedal=0.3)
+    assert watch.fault(now_s) == ""
+
+
+def test_a_vehicle_that_was_not_begun_owes_nothing():
+    assert VehicleWatch().fault(1e9) == ""
+
+
+def test_silence_after_two_periods_also_before_the_first_report():
+    watch = VehicleWatch()
+    watch.begin(10.0)
+    assert watch.fault(10.0 + SILENCE_S) == ""
+    assert watch.fault(10.001 + SILENCE_S) == SILENT
+    watch.report(report(), 10.3)
+    assert watch.fault(10.3) == ""
+    assert watch.silent_at_s == pytest.approx(10.3 + SILENCE_S)
+
+
+def test_an_actuator_outside_of_all_that_was_asked_is_stuck_only_after_a_while():
+    watch, now_s = watched(asked=0.6, pedal=0.6)
+    watch.report(report(pedal=-1.0), now_s + TICK_S)
+    assert watch.fault(now_s + TICK_S + DEVIATES_S) == ""
+    assert watch.fault(now_s + TICK_S + DEVIATES_S + 0.001) == STUCK
+    watch.report(report(pedal=0.6), now_s + 2 * TICK_S)
+    assert watch.fault(now_s + 2 * TICK_S) == ""
+
+
+def test_an_actuator_on_its_way_between_two_commands_is_not_stuck():
+    watch, now_s = watched(asked=-1.0, pedal=-1.0)
+    watch.command({"pedal": 1.0}, now_s)
+    for tick in range(1, 6):
+        watch.report(report(pedal=-1.0 + tick * 0.4), now_s + tick * TICK_S)
+        assert watch.fault(now_s + tick * TICK_S) == ""
+
+
+def test_a_vehicle_that_brakes_by_itself_obeys_nobody_and_is_not_stuck():
+    watch, now_s = watched(asked=0.6, pedal=-1.0, self_braking=True)
+    assert watch.fault(now_s) == ""
+
+
+@pytest.mark.parametrize(
+    "impossible",
+    [
+        report(speed_mps=9.0),
+        report(speed_mps=math.nan),
+        report(pedal=1.1),
+        report(pedal=math.inf),
+    ],
+)
+def test_what_cannot_be_is_a_lie(impossible):
+    watch, now_s = watched()
+    watch.report(impossible, now_s + TICK_S)
+    assert watch.fault(now_s + TICK_S) == LYING
+
+
+def test_a_leap_is_a_lie_until_that_speed_could_be_real():
+    watch, now_s = watched(speed_mps=1.0)
+    watch.report(report(speed_mps=5.0), now_s + 0.2)  # 0.5 m/s and 15 m/s2 for 0.2 s: up to 4.5
+    assert watch.fault(now_s + 0.2) == LYING
+    watch.report(report(speed_mps=5.0), now_s + 0.3)  # up to 6.0
+    assert watch.fault(now_s + 0.3) == ""
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-1, 1), min_size=1, max_size=30))
+def test_the_mock_is_never_accused(pedals):
+    """Whatever a policy asks at the control rate, reported at the feedback's."""
+    vehicle, watch = MockVehicle(), VehicleWatch()
+    vehicle.enable(0.0)
+    watch.begin(0.0)
+    for step, pedal in enumerate(pedals):
+        for offset_s in (0.0, TICK_S):
+            now_s = step * 0.1 + offset_s
+            if offset_s == 0.0:
+                vehicle.command({"pedal": pedal}, now_s)
+                watch.command({"pedal": pedal, "steering": 0.0}, now_s)
+            watch.report(vehicle.feedback(now_s), now_s)
+            assert watch.fault(now_s) == ""

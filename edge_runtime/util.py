@@ -1,0 +1,117 @@
+"""What every part of the repository shares, with the standard library alone: the one error that a
+user meets, text for a terminal, files to read, and signals that end a process.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import stat
+from typing import Any, BinaryIO, Dict, Set, Union
+
+PathLike = Union[str, "os.PathLike[str]"]
+MAX_FILE_MIB = 64
+"""More than any policy, certificate, configuration or report needs."""
+
+# Nobody can catch the first two. The processor raises the next four, and would raise them again
+# before Python could act. The others do not end a process.
+_NOT_OURS = (
+    *(signal.SIGKILL, signal.SIGSTOP),
+    *(signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL),
+    *(signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH),
+    *(signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU),
+)
+
+
+class UserError(Exception):
+    """Bad input. Its text is one line: what is wrong, and what would be right."""
+
+    def __str__(self) -> str:
+        """The text on one line, whatever a file name or a library put into it."""
+        return printable(" ".join(super().__str__().split()))
+
+
+def counted(count: int, noun: str) -> str:
+    """``count`` of what ``noun`` names, in its regular plural but for one: "1 step", "2 steps"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def printable(text: str) -> str:
+    """The text, with what a terminal would act upon written as its escape, as ``repr`` does."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def open_regular(path: PathLike) -> BinaryIO:
+    """Open an existing file to read; OSError where it cannot be, or is no regular file.
+
+    A pipe would be waited for, and a device may have no end.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise OSError(errno.EINVAL, "it is no regular file", str(path))
+
+
+def read_bytes(path: PathLike, what: str) -> bytes:
+    """The bytes of an existing regular file. `what` names it in the error, as in "policy file".
+
+    Raises UserError where it cannot be read, or holds more than MAX_FILE_MIB.
+    """
+    limit = MAX_FILE_MIB << 20
+    try:
+        with open_regular(path) as stream:
+            # The size first; and no more than that, for a file of /proc has none.
+            is_small = os.fstat(stream.fileno()).st_size <= limit
+            data = stream.read(limit + 1) if is_small else b""
+    except FileNotFoundError:
+        raise UserError(f"{what} {path} does not exist") from None
+    except IsADirectoryError:
+        raise UserError(f"{what} {path} is a directory, not a file") from None
+    except OSError as error:
+        raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
+    except ValueError as error:  # a NUL inside the name
+        raise UserError(f"{what} {path!r} is not a file name: {error}") from None
+    if not is_small or len(data) > limit:
+        raise UserError(f"{what} {path} is larger than {MAX_FILE_MIB} MiB")
+    return data
+
+
+def read_json(path: PathLike, what: str) -> Any:
+    """The value in a JSON file. Raises UserError where there is none."""
+    return parse_json(read_bytes(path, what), f"{what} {path}")
+
+
+def parse_json(data: bytes, what: str) -> Any:
+    """The value of a JSON text. Raises UserError where it is none, or nested too deep."""
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{what} is not JSON: {error}") from None
+
+
+def read_toml(path: PathLike, what: str) -> Dict[str, Any]:
+    """The tables of a TOML file. Raises UserError where it is none, or nested too deep."""
+    import msgspec  # here: `hil_tests doctor` runs before anything is installed
+
+    data = read_bytes(path, what)
+    try:
+        tables: Dict[str, Any] = msgspec.toml.decode(data)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise UserError(f"{what} {path} is no TOML: {error}") from None
+    return tables
+
+
+def ending_signals() -> Set[int]:
+    """Those that would end this process as it is now, and that it can catch.
+
+    One that is ignored (SIGHUP under nohup), or has a handler already, is none of them.
+    """
+    found = {int(number) for number in signal.valid_signals()} - {int(one) for one in _NOT_OURS}
+    ends = (signal.SIG_DFL, signal.default_int_handler)
+    return {number for number in found if signal.getsignal(number) in ends}

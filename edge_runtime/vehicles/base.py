@@ -1,0 +1,381 @@
+"""What a vehicle driver must do, whether it can be believed, and the thread that runs it.
+
+A driver is called by one thread at a time, and is passed the time as monotonic seconds. The thread
+is apart from the control loop: so the feedback goes on when the loop hangs, and shows the vehicle
+braking by itself; and the loop goes on, and says safe stop, when the driver raises or hangs.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+import threading
+import time
+from collections import deque
+from typing import Callable, ClassVar, Deque, Dict, List, NamedTuple, Optional, Sequence, Tuple
+
+from edge_runtime import log
+from edge_runtime.controller import ActionLimit
+from edge_runtime.wire import CONTROL_PERIOD_S, MAX_TEXT_CHARS, SAFE_STOP, TOPICS, Command, Feedback
+
+
+class VehicleReport(NamedTuple):
+    """What the vehicle does. `action` is what its actuators have reached, in -1 to 1.
+
+    `faults` says in words why it does not drive, until it is enabled again; `standing` are those
+    whose cause is there now, so that enabling would be in vain. A vehicle that takes a speed
+    instead of a pedal says which one it is asked for (m/s of its own), and what its own speed is
+    in the scenario; its pedal is then worked out from its speed.
+    """
+
+    action: Dict[str, float]
+    speed_mps: float
+    self_braking: bool
+    faults: List[str]
+    standing: Sequence[str] = ()
+    scenario_speed_mps: Optional[float] = None
+    commanded_speed_mps: Optional[float] = None
+    battery_v: Optional[float] = None
+
+
+class Vehicle(abc.ABC):
+    """A vehicle under command. `limits` is keyed by the action names of the manifest."""
+
+    name: ClassVar[str]
+    limits: Dict[str, ActionLimit]
+
+    @abc.abstractmethod
+    def enable(self, now_s: float) -> None:
+        """Take control, at the start and again at each re-arm: what stopped it is forgotten.
+
+        Does not wait: until the vehicle confirms, it stands, and `feedback` says how it goes. It
+        stands as well until the first command.
+        """
+
+    @abc.abstractmethod
+    def command(
+        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+    ) -> None:
+        """Ask for an action; it holds for 2 T, after which the vehicle brakes by itself.
+
+        Raises ValueError for one that lacks what the vehicle needs: it never guesses.
+
+        `scenario_speed_mps` is the speed of the scenario's car: what a policy without a pedal
+        has in place of one. Moves nothing while the vehicle is stopped (`brake`, or a fault).
+        """
+
+    @abc.abstractmethod
+    def brake(self, now_s: float, latch: bool = True) -> None:
+        """Full brake at once, steering held; it needs no repetition.
+
+        It moves again only after `enable`; with `latch` False (the end of an episode) already
+        with the next command.
+        """
+
+    @abc.abstractmethod
+    def feedback(self, now_s: float) -> VehicleReport:
+        """What the vehicle does now."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Brake, give control back and free what the driver holds. Safe to call twice."""
+
+
+PEDAL = "pedal"
+SILENT, STUCK, LYING = "vehicle_silent", "vehicle_stuck", "vehicle_lying"
+SILENCE_S = 2 * CONTROL_PERIOD_S
+LAG_S = 3 * CONTROL_PERIOD_S  # an actuator may still follow a command of this age
+DEVIATION = 0.25  # of full pedal or steering, outside of all that was asked within LAG_S
+DEVIATES_S = CONTROL_PERIOD_S  # for this long without a break
+MAX_ACCELERATION_MPS2 = 15.0  # no tyre gives more, on dry asphalt and without wings
+SPEED_NOISE_MPS = 0.5
+_ROUNDING = 1e-3
+
+
+class VehicleWatch:
+    """Told every command and report; `fault` says what is wrong. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._asked: Deque[Tuple[float, Dict[str, float]]] = deque()
+        self._reported_s: Optional[float] = None
+        self._believed: Optional[Tuple[float, float]] = None  # time, speed of the last possible one
+        self._deviates_since_s: Optional[float] = None
+        self._lies = False
+
+    @property
+    def silent_at_s(self) -> float:
+        """When it counts as silent if no further report comes; inf before the first report."""
+        return math.inf if self._reported_s is None else self._reported_s + SILENCE_S
+
+    def begin(self, now_s: float) -> None:
+        """The vehicle is enabled: from now on it owes reports."""
+        self._reported_s = now_s
+
+    def command(self, action: Dict[str, float], now_s: float) -> None:
+        """Note what was asked; the pedal of a safe stop is -1."""
+        self._asked.append((now_s, action))
+        # One entry older than LAG_S stays: it was in force when the window began.
+        while len(self._asked) > 1 and self._asked[1][0] < now_s - LAG_S:
+            self._asked.popleft()
+
+    def report(self, report: VehicleReport, now_s: float) -> None:
+        """Note what the vehicle says of itself."""
+        self._lies = self._is_impossible(report, now_s)
+        if not self._lies:
+            self._believed = (now_s, report.speed_mps)
+        self._reported_s = now_s
+        if not self._deviates(report, now_s):
+            self._deviates_since_s = None
+        elif self._deviates_since_s is None:
+            self._deviates_since_s = now_s
+
+    def fault(self, now_s: float) -> str:
+        """SILENT, LYING, STUCK, or empty where nothing is wrong."""
+        if now_s > self.silent_at_s:
+            return SILENT
+        if self._lies:
+            return LYING
+        since_s = self._deviates_since_s
+        return STUCK if since_s is not None and now_s - since_s > DEVIATES_S else ""
+
+    def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
+        numbers = [report.speed_mps, *report.action.values()]
+        if not all(map(math.isfinite, numbers)):
+            return True
+        if any(abs(value) > 1.0 + _ROUNDING for value in report.action.values()):
+            return True
+        if self._believed is None:
+            return False
+        # From the last possible report on: a leap is a lie until that speed could be real.
+        since_s, speed_mps = self._believed
+        most_mps = SPEED_NOISE_MPS + MAX_ACCELERATION_MPS2 * (now_s - since_s)
+        return abs(report.speed_mps - speed_mps) > most_mps
+
+    def _deviates(self, report: VehicleReport, now_s: float) -> bool:
+        if not self._asked or report.self_braking or self._asked[0][0] > now_s - LAG_S:
+            return False  # It obeys nobody yet, or has had no time to.
+        for name, value in report.action.items():
+            if name == PEDAL and report.commanded_speed_mps is not None:
+                continue  # worked out from a speed, whose limits it cannot know: the driver judges
+            asked = [action[name] for _, action in self._asked if name in action]
+            if asked and not min(asked) - DEVIATION <= value <= max(asked) + DEVIATION:
+                return True
+        return False
+
+
+_PERIOD_S = 1.0 / TOPICS["feedback"].rate_hz
+_JOIN_S = 0.5
+
+
+class _Task(NamedTuple):
+    """A command, and what the vehicle needs besides."""
+
+    command: Command
+    scenario_speed_mps: Optional[float]
+    latch: bool
+    given_s: float
+
+
+class VehicleRunner:
+    """Owns the vehicle: once started, its own thread alone calls it until `close`.
+
+    `action_names` are the policy's, in the order of a command's action.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, action_names: Sequence[str], publish: Callable[[Feedback], None]
+    ) -> None:
+        self._vehicle = vehicle
+        self._action_names = action_names
+        self._publish = publish
+        self.on_fault: Callable[[], None] = lambda: None
+        self._watch = VehicleWatch()
+        self._refuses = False  # the driver raised at the newest command
+        self._failing = False
+        self._next: Optional[_Task] = None  # the newest, until the driver takes it
+        self._last: Optional[Command] = None
+        self._report_seen: Optional[VehicleReport] = None
+        self._enable_due = False
+        self._stopping = False
+        self._busy_since_s: Optional[float] = None  # its thread is in the driver
+        self._due = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
+
+    @property
+    def name(self) -> str:
+        """The vehicle's, as `--vehicle` knows it."""
+        return self._vehicle.name
+
+    @property
+    def silent_at_s(self) -> float:
+        """When the vehicle counts as silent if nothing more is heard of it (monotonic)."""
+        return self._watch.silent_at_s
+
+    def busy_s(self, now_s: float) -> float:
+        """For how long the driver has kept its thread; 0 while that waits. Waits for nobody."""
+        since_s = self._busy_since_s
+        return 0.0 if since_s is None else now_s - since_s
+
+    def fault(self, now_s: float) -> str:
+        """What is wrong with the vehicle, empty if nothing. Waits for nobody."""
+        with self._due:
+            if self._enable_due:
+                return self._seen_fault(now_s)
+        seen = self._report_seen
+        return self._seen_fault(now_s) or (seen.faults[0] if seen and seen.faults else "")
+
+    def standing_fault(self, now_s: float) -> str:
+        """What enabling the vehicle now would not end, empty if nothing. Waits for nobody."""
+        seen = self._report_seen
+        return self._seen_fault(now_s) or (seen.standing[0] if seen and seen.standing else "")
+
+    def start(self, armed: bool = True) -> None:
+        """Start the vehicle's feedback, and enable it unless that is to wait for an operator."""
+        now_s = time.monotonic()
+        if armed:
+            self._vehicle.enable(now_s)
+        self._watch.begin(now_s)
+        self._thread.start()
+
+    def enable(self) -> None:
+        """Have the vehicle enabled again: an operator has re-armed it. Never waits.
+
+        Its old faults no longer count; a command that is still on its way is dropped, because a
+        stop from before would undo it.
+        """
+        with self._due:
+            self._enable_due, self._next = True, None
+            self._due.notify()
+
+    def command(
+        self, command: Command, scenario_speed_mps: Optional[float] = None, latch: bool = True
+    ) -> None:
+        """Hand on a command, in place of one that the driver has not taken yet. Never waits.
+
+        `scenario_speed_mps` is that of the state it answers. A safe stop with `latch` False may
+        be followed by a drive without `enable`.
+        """
+        with self._due:
+            self._next = _Task(command, scenario_speed_mps, latch, time.monotonic())
+            self._due.notify()
+
+    def close(self) -> None:
+        """Brake, end the feedback, close the driver; one that hangs is left alone."""
+        with self._due:
+            self._stopping = True
+            self._due.notify()
+        if self._thread.is_alive():
+            self._thread.join(_JOIN_S)
+        if self._thread.is_alive():
+            log.event("error", "driver_hangs", vehicle=self.name)
+            return
+        for end in (lambda: self._vehicle.brake(time.monotonic()), self._vehicle.close):
+            try:
+                end()
+            except Exception as error:  # the rest of the runtime must still come to its end
+                log.event("error", "driver_not_closed", detail=error)
+
+    def _run(self) -> None:
+        next_s = time.monotonic()
+        while not self._stopping:
+            enables, task = self._wait(next_s)
+            self._busy_since_s = time.monotonic()
+            if enables:
+                self._enable()
+            if task is not None:
+                self._obey(task)
+            now_s = time.monotonic()
+            if now_s >= next_s:
+                # Absolute deadlines; after a long pause one report, not one for each missed period.
+                next_s = max(next_s + _PERIOD_S, now_s)
+                self._report()
+            self._busy_since_s = None
+
+    def _wait(self, until_s: float) -> Tuple[bool, Optional[_Task]]:
+        """Whether to enable, and then the newest command; as soon as there is one, or at a time."""
+        with self._due:
+            pause_s = max(0.0, until_s - time.monotonic())
+            self._due.wait_for(
+                lambda: self._next is not None or self._enable_due or self._stopping, pause_s
+            )
+            task, self._next = self._next, None
+            return self._enable_due, task
+
+    def _enable(self) -> None:
+        try:
+            self._vehicle.enable(time.monotonic())
+        except Exception as error:  # as in _obey; its report goes on saying what is wrong
+            log.event("error", "not_enabled", detail=error)
+        else:
+            self._ask()
+        with self._due:
+            self._enable_due = False
+
+    def _obey(self, task: _Task) -> None:
+        """Ask the driver. A safe stop's mode alone means brake."""
+        self._last = command = task.command
+        now_s = time.monotonic()
+        action = dict(zip(self._action_names, command.action))
+        self._watch.command(action, now_s)
+        try:
+            if command.mode == SAFE_STOP:
+                self._vehicle.brake(now_s, task.latch)
+            elif len(command.action) != len(self._action_names):
+                raise ValueError(f"a command of {command.action} for {self._action_names}")
+            elif now_s - task.given_s <= SILENCE_S:  # a driver that hung must not obey the past
+                self._vehicle.command(action, now_s, task.scenario_speed_mps)
+        except Exception as error:  # a driver may raise anything; its thread must live on
+            if not self._refuses:
+                log.event("error", "not_obeyed", detail=error)
+            self._refuses = True
+            self.on_fault()
+            return
+        self._refuses = False
+
+    def _report(self) -> None:
+        report = self._ask()
+        fault = self.fault(time.monotonic())
+        if fault:
+            self.on_fault()
+        if report is not None:
+            self._publish(self._feedback(report, self._last, fault))
+
+    def _seen_fault(self, now_s: float) -> str:
+        return SILENT if self._refuses else self._watch.fault(now_s)
+
+    def _ask(self) -> Optional[VehicleReport]:
+        """The vehicle's report; None where the driver fails, which is silence like any other."""
+        try:
+            report = self._vehicle.feedback(time.monotonic())
+        except Exception as error:  # as in _obey
+            if not self._failing:
+                log.event("error", "no_feedback", detail=error)
+            self._failing = True
+            return None
+        self._failing = False
+        self._report_seen = report
+        self._watch.report(report, time.monotonic())
+        return report
+
+    def _feedback(self, report: VehicleReport, last: Optional[Command], fault: str) -> Feedback:
+        return Feedback(
+            vehicle=self._vehicle.name,
+            session=last.session if last else "",
+            episode=last.episode if last else -1,
+            step=last.step if last else -1,
+            mode=last.mode if last else "standby",
+            action=[report.action.get(name, 0.0) for name in self._action_names],
+            speed_mps=report.speed_mps,
+            self_braking=report.self_braking,
+            faults=_texts(report.faults, fault),
+            sent_ns=time.time_ns(),
+            scenario_speed_mps=report.scenario_speed_mps,
+            commanded_speed_mps=report.commanded_speed_mps,
+            battery_v=report.battery_v,
+        )
+
+
+def _texts(faults: Sequence[str], fault: str) -> List[str]:
+    """All faults once, none longer than the wire takes."""
+    every = [*faults, fault] if fault and fault not in faults else faults
+    return [text[:MAX_TEXT_CHARS] for text in every]

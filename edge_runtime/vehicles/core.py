@@ -1,0 +1,299 @@
+"""The driver of a vehicle that must hear from it 50 times a second: pure, and shared by vehicles.
+
+A core is a state machine (LEADS_TO), what was heard of the vehicle, and what is asked of it. It has
+no clock, no thread and no bus: whoever holds it (stream.py, a test) serialises the calls, passes
+monotonic seconds, and sends what `tick` returns. A vehicle adds what it hears and says.
+
+STOPPED is a latch of our own: a chassis takes commands again by itself when they resume after its
+time-out, when the remote control lets go, or when an error passes. Only ENABLE leads out.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections import deque
+from enum import Enum
+from typing import ClassVar, Deque, Dict, List, NamedTuple, Optional, Tuple
+
+from edge_runtime.safety import SILENCE_S
+from edge_runtime.vehicles.base import VehicleReport
+from edge_runtime.vehicles.mapping import (
+    HunterSpec,
+    SetPoint,
+    Similarity,
+    Wish,
+    acceleration_to_pedal,
+    wish_of,
+)
+from edge_runtime.wire import CONTROL_PERIOD_S
+
+# A beat later than the runtime's own silence rule, which then tells the reason; still within
+# the promise of 2 T + 50 ms, and less than half of the 500 ms of a Hunter's chassis.
+COMMAND_TIMEOUT_S = SILENCE_S + 0.02
+ENABLE_TIMEOUT_S = 1.0
+# At the end zeros go out for so long, unless it is known to stand before; and what is then not
+# known to stand gets the parking brake, where there is one.
+STOP_TAKES_S = 1.0
+
+FOLLOWS_S = 10 * CONTROL_PERIOD_S  # a drive may still follow a set-point of this age
+DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
+DEVIATES_S = CONTROL_PERIOD_S
+STANDS_MPS = 0.02
+IMPOSSIBLE = 1.3
+"""Times what the model can do: who reports more than that is not believed."""
+_SLACK_S = 0.01
+
+
+class State(str, Enum):
+    """DISABLED: nothing is sent. ENABLING and STOPPED: speed 0 is sent. ENABLED: commands are."""
+
+    DISABLED = "disabled"
+    ENABLING = "enabling"
+    ENABLED = "enabled"
+    STOPPED = "stopped"
+
+
+class Event(str, Enum):
+    """What can happen. All after CLOSE are what the vehicle, the bus or time do."""
+
+    ENABLE = "enable"
+    BRAKE = "brake"
+    CLOSE = "close"
+    CONFIRMED = "confirmed"  # CAN control, brake released, no error; or fresh odometry
+    NOT_CONFIRMED = "not_confirmed"  # within ENABLE_TIMEOUT_S
+    COMMAND_LATE = "command_late"  # no fresh command for 2 T
+    REMOTE = "remote_control"
+    ESTOP = "emergency_stop"
+    STANDBY = "chassis_standby"  # or another mode that is not CAN control
+    LOCKED = "brake_locked"
+    FAULT = "chassis_fault"
+    SILENT = "feedback_silent"
+    LYING = "feedback_impossible"
+    STUCK = "speed_stuck"
+    BUS = "bus_error"
+    FOREIGN = "foreign_command"  # somebody else commands the chassis
+
+
+_D, _G, _E, _X = State.DISABLED, State.ENABLING, State.ENABLED, State.STOPPED
+
+# By the state before. A state that is not named stays as it is.
+LEADS_TO: Dict[Event, Dict[State, State]] = {
+    Event.ENABLE: {_D: _G, _E: _G, _X: _G},
+    Event.BRAKE: {_G: _X, _E: _X},
+    Event.CLOSE: {_G: _D, _E: _D, _X: _D},
+    Event.CONFIRMED: {_G: _E},
+    Event.NOT_CONFIRMED: {_G: _X},
+    Event.COMMAND_LATE: {_E: _X},  # while ENABLING nothing moves yet
+    Event.REMOTE: {_G: _X, _E: _X},
+    Event.ESTOP: {_G: _X, _E: _X},
+    Event.STANDBY: {_E: _X},  # while ENABLING that is what is to be ended; so for the next three
+    Event.LOCKED: {_E: _X},
+    Event.FAULT: {_E: _X},
+    Event.SILENT: {_E: _X},
+    Event.LYING: {_E: _X},
+    Event.STUCK: {_E: _X},
+    Event.BUS: {_G: _X, _E: _X},
+    Event.FOREIGN: {_G: _X, _E: _X},
+}
+
+
+class Finding(NamedTuple):
+    """An event with what it is in words, empty where our own side asked for it."""
+
+    event: Event
+    words: str
+
+
+class Speeds:
+    """The speeds that a vehicle reported in the last control period, and what follows from them."""
+
+    def __init__(self) -> None:
+        self._noted: Deque[Tuple[float, float]] = deque()
+
+    def note(self, speed_mps: float, now_s: float) -> None:
+        """The newest one."""
+        self._noted.append((now_s, speed_mps))
+        while self._noted[0][0] < now_s - CONTROL_PERIOD_S - _SLACK_S:
+            self._noted.popleft()
+
+    def forget(self) -> None:
+        """As before the first one."""
+        self._noted.clear()
+
+    @property
+    def speed_mps(self) -> float:
+        """The newest one, 0 before the first."""
+        return self._noted[-1][1] if self._noted else 0.0
+
+    @property
+    def stands(self) -> bool:
+        """Whether it stood when it was last heard."""
+        return abs(self.speed_mps) < STANDS_MPS
+
+    def acceleration_mps2(self) -> float:
+        """Over the last control period; 0 while there is too little to tell."""
+        if len(self._noted) < 2:
+            return 0.0
+        (since_s, before_mps), (now_s, speed_mps) = self._noted[0], self._noted[-1]
+        return (speed_mps - before_mps) / (now_s - since_s) if now_s > since_s else 0.0
+
+
+class SpeedWatch:
+    """Whether the measured speed stays outside of every speed that was lately asked for."""
+
+    def __init__(self, max_speed_mps: float) -> None:
+        self._tolerance_mps = DEVIATION * max_speed_mps
+        self._asked: Deque[Tuple[float, float]] = deque()
+        self._deviates_since_s: Optional[float] = None
+
+    def begin(self) -> None:
+        """Forget what was asked before: it has a new chance to follow."""
+        self._asked.clear()
+        self._deviates_since_s = None
+
+    def is_stuck(self, asked_mps: float, measured_mps: float, now_s: float) -> bool:
+        """Note what is asked and measured now, and judge."""
+        self._asked.append((now_s, asked_mps))
+        while len(self._asked) > 1 and self._asked[1][0] < now_s - FOLLOWS_S:
+            self._asked.popleft()
+        if self._asked[0][0] > now_s - FOLLOWS_S:
+            return False  # it has had no time to follow
+        speeds = [speed for _, speed in self._asked]
+        low, high = min(speeds) - self._tolerance_mps, max(speeds) + self._tolerance_mps
+        if low <= measured_mps <= high:
+            self._deviates_since_s = None
+        elif self._deviates_since_s is None:
+            self._deviates_since_s = now_s
+        since_s = self._deviates_since_s
+        return since_s is not None and now_s - since_s > DEVIATES_S
+
+
+class StreamedCore(abc.ABC):
+    """The state machine, and what is asked for. `heard` is what the vehicle said of itself."""
+
+    leads_to: ClassVar[Dict[Event, Dict[State, State]]] = LEADS_TO
+
+    def __init__(self, spec: HunterSpec, similarity: Similarity, heard: Speeds) -> None:
+        self.state = State.DISABLED
+        self.cause: Optional[Event] = None  # what stopped it
+        self.words = ""  # the same for a person; empty where our own side asked for the stop
+        self.set_point = SetPoint(spec, similarity)
+        self._spec, self._similarity, self._heard = spec, similarity, heard
+        self._speed_watch = SpeedWatch(spec.max_speed_mps)
+        self._wish: Optional[Wish] = None  # None: stand
+        self._wished_s = self._ticked_s = -math.inf
+        self._since_s = -math.inf  # when this state began
+
+    def enable(self, now_s: float) -> None:
+        """Ask for control, from now on until the vehicle confirms it."""
+        self._wish = None
+        self.set_point.stand()
+        self._speed_watch.begin()
+        self._apply(Finding(Event.ENABLE, ""), now_s)
+        self._since_s = now_s
+
+    def command(
+        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+    ) -> None:
+        """The newest command; forgotten where it may not drive. ValueError: see `wish_of`."""
+        wish = wish_of(action, scenario_speed_mps)
+        if self.state is State.ENABLED:
+            self._wish, self._wished_s = wish, now_s
+
+    def brake(self, now_s: float, latch: bool = True) -> None:
+        """Speed 0 at the next tick, until the next command or (latched) the next `enable`."""
+        self._wish = None
+        self.set_point.stand()
+        if latch:
+            self._apply(Finding(Event.BRAKE, ""), now_s)
+
+    @property
+    def late_at_s(self) -> float:
+        """After which moment its newest command is too old to be obeyed; inf where it has none."""
+        return math.inf if self._wish is None else self._wished_s + COMMAND_TIMEOUT_S
+
+    def report(self, now_s: float) -> VehicleReport:
+        """What the vehicle does, in the policy's terms and in its own."""
+        speed_mps = self._heard.speed_mps
+        return VehicleReport(
+            action={"pedal": self._pedal(), "steering": self._steering()},
+            speed_mps=speed_mps,
+            self_braking=self.state is not State.ENABLED,
+            faults=self._faults(now_s),
+            standing=self.standing(now_s),
+            scenario_speed_mps=self._similarity.scenario_mps(speed_mps),
+            commanded_speed_mps=self.set_point.speed_mps,
+        )
+
+    def standing(self, now_s: float) -> List[str]:
+        """What would make an `enable` now be in vain, in words."""
+        may_ask = self.state in (State.STOPPED, State.DISABLED)
+        return self._obstacles(now_s) if may_ask else []
+
+    @abc.abstractmethod
+    def is_at_rest(self, now_s: float) -> bool:
+        """Whether the vehicle is known to stand, or nobody here can do more about it."""
+
+    @abc.abstractmethod
+    def _obstacles(self, now_s: float) -> List[str]:
+        """In words what stands between the vehicle and our commands, whoever is to end it."""
+
+    @abc.abstractmethod
+    def _why_not_confirmed(self, now_s: float) -> str:
+        """In words why the vehicle did not confirm an `enable` in time."""
+
+    @abc.abstractmethod
+    def _wrong(self, now_s: float) -> Optional[Finding]:
+        """What is wrong with the newest feedback while ENABLED."""
+
+    @abc.abstractmethod
+    def _steering(self) -> float:
+        """The steering in -1 to 1 that the vehicle reports."""
+
+    def _apply(self, finding: Finding, now_s: float) -> None:
+        after = self.leads_to[finding.event].get(self.state, self.state)
+        if after is self.state:
+            return
+        self.cause, self.words = None, ""
+        if after is State.STOPPED:
+            self._wish = None
+            self.set_point.stand()
+            self.cause, self.words = finding
+        self.state, self._since_s = after, now_s
+
+    def _watch(self, now_s: float) -> None:
+        """What time alone tells."""
+        if self.state is State.ENABLING and now_s - self._since_s > ENABLE_TIMEOUT_S:
+            self._apply(Finding(Event.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
+        if self.state is not State.ENABLED:
+            return
+        found = self._wrong(now_s)
+        if found is None and self._wish is not None and now_s - self._wished_s > COMMAND_TIMEOUT_S:
+            found = Finding(Event.COMMAND_LATE, f"no command for {COMMAND_TIMEOUT_S:.2f} s")
+        asked_mps, measured_mps = self.set_point.speed_mps, self._heard.speed_mps
+        if self._speed_watch.is_stuck(asked_mps, measured_mps, now_s) and found is None:
+            words = f"the speed stays at {measured_mps:.2f} m/s, asked for {asked_mps:.2f}"
+            found = Finding(Event.STUCK, words)
+        if found is not None:
+            self._apply(found, now_s)
+
+    def _step(self, now_s: float) -> None:
+        """Move the set-point by the time since the last tick."""
+        step_s, self._ticked_s = now_s - self._ticked_s, now_s
+        if self.state is State.ENABLED and self._wish is not None:
+            self.set_point.follow(self._wish, step_s, self._heard.speed_mps)
+        else:
+            self.set_point.stand()
+
+    def _faults(self, now_s: float) -> List[str]:
+        if self.state is not State.STOPPED:
+            return []
+        words = [self.words] if self.words else []
+        return words + [more for more in self.standing(now_s) if more not in words]
+
+    def _pedal(self) -> float:
+        """From the measured acceleration; the brake where it stands and is to stand."""
+        if self._heard.stands and self.set_point.speed_mps == 0.0:
+            return -1.0
+        return acceleration_to_pedal(self._heard.acceleration_mps2(), self._similarity)

@@ -1,0 +1,307 @@
+"""The Hunter's CAN frames (protocol V2) and fault bits: tables, one encoder, one decoder. Pure.
+
+CAN 2.0B with 11-bit identifiers, 500 kbit/s, big-endian, no checksum. Source: the maker's manual,
+as gathered in the hardware facts; a test holds its golden vectors. All frames go both ways here,
+because the mock of the chassis speaks the other side.
+
+Manuals of different firmware place the bits of 0x211 elsewhere, so that the profile is a setting.
+A bit that the profile does not know is a fault as well: then the profile is not this firmware's.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any, Dict, List, NamedTuple, Optional, Tuple, Type
+
+from edge_runtime.vehicles.mapping import HunterSpec
+
+BITRATE = 500_000
+
+# Values of ModeCommand.mode and of SystemStatus.mode.
+STANDBY, CAN_CONTROL, REMOTE_CONTROL = 0, 1, 2
+# Values of SystemStatus.state.
+STATE_OK, STATE_ESTOP, STATE_EXCEPTION = 0, 1, 2
+
+
+class MotionCommand(NamedTuple):
+    """0x111: what is asked for, every 20 ms; the chassis waits 500 ms for the next one."""
+
+    speed_mps: float
+    inner_steering_rad: float
+
+
+class ModeCommand(NamedTuple):
+    """0x421: STANDBY or CAN_CONTROL."""
+
+    mode: int
+
+
+class BrakeCommand(NamedTuple):
+    """0x131: 0 releases the parking brake, 1 locks it."""
+
+    locked: int
+
+
+class ClearCommand(NamedTuple):
+    """0x441: clear errors; 0 clears all."""
+
+    what: int = 0
+
+
+class SystemStatus(NamedTuple):
+    """0x211. `faults` are bytes 4 (high) and 5 (low); PROFILES says what the bits mean."""
+
+    state: int
+    mode: int
+    battery_v: float
+    faults: int
+    brake: int
+    counter: int
+
+
+class MotionStatus(NamedTuple):
+    """0x221: what the wheels do."""
+
+    speed_mps: float
+    inner_steering_rad: float
+
+
+class MotorFast(NamedTuple):
+    """0x251 to 0x253 (steering, rear right, rear left): turning."""
+
+    speed_rpm: int
+    current_a: float
+    pulses: int
+
+
+class MotorSlow(NamedTuple):
+    """0x261 to 0x263 (steering, rear right, rear left): the motor's driver and its health."""
+
+    voltage_v: float
+    driver_c: int
+    motor_c: int
+    status: int
+
+
+class Field(NamedTuple):
+    """Where a number stands: first byte, struct code, and what one count of it is worth."""
+
+    offset: int
+    code: str
+    per_count: Optional[float] = None  # None: a plain integer
+
+
+class Frame(NamedTuple):
+    """A row of the table. `fields` are in the order of the message's; bytes without one are 0."""
+
+    can_id: int
+    message: Type[Any]
+    length: int
+    fields: Tuple[Field, ...]
+    period_s: Optional[float] = None  # None: sent when something happens
+
+
+_MILLI, _TENTH = 0.001, 0.1
+_MOTION = (Field(0, "h", _MILLI), Field(6, "h", _MILLI))
+_FAST = (Field(0, "h"), Field(2, "h", _TENTH), Field(4, "i"))
+_SLOW = (Field(0, "H", _TENTH), Field(2, "h"), Field(4, "b"), Field(5, "B"))
+_STATUS = (
+    Field(0, "B"), Field(1, "B"), Field(2, "H", _TENTH), Field(4, "H"), Field(6, "B"), Field(7, "B")
+)  # fmt: skip
+
+MOTION_COMMAND = Frame(0x111, MotionCommand, 8, _MOTION, 0.02)
+BRAKE_COMMAND = Frame(0x131, BrakeCommand, 1, (Field(0, "B"),))
+MODE_COMMAND = Frame(0x421, ModeCommand, 1, (Field(0, "B"),))
+CLEAR_COMMAND = Frame(0x441, ClearCommand, 1, (Field(0, "B"),))
+SYSTEM_STATUS = Frame(0x211, SystemStatus, 8, _STATUS, 0.1)
+MOTION_STATUS = Frame(0x221, MotionStatus, 8, _MOTION, 0.02)
+STEER_MOTOR_FAST = Frame(0x251, MotorFast, 8, _FAST, 0.02)
+REAR_RIGHT_FAST = Frame(0x252, MotorFast, 8, _FAST, 0.02)
+REAR_LEFT_FAST = Frame(0x253, MotorFast, 8, _FAST, 0.02)
+STEER_MOTOR_SLOW = Frame(0x261, MotorSlow, 8, _SLOW, 0.1)
+REAR_RIGHT_SLOW = Frame(0x262, MotorSlow, 8, _SLOW, 0.1)
+REAR_LEFT_SLOW = Frame(0x263, MotorSlow, 8, _SLOW, 0.1)
+
+COMMANDS: Tuple[Frame, ...] = (MOTION_COMMAND, BRAKE_COMMAND, MODE_COMMAND, CLEAR_COMMAND)
+FEEDBACK: Tuple[Frame, ...] = (
+    SYSTEM_STATUS,
+    MOTION_STATUS,
+    STEER_MOTOR_FAST,
+    REAR_RIGHT_FAST,
+    REAR_LEFT_FAST,
+    STEER_MOTOR_SLOW,
+    REAR_RIGHT_SLOW,
+    REAR_LEFT_SLOW,
+)
+FRAMES: Dict[int, Frame] = {frame.can_id: frame for frame in COMMANDS + FEEDBACK}
+
+MOTOR_OF_SLOW: Dict[int, str] = {
+    STEER_MOTOR_SLOW.can_id: "steering",
+    REAR_RIGHT_SLOW.can_id: "rear right",
+    REAR_LEFT_SLOW.can_id: "rear left",
+}
+
+
+class Sent(NamedTuple):
+    """A frame to be sent."""
+
+    frame: Frame
+    data: bytes
+
+
+class Decoded(NamedTuple):
+    """A frame that was understood: its row and its message."""
+
+    frame: Frame
+    message: Any
+
+
+def encode(frame: Frame, message: Any) -> bytes:
+    """The data bytes of a message: rounded to counts, and clamped to what the field can hold.
+
+    Raises ValueError for a number that is not finite: no count stands for it.
+    """
+    data = bytearray(frame.length)
+    for field, value in zip(frame.fields, message):
+        _packer(field).pack_into(data, field.offset, _count(field, value))
+    return bytes(data)
+
+
+def encode_motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> bytes:
+    """0x111 within the limits of the model. Raises ValueError for what is not finite."""
+    return encode(
+        MOTION_COMMAND,
+        MotionCommand(
+            _clamp(speed_mps, spec.max_speed_mps),
+            _clamp(inner_steering_rad, spec.max_inner_steering_rad),
+        ),
+    )
+
+
+def decode(can_id: int, data: bytes) -> Optional[Decoded]:
+    """The message of a frame; None for an identifier or a length that is not in the table."""
+    frame = FRAMES.get(can_id)
+    if frame is None or len(data) != frame.length:
+        return None
+    values: List[float] = []
+    for field in frame.fields:
+        (count,) = _packer(field).unpack_from(data, field.offset)
+        values.append(count if field.per_count is None else count * field.per_count)
+    return Decoded(frame, frame.message(*values))
+
+
+def _packer(field: Field) -> struct.Struct:
+    return _PACKERS[field.code]
+
+
+_RANGES: Dict[str, Tuple[int, int]] = {
+    "b": (-(2**7), 2**7 - 1),
+    "B": (0, 2**8 - 1),
+    "h": (-(2**15), 2**15 - 1),
+    "H": (0, 2**16 - 1),
+    "i": (-(2**31), 2**31 - 1),
+}
+_PACKERS: Dict[str, struct.Struct] = {code: struct.Struct(f">{code}") for code in _RANGES}
+
+
+def _count(field: Field, value: float) -> int:
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no number for the bus")
+    low, high = _RANGES[field.code]
+    counts = value if field.per_count is None else value / field.per_count
+    return round(min(max(counts, low), high))
+
+
+def _clamp(value: float, most: float) -> float:
+    return min(max(value, -most), most)  # NaN passes, and encode refuses it
+
+
+class FaultBit(NamedTuple):
+    """Byte 4 or 5 of 0x211, bit 0 to 7 of it, and what it means."""
+
+    byte: int
+    bit: int
+    words: str
+
+    @property
+    def mask(self) -> int:
+        """The bit within SystemStatus.faults."""
+        return 1 << (self.bit + (8 if self.byte == 4 else 0))
+
+
+# While nobody streams, the chassis misses its upper computer: only a fault once we stream.
+LINK_LOST = "link to the upper computer lost"
+UNDERVOLTAGE = "battery undervoltage"
+REMOTE_LOST = "remote control lost"
+STEER_ENCODER = "steering encoder"
+DRIVER = "motor driver"
+LINK_STEER = "link to the steering motor lost"
+LINK_REAR_RIGHT = "link to the rear right motor lost"
+LINK_REAR_LEFT = "link to the rear left motor lost"
+OVERTEMPERATURE = "overtemperature"
+OVERCURRENT = "overcurrent"
+
+PROFILES: Dict[str, List[FaultBit]] = {
+    # The hardware facts' layout.
+    "v2": [
+        FaultBit(4, 1, STEER_ENCODER),
+        FaultBit(4, 2, REMOTE_LOST),
+        FaultBit(4, 4, LINK_LOST),
+        FaultBit(4, 6, DRIVER),
+        FaultBit(5, 0, UNDERVOLTAGE),
+        FaultBit(5, 3, LINK_STEER),
+        FaultBit(5, 4, LINK_REAR_RIGHT),
+        FaultBit(5, 5, LINK_REAR_LEFT),
+        FaultBit(5, 6, OVERTEMPERATURE),
+        FaultBit(5, 7, OVERCURRENT),
+    ],
+    # Table 3.1 of the Hunter 2.0 user manual, page 7.
+    "manual": [
+        FaultBit(4, 0, DRIVER),
+        FaultBit(4, 1, LINK_LOST),
+        FaultBit(5, 0, UNDERVOLTAGE),
+        FaultBit(5, 2, REMOTE_LOST),
+        FaultBit(5, 3, LINK_STEER),
+        FaultBit(5, 4, LINK_REAR_RIGHT),
+        FaultBit(5, 5, LINK_REAR_LEFT),
+        FaultBit(5, 7, STEER_ENCODER),
+    ],
+}
+DEFAULT_PROFILE = "v2"
+
+# Bits 0 to 5 of byte 5 of 0x261 to 0x263; 6 and 7 (enabled, reset) are no faults.
+DRIVER_FAULTS = (
+    "supply voltage low",
+    "motor overtemperature",
+    "driver overcurrent",
+    "driver overtemperature",
+    "sensor",
+    "driver",
+)
+
+
+def status_faults(status: SystemStatus, profile: str) -> List[str]:
+    """The faults that 0x211 names, in words; empty where it names none."""
+    known = PROFILES[profile]
+    words = [fault.words for fault in known if status.faults & fault.mask]
+    for bit in range(16):
+        mask = 1 << bit
+        if status.faults & mask and not any(fault.mask == mask for fault in known):
+            words.append(f"unknown to profile {profile}: byte {5 - bit // 8} bit {bit % 8}")
+    return words
+
+
+def fault_bits(words: str, profile: str) -> int:
+    """The bits of SystemStatus.faults of a fault in words: what the mock sends."""
+    return sum(fault.mask for fault in PROFILES[profile] if fault.words == words)
+
+
+def motor_faults(can_id: int, motor: MotorSlow) -> List[str]:
+    """The faults that 0x261 to 0x263 name, in words, with the motor's place."""
+    place = MOTOR_OF_SLOW[can_id]
+    return [
+        f"{place} motor: {words}"
+        for bit, words in enumerate(DRIVER_FAULTS)
+        if motor.status & (1 << bit)
+    ]

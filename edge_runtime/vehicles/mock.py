@@ -1,0 +1,148 @@
+"""A vehicle of arithmetic: dead time, rate limit and first-order lag before the wheels obey.
+
+It integrates its own motion up to the time it is asked about, so that it needs no thread, and a
+test with made-up times sees exactly what a process sees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import ClassVar, Deque, Dict, NamedTuple, Optional, Tuple
+
+from edge_runtime.controller import ActionLimit
+from edge_runtime.vehicles.base import Vehicle, VehicleReport
+from edge_runtime.wire import CONTROL_PERIOD_S
+
+COMMAND_TIMEOUT_S = 2 * CONTROL_PERIOD_S
+_INTEGRATION_STEP_S = 0.005
+# After this long without a command it has braked to a stand, whatever it did before.
+_LONGEST_GAP_S = 10.0
+
+
+class MockParameters(NamedTuple):
+    """The actuators and the body of the mock. Rates are in full pedal or steering per second.
+
+    The body's numbers are the car's of this repository's scenarios (similarity.CARS).
+    """
+
+    dead_time_s: float = 0.02
+    time_constant_s: float = 0.05
+    slew_per_s: float = 40.0
+    throttle_mps2: float = 3.0  # at full pedal
+    brake_mps2: float = 4.0
+    max_speed_mps: float = 6.0
+
+
+class MockState(NamedTuple):
+    """Actuator positions in -1 to 1, and the speed."""
+
+    pedal: float = -1.0
+    steering: float = 0.0
+    speed_mps: float = 0.0
+
+
+def advance(
+    state: MockState, pedal: float, steering: float, step_s: float, parameters: MockParameters
+) -> MockState:
+    """One integration step towards the targets `pedal` and `steering`."""
+    position = _follow(state.pedal, pedal, step_s, parameters)
+    full_mps2 = parameters.throttle_mps2 if position > 0.0 else parameters.brake_mps2
+    speed_mps = state.speed_mps + position * full_mps2 * step_s
+    return MockState(
+        pedal=position,
+        steering=_follow(state.steering, steering, step_s, parameters),
+        speed_mps=min(max(speed_mps, 0.0), parameters.max_speed_mps),
+    )
+
+
+def _follow(position: float, target: float, step_s: float, parameters: MockParameters) -> float:
+    """First-order lag towards the target, no faster than the actuator's rate."""
+    change = (target - position) * (1.0 - math.exp(-step_s / parameters.time_constant_s))
+    most = parameters.slew_per_s * step_s
+    return position + min(max(change, -most), most)
+
+
+class MockVehicle(Vehicle):
+    """Takes pedal and steering; brakes by itself when no command came for 2 T."""
+
+    name: ClassVar[str] = "mock"
+    # Every action of a policy goes through unchanged, in lock-step, too, where states follow one
+    # another faster than its time. What the body does with it is the lag's business.
+    limits: Dict[str, ActionLimit] = {  # noqa: RUF012
+        "pedal": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
+        "steering": ActionLimit(-1.0, 1.0, slew_per_s=math.inf),
+    }
+
+    def __init__(self, parameters: Optional[MockParameters] = None) -> None:
+        self._parameters = parameters or MockParameters()
+        self._state = MockState()
+        self._now_s: Optional[float] = None
+        self._commanded_s = -math.inf
+        self._on_the_way: Deque[Tuple[float, float, float]] = deque()
+        self._target = (-1.0, 0.0)
+        self._latched = True  # until it is enabled
+
+    def enable(self, now_s: float) -> None:
+        """Take a stop back; the brake is on until the first command."""
+        self._integrate(now_s)
+        self._latched = False
+
+    def command(
+        self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
+    ) -> None:
+        """An action that a policy does not have is zero: no pedal, wheels straight."""
+        if not action:
+            raise ValueError("a command that lacks an action")
+        self._integrate(now_s)
+        if self._latched:
+            return
+        self._commanded_s = now_s
+        effective_s = now_s + self._parameters.dead_time_s
+        self._on_the_way.append(
+            (effective_s, action.get("pedal", 0.0), action.get("steering", 0.0))
+        )
+
+    def brake(self, now_s: float, latch: bool = True) -> None:
+        """Full brake without the dead time of the command's way."""
+        self._integrate(now_s)
+        self._latched = self._latched or latch
+        self._on_the_way.clear()
+        self._commanded_s = now_s
+        self._target = (-1.0, self._target[1])
+
+    def feedback(self, now_s: float) -> VehicleReport:
+        """Where the actuators are and how fast the body is."""
+        self._integrate(now_s)
+        return VehicleReport(
+            action={"pedal": self._state.pedal, "steering": self._state.steering},
+            speed_mps=self._state.speed_mps,
+            self_braking=self._is_left_alone(now_s),
+            faults=[],
+        )
+
+    def close(self) -> None:
+        """Nothing to free; the brake comes on with the last command's age."""
+        self._on_the_way.clear()
+        self._target = (-1.0, self._target[1])
+
+    def _is_left_alone(self, now_s: float) -> bool:
+        return now_s - self._commanded_s > COMMAND_TIMEOUT_S
+
+    def _integrate(self, until_s: float) -> None:
+        if self._now_s is None:
+            self._now_s = until_s
+        self._now_s = max(self._now_s, until_s - _LONGEST_GAP_S)
+        while until_s - self._now_s > 1e-9:
+            step_s = min(_INTEGRATION_STEP_S, until_s - self._now_s)
+            pedal, steering = self._target_at(self._now_s + step_s)
+            self._state = advance(self._state, pedal, steering, step_s, self._parameters)
+            self._now_s += step_s
+
+    def _target_at(self, now_s: float) -> Tuple[float, float]:
+        while self._on_the_way and self._on_the_way[0][0] <= now_s:
+            _, pedal, steering = self._on_the_way.popleft()
+            self._target = (pedal, steering)
+        if self._is_left_alone(now_s):
+            self._target = (-1.0, self._target[1])
+        return self._target

@@ -1,0 +1,301 @@
+"""ROS 2 on Zenoh without ROS 2: the standard messages that we speak, in CDR, and who speaks them.
+
+Field names, order and types are those of the packages' .msg files (common_interfaces and
+ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
+the left, positive steering and yaw to the left (REP 103). On the wire they are CDR behind a header
+of four bytes that says plain CDR (XCDR version 1), little-endian: `00 01 00 00`; a big-endian one
+is read, too. Safe with several threads: pycdr2's own buffer, one for each type, is not used.
+
+The one file that imports pycdr2: a board without ROS 2 need not have it. No `from __future__ import
+annotations` here: pycdr2 reads the annotations, also on Python 3.8.
+"""
+
+import contextlib
+import math
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Callable, Dict, Iterator, List, Tuple, Type, TypeVar, Union
+
+import zenoh
+
+from edge_runtime.transport import only_own
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.ros2 import names
+from edge_runtime.wire import Reason, Rejection
+
+try:
+    from pycdr2 import IdlStruct
+
+    # Private, but in the signature of `serialize`; the package is pinned, and a test would notice.
+    from pycdr2._support import Buffer, Endianness
+    from pycdr2.types import array, float32, float64, int32, uint8, uint32
+except ImportError:
+    raise UserError(
+        "ROS 2 messages need the package pycdr2: pip install 'phil-edge-runtime[ros2]',"
+        " or pip install pycdr2"
+    ) from None
+
+
+HEADER_BYTES = 4
+CDR_BIG_ENDIAN, CDR_LITTLE_ENDIAN = 0, 1
+MAX_PAYLOAD_BYTES = 1024 * 1024
+_ALIGNMENT = 4  # DDS fills a message up to this.
+# What hostile bytes make pycdr2 raise: the end too early, bad UTF-8, absurd lengths.
+_DECODE_ERRORS = (struct.error, ValueError, OverflowError, MemoryError, IndexError)
+COVARIANCE_SIZE = 36
+if TYPE_CHECKING:
+    Covariance = List[float]
+else:
+    Covariance = array[float64, COVARIANCE_SIZE]
+
+
+def no_covariance() -> List[float]:
+    """A 6x6 matrix of zeros, row by row: to ROS that means unknown."""
+    return [0.0] * COVARIANCE_SIZE
+
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces/msg/Time"):
+    """Seconds and nanoseconds since 1970."""
+
+    sec: int32 = 0
+    nanosec: uint32 = 0
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs/msg/Header"):
+    """When, and in which coordinate frame."""
+
+    stamp: Time = field(default_factory=Time)
+    frame_id: str = ""
+
+
+@dataclass
+class AckermannDrive(IdlStruct, typename="ackermann_msgs/msg/AckermannDrive"):
+    """`steering_angle` (rad) of a wheel at the centre of the front axle; `speed` in m/s.
+
+    Zero in `acceleration` (m/s2), `jerk` and `steering_angle_velocity` means as quick as can be.
+    """
+
+    steering_angle: float32 = 0.0
+    steering_angle_velocity: float32 = 0.0
+    speed: float32 = 0.0
+    acceleration: float32 = 0.0
+    jerk: float32 = 0.0
+
+
+@dataclass
+class AckermannDriveStamped(IdlStruct, typename="ackermann_msgs/msg/AckermannDriveStamped"):
+    """A drive command and its time."""
+
+    header: Header = field(default_factory=Header)
+    drive: AckermannDrive = field(default_factory=AckermannDrive)
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs/msg/Vector3"):
+    """Three numbers; as a Point of the same layout, a place in metres."""
+
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs/msg/Quaternion"):
+    """A rotation; the default is none."""
+
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+    w: float64 = 1.0
+
+
+@dataclass
+class Twist(IdlStruct, typename="geometry_msgs/msg/Twist"):
+    """Velocity in m/s and rad/s."""
+
+    linear: Vector3 = field(default_factory=Vector3)
+    angular: Vector3 = field(default_factory=Vector3)
+
+
+@dataclass
+class Pose(IdlStruct, typename="geometry_msgs/msg/Pose"):
+    """Where, and turned how."""
+
+    position: Vector3 = field(default_factory=Vector3)
+    orientation: Quaternion = field(default_factory=Quaternion)
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, typename="geometry_msgs/msg/PoseWithCovariance"):
+    """A pose, and the covariance of x, y, z and the rotations about them."""
+
+    pose: Pose = field(default_factory=Pose)
+    covariance: Covariance = field(default_factory=no_covariance)
+
+
+@dataclass
+class TwistWithCovariance(IdlStruct, typename="geometry_msgs/msg/TwistWithCovariance"):
+    """A velocity and its covariance."""
+
+    twist: Twist = field(default_factory=Twist)
+    covariance: Covariance = field(default_factory=no_covariance)
+
+
+@dataclass
+class Odometry(IdlStruct, typename="nav_msgs/msg/Odometry"):
+    """A pose in the frame `header.frame_id`, and the velocity in the frame `child_frame_id`."""
+
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+    twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
+
+
+@dataclass
+class Image(IdlStruct, typename="sensor_msgs/msg/Image"):
+    """`height` rows of `step` bytes each."""
+
+    header: Header = field(default_factory=Header)
+    height: uint32 = 0
+    width: uint32 = 0
+    encoding: str = "mono8"
+    is_bigendian: uint8 = 0
+    step: uint32 = 0
+    data: bytes = b""  # On the wire a sequence of uint8; pycdr2 copies bytes in one piece.
+
+
+def stamp_of(time_ns: int) -> Time:
+    """The wall clock's nanoseconds as a ROS time."""
+    return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+
+
+RosMessage = Union[AckermannDriveStamped, Twist, Odometry, Image]
+_M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry, Image)
+
+
+def encode(message: RosMessage) -> bytes:
+    """The header and the message in little-endian CDR.
+
+    Raises struct.error for a number that its field cannot hold.
+    """
+    return bytes(message.serialize(buffer=Buffer(), endianness=Endianness.Little))
+
+
+def decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
+    """A message of that kind, all of whose numbers are finite, or why not. Never raises."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        detail = f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read"
+        return Rejection(Reason.OVERSIZED, detail)
+    if len(payload) < HEADER_BYTES:
+        return Rejection(Reason.MALFORMED, f"{len(payload)} bytes are no CDR")
+    (representation,) = struct.unpack_from(">H", payload)
+    if representation not in (CDR_BIG_ENDIAN, CDR_LITTLE_ENDIAN):
+        return Rejection(Reason.SCHEMA, f"CDR of kind {representation:#06x}, not plain CDR")
+    buffer = Buffer(payload, align_offset=HEADER_BYTES)
+    try:
+        # A buffer of our own in place of the bytes, to see where the message ends.
+        message: _M = kind.deserialize(buffer)  # type: ignore[arg-type]
+    except _DECODE_ERRORS as error:
+        return Rejection(Reason.MALFORMED, str(error))
+    # pycdr2 takes a text or data that is cut off for a short one; and the type is not in the
+    # payload: what is left over is the mark of another one.
+    if not 0 <= len(payload) - buffer.tell() < _ALIGNMENT:
+        detail = f"{len(payload)} bytes, the {kind.__name__} ends at {buffer.tell()}"
+        return Rejection(Reason.MALFORMED, detail)
+    return _finite(message)
+
+
+def _finite(message: _M) -> Union[_M, Rejection]:
+    for name, value in _leaves(message, ""):
+        if isinstance(value, float) and not math.isfinite(value):
+            return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
+    return message
+
+
+def _leaves(value: Any, name: str) -> Iterator[Tuple[str, Any]]:
+    if isinstance(value, (list, tuple)):
+        for number in value:
+            yield name, number
+    elif hasattr(value, "__dataclass_fields__"):
+        for part in value.__dataclass_fields__:
+            yield from _leaves(getattr(value, part), f"{name}.{part}" if name else part)
+    else:
+        yield name, value
+
+
+class Ros2Node:
+    """Uses a session that somebody else opens and closes. `close` it before the session.
+
+    `rejected` counts what arrived and could not be read, by reason; `sent` what was published, by
+    key.
+    """
+
+    def __init__(self, session: zenoh.Session, namespace: str) -> None:
+        self.rejected: Dict[str, int] = {}
+        self.sent: Dict[str, int] = {}
+        self._session = session
+        self._namespace = namespace
+        self._zid = str(session.info.zid())
+        self._declared: List[Any] = []
+        self._announce(names.member_token(self._zid))
+
+    def publisher(self, topic: str, kind: Type[_M]) -> Callable[[_M], None]:
+        """What publishes messages of that kind on that topic. It never waits for a subscriber."""
+        key = names.key(self._namespace, topic)
+        publisher = self._session.declare_publisher(
+            key, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._declared.append(publisher)
+        self._announce_topic(names.PUBLISHER, key, kind, names.RELIABLE)
+        self.sent[key] = 0
+
+        def publish(message: _M) -> None:
+            publisher.put(encode(message))
+            self.sent[key] += 1
+
+        return publish
+
+    def subscribe(self, topic: str, kind: Type[_M], take: Callable[[_M], None]) -> None:
+        """Call `take` with each message, in Zenoh's thread; what cannot be read is counted."""
+        key = names.key(self._namespace, topic)
+
+        def hear(sample: zenoh.Sample) -> None:
+            # Something huge is not copied to be counted.
+            if len(sample.payload) > MAX_PAYLOAD_BYTES:
+                self._count(Reason.OVERSIZED)
+                return
+            message = decode(sample.payload.to_bytes(), kind)
+            if isinstance(message, Rejection):
+                self._count(message.reason)
+            else:
+                take(message)
+
+        self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
+        self._announce_topic(names.SUBSCRIBER, key, kind, names.BEST_EFFORT)
+
+    def close(self) -> None:
+        """Withdraw everything; safe to call twice."""
+        while self._declared:
+            self._declared.pop().undeclare()
+
+    def _announce_topic(self, role: str, key: str, kind: Any, qos: names.Qos) -> None:
+        type_name = str(kind.__idl_typename__)
+        self._announce(names.topic_token(self._zid, role, key, type_name, qos))
+
+    def _announce(self, token: str) -> None:
+        self._declared.append(self._session.liveliness().declare_token(token))
+
+    def _count(self, reason: Reason) -> None:
+        self.rejected[reason.value] = self.rejected.get(reason.value, 0) + 1
+
+
+@contextlib.contextmanager
+def open_node(session: zenoh.Session, namespace: str) -> Iterator[Ros2Node]:
+    """A node for the length of a block."""
+    node = Ros2Node(session, namespace)
+    try:
+        yield node
+    finally:
+        node.close()
