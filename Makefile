@@ -12,8 +12,8 @@ CONTAINER_STAMP := $(CONTAINER)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor pictures demo test test-ray test-network test-board lint format lint-container bench bench-quick \
-	bench-loop bench-view bench-can network vehicle board fleet recording mutate lock clean
+.PHONY: help install doctor pictures demo test test-ray test-board lint format lint-container bench \
+	bench-quick bench-loop vehicle board recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -45,9 +45,6 @@ test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
 	$(BIN)/python -m pytest -m ray trainer
-
-test-network: $(STAMP)  ## the loop over a kernel network of two namespaces; needs root
-	$(BIN)/python -m pytest -m network hil_tests
 
 test-board: $(STAMP)  ## whole bundles installed, on an emulated board, too, with every fault; minutes, root
 	$(BIN)/python -m pytest -m board
@@ -85,26 +82,13 @@ bench: $(STAMP) $(PEERS_STAMP)  ## speed and memory beside peers: tables, and JS
 bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table only
 	$(BIN)/python -m trainer bench --quick --threads 1
 
-network: $(STAMP)  ## TCP, UDP, relay and virtual time on the same network; needs root, some 25 minutes
-	$(BIN)/python -m hil_tests network --out results/network/network.json --report results/network
-	$(BIN)/python -m hil_tests.network.variants --out results/network/variants.json
-
 board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
 	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
 	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
 	$(BIN)/python -m hil_tests board --boards systemd --out results/deploy/systemd.json
 
-fleet: $(STAMP)  ## a router with 1, 5, 10 and 20 edge runtimes: processor, memory, bandwidth each
-	$(BIN)/python -m hil_tests fleet --out results/deploy/fleet.json
-
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
 	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
-
-bench-view: $(STAMP)  ## what looking on costs the training loop and the simulator
-	$(BIN)/python -m hil_tests.benches.viewing --out $(BENCH)/viewing.json
-
-bench-can: $(STAMP)  ## ten minutes of the 50 Hz CAN stream, every core busy, beside a bare sender
-	$(BIN)/python -m hil_tests.benches.can_stream --out $(BENCH)/can_stream.json
 
 vehicle: $(STAMP)  ## policy in the loop against a mock Hunter in the loop, and the lag it may have; some 15 minutes
 	$(BIN)/python -m hil_tests vehicle --out results/vehicle/left_turn.json

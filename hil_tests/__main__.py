@@ -26,14 +26,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "hil_tests.board.command",
         "a bundle installed and driven on boards that are not there; needs root",
     ),
-    "fleet": (
-        "hil_tests.fleet.command",
-        "a router with TLS and rights for many vehicles, and what each of them costs",
-    ),
-    "network": (
-        "hil_tests.network.command",
-        "the left turn over a kernel's TCP and UDP, and the model in two times",
-    ),
 }
 
 

@@ -96,23 +96,6 @@ def virtual_can() -> str:
     return "a vcan device could be made"
 
 
-def namespaces() -> str:
-    """The two namespaces and the TUN device of `hil_tests network`."""
-    from hil_tests.network.namespaces import TUN_DEVICE, why_not
-
-    if reason := why_not():
-        raise MissingError(reason)
-    with TUN_DEVICE.open("r+b", buffering=0):
-        return f"two namespaces were made; {TUN_DEVICE} opens"
-
-
-def netem() -> str:
-    """The kernel takes a netem queue, in a network namespace that goes with the command."""
-    words = ("tc", "qdisc", "add", "dev", "lo", "root", "netem", "delay", "1ms")
-    output_of(*throwaway_namespace(), *words, name="tc qdisc add netem")
-    return "a netem queue could be added"
-
-
 def throwaway_namespace() -> tuple[str, ...]:
     """The words to put before a command that needs a network of its own, and rights in it."""
     if shutil.which("unshare") is None:

@@ -94,16 +94,6 @@ CHECKS: dict[str, tuple[Check, ...]] = {
             "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)",
         ),
     ),
-    "network": (
-        Check(
-            "namespaces, TUN", links.namespaces, "no `hil_tests network`, no `make test-network`",
-            "root, iproute2; in a container --cap-add NET_ADMIN,SYS_ADMIN --device /dev/net/tun",
-        ),
-        Check(
-            "netem", links.netem, "everything: `hil_tests network` then carries packets itself",
-            "`modprobe sch_netem` (Ubuntu: package linux-modules-extra-*)",
-        ),
-    ),
     "board": (
         Check("ssh", machine.ssh, "no `deploy push`", "apt install openssh-client"),
         Check(

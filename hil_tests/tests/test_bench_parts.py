@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from hil_tests.benches import can_stream
 from hil_tests.benches.quantiles import compare
 from hil_tests.benches.table import lines
 
@@ -56,26 +55,3 @@ def test_every_bar_is_met_or_missed_by_its_own_figure():
     ):  # fmt: skip
         bars = [line.bar for line in lines(report(**missed))]
         assert sum(bar.endswith("MISSED") for bar in bars) == 1
-
-
-def test_gaps_of_a_stream_by_hand():
-    found = can_stream.gaps([0.0, 0.020, 0.040, 0.070, 0.090])
-    assert found == {
-        "frames": 5,
-        "p50_ms": 20.0,
-        "p99_ms": pytest.approx(29.7),
-        "max_ms": pytest.approx(30.0),
-        "over_25_ms": 1,
-    }
-
-
-@pytest.mark.parametrize(
-    ("p99_ms", "max_ms", "verdict"),
-    [(24.9, 499.0, "met"), (25.0, 30.0, "MISSED"), (21.0, 500.0, "MISSED")],
-)
-def test_the_table_of_a_stream_says_whether_its_bars_are_met(p99_ms, max_ms, verdict):
-    row = {"frames": 30_000, "p50_ms": 20.0, "p99_ms": p99_ms, "max_ms": max_ms, "over_25_ms": 0}
-    report = {"seconds": 600.0, "busy_processes": 2, "realtime_priority": 0, "links_lost": 0}
-    text = can_stream.render({**report, "safe_stops": 1, "driver": row, "floor": row})
-    assert f"under 500: {verdict}; the chassis lost the link 0 times, 1 safe stops" in text
-    assert "10.0 min, 2 busy processes" in text
