@@ -88,13 +88,13 @@ board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline,
 	$(BIN)/python -m hil_tests board --boards systemd --out results/deploy/systemd.json
 
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
-	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
+	$(BIN)/python -m hil_tests bench --out $(BENCH)/loop.json
 
 vehicle: $(STAMP)  ## policy in the loop against a mock Hunter in the loop, and the lag it may have; some 15 minutes
 	$(BIN)/python -m hil_tests vehicle --out results/vehicle/left_turn.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
-	$(BIN)/python -m hil_tests.recordings.make
+	$(BIN)/python -m hil_tests recording
 
 $(MUTATION_STAMP): requirements/mutation.txt
 	$(PYTHON) -m venv $(MUTATION)

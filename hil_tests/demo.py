@@ -8,17 +8,17 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
+from rich.table import Table
 
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_json
 from edge_runtime.option_types import not_negative, positive, positive_number
 from edge_runtime.transport import free_endpoint
-from hil_tests.commands import BackgroundCommand, run_command
-from hil_tests.drives_table import drives_table
-from hil_tests.operator import Operator
+from hil_tests.processes import BackgroundCommand, Operator, run_command
 
 MARKER = ".phil-demo"
 """Says that a directory is a demo's, so that the demo may replace what is in it."""
@@ -240,3 +240,27 @@ class Demo:
 def heading(text: str) -> None:
     """Announce a step."""
     Console().print(f"\n[bold]{text}[/bold]")
+
+
+COLUMNS = ("drive", "success", "distance, m", "p50, ms", "p99, ms", "safe stops")
+
+
+def drives_table(reports: dict[str, dict[str, Any]]) -> Table:
+    """A row for each report, under its name."""
+    table = Table(title="Left turn, the same seeds; latency from state sent to command received")
+    for column in COLUMNS:
+        table.add_column(column, justify="left" if column == COLUMNS[0] else "right")
+    for name, report in reports.items():
+        table.add_row(name, *_cells(report))
+    return table
+
+
+def _cells(report: dict[str, Any]) -> list[str]:
+    distance, latency = report["surviving_distance_m"], report.get("latency_ms")
+    return [
+        f"{report['success_rate']:.0%}",
+        f"{distance['mean']:.2f} ± {distance['std']:.2f}",
+        f"{latency['p50']:.1f}" if latency else "-",
+        f"{latency['p99']:.1f}" if latency else "-",
+        str(report.get("safe_stops", "-")),
+    ]

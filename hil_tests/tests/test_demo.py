@@ -1,8 +1,11 @@
 """The demo, whole but small: every step once, and again from what it kept."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -10,8 +13,8 @@ import pytest
 from edge_runtime.errors import UserError
 from edge_runtime.tests.commands import exit_status
 from hil_tests.__main__ import main
-from hil_tests.commands import BackgroundCommand
 from hil_tests.demo import Demo
+from hil_tests.processes import BackgroundCommand
 
 SMALL = (
     "--episodes", "2", "--human-episodes", "20", "--human-minutes", "0.001", "--runs", "1",
@@ -81,3 +84,36 @@ def test_a_background_command_that_fails_says_why(tmp_path):
     missing = str(tmp_path / "none.onnx")
     with pytest.raises(UserError, match="does not exist"):
         BackgroundCommand("edge_runtime", "run", "--policy", missing, ready="ready")
+
+
+CHILD = """
+import signal, sys, time
+from pathlib import Path
+
+def keep(number, frame):
+    time.sleep(1.0)
+    Path("kept").touch()
+    sys.exit(130)
+
+signal.signal(signal.SIGINT, keep)
+Path("ready").touch()
+time.sleep(60)
+"""
+
+
+def test_what_an_interrupted_command_keeps_is_waited_for(tmp_path):
+    (tmp_path / "child.py").write_text(CHILD)
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "from hil_tests.processes import run_command; run_command('child')"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )  # fmt: skip
+    end_s = time.monotonic() + 30.0
+    while not (tmp_path / "ready").exists() and time.monotonic() < end_s:
+        time.sleep(0.02)
+    os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
+    assert parent.wait(30) != 0
+    assert (tmp_path / "kept").exists()
