@@ -99,10 +99,17 @@ recording: $(STAMP)  ## drive and record anew what the next release is replayed 
 $(MUTATION_STAMP): requirements/mutation.txt
 	$(PYTHON) -m venv $(MUTATION)
 	$(MUTATION)/bin/python -m pip install --quiet --requirement requirements/mutation.txt
+	$(MUTATION)/bin/python -m pip install --quiet --no-deps --editable .
 	@touch $@
 
+# On a copy: a run that is killed must change no source.
 mutate: $(MUTATION_STAMP)  ## change the safety core in every small way: a test must fail each time
-	$(MUTATION)/bin/python -m hil_tests.mutation --out results/mutation
+	rm -rf build/mutation && mkdir -p build/mutation && cp -r edge_runtime hil_tests build/mutation
+	export PATH="$(CURDIR)/$(MUTATION)/bin:$$PATH" && cd build/mutation && for part in core hunter; do \
+		configuration=hil_tests/mutation/$$part.toml && cosmic-ray init $$configuration $$part.sqlite && \
+		cr-filter-operators $$part.sqlite $$configuration && cosmic-ray baseline $$configuration && \
+		cosmic-ray exec $$configuration $$part.sqlite || exit; \
+	done && python -m hil_tests.mutation.judge core.sqlite hunter.sqlite
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new
