@@ -10,11 +10,9 @@ import argparse
 import queue
 import statistics
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,7 +26,7 @@ from edge_runtime.latency.model import parse_spec
 from edge_runtime.option_types import not_negative, positive
 from edge_runtime.transport import free_endpoint
 from hil_tests.faults.run import choose_rows, run_faults
-from hil_tests.processes import BackgroundCommand, CommandTimeoutError, trusting
+from hil_tests.processes import BackgroundCommand, CommandTimeoutError, in_threads, trusting
 from hil_tests.report import (
     check_report,
     render_faults,
@@ -321,48 +319,34 @@ def drive_chunks(
     jobs: int,
     on_chunk: Callable[[Chunk, dict[str, Any]], None],
 ) -> None:
-    """Drive all chunks, ``jobs`` at a time; ``on_chunk`` is called by one thread at a time.
+    """Drive all chunks, ``jobs`` at a time.
 
     Raises:
         UserError: a command failed, or the machine stood still again and again.
     """
-    waiting: queue.SimpleQueue[Chunk] = queue.SimpleQueue()
-    for chunk in chunks:
-        waiting.put(chunk)
-    stopping, one_at_a_time = threading.Event(), threading.Lock()
+    idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
 
-    def work() -> None:
-        with tempfile.TemporaryDirectory(prefix="phil-campaign-") as directory:
-            worker = Worker(task, Path(directory))
-            try:
-                while not stopping.is_set():
-                    try:
-                        chunk = waiting.get_nowait()
-                    except queue.Empty:
-                        return
-                    found = worker.drive(chunk)
-                    with one_at_a_time:
-                        on_chunk(chunk, found)
-            finally:
-                worker.close()
-
-    count = min(jobs, len(chunks))
-    with ThreadPoolExecutor(count) as pool:
-        futures = [pool.submit(work) for _ in range(count)]
+    def work(chunk: Chunk) -> dict[str, Any]:
+        worker = idle.get()
         try:
-            wait(futures, return_when=FIRST_EXCEPTION)
-        finally:  # Also on ^C: what is being driven is ended, the rest is not begun.
-            stopping.set()
-        for future in futures:
-            future.result()
+            return worker.drive(chunk)
+        finally:
+            idle.put(worker)
+
+    with ExitStack() as stack:
+        directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="phil-campaign-"))
+        for number in range(min(jobs, len(chunks))):
+            worker = Worker(task, Path(directory) / f"{number}.json")
+            stack.callback(worker.close)
+            idle.put(worker)
+        in_threads(work, chunks, jobs, on_chunk)
 
 
 class Worker:
     """One edge runtime that stays, and one simulator after another."""
 
-    def __init__(self, task: Task, directory: Path) -> None:
-        self._task = task
-        self._out = directory / "report.json"
+    def __init__(self, task: Task, out: Path) -> None:
+        self._task, self._out = task, out
         self.start_edge()
 
     def start_edge(self) -> None:

@@ -46,29 +46,15 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--fresh", action="store_true", help="train anew even where a trained policy is kept"
     )
-    parser.add_argument("--seed", type=not_negative, default=1, help="of the training")
-    parser.add_argument(
-        "--episodes",
-        type=positive,
-        default=TRAINING_EPISODES,
-        help="of the PHIL-TD3 training, at most",
-    )
-    parser.add_argument(
-        "--human-episodes", type=positive, default=60, help="of the human model's training"
-    )
-    parser.add_argument(
-        "--human-minutes",
-        type=positive_number,
-        default=HUMAN_MINUTES,
-        help="limit of the human model's training",
-    )
-    parser.add_argument(
-        "--minutes",
-        type=positive_number,
-        default=TRAINING_MINUTES,
-        help="limit of the PHIL-TD3 training",
-    )
-    parser.add_argument("--runs", type=positive, default=RUNS, help="test episodes of each drive")
+    for name, kind, default, text in (
+        ("--seed", not_negative, 1, "of the training"),
+        ("--episodes", positive, TRAINING_EPISODES, "of the PHIL-TD3 training, at most"),
+        ("--human-episodes", positive, 60, "of the human model's training"),
+        ("--human-minutes", positive_number, HUMAN_MINUTES, "limit of the human model's training"),
+        ("--minutes", positive_number, TRAINING_MINUTES, "limit of the PHIL-TD3 training"),
+        ("--runs", positive, RUNS, "test episodes of each drive"),
+    ):
+        parser.add_argument(name, type=kind, default=default, help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -16,12 +16,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from edge_runtime.errors import UserError
 from edge_runtime.operator_commands import ask
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 POLICY = Path("results/policies/left_turn.onnx")
 PUBLIC_KEY = POLICY.with_name("policy.pub")
 """The policy that ships, and what it is verified with."""
@@ -280,6 +283,28 @@ def end_children() -> None:
         for child in children.read_text().split():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(int(child), signal.SIGTERM)
+
+
+def in_threads(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    jobs: int,
+    on_done: Callable[[Item, Result], None],
+) -> None:
+    """Do the work of each item, ``jobs`` at a time; ``on_done`` is called here, as they end.
+
+    After a failure, and on ^C, what has not begun is not begun any more, and every process that
+    the others wait for is asked to end.
+    """
+    with ThreadPoolExecutor(min(jobs, len(items)) or 1) as pool:
+        futures = {pool.submit(work, item): item for item in items}
+        try:
+            for future in as_completed(futures):
+                on_done(futures[future], future.result())
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            end_children()
+            raise
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:

@@ -14,14 +14,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_EXCEPTION,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    as_completed,
-    wait,
-)
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from functools import cache
@@ -36,7 +29,7 @@ from edge_runtime.option_types import not_negative, positive
 from edge_runtime.transport import free_endpoint
 from hil_tests.faults.rig import free_bus
 from hil_tests.mock_hunter.body import make_parameters, read_changes
-from hil_tests.processes import BackgroundCommand, Operator, end_children, trusting
+from hil_tests.processes import BackgroundCommand, Operator, in_threads, trusting
 from hil_tests.report import (
     check_report,
     comparison_verdict,
@@ -165,11 +158,7 @@ def _compare(drive: Drive, arguments: argparse.Namespace) -> dict[str, Any]:
         def on_part(report: dict[str, Any]) -> None:
             bar.advance({"success": f"{report['success_rate']:.2f}", "loop": report["loop"]})
 
-        try:
-            return run_comparison(drive, arguments.target, arguments.rigs, on_part)
-        except BaseException:
-            end_children()
-            raise
+        return run_comparison(drive, arguments.target, arguments.rigs, on_part)
 
 
 def _sweep(
@@ -224,7 +213,14 @@ def run_comparison(drive: Drive, target: float, rigs: int, on_part: Told) -> dic
     Raises:
         UserError: a command failed.
     """
-    reports = _run_all([(part, loop) for loop in LOOPS for part in parts(drive)], rigs, on_part)
+    reports: list[dict[str, Any]] = []
+
+    def on_done(_: tuple[Drive, str], report: dict[str, Any]) -> None:
+        reports.append(report)
+        on_part(report)
+
+    turns = [(part, loop) for loop in LOOPS for part in parts(drive)]
+    in_threads(lambda turn: run_rig(*turn), turns, rigs, on_done)
     rows = {loop: loop_row(loop, [r for r in reports if r["loop"] == loop]) for loop in LOOPS}
     return {
         **_drive_facts(drive),
@@ -242,22 +238,6 @@ def parts(drive: Drive) -> list[Drive]:
         drive._replace(first_seed=seed, episodes=min(PART_EPISODES, end - seed))
         for seed in range(drive.first_seed, end, PART_EPISODES)
     ]
-
-
-def _run_all(drives: Sequence[tuple[Drive, str]], rigs: int, on_part: Told) -> list[dict[str, Any]]:
-    def told(done: Future[dict[str, Any]]) -> None:
-        if not done.cancelled() and done.exception() is None:
-            on_part(done.result())
-
-    with ThreadPoolExecutor(rigs) as pool:
-        futures = [pool.submit(run_rig, drive, loop) for drive, loop in drives]
-        for future in futures:
-            future.add_done_callback(told)
-        try:
-            wait(futures, return_when=FIRST_EXCEPTION)
-        finally:  # Also on ^C: what has not begun is not begun any more.
-            pool.shutdown(wait=False, cancel_futures=True)
-        return [future.result() for future in futures if not future.cancelled()]
 
 
 def run_rig(drive: Drive, loop: str) -> dict[str, Any]:

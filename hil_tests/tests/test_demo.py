@@ -6,12 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from edge_runtime.errors import UserError
 from edge_runtime.tests.commands import exit_status
+from hil_tests import demo
 from hil_tests.__main__ import main
 from hil_tests.demo import Demo
 from hil_tests.processes import BackgroundCommand
@@ -22,17 +22,15 @@ SMALL = (
 )  # fmt: skip
 
 
-def demo(out: Path) -> subprocess.CompletedProcess:
-    """Run the demo as a person would, without a terminal."""
-    arguments = [sys.executable, "-m", "hil_tests", "demo", "--out", str(out), *SMALL]
-    return subprocess.run(
-        arguments, capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False
-    )
-
-
 @pytest.mark.timeout(400)
-def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(tmp_path):
-    first = demo(tmp_path / "demo")
+def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(
+    tmp_path, monkeypatch, capsys
+):
+    words = ["demo", "--out", str(tmp_path / "demo"), *SMALL]
+    first = subprocess.run(  # as a person would, without a terminal
+        [sys.executable, "-m", "hil_tests", *words],
+        capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False,
+    )  # fmt: skip
     # A policy of two episodes may well drive badly (status 1); anything else is a fault.
     assert first.returncode in (0, 1), first.stderr
     made = {path.name for path in (tmp_path / "demo").iterdir()}
@@ -49,10 +47,13 @@ def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(tmp_pa
     for text in ("in process", "over Zenoh", "each way", "safe stops"):
         assert text in first.stdout
     policy = (tmp_path / "demo" / "left_turn.onnx").read_bytes()
-    second = demo(tmp_path / "demo")
-    assert second.returncode == first.returncode
-    assert "is kept" in second.stdout
-    assert "trainer train" not in second.stdout
+    # What the second one does with its policy is what the first one did: only its commands count.
+    commands = []
+    monkeypatch.setattr(demo, "run_command", lambda *words: commands.append(words[:2]))
+    monkeypatch.setattr(demo.Demo, "_simulate", lambda *_: commands.append(("simulate",)))
+    assert main(words) == first.returncode
+    assert "is kept" in capsys.readouterr().out
+    assert commands == [("trainer", "evaluate"), *[("simulate",)] * 3]
     assert (tmp_path / "demo" / "left_turn.onnx").read_bytes() == policy
 
 
