@@ -1,7 +1,7 @@
 """``python -m hil_tests doctor``: what this machine can and cannot do, and how to get the rest.
 
-Each probe does the thing instead of looking for it. At the end CHECKS lists them all: what is not
-there without it, and how to get it. It runs in a fresh clone, before anything is installed, so
+Each probe does the thing instead of looking for it. Above it stands what is not there
+without it, and how to get it. It runs in a fresh clone, before anything is installed, so
 only the standard library is imported up here; heavy libraries are tried in a process of their own.
 """
 
@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.errors import UserError
 
+BASICS = "basics"
 INSTALL = "make install"
 NOT_READY = 1
 """Exit status where a basic is missing."""
@@ -152,18 +153,35 @@ class MissingError(Exception):
     """The machine has it not; the text says what was tried and what came of it."""
 
 
+Probe = Callable[[], str]
+"""Does it, and says in a few words what it found; any exception says that it is missing."""
+
+
 class Check(NamedTuple):
     """One thing that a machine may have."""
 
     name: str
-    probe: Callable[[], str]
-    """Does it, and says in a few words what it found; any exception says that it is missing."""
+    probe: Probe
     without: str
     """What there is where it is missing, or is not."""
     remedy: str
     """How to get it."""
-    basic: bool = False
-    """Whether nothing much works without it."""
+
+
+CHECKS: dict[str, list[Check]] = {
+    group: [] for group in (BASICS, "training", "person", "seeing", "ports", "vehicle", "board")
+}
+"""Group -> its checks; `check` puts them there. Nothing much works without the basics."""
+
+
+def check(group: str, name: str, without: str, remedy: str) -> Callable[[Probe], Probe]:
+    """Put a probe into CHECKS."""
+
+    def add(probe: Probe) -> Probe:
+        CHECKS[group].append(Check(name, probe, without, remedy))
+        return probe
+
+    return add
 
 
 class Finding(NamedTuple):
@@ -186,15 +204,16 @@ def examine(group: str, check: Check) -> Finding:
     # Whatever it is that was to be tried: it was not come to.
     except ModuleNotFoundError as error:
         ok, detail, remedy = False, f"Python finds no module {error.name}", INSTALL
-    except MissingError as error:
+    except (MissingError, UserError) as error:
         ok, detail = False, str(error)
     # A broken library may raise anything at all, and the checks after it are still wanted.
     except Exception as error:
         ok, detail = False, f"{type(error).__name__}: {error}"
     text = " ".join(detail.split())
-    return Finding(group, check.name, ok, text, check.basic, check.without, remedy)
+    return Finding(group, check.name, ok, text, group == BASICS, check.without, remedy)
 
 
+@check(BASICS, "Python", "nothing", "Python 3.11 or newer; make PYTHON=...")
 def python() -> str:
     """The interpreter that runs this."""
     number = tuple(map(int, platform.python_version_tuple()[:2]))
@@ -203,6 +222,7 @@ def python() -> str:
     return f"{platform.python_version()}, {sys.executable}"
 
 
+@check(BASICS, "packages", "nothing that imports them", INSTALL)
 def packages() -> str:
     """Every library that pyproject.toml asks for is there."""
     import tomllib  # An older Python has none, and is to say so in the check before.
@@ -215,169 +235,10 @@ def packages() -> str:
     return f"all {len(wanted)} that pyproject.toml asks for"
 
 
-def versions() -> str:
-    """What is installed is what the lock names."""
-    locked = dict(line.split("==") for line in LOCK.read_text().splitlines() if "==" in line)
-    found = {name: version for name in locked if (version := _installed(name)) is not None}
-    other = [
-        f"{name} {version} (locked: {locked[name]})"
-        for name, version in found.items()
-        # torch says +cpu or +cu130 behind its version.
-        if version.split("+")[0] != locked[name]
-    ]
-    if other:
-        raise MissingError(f"other versions: {', '.join(other)}")
-    return f"{len(found)} packages as in {LOCK.name}"
-
-
-def kernel() -> str:
-    """The learner's C++ kernel builds and loads."""
-    facts = _torch_facts()
-    if not facts["kernel"]:
-        raise MissingError("; ".join(facts["why"]) or "turned off by PHIL_KERNEL=0")
-    return "the learner's kernel is built and loaded"
-
-
-def gpu() -> str:
-    """Torch sees a CUDA device."""
-    facts = _torch_facts()
-    if not facts["gpu"]:
-        raise MissingError(f"torch {facts['torch']} sees no CUDA device")
-    return str(facts["gpu"])
-
-
-def _installed(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-@functools.lru_cache(maxsize=None)  # noqa: UP033
-def _torch_facts() -> dict[str, Any]:
-    # A driver that does not fit may end the process that asks for it.
-    facts: dict[str, Any] = json.loads(output_of_python(_TORCH).splitlines()[-1])
-    return facts
-
-
-def disk() -> str:
-    """Room where runs are written by default, and the right to write there."""
-    with tempfile.NamedTemporaryFile(dir=Path.cwd(), prefix=".doctor-") as file:
-        file.write(b"doctor")
-    free = shutil.disk_usage(Path.cwd()).free
-    if free < DISK_BYTES:
-        raise MissingError(f"{free / 1e9:.1f} GB are free here, {DISK_BYTES / 1e9:.0f} are wanted")
-    return f"{free / 1e9:.0f} GB free in {Path.cwd()}"
-
-
-def memory() -> str:
-    """Memory that could be had now."""
-    lines = Path("/proc/meminfo").read_text().splitlines()
-    available = next(int(line.split()[1]) * 1024 for line in lines if "MemAvailable" in line)
-    if available < MEMORY_BYTES:
-        raise MissingError(f"{available / 1e9:.1f} GB available, {MEMORY_BYTES / 1e9:.0f} wanted")
-    return f"{available / 1e9:.0f} GB available, {os.cpu_count()} cores"
-
-
-def realtime_priority() -> str:
-    """A thread gets the priority that `edge_runtime run` may ask for."""
-    try:
-        # The thread keeps the priority to itself, and ends with it.
-        with ThreadPoolExecutor(1) as thread:
-            thread.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).result()
-    except OSError as error:
-        raise MissingError(f"SCHED_FIFO is refused: {error.strerror}") from None
-    return "SCHED_FIFO was given to a thread"
-
-
-def program(name: str, *arguments: str) -> Callable[[], str]:
-    """A probe: the program runs, and says what it is."""
-
-    def probe() -> str:
-        path = _program(name)
-        return (output_of(path, *arguments).splitlines() or [path])[0]
-
-    return probe
-
-
-def ssh() -> str:
-    """OpenSSH says its version on stderr."""
-    path = _program("ssh")
-    output_of(path, "-V")
-    return path
-
-
-def xvfb() -> str:
-    """An X server without a screen starts, and ends."""
-    reader, writer = os.pipe()
-    command = [_program("Xvfb"), "-displayfd", str(writer), "-nolisten", "tcp"]
-    server = subprocess.Popen(command, pass_fds=[writer], stderr=subprocess.DEVNULL)
-    os.close(writer)
-    try:
-        with os.fdopen(reader) as pipe:
-            display = pipe.readline().strip()
-    finally:
-        server.terminate()
-        server.wait()
-    if not display:
-        raise MissingError("Xvfb ends at once")
-    return f"display :{display} came up and went"
-
-
-def chromium() -> str:
-    """A browser that runs without a screen."""
-    from trainer.benches.chromium import NAMES, find_chromium
-
-    if (path := find_chromium()) is None:
-        raise MissingError(f"none of {', '.join(NAMES)} is installed")
-    return output_of(path, "--version")
-
-
-def rerun_viewer() -> str:
-    """Rerun's viewer comes up without a screen, and goes."""
-    from hil_tests.pictures import headless_viewer
-
-    try:
-        with headless_viewer() as client:
-            picture = client.take_screenshot()
-    except UserError as error:
-        raise MissingError(str(error)) from None
-    return f"came up and drew a picture of {len(picture) / 1000:.0f} kB"
-
-
-def window() -> str:
-    """SDL opens the display that pygame's window would be on."""
-    facts = _sdl()
-    if facts["driver"] in ("", "dummy", "offscreen"):
-        shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        where = f"display {shown}" if shown else "neither DISPLAY nor WAYLAND_DISPLAY is set"
-        raise MissingError(f"SDL opens no window ({where})")
-    return f"SDL's driver {facts['driver']}"
-
-
-def controller() -> str:
-    """SDL sees a gamepad or a steering wheel."""
-    found = _sdl()["controllers"]
-    if found:
-        return ", ".join(found)
-    unreadable = [
-        str(path)
-        for path in [*_EVENTS.glob("event*"), *_EVENTS.glob("js*")]
-        if not os.access(path, os.R_OK)
-    ]
-    if unreadable:
-        raise MissingError(f"none that may be read: no right to {', '.join(sorted(unreadable))}")
-    raise MissingError("SDL sees no game controller")
-
-
-# Not functools.cache: an older Python, too, is to hear that it is too old.
-@functools.lru_cache(maxsize=None)  # noqa: UP033
-def _sdl() -> dict[str, Any]:
-    # In a process of its own: a display that is gone may end it.
-    facts: dict[str, Any] = json.loads(output_of_python(_SDL).splitlines()[-1])
-    return facts
-
-
+@check(
+    BASICS, "loopback", "no drive over Zenoh, no `make demo`, no `make test`",
+    "TCP on 127.0.0.1: `ip link set lo up`, or a rule in the firewall",
+)  # fmt: skip
 def zenoh_loopback() -> str:
     """A message from one Zenoh session to another, over TCP on loopback."""
     from edge_runtime.transport import free_endpoint, open_session
@@ -397,6 +258,163 @@ def zenoh_loopback() -> str:
     return f"a message went over {endpoint}"
 
 
+@check(
+    BASICS, "disk", "no training, no recordings (--out)",
+    "free some space, or work in another directory",
+)  # fmt: skip
+def disk() -> str:
+    """Room where runs are written by default, and the right to write there."""
+    with tempfile.NamedTemporaryFile(dir=Path.cwd(), prefix=".doctor-") as file:
+        file.write(b"doctor")
+    free = shutil.disk_usage(Path.cwd()).free
+    if free < DISK_BYTES:
+        raise MissingError(f"{free / 1e9:.1f} GB are free here, {DISK_BYTES / 1e9:.0f} are wanted")
+    return f"{free / 1e9:.0f} GB free in {Path.cwd()}"
+
+
+@check(BASICS, "memory", "no training", "end other programs")
+def memory() -> str:
+    """Memory that could be had now."""
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    available = next(int(line.split()[1]) * 1024 for line in lines if "MemAvailable" in line)
+    if available < MEMORY_BYTES:
+        raise MissingError(f"{available / 1e9:.1f} GB available, {MEMORY_BYTES / 1e9:.0f} wanted")
+    return f"{available / 1e9:.0f} GB available, {os.cpu_count()} cores"
+
+
+@check("training", "locked versions", "everything, but not to the last bits of results/", INSTALL)
+def versions() -> str:
+    """What is installed is what the lock names."""
+    locked = dict(line.split("==") for line in LOCK.read_text().splitlines() if "==" in line)
+    found = {name: version for name in locked if (version := _installed(name)) is not None}
+    other = [
+        f"{name} {version} (locked: {locked[name]})"
+        for name, version in found.items()
+        # torch says +cpu or +cu130 behind its version.
+        if version.split("+")[0] != locked[name]
+    ]
+    if other:
+        raise MissingError(f"other versions: {', '.join(other)}")
+    return f"{len(found)} packages as in {LOCK.name}"
+
+
+@check(
+    "training", "C++ kernel", "everything, but `trainer train` takes several times as long",
+    "a C++ compiler: apt install g++",
+)  # fmt: skip
+def kernel() -> str:
+    """The learner's C++ kernel builds and loads."""
+    facts = _torch_facts()
+    if not facts["kernel"]:
+        raise MissingError("; ".join(facts["why"]) or "turned off by PHIL_KERNEL=0")
+    return "the learner's kernel is built and loaded"
+
+
+@check(
+    "training", "GPU", "no `trainer train --device cuda`; the processor trains, too",
+    "an NVIDIA GPU with its driver, and torch with CUDA",
+)  # fmt: skip
+def gpu() -> str:
+    """Torch sees a CUDA device."""
+    facts = _torch_facts()
+    if not facts["gpu"]:
+        raise MissingError(f"torch {facts['torch']} sees no CUDA device")
+    return str(facts["gpu"])
+
+
+@check(
+    "person", "window", "no `--human keyboard`, `gamepad` or `wheel`, no rerun window (--spawn)",
+    "a desktop session; without one: --human web, and --serve or --save",
+)  # fmt: skip
+def window() -> str:
+    """SDL opens the display that pygame's window would be on."""
+    facts = _sdl()
+    if facts["driver"] in ("", "dummy", "offscreen"):
+        shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        where = f"display {shown}" if shown else "neither DISPLAY nor WAYLAND_DISPLAY is set"
+        raise MissingError(f"SDL opens no window ({where})")
+    return f"SDL's driver {facts['driver']}"
+
+
+@check(
+    "person", "gamepad or wheel", "no `--human gamepad`, no `--human wheel`",
+    "plug one in; if it is: the right to read /dev/input/* (group input)",
+)  # fmt: skip
+def controller() -> str:
+    """SDL sees a gamepad or a steering wheel."""
+    found = _sdl()["controllers"]
+    if found:
+        return ", ".join(found)
+    unreadable = [
+        str(path)
+        for path in [*_EVENTS.glob("event*"), *_EVENTS.glob("js*")]
+        if not os.access(path, os.R_OK)
+    ]
+    if unreadable:
+        raise MissingError(f"none that may be read: no right to {', '.join(sorted(unreadable))}")
+    raise MissingError("SDL sees no game controller")
+
+
+@check("person", "Xvfb", "tests and pictures of the window skip", "apt install xvfb")
+def xvfb() -> str:
+    """An X server without a screen starts, and ends."""
+    reader, writer = os.pipe()
+    command = [_program("Xvfb"), "-displayfd", str(writer), "-nolisten", "tcp"]
+    server = subprocess.Popen(command, pass_fds=[writer], stderr=subprocess.DEVNULL)
+    os.close(writer)
+    try:
+        with os.fdopen(reader) as pipe:
+            display = pipe.readline().strip()
+    finally:
+        server.terminate()
+        server.wait()
+    if not display:
+        raise MissingError("Xvfb ends at once")
+    return f"display :{display} came up and went"
+
+
+def program(name: str, *arguments: str) -> Callable[[], str]:
+    """A probe: the program runs, and says what it is."""
+
+    def probe() -> str:
+        path = _program(name)
+        return (output_of(path, *arguments).splitlines() or [path])[0]
+
+    return probe
+
+
+check("person", "xdotool", "tests that press real keys skip", "apt install xdotool")(
+    program("xdotool", "--version")
+)
+
+
+@check(
+    "person", "Chromium", "tests of the browser cockpit skip, no picture of it",
+    "apt install chromium; any browser shows the cockpit",
+)  # fmt: skip
+def chromium() -> str:
+    """A browser that runs without a screen."""
+    from trainer.benches.chromium import NAMES, find_chromium
+
+    if (path := find_chromium()) is None:
+        raise MissingError(f"none of {', '.join(NAMES)} is installed")
+    return output_of(path, "--version")
+
+
+@check(
+    "seeing", "rerun's viewer",
+    "no rerun window (--spawn), no pictures of rerun; --serve and --save do",
+    "a graphics card with Vulkan, or apt install mesa-vulkan-drivers",
+)  # fmt: skip
+def rerun_viewer() -> str:
+    """Rerun's viewer comes up without a screen, and goes."""
+    from hil_tests.processes import headless_viewer
+
+    with headless_viewer() as client:
+        picture = client.take_screenshot()
+    return f"came up and drew a picture of {len(picture) / 1000:.0f} kB"
+
+
 def port(number: int) -> Callable[[], str]:
     """A probe: the port is free on loopback."""
 
@@ -414,6 +432,22 @@ def port(number: int) -> Callable[[], str]:
     return probe
 
 
+check(
+    "ports", "7447", "no `bridge simulate`, no `bridge router` without options",
+    "end who listens there, or give --listen and --connect another port",
+)(port(7447))  # fmt: skip
+check(
+    "ports", "7448", "no `bridge ros2` without options",
+    "end who listens there, or give --ros2-listen another port",
+)(port(7448))  # fmt: skip
+check("ports", "9876", "no --serve, no --spawn", "end the other rerun")(port(9876))
+check("ports", "9090", "no --serve", "end the other rerun")(port(9090))
+
+
+@check(
+    "vehicle", "CAN over UDP", "no `hil_tests mock_hunter` without options",
+    "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`",
+)  # fmt: skip
 def multicast_can() -> str:
     """A CAN frame from one bus to another on a group and port of their own."""
     import can
@@ -424,17 +458,18 @@ def multicast_can() -> str:
         probe.bind((LOOPBACK, 0))
         number = probe.getsockname()[1]
     name = parse_bus(f"udp_multicast:239.74.163.9:{number}")
-    try:
-        with open_bus(name) as sender, open_bus(name) as receiver:
-            sender.send(can.Message(arbitration_id=0x111, data=b"doctor", is_extended_id=False))
-            heard = receiver.recv(ARRIVAL_S)
-    except UserError as error:
-        raise MissingError(str(error)) from None
+    with open_bus(name) as sender, open_bus(name) as receiver:
+        sender.send(can.Message(arbitration_id=0x111, data=b"doctor", is_extended_id=False))
+        heard = receiver.recv(ARRIVAL_S)
     if heard is None or bytes(heard.data) != b"doctor":
         raise MissingError("a frame did not arrive on loopback")
     return "a frame went through UDP multicast on loopback"
 
 
+@check(
+    "vehicle", "CAN interface", "no `edge_runtime run --bus socketcan:can0`",
+    "a CAN adapter: `ip link set can0 up type can bitrate 500000`",
+)  # fmt: skip
 def can_interface() -> str:
     """SocketCAN's sockets open, and there is an interface to bind them to."""
     try:
@@ -448,6 +483,10 @@ def can_interface() -> str:
     return ", ".join(found)
 
 
+@check(
+    "vehicle", "virtual CAN", "no `--bus socketcan:vcan0`; udp_multicast does it",
+    "root, and `modprobe vcan`: `ip link add vcan0 type vcan`",
+)  # fmt: skip
 def virtual_can() -> str:
     """The kernel makes a vcan device, in a network namespace that goes with the command."""
     _program("unshare")
@@ -455,6 +494,30 @@ def virtual_can() -> str:
     words = ("ip", "link", "add", "dev", "doctor0", "type", "vcan")
     output_of("unshare", *mine, "--net", *words, name="ip link add type vcan")
     return "a vcan device could be made"
+
+
+@check(
+    "vehicle", "real-time priority",
+    "`edge_runtime run`, but a busy machine may make its commands late",
+    "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)",
+)  # fmt: skip
+def realtime_priority() -> str:
+    """A thread gets the priority that `edge_runtime run` may ask for."""
+    try:
+        # The thread keeps the priority to itself, and ends with it.
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).result()
+    except OSError as error:
+        raise MissingError(f"SCHED_FIFO is refused: {error.strerror}") from None
+    return "SCHED_FIFO was given to a thread"
+
+
+@check("board", "ssh", "no `deploy push`", "apt install openssh-client")
+def ssh() -> str:
+    """OpenSSH says its version on stderr."""
+    path = _program("ssh")
+    output_of(path, "-V")
+    return path
 
 
 def board(name: str) -> Callable[[], str]:
@@ -468,6 +531,42 @@ def board(name: str) -> Callable[[], str]:
         return f"hil_tests board --boards {name} can run"
 
     return probe
+
+
+check(
+    "board", "aarch64", "no `hil_tests board --boards aarch64`",
+    "root, apt install debootstrap qemu-user-static",
+)(board("aarch64"))  # fmt: skip
+check(
+    "board", "Python 3.8", "no `hil_tests board --boards python38`",
+    "root, and a python3.8 (pyenv install 3.8)",
+)(board("python38"))  # fmt: skip
+check(
+    "board", "systemd", "no `hil_tests board --boards systemd`",
+    "root, Python 3.8, debootstrap, control groups of version 2",
+)(board("systemd"))  # fmt: skip
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+@functools.lru_cache(maxsize=None)  # noqa: UP033
+def _torch_facts() -> dict[str, Any]:
+    # A driver that does not fit may end the process that asks for it.
+    facts: dict[str, Any] = json.loads(output_of_python(_TORCH).splitlines()[-1])
+    return facts
+
+
+# Not functools.cache: an older Python, too, is to hear that it is too old.
+@functools.lru_cache(maxsize=None)  # noqa: UP033
+def _sdl() -> dict[str, Any]:
+    # In a process of its own: a display that is gone may end it.
+    facts: dict[str, Any] = json.loads(output_of_python(_SDL).splitlines()[-1])
+    return facts
 
 
 def output_of_python(script: str) -> str:
@@ -512,111 +611,3 @@ def _program(name: str) -> str:
     if (path := shutil.which(name)) is None:
         raise MissingError(f"{name} is not installed")
     return path
-
-
-CHECKS: dict[str, tuple[Check, ...]] = {
-    "basics": (
-        Check("Python", python, "nothing", "Python 3.11 or newer; make PYTHON=...", True),
-        Check("packages", packages, "nothing that imports them", INSTALL, True),
-        Check(
-            "loopback", zenoh_loopback, "no drive over Zenoh, no `make demo`, no `make test`",
-            "TCP on 127.0.0.1: `ip link set lo up`, or a rule in the firewall", True,
-        ),
-        Check(
-            "disk", disk, "no training, no recordings (--out)",
-            "free some space, or work in another directory", True,
-        ),
-        Check("memory", memory, "no training", "end other programs", True),
-    ),
-    "training": (
-        Check(
-            "locked versions", versions,
-            "everything, but not to the last bits of results/", INSTALL,
-        ),
-        Check(
-            "C++ kernel", kernel, "everything, but `trainer train` takes several times as "
-            "long", "a C++ compiler: apt install g++",
-        ),
-        Check(
-            "GPU", gpu, "no `trainer train --device cuda`; the processor trains, too",
-            "an NVIDIA GPU with its driver, and torch with CUDA",
-        ),
-    ),
-    "person": (
-        Check(
-            "window", window,
-            "no `--human keyboard`, `gamepad` or `wheel`, no rerun window (--spawn)",
-            "a desktop session; without one: --human web, and --serve or --save",
-        ),
-        Check(
-            "gamepad or wheel", controller, "no `--human gamepad`, no `--human wheel`",
-            "plug one in; if it is: the right to read /dev/input/* (group input)",
-        ),
-        Check(
-            "Xvfb", xvfb, "tests and pictures of the window skip", "apt install xvfb",
-        ),
-        Check(
-            "xdotool", program("xdotool", "--version"),
-            "tests that press real keys skip", "apt install xdotool",
-        ),
-        Check(
-            "Chromium", chromium,
-            "tests of the browser cockpit skip, no picture of it",
-            "apt install chromium; any browser shows the cockpit",
-        ),
-    ),
-    "seeing": (
-        Check(
-            "rerun's viewer", rerun_viewer,
-            "no rerun window (--spawn), no pictures of rerun; --serve and --save do",
-            "a graphics card with Vulkan, or apt install mesa-vulkan-drivers",
-        ),
-    ),
-    "ports": (
-        Check(
-            "7447", port(7447), "no `bridge simulate`, no `bridge router` without options",
-            "end who listens there, or give --listen and --connect another port",
-        ),
-        Check(
-            "7448", port(7448), "no `bridge ros2` without options",
-            "end who listens there, or give --ros2-listen another port",
-        ),
-        Check("9876", port(9876), "no --serve, no --spawn", "end the other rerun"),
-        Check("9090", port(9090), "no --serve", "end the other rerun"),
-    ),
-    "vehicle": (
-        Check(
-            "CAN over UDP", multicast_can, "no `hil_tests mock_hunter` without options",
-            "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`",
-        ),
-        Check(
-            "CAN interface", can_interface, "no `edge_runtime run --bus socketcan:can0`",
-            "a CAN adapter: `ip link set can0 up type can bitrate 500000`",
-        ),
-        Check(
-            "virtual CAN", virtual_can, "no `--bus socketcan:vcan0`; udp_multicast does it",
-            "root, and `modprobe vcan`: `ip link add vcan0 type vcan`",
-        ),
-        Check(
-            "real-time priority", realtime_priority,
-            "`edge_runtime run`, but a busy machine may make its commands late",
-            "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)",
-        ),
-    ),
-    "board": (
-        Check("ssh", ssh, "no `deploy push`", "apt install openssh-client"),
-        Check(
-            "aarch64", board("aarch64"), "no `hil_tests board --boards aarch64`",
-            "root, apt install debootstrap qemu-user-static",
-        ),
-        Check(
-            "Python 3.8", board("python38"), "no `hil_tests board --boards python38`",
-            "root, and a python3.8 (pyenv install 3.8)",
-        ),
-        Check(
-            "systemd", board("systemd"), "no `hil_tests board --boards systemd`",
-            "root, Python 3.8, debootstrap, control groups of version 2",
-        ),
-    ),
-}  # fmt: skip
-"""Group -> its checks."""
