@@ -12,8 +12,8 @@ CONTAINER_STAMP := $(CONTAINER)/.installed
 BENCH := results/bench
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor pictures demo test test-ray test-network test-board lint format lint-container bench bench-quick \
-	bench-loop bench-view bench-can network vehicle board fleet recording mutate lock clean
+.PHONY: help install doctor pictures demo test test-ray test-board lint format lint-container bench \
+	bench-quick bench-loop vehicle board recording mutate lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -45,9 +45,6 @@ test: $(STAMP)  ## every test, with real processes and real Zenoh sessions
 test-ray: $(STAMP)  ## experiments on a local Ray cluster of several nodes
 	$(BIN)/python -m pip install --quiet --constraint requirements/workstation.txt --editable '.[ray]'
 	$(BIN)/python -m pytest -m ray trainer
-
-test-network: $(STAMP)  ## the loop over a kernel network of two namespaces; needs root
-	$(BIN)/python -m pytest -m network hil_tests
 
 test-board: $(STAMP)  ## whole bundles installed, on an emulated board, too, with every fault; minutes, root
 	$(BIN)/python -m pytest -m board
@@ -85,40 +82,34 @@ bench: $(STAMP) $(PEERS_STAMP)  ## speed and memory beside peers: tables, and JS
 bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table only
 	$(BIN)/python -m trainer bench --quick --threads 1
 
-network: $(STAMP)  ## TCP, UDP, relay and virtual time on the same network; needs root, some 25 minutes
-	$(BIN)/python -m hil_tests network --out results/network/network.json --report results/network
-	$(BIN)/python -m hil_tests.network.variants --out results/network/variants.json
-
 board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
 	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
 	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
 	$(BIN)/python -m hil_tests board --boards systemd --out results/deploy/systemd.json
 
-fleet: $(STAMP)  ## a router with 1, 5, 10 and 20 edge runtimes: processor, memory, bandwidth each
-	$(BIN)/python -m hil_tests fleet --out results/deploy/fleet.json
-
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
-	$(BIN)/python -m hil_tests.benches --out $(BENCH)/loop.json
-
-bench-view: $(STAMP)  ## what looking on costs the training loop and the simulator
-	$(BIN)/python -m hil_tests.benches.viewing --out $(BENCH)/viewing.json
-
-bench-can: $(STAMP)  ## ten minutes of the 50 Hz CAN stream, every core busy, beside a bare sender
-	$(BIN)/python -m hil_tests.benches.can_stream --out $(BENCH)/can_stream.json
+	$(BIN)/python -m hil_tests bench --out $(BENCH)/loop.json
 
 vehicle: $(STAMP)  ## policy in the loop against a mock Hunter in the loop, and the lag it may have; some 15 minutes
 	$(BIN)/python -m hil_tests vehicle --out results/vehicle/left_turn.json
 
 recording: $(STAMP)  ## drive and record anew what the next release is replayed against
-	$(BIN)/python -m hil_tests.recordings.make
+	$(BIN)/python -m hil_tests recording
 
 $(MUTATION_STAMP): requirements/mutation.txt
 	$(PYTHON) -m venv $(MUTATION)
 	$(MUTATION)/bin/python -m pip install --quiet --requirement requirements/mutation.txt
+	$(MUTATION)/bin/python -m pip install --quiet --no-deps --editable .
 	@touch $@
 
+# On a copy: a run that is killed must change no source.
 mutate: $(MUTATION_STAMP)  ## change the safety core in every small way: a test must fail each time
-	$(MUTATION)/bin/python -m hil_tests.mutation --out results/mutation
+	rm -rf build/mutation && mkdir -p build/mutation && cp -r edge_runtime hil_tests build/mutation
+	export PATH="$(CURDIR)/$(MUTATION)/bin:$$PATH" && cd build/mutation && for part in core hunter; do \
+		configuration=hil_tests/mutation/$$part.toml && cosmic-ray init $$configuration $$part.sqlite && \
+		cr-filter-operators $$part.sqlite $$configuration && cosmic-ray baseline $$configuration && \
+		cosmic-ray exec $$configuration $$part.sqlite || exit; \
+	done && python -m hil_tests.mutation.judge core.sqlite hunter.sqlite
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new

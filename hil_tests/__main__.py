@@ -8,31 +8,28 @@ from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "doctor": (
-        "hil_tests.doctor.command",
+        "hil_tests.doctor",
         "what this machine can and cannot do, and how to get the rest",
     ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
-    "pictures": ("hil_tests.pictures.command", "every picture of the READMEs"),
-    "campaign": ("hil_tests.campaign.command", "every fault, every latency row, one report"),
+    "pictures": ("hil_tests.pictures", "every picture of the READMEs"),
+    "campaign": ("hil_tests.campaign", "every fault, every latency row, one report"),
     "mock_hunter": (
-        "hil_tests.mock_hunter.command",
+        "hil_tests.mock_hunter.process",
         "a Hunter on a CAN bus, with a switch for each fault",
     ),
     "vehicle": (
-        "hil_tests.vehicle.command",
+        "hil_tests.vehicle",
         "policy in the loop against vehicle in the loop, and the lag it may have",
+    ),
+    "bench": ("hil_tests.bench_loop", "the loop against the least that could answer"),
+    "recording": (
+        "hil_tests.recording",
+        "drive and record anew what the next release is replayed against",
     ),
     "board": (
         "hil_tests.board.command",
         "a bundle installed and driven on boards that are not there; needs root",
-    ),
-    "fleet": (
-        "hil_tests.fleet.command",
-        "a router with TLS and rights for many vehicles, and what each of them costs",
-    ),
-    "network": (
-        "hil_tests.network.command",
-        "the left turn over a kernel's TCP and UDP, and the model in two times",
     ),
 }
 

@@ -8,15 +8,15 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
+from rich.table import Table
 
 from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, positive_number
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
-from hil_tests.commands import BackgroundCommand, run_command
-from hil_tests.drives_table import drives_table
-from hil_tests.operator import Operator
+from hil_tests.processes import BackgroundCommand, Operator, run_command
 
 MARKER = ".phil-demo"
 """Says that a directory is a demo's, so that the demo may replace what is in it."""
@@ -44,29 +44,15 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--fresh", action="store_true", help="train anew even where a trained policy is kept"
     )
-    parser.add_argument("--seed", type=not_negative, default=1, help="of the training")
-    parser.add_argument(
-        "--episodes",
-        type=positive,
-        default=TRAINING_EPISODES,
-        help="of the PHIL-TD3 training, at most",
-    )
-    parser.add_argument(
-        "--human-episodes", type=positive, default=60, help="of the human model's training"
-    )
-    parser.add_argument(
-        "--human-minutes",
-        type=positive_number,
-        default=HUMAN_MINUTES,
-        help="limit of the human model's training",
-    )
-    parser.add_argument(
-        "--minutes",
-        type=positive_number,
-        default=TRAINING_MINUTES,
-        help="limit of the PHIL-TD3 training",
-    )
-    parser.add_argument("--runs", type=positive, default=RUNS, help="test episodes of each drive")
+    for name, kind, default, text in (
+        ("--seed", not_negative, 1, "of the training"),
+        ("--episodes", positive, TRAINING_EPISODES, "of the PHIL-TD3 training, at most"),
+        ("--human-episodes", positive, 60, "of the human model's training"),
+        ("--human-minutes", positive_number, HUMAN_MINUTES, "limit of the human model's training"),
+        ("--minutes", positive_number, TRAINING_MINUTES, "limit of the PHIL-TD3 training"),
+        ("--runs", positive, RUNS, "test episodes of each drive"),
+    ):
+        parser.add_argument(name, type=kind, default=default, help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -238,3 +224,27 @@ class Demo:
 def heading(text: str) -> None:
     """Announce a step."""
     Console().print(f"\n[bold]{text}[/bold]")
+
+
+COLUMNS = ("drive", "success", "distance, m", "p50, ms", "p99, ms", "safe stops")
+
+
+def drives_table(reports: dict[str, dict[str, Any]]) -> Table:
+    """A row for each report, under its name."""
+    table = Table(title="Left turn, the same seeds; latency from state sent to command received")
+    for column in COLUMNS:
+        table.add_column(column, justify="left" if column == COLUMNS[0] else "right")
+    for name, report in reports.items():
+        table.add_row(name, *_cells(report))
+    return table
+
+
+def _cells(report: dict[str, Any]) -> list[str]:
+    distance, latency = report["surviving_distance_m"], report.get("latency_ms")
+    return [
+        f"{report['success_rate']:.0%}",
+        f"{distance['mean']:.2f} ± {distance['std']:.2f}",
+        f"{latency['p50']:.1f}" if latency else "-",
+        f"{latency['p99']:.1f}" if latency else "-",
+        str(report.get("safe_stops", "-")),
+    ]

@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 
 from hil_tests.board.place import Place
-from hil_tests.faults.processes import wait_until
+from hil_tests.processes import wait_until
 
 _BOOT_LIMIT_S = 90.0
 _DEVICES = "null zero full random urandom tty"

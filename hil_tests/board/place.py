@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from deploy.installer.apart import before_exec
-from hil_tests.faults.processes import wait_until
+from hil_tests.processes import wait_until
 
 # Before onnxruntime is imported, /proc, /sys and /dev must be there.
 _ENTER = """\

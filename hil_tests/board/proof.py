@@ -17,8 +17,7 @@ from edge_runtime.util import UserError
 from hil_tests.board.emulation import emulated
 from hil_tests.board.place import Place
 from hil_tests.board.rootfs import AARCH64, fresh_root
-from hil_tests.commands import BackgroundCommand
-from hil_tests.faults.campaign import POLICY, PUBLIC_KEY
+from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand
 
 VEHICLE = "hunter01"
 ENDPOINT = "tls/127.0.0.1:7447"

@@ -16,7 +16,7 @@ from edge_runtime.util import UserError
 from hil_tests.board.booted import BootedPlace, control_group
 from hil_tests.board.proof import Site, pack, prove, remove
 from hil_tests.board.rootfs import BOOTABLE, fresh_root
-from hil_tests.faults.processes import wait_until
+from hil_tests.processes import wait_until
 
 CAN_UNIT = "phil-can.service"
 _OPT, _PREFIX = "/opt/phil", "usr/local/python38"

@@ -1,74 +1,99 @@
-"""Faults of the ends and of what is between them: killed, stopped, cut, stalled, stepped, slow."""
+"""Faults of the ends and of what is between them, of the vehicle, and of the recorder.
+
+Killed, stopped, cut, stalled, stepped, slow; a vehicle that is silent, stuck or lying; a recorder
+whose disk is full, or that is killed, and whose drive must not notice.
+"""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import resource
 import signal
 import socket
 import time
+from functools import partial
+from pathlib import Path
 
-import numpy as np
-
-from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP
-from hil_tests.faults.link import address
-from hil_tests.faults.processes import wait_until
-from hil_tests.faults.rig import Rig
-from hil_tests.faults.row import Row, Try
-from hil_tests.faults.timeline import last_drive_s, longest_gap_s, stops_between
-from hil_tests.faults.waits import (
-    drive_after_s,
+from bridge.recording import Recording
+from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP, State, decode_state
+from hil_tests.faults.inside import VEHICLE
+from hil_tests.faults.observe import last_drive_s
+from hil_tests.faults.rig import Rig, address
+from hil_tests.faults.row import (
+    GAP,
+    Try,
+    at_any_phase,
+    drives_on,
+    drove_on,
+    fault,
     last_answered_s,
     last_state_s,
     logged_stop,
+    longest_gap,
     must_stop_first,
     own_brake_s,
+    recovered_after_s,
+    sleep_until,
     stop_command,
 )
+from hil_tests.processes import Process, wait_until
 
-STOPPED_S = 1.0
-CUT_S = 1.0
+STOPPED_S = CUT_S = STEPPED_S = 1.0
 STALLED_S = 0.6
 """Shorter than Zenoh's lease, so that the connection lives and brings all that it held at once."""
 BRIGHT_S = 0.5
 STARVED_S = 2.0
-STEPPED_S = 1.0
+FAULTY_S = 1.0
+SETTLED_S = 0.5
+"""So long the drive is steady first: a vehicle may lag behind what it was asked before."""
+FULL_AT_BYTES = 60_000
+"""The recorder writes about 1 kB for each state: the picture of noise compresses badly."""
+RECORDED_S = 2.5
+MOST_LOST_S = 1.0
+_CANNOT_WRITE = 1
+"""Exit status of a recorder that cannot write."""
+_FEWEST_STATES = 5
+_EXPECT_OWN = "simulator brakes by itself: no_command"
+_EXPECT_EDGE = "edge sends safe_stop: no_fresh_state"
+_EXPECT_BOTH = "both ends stop, each by itself"
+_TO_BRAKE = "last drive command to the simulator's brake"
+_TO_STOP = "last state at the probe to safe_stop on the wire"
+_THROUGH_LINK = "last state through the link to safe_stop in the edge's log"
 
 
-def at_any_phase(number: int) -> None:
-    """Wait a part of the control period, so that faults do not all come at the same moment."""
-    time.sleep(float(np.random.default_rng(number).uniform(0, CONTROL_PERIOD_S)))
-
-
+@fault("SIGKILL to the edge runtime; a new one", _EXPECT_OWN, _TO_BRAKE)
 def edge_killed(rig: Rig, number: int) -> Try:
-    """SIGKILL; the simulator brakes by itself; a new edge runtime drives on."""
+    """The simulator brakes by itself; a new edge runtime drives on."""
     at_any_phase(number)
-    begin_s = rig.mark()
+    begin_s = time.monotonic()
     rig.edge.kill()
     reaction_s = own_brake_s(rig, begin_s) - last_drive_s(rig.timeline)
     rig.edge = rig.start_edge()
     ended_s = rig.edge.wait_for_line("ready")
-    return Try(reaction_s, drive_after_s(rig, ended_s) - ended_s, "no_command")
+    return Try(reaction_s, recovered_after_s(rig, ended_s), "no_command")
 
 
+@fault("edge runtime stopped for 1 s and continued", _EXPECT_OWN, _TO_BRAKE, flows=True)
 def edge_stopped(rig: Rig, number: int) -> Try:
-    """SIGSTOP for a second: the simulator brakes by itself; what piled up is not driven on."""
+    """SIGSTOP: the simulator brakes by itself; what piled up is not driven on."""
     at_any_phase(number)
-    begin_s = rig.mark()
+    begin_s = time.monotonic()
     rig.edge.send(signal.SIGSTOP)
     reaction_s = own_brake_s(rig, begin_s) - last_drive_s(rig.timeline)
-    time.sleep(max(0.0, begin_s + STOPPED_S - time.monotonic()))
-    ended_s = rig.mark()
+    sleep_until(begin_s + STOPPED_S)
+    ended_s = time.monotonic()
     rig.edge.send(signal.SIGCONT)
-    recovery_s = drive_after_s(rig, ended_s) - ended_s
-    return Try(reaction_s, recovery_s, "no_command", wrong=must_stop_first(rig, ended_s))
+    recovered_s = recovered_after_s(rig, ended_s)
+    return Try(reaction_s, recovered_s, "no_command", wrong=must_stop_first(rig, ended_s))
 
 
+@fault("SIGKILL to the simulator; a new one", _EXPECT_EDGE, _TO_STOP)
 def simulator_killed(rig: Rig, number: int) -> Try:
-    """SIGKILL; the edge runtime's safe stop; a new simulator has a new session."""
+    """The edge runtime's safe stop; a new simulator has a new session."""
     at_any_phase(number)
     assert rig.simulator is not None
-    begin_s = rig.mark()
+    begin_s = time.monotonic()
     rig.simulator.kill()
     stop = stop_command(rig, begin_s)
     last_s = last_state_s(rig, before_s=stop.seen_s)
@@ -76,102 +101,211 @@ def simulator_killed(rig: Rig, number: int) -> Try:
     rig.simulator = rig.start_simulator()
     new = wait_until(lambda: set(rig.timeline.states) - known, "the new simulator's states")
     ended_s = min(rig.timeline.states[place] for place in new)
-    return Try(stop.seen_s - last_s, drive_after_s(rig, ended_s) - ended_s, stop.reason)
+    return Try(stop.seen_s - last_s, recovered_after_s(rig, ended_s), stop.reason)
 
 
+@fault("TCP cut for 1 s and restored", _EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
 def link_cut(rig: Rig, number: int) -> Try:
     """Every connection broken and refused for a second: both ends stop, each by itself."""
     assert rig.link is not None
     at_any_phase(number)
-    begin_s, drive_s = rig.mark(), last_drive_s(rig.timeline)
+    begin_s, drive_s = time.monotonic(), last_drive_s(rig.timeline)
     rig.link.cut()
     last_s = rig.link.last_state_s
-    reaction_s, reason = logged_stop(rig, begin_s)
+    stopped_s, reason = logged_stop(rig, begin_s)
     brake_s = own_brake_s(rig, begin_s) - max(drive_s, last_drive_s(rig.timeline))
-    time.sleep(max(0.0, begin_s + CUT_S - time.monotonic()))
-    ended_s = rig.mark()
+    sleep_until(begin_s + CUT_S)
+    ended_s = time.monotonic()
     rig.link.restore()
-    recovery_s = drive_after_s(rig, ended_s) - ended_s
+    recovered_s = recovered_after_s(rig, ended_s)
     figures = {"simulator brakes, ms": brake_s * 1e3}
-    return Try(reaction_s - last_s, recovery_s, reason, figures=figures)
+    return Try(stopped_s - last_s, recovered_s, reason, figures=figures)
 
 
+@fault("TCP held for 0.6 s, then all at once", _EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
 def link_stalled(rig: Rig, number: int) -> Try:
     """The link holds everything for a while, then brings it all at once."""
     assert rig.link is not None
     at_any_phase(number)
-    begin_s = rig.mark()
+    begin_s = time.monotonic()
     rig.link.stall()
-    reaction_s, reason = logged_stop(rig, begin_s)
+    stopped_s, reason = logged_stop(rig, begin_s)
     last_s = rig.link.last_state_s
-    time.sleep(max(0.0, begin_s + STALLED_S - time.monotonic()))
-    ended_s = rig.mark()
+    sleep_until(begin_s + STALLED_S)
+    ended_s = time.monotonic()
     rig.link.restore()
-    recovery_s = drive_after_s(rig, ended_s) - ended_s
-    wrong = must_stop_first(rig, ended_s)
-    return Try(reaction_s - last_s, recovery_s, reason, wrong=wrong)
+    recovered_s = recovered_after_s(rig, ended_s)
+    return Try(stopped_s - last_s, recovered_s, reason, wrong=must_stop_first(rig, ended_s))
 
 
+@fault(
+    "SIGKILL to the router; a new one", _EXPECT_BOTH,
+    "last state at the router to safe_stop in the edge's log", rig={"between": "router"},
+)  # fmt: skip
 def router_restarted(rig: Rig, number: int) -> Try:
-    """SIGKILL to the router between the ends, and a new one on the same port."""
+    """The router between the ends is gone, and a new one comes on the same port."""
     assert rig.router is not None
     at_any_phase(number)
-    begin_s = rig.mark()
+    begin_s = time.monotonic()
     rig.router.kill()
-    reaction_s, reason = logged_stop(rig, begin_s)
+    stopped_s, reason = logged_stop(rig, begin_s)
     rig.router = rig.start_router()
-    ended_s = wait_until(lambda: listens_s(rig.router_endpoint), "the new router")
-    recovery_s = drive_after_s(rig, ended_s) - ended_s
-    return Try(reaction_s - last_state_s(rig, before_s=begin_s), recovery_s, reason)
+    ended_s = wait_until(lambda: _listens_s(rig.router_endpoint), "the new router")
+    reaction_s = stopped_s - last_state_s(rig, before_s=begin_s)
+    return Try(reaction_s, recovered_after_s(rig, ended_s), reason)
 
 
-def edge_clock_stepped(rig: Rig, number: int) -> Try:
+@drives_on("edge's wall clock 1 h ahead and back", "drives on", by_arrival=True)
+def clock_stepped_edge(rig: Rig, number: int) -> Try:
     """The edge runtime's wall clock jumps an hour ahead, then back."""
     return _stepped(rig, rig.edge, number)
 
 
-def simulator_clock_stepped(rig: Rig, number: int) -> Try:
+@drives_on("simulator's wall clock 1 h ahead and back", "drives on")
+def clock_stepped_simulator(rig: Rig, number: int) -> Try:
     """The simulator's wall clock jumps an hour ahead, then back."""
+    assert rig.simulator is not None
     return _stepped(rig, rig.simulator, number)
 
 
+@fault(
+    "inference of about 2.5 T for 0.5 s", "edge sends safe_stop: inference_too_long",
+    "last answered state at the probe to safe_stop on the wire",
+    policy="slow", flows=True, alone=True,
+)  # fmt: skip
 def slow_inference(rig: Rig, number: int) -> Try:
     """Frames on which the policy takes longer than T; the last good state is the one before."""
     at_any_phase(number)
-    begin_s = rig.mark()
+    begin_s = time.monotonic()
     rig.bright(True)
     try:
         stop = stop_command(rig, begin_s)
         last_s = last_answered_s(rig, stop.seen_s)
-        time.sleep(max(0.0, begin_s + BRIGHT_S - time.monotonic()))
+        sleep_until(begin_s + BRIGHT_S)
     finally:
         rig.bright(False)
-    ended_s = rig.mark()
-    return Try(stop.seen_s - last_s, drive_after_s(rig, ended_s) - ended_s, stop.reason)
+    ended_s = time.monotonic()
+    return Try(stop.seen_s - last_s, recovered_after_s(rig, ended_s), stop.reason)
 
 
+@fault("two spinning processes for each core, 2 s", "drives on or safe_stop", GAP, alone=True)
 def cpu_starved(rig: Rig, number: int) -> Try:
-    """Two spinning processes for each core, at normal priority, for two seconds."""
+    """The spinning processes have the same priority as all others."""
     at_any_phase(number)
     spinners = [
-        multiprocessing.get_context("spawn").Process(target=spin, daemon=True)
+        multiprocessing.get_context("spawn").Process(target=_spin, daemon=True)
         for _ in range(2 * (os.cpu_count() or 1))
     ]
-    begin_s = rig.mark()
+    begin_s = time.monotonic()
     for spinner in spinners:
         spinner.start()
     time.sleep(STARVED_S)
-    ended_s = rig.mark()
+    ended_s = time.monotonic()
     for spinner in spinners:
         spinner.kill()
         spinner.join()
-    recovery_s = drive_after_s(rig, ended_s) - ended_s
-    gap_s = longest_gap_s((c.seen_s for c in rig.timeline.commands), begin_s, ended_s)
+    recovered_s = recovered_after_s(rig, ended_s)
     stops = sum(begin_s < m.seen_s < ended_s and m.mode == SAFE_STOP for m in rig.timeline.modes)
-    return Try(gap_s, recovery_s, figures={"safe stops": stops})
+    return Try(longest_gap(rig, begin_s, ended_s), recovered_s, figures={"safe stops": stops})
 
 
-def listens_s(endpoint: str) -> float | None:
+def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
+    """Stops for the fault, stays stopped when it is over, and drives again once re-armed."""
+    time.sleep(SETTLED_S)
+    at_any_phase(number)
+    begin_s = time.monotonic()
+    rig.switch(VEHICLE, word)
+    stop = stop_command(rig, begin_s)
+    # A silent vehicle may still speak between the mark and the switch, and what it says counts.
+    # What another says after the switch is no good any more.
+    end_s = stop.seen_s if word == "silent" else begin_s
+    last_s = max(s for s in rig.timeline.feedback_s if s < end_s)
+    sleep_until(begin_s + FAULTY_S)
+    said = any(f"vehicle_{word}" in line for seen_s, line in rig.edge.lines if seen_s > begin_s)
+    rig.switch(VEHICLE, None)
+    time.sleep(FAULTY_S)
+    drove = [c for c in rig.timeline.commands if c.seen_s > stop.seen_s and c.mode == DRIVE]
+    wrong = ["drove before it was re-armed"] if drove else []
+    wrong += [] if said else [f"the log does not say vehicle_{word}"]
+    rig.rearm()
+    rearmed_s = time.monotonic()
+    rig.wait_until_driving()
+    recovered_s = recovered_after_s(rig, rearmed_s)
+    return Try(stop.seen_s - last_s, recovered_s, stop.reason, wrong=wrong)
+
+
+for _word, _done in (
+    ("silent", "vehicle silent"),
+    ("stuck", "vehicle's pedal stuck"),
+    ("lying", "vehicle reports a speed that cannot be"),
+):
+    fault(
+        _done, "edge sends safe_stop: vehicle_fault; stays until re-armed",
+        "last good feedback at the probe to safe_stop on the wire", name=f"vehicle_{_word}",
+        rig={"vehicle": "mock"}, policy="steady", flows=True,
+    )(partial(_vehicle_is, _word))  # fmt: skip
+
+
+@drives_on(
+    "disk full while recording", "recorder says so and ends; the recording is readable; drives on"
+)
+def disk_full(rig: Rig, number: int) -> Try:
+    """No file may grow beyond a limit: the same failing write as on a full disk."""
+    path, recorder = _start_recorder(rig, number)
+    begin_s = time.monotonic()
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FULL_AT_BYTES, FULL_AT_BYTES))
+    status = recorder.wait()
+    end_s = time.monotonic()
+    wrong = _too_few(states_in(path))
+    if status != _CANNOT_WRITE:
+        wrong.append(f"status {status}: {recorder.lines[-1:]}")
+    if not any("error: recording" in line for _, line in recorder.lines):
+        wrong.append(f"it does not say so: {recorder.lines[-1:]}")
+    return drove_on(rig, begin_s, end_s, wrong=wrong)
+
+
+@drives_on("SIGKILL to the recorder", "at most 1 s of the recording is lost; drives on")
+def recorder_killed(rig: Rig, number: int) -> Try:
+    """In the middle of a recording: at most the last second is lost."""
+    path, recorder = _start_recorder(rig, number)
+    begin_s = time.monotonic()
+    time.sleep(RECORDED_S)
+    at_any_phase(number)
+    sent = len(rig.timeline.states)
+    recorder.kill()
+    end_s = time.monotonic()
+    states, places = states_in(path), list(rig.timeline.states)
+    last = (states[-1].session, states[-1].episode, states[-1].step) if states else None
+    lost = sent - 1 - places.index(last) if last in places else sent
+    lost_s = max(0, lost) * CONTROL_PERIOD_S
+    wrong = _too_few(states)
+    wrong += [f"{lost_s:.1f} s lost"] if lost_s > MOST_LOST_S + CONTROL_PERIOD_S / 2 else []
+    return drove_on(rig, begin_s, end_s, wrong=wrong, figures={"lost, s": lost_s})
+
+
+def states_in(path: Path) -> list[State]:
+    """The states that can be read from a recording, whole or torn."""
+    found = []
+    for stored in Recording(path).messages():
+        if stored.channel.topic.endswith("/state") and stored.channel.message_encoding == "msgpack":
+            state = decode_state(stored.message.data)
+            if isinstance(state, State):
+                found.append(state)
+    return found
+
+
+def _too_few(states: list[State]) -> list[str]:
+    return [f"only {len(states)} states can be read"] if len(states) < _FEWEST_STATES else []
+
+
+def _start_recorder(rig: Rig, number: int) -> tuple[Path, Process]:
+    path = rig.directory / f"{number}.mcap"
+    recorder = rig.start_recorder(path)
+    recorder.wait_for_line("recording")
+    return path, recorder
+
+
+def _listens_s(endpoint: str) -> float | None:
     """Now, if somebody listens there."""
     try:
         socket.create_connection(address(endpoint), timeout=0.1).close()
@@ -180,54 +314,15 @@ def listens_s(endpoint: str) -> float | None:
     return time.monotonic()
 
 
-def spin() -> None:
+def _spin() -> None:
     """Keep a core busy."""
     while True:
         pass
 
 
-def _stepped(rig: Rig, process: object, number: int) -> Try:
+def _stepped(rig: Rig, process: Process, number: int) -> Try:
     at_any_phase(number)
-    begin_s = rig.mark()
-    process.send(signal.SIGUSR1 if number % 2 == 0 else signal.SIGUSR2)  # type: ignore[attr-defined]
+    begin_s = time.monotonic()
+    process.send(signal.SIGUSR1 if number % 2 == 0 else signal.SIGUSR2)
     time.sleep(STEPPED_S)
-    end_s = rig.mark()
-    commands = list(rig.timeline.commands)
-    gap_s = longest_gap_s((c.seen_s for c in commands), begin_s, end_s)
-    return Try(gap_s, wrong=stops_between(commands, begin_s, end_s))
-
-
-_EXPECT_OWN = "simulator brakes by itself: no_command"
-_EXPECT_EDGE = "edge sends safe_stop: no_fresh_state"
-_EXPECT_BOTH = "both ends stop, each by itself"
-_TO_BRAKE = "last drive command to the simulator's brake"
-_TO_STOP = "last state at the probe to safe_stop on the wire"
-
-ROWS = (
-    Row("edge_killed", "SIGKILL to the edge runtime; a new one", _EXPECT_OWN, _TO_BRAKE,
-        edge_killed),
-    Row("edge_stopped", "edge runtime stopped for 1 s and continued", _EXPECT_OWN, _TO_BRAKE,
-        edge_stopped, flows=True),
-    Row("simulator_killed", "SIGKILL to the simulator; a new one", _EXPECT_EDGE, _TO_STOP,
-        simulator_killed),
-    Row("link_cut", "TCP cut for 1 s and restored", _EXPECT_BOTH,
-        "last state through the link to safe_stop in the edge's log", link_cut,
-        rig={"between": "link"}),
-    Row("link_stalled", "TCP held for 0.6 s, then all at once", _EXPECT_BOTH,
-        "last state through the link to safe_stop in the edge's log", link_stalled,
-        rig={"between": "link"}),
-    Row("router_restarted", "SIGKILL to the router; a new one", _EXPECT_BOTH,
-        "last state at the router to safe_stop in the edge's log", router_restarted,
-        rig={"between": "router"}),
-    Row("clock_stepped_edge", "edge's wall clock 1 h ahead and back", "drives on",
-        "longest gap between commands", edge_clock_stepped, recovery_limit_s=None, flows=True,
-        by_arrival=True),
-    Row("clock_stepped_simulator", "simulator's wall clock 1 h ahead and back", "drives on",
-        "longest gap between commands", simulator_clock_stepped, recovery_limit_s=None, flows=True),
-    Row("slow_inference", "inference of about 2.5 T for 0.5 s",
-        "edge sends safe_stop: inference_too_long",
-        "last answered state at the probe to safe_stop on the wire", slow_inference,
-        policy="slow", flows=True, alone=True),
-    Row("cpu_starved", "two spinning processes for each core, 2 s", "drives on or safe_stop",
-        "longest gap between commands", cpu_starved, alone=True),
-)  # fmt: skip
+    return drove_on(rig, begin_s, time.monotonic())

@@ -22,15 +22,11 @@ from edge_runtime.safety import Event
 from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S
 from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
 from edge_runtime.wire import DRIVE
-from hil_tests.faults.can_ears import CanEars, Heard
-from hil_tests.faults.chassis import ChassisProcess
-from hil_tests.faults.ends import at_any_phase
-from hil_tests.faults.rig import Rig
-from hil_tests.faults.row import Row, Try
-from hil_tests.faults.timeline import REACTION_LIMIT_S, CommandSeen
-from hil_tests.faults.waits import drive_after_s, stop_command
-from hil_tests.mock_hunter.faults import BITS, FAULTS
-from hil_tests.mock_hunter.parameters import MODELS
+from hil_tests.faults.observe import REACTION_LIMIT_S, CanMonitor, CommandSeen, Heard
+from hil_tests.faults.rig import ChassisProcess, Rig
+from hil_tests.faults.row import Try, at_any_phase, fault, recovered_after_s, stop_command
+from hil_tests.mock_hunter.body import MODELS
+from hil_tests.mock_hunter.chassis import BITS, FAULTS
 
 MODEL = "hunter-2.0"
 QUIET_S = 0.5
@@ -62,22 +58,23 @@ def speed_mps(frame: Heard) -> float:
 
 def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
     """Stops for it, stands when it is over, and drives again once re-armed."""
-    chassis, ears = rig.chassis, rig.ears
+    chassis, monitor = rig.chassis, rig.monitor
     assert chassis is not None
-    assert ears is not None
-    rig.wait_until_driving(ready=lambda: _drives(ears))
+    assert monitor is not None
+    rig.wait_until_driving(ready=lambda: _drives(monitor))
     at_any_phase(number)
     on_s = chassis.switch(expect.name, True)
     stop = stop_command(rig, on_s)
     stands_s = chassis.stands_s(on_s, STANDS_WITHIN_S)
-    wrong = _refuses(rig) if expect.name in _REFUSED else []
-    known_s = _known_s(expect, ears, on_s)
+    taken = expect.name in _REFUSED and rig.try_rearm()
+    wrong = ["was re-armed while the fault lasted"] if taken else []
+    known_s = _known_s(expect, monitor, on_s)
     chassis.switch(expect.name, False)
     time.sleep(QUIET_S)
-    quiet_s = rig.mark()
+    quiet_s = time.monotonic()
     wrong += _stayed(rig, chassis, stop, stands_s, quiet_s)
     wrong += _named(rig, expect, on_s)
-    told_s = _told_s(ears, on_s, quiet_s)
+    told_s = _told_s(monitor, on_s, quiet_s)
     figures = {"stands, ms": (stands_s - on_s) * 1e3, "safe_stop, ms": (stop.seen_s - on_s) * 1e3}
     done = Try(told_s - known_s, None, stop.reason, wrong=wrong, figures=figures)
     return _rearmed(rig, done)
@@ -85,41 +82,43 @@ def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
 
 def stuck(rig: Rig, number: int) -> Try:
     """Its motors hold their speed; nobody can know before it is asked for another one."""
-    chassis, ears = rig.chassis, rig.ears
+    chassis, monitor = rig.chassis, rig.monitor
     assert chassis is not None
-    assert ears is not None
+    assert monitor is not None
     rig.bright(True)
-    rig.wait_until_driving(ready=lambda: _drives(ears))
+    rig.wait_until_driving(ready=lambda: _drives(monitor))
     at_any_phase(number)
     on_s = chassis.switch("stuck", True)
-    held_mps = speed_mps(ears.of(0x221)[-1])
+    held_mps = speed_mps(monitor.of(0x221)[-1])
     rig.bright(False)
     stop = stop_command(rig, on_s)
     stands_s = chassis.stands_s(stop.seen_s, STANDS_WITHIN_S)
-    asked = [one.seen_s for one in ears.of(0x111, on_s) if held_mps - speed_mps(one) > _DIFFERS_MPS]
+    asked = [
+        one.seen_s for one in monitor.of(0x111, on_s) if held_mps - speed_mps(one) > _DIFFERS_MPS
+    ]
     known_s = asked[0]  # the stop at the latest: its set-point is 0
     chassis.switch("stuck", False)
     rig.bright(True)
     time.sleep(QUIET_S)
-    quiet_s = rig.mark()
+    quiet_s = time.monotonic()
     wrong = _stayed(rig, chassis, stop, stands_s, quiet_s)
     wrong += _named(rig, Expect("stuck", "stuck|speed stays"), on_s)
-    told_s = _told_s(ears, on_s, quiet_s)
+    told_s = _told_s(monitor, on_s, quiet_s)
     figures = {"stands after the stop, ms": (stands_s - stop.seen_s) * 1e3}
     done = Try(told_s - known_s, None, stop.reason, wrong=wrong, figures=figures)
     return _rearmed(rig, done)
 
 
-def _drives(ears: CanEars) -> bool:
+def _drives(monitor: CanMonitor) -> bool:
     """By its reports: all is well still."""
-    recent = ears.heard[-20:]
+    recent = monitor.heard[-20:]
     return any(one.can_id == 0x221 and speed_mps(one) > _FAST_MPS for one in recent)
 
 
-def _known_s(expect: Expect, ears: CanEars, on_s: float) -> float:
+def _known_s(expect: Expect, monitor: CanMonitor, on_s: float) -> float:
     if expect.name in _NO_FRAME_TO_SHOW_IT:
-        return max(one.seen_s for one in ears.of(0x221) if one.seen_s <= on_s)
-    heard = list(ears.heard)
+        return max(one.seen_s for one in monitor.of(0x221) if one.seen_s <= on_s)
+    heard = list(monitor.heard)
     shown = (one.seen_s for one in heard if one.seen_s > on_s and expect.shown(one))
     known_s = next(shown, None)
     if known_s is None:
@@ -127,9 +126,9 @@ def _known_s(expect: Expect, ears: CanEars, on_s: float) -> float:
     return known_s
 
 
-def _told_s(ears: CanEars, on_s: float, until_s: float) -> float:
+def _told_s(monitor: CanMonitor, on_s: float, until_s: float) -> float:
     """Since when every set-point has been speed 0; the end of the window where it never was."""
-    asked = [one for one in ears.of(0x111, on_s) if one.seen_s < until_s]
+    asked = [one for one in monitor.of(0x111, on_s) if one.seen_s < until_s]
     moving = [place for place, one in enumerate(asked) if speed_mps(one) != 0.0]
     after = asked[moving[-1] + 1 :] if moving else asked
     return after[0].seen_s if after else until_s
@@ -138,8 +137,8 @@ def _told_s(ears: CanEars, on_s: float, until_s: float) -> float:
 def _stayed(
     rig: Rig, chassis: ChassisProcess, stop: CommandSeen, stands_s: float, until_s: float
 ) -> list[str]:
-    assert rig.ears is not None
-    wrong = _kept_to_its_own(rig.ears)
+    assert rig.monitor is not None
+    wrong = _kept_to_its_own(rig.monitor)
     if stop.reason != Event.VEHICLE.value:
         wrong.append(f"stopped for {stop.reason}")
     if chassis.moved_between(stands_s, until_s):
@@ -149,11 +148,11 @@ def _stayed(
     return wrong
 
 
-def _kept_to_its_own(ears: CanEars) -> list[str]:
+def _kept_to_its_own(monitor: CanMonitor) -> list[str]:
     """Wrong where a frame or a set-point was on the bus that should never be."""
     most_mps = MODELS[MODEL].max_speed_mps
-    fast = [one for one in ears.of(0x111) if abs(speed_mps(one)) > most_mps]
-    wrong = [f"0x{one.can_id:x} was on the bus" for one in ears.strange[:1]]
+    fast = [one for one in monitor.of(0x111) if abs(speed_mps(one)) > most_mps]
+    wrong = [f"0x{one.can_id:x} was on the bus" for one in monitor.strange[:1]]
     return wrong + [f"asked for {speed_mps(one):.2f} m/s" for one in fast[:1]]
 
 
@@ -166,21 +165,22 @@ def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
     return [f"feedback says {sorted(set(said))}, not {expect.says!r}"]
 
 
-def _refuses(rig: Rig) -> list[str]:
-    return ["was re-armed while the fault lasted"] if rig.try_rearm() else []
-
-
 def _rearmed(rig: Rig, done: Try) -> Try:
     """Re-arm, and wait until it moves in fact; the recovery lasts to the first drive command."""
     assert rig.chassis is not None
     rig.rearm()
-    rearmed_s = rig.mark()
+    rearmed_s = time.monotonic()
     rig.wait_until_driving(ready=lambda: rig.chassis is not None and rig.chassis.moves)
-    drove_s = drive_after_s(rig, rearmed_s)
+    recovered_s = recovered_after_s(rig, rearmed_s)
+    drove_s = rearmed_s + recovered_s
     # Between a re-arm and the first drive feedback has nothing to say, or it was stopped again.
     said = {w for s, w in list(rig.timeline.named) if rearmed_s + _SAID_BEFORE_S < s < drove_s}
     notes = [f"after the re-arm: {', '.join(sorted(said))}"] if said else []
-    return replace(done, recovery_s=drove_s - rearmed_s, notes=notes)
+    return replace(done, recovery_s=recovered_s, notes=notes)
+
+
+def _reported_mps(frame: Heard) -> float:
+    return speed_mps(frame) if frame.can_id == 0x221 else 0.0
 
 
 def _status(test: Callable[[bytes], bool]) -> Callable[[Heard], bool]:
@@ -192,46 +192,31 @@ _EXPECTS = (
     Expect("frozen", "stands still"),
     Expect("bus_off", "sends no 0x2"),
     Expect("late", "sends no 0x2"),
-    Expect(
-        "lying",
-        "reports",
-        lambda frame: frame.can_id == 0x221 and speed_mps(frame) > _IMPOSSIBLE_MPS,
-    ),
+    Expect("lying", "reports", lambda frame: _reported_mps(frame) > _IMPOSSIBLE_MPS),
     Expect("remote", "remote control", _status(lambda data: data[1] == 2)),
     Expect("estop", "emergency stop", _status(lambda data: data[0] == 1)),
     *(Expect(name, bit.words, _status(lambda data: any(data[4:6]))) for name, bit in BITS.items()),
 )
-_EXPECT = "set-point 0 on the bus, vehicle_fault; stands until re-armed"
-_RIG = {"vehicle": "hunter", "model": MODEL}
-_STUCK_LIMIT_S = FOLLOWS_S + DEVIATES_S + REACTION_LIMIT_S
-_LIMITS_S = {"frozen": STATUS_SILENCE_S + REACTION_LIMIT_S}
+_hunter = partial(
+    fault, expected="set-point 0 on the bus, vehicle_fault; stands until re-armed",
+    rig={"vehicle": "hunter", "model": MODEL}, flows=True,
+)  # fmt: skip
 
-ROWS = (
-    *(
-        Row(
-            f"hunter_{expect.name}",
-            f"Hunter: {FAULTS[expect.name]}",
-            _EXPECT,
-            "last frame in time on the bus to set-point 0"
-            if expect.name in _NO_FRAME_TO_SHOW_IT
-            else "first frame on the bus that shows it to set-point 0",
-            partial(at_fault, expect),
-            reaction_limit_s=_LIMITS_S.get(expect.name, REACTION_LIMIT_S),
-            rig=_RIG,
-            policy="full",
-            flows=True,
-        )
-        for expect in _EXPECTS
-    ),
-    Row(
-        "hunter_stuck",
-        f"Hunter: {FAULTS['stuck']}",
-        _EXPECT,
-        "first set-point that it does not follow to set-point 0",
-        stuck,
-        reaction_limit_s=_STUCK_LIMIT_S,
-        rig=_RIG,
-        policy="mean",
-        flows=True,
-    ),
-)
+for _expect in _EXPECTS:
+    _hunter(
+        f"Hunter: {FAULTS[_expect.name]}",
+        name=f"hunter_{_expect.name}",
+        measured="last frame in time on the bus to set-point 0"
+        if _expect.name in _NO_FRAME_TO_SHOW_IT
+        else "first frame on the bus that shows it to set-point 0",
+        reaction_limit_s=REACTION_LIMIT_S + (STATUS_SILENCE_S if _expect.name == "frozen" else 0.0),
+        policy="full",
+    )(partial(at_fault, _expect))
+
+_hunter(
+    f"Hunter: {FAULTS['stuck']}",
+    name="hunter_stuck",
+    measured="first set-point that it does not follow to set-point 0",
+    reaction_limit_s=FOLLOWS_S + DEVIATES_S + REACTION_LIMIT_S,
+    policy="mean",
+)(stuck)

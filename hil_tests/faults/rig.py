@@ -9,29 +9,37 @@ from __future__ import annotations
 
 import contextlib
 import re
+import socket
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from edge_runtime.commands import ask
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
-from hil_tests.faults.can_ears import CanEars
-from hil_tests.faults.chassis import ChassisProcess, free_bus
-from hil_tests.faults.endless import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
-from hil_tests.faults.link import Link
-from hil_tests.faults.probe import Probe
-from hil_tests.faults.processes import Process, wait_until
-from hil_tests.faults.sender import Sender
-from hil_tests.faults.timeline import BrakeSeen, ModeSeen, Timeline, last_drive_s
+from edge_runtime.vehicles.hunter import bus as multicast
+from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE, State, encode
+from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
+from hil_tests.faults.observe import BrakeSeen, CanMonitor, ModeSeen, Probe, Timeline, last_drive_s
+from hil_tests.processes import Process, wait_until
 
 VEHICLE_ID = "faults"
-EARS = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
+SESSION = "campaign"
+HEARD = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
 """What is kept of the CAN bus: all commands, the chassis's state, its speed."""
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
+_TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(\w+)")
+_SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
 _REARM_EVERY_S = 2.0
+_CHUNK_BYTES = 65536
+_STATE_BYTES = 20
+"""More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
+(then 47 bytes for each are on the link)."""
 
 
 class Rig:
@@ -62,7 +70,7 @@ class Rig:
         self.router = self.start_router() if self.router_endpoint else None
         self._bus = free_bus() if model else ""
         self.chassis = ChassisProcess(self._bus, "--model", model) if model else None
-        self.ears = CanEars(self._bus, EARS) if model else None
+        self.monitor = CanMonitor(self._bus, HEARD) if model else None
         if self.chassis is not None:
             self._processes.append(("chassis", self.chassis.process))
         self.edge = self.start_edge()
@@ -74,14 +82,14 @@ class Rig:
         arguments += ["--vehicle-id", VEHICLE_ID, "--vehicle", self._vehicle]
         if self._bus:
             arguments += ["--bus", self._bus]
-        return self._start("edge", "hil_tests.faults.launch", *arguments)
+        return self._start("edge", "hil_tests.faults.inside", *arguments)
 
     def start_simulator(self) -> Process:
         """`bridge simulate` in real time, not waited for."""
         arguments = ["bridge", "simulate", "--env", ENVIRONMENT, "--clock", "realtime"]
         arguments += ["--listen", self._simulator_endpoint, "--vehicle-id", VEHICLE_ID]
         arguments += ["--out", str(self.directory / "report.json")]
-        return self._start("simulator", "hil_tests.faults.launch", *arguments)
+        return self._start("simulator", "hil_tests.faults.inside", *arguments)
 
     def start_recorder(self, path: Path) -> Process:
         """`bridge record` of this drive, not waited for."""
@@ -90,7 +98,9 @@ class Rig:
 
     def start_router(self) -> Process:
         """The router process between edge and probe, not waited for."""
-        return self._start("router", "hil_tests.faults.router", self.router_endpoint, self._hub)
+        return self._start(
+            "router", "hil_tests.faults.inside", "router", self.router_endpoint, self._hub
+        )
 
     def wait_until_driving(
         self, timeout_s: float = 30.0, ready: Callable[[], bool] = lambda: True
@@ -105,15 +115,11 @@ class Rig:
             nonlocal rearmed_s
             if self._vehicle != "none" and time.monotonic() - rearmed_s > _REARM_EVERY_S:
                 # A busy machine may have stopped it once more: the operator stays beside it.
-                self._ask_to_rearm()
+                self.try_rearm()
                 rearmed_s = time.monotonic()
             return self._is_driving() and ready()
 
         wait_until(driving, "a steady drive", timeout_s)
-
-    def mark(self) -> float:
-        """Now, the moment before a fault."""
-        return time.monotonic()
 
     def brakes(self) -> list[BrakeSeen]:
         """What the simulated vehicle's brake did so far."""
@@ -131,12 +137,14 @@ class Rig:
         temporary.replace(path)
 
     def rearm(self) -> None:
-        """As an operator does, once the runtime takes it."""
-        wait_until(self._ask_to_rearm, "the vehicle to be re-armed")
+        """As an operator does, until the runtime takes it."""
+        wait_until(self.try_rearm, "the vehicle to be re-armed")
 
     def try_rearm(self) -> bool:
         """Ask once; whether the runtime took it."""
-        return self._ask_to_rearm()
+        with contextlib.suppress(UserError):  # on a starved machine an answer may take too long
+            return bool(ask(self._hub, VEHICLE_ID, "rearm")["accepted"])
+        return False
 
     def bright(self, on: bool) -> None:
         """Turn the frames white, or back."""
@@ -160,8 +168,8 @@ class Rig:
             process.end()
         if self.link is not None:
             self.link.close()
-        if self.ears is not None:
-            self.ears.close()
+        if self.monitor is not None:
+            self.monitor.close()
         self.probe.close()
 
     def __enter__(self) -> Rig:
@@ -169,11 +177,6 @@ class Rig:
 
     def __exit__(self, *_: Any) -> None:
         self.close()
-
-    def _ask_to_rearm(self) -> bool:
-        with contextlib.suppress(UserError):  # on a starved machine an answer may take too long
-            return bool(ask(self._hub, VEHICLE_ID, "rearm")["accepted"])
-        return False
 
     def _is_driving(self) -> bool:
         now_s = time.monotonic()
@@ -194,3 +197,213 @@ class Rig:
         if found:
             mode, reason = found.group(1), found.group(2) or ""
             self.timeline.modes.append(ModeSeen(seen_s, mode, reason))
+
+
+class Sender:
+    """The rig's own simulator: step after step at absolute ticks until it is stopped."""
+
+    def __init__(self, probe: Probe) -> None:
+        self.step = 0
+        self.running = threading.Event()
+        self.running.set()
+        self._probe = probe
+        self._stopping = threading.Event()
+        self.lock = threading.Lock()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def send(self, state: State) -> None:
+        """Send one acceptable state and remember it as such. Hold ``lock`` to keep the order."""
+        payload = encode(state)
+        self._probe.note_state(payload, time.monotonic())
+        self._probe.put("state", payload)
+
+    def send_next(self) -> None:
+        """Send the next step now."""
+        with self.lock:
+            self.step += 1
+            self.send(make_state(self.step))
+
+    def stop(self) -> None:
+        """End the thread."""
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        next_s = time.monotonic()
+        while not self._stopping.wait(max(0.0, next_s - time.monotonic())):
+            next_s = max(next_s + CONTROL_PERIOD_S, time.monotonic())
+            if self.running.is_set():
+                self.send_next()
+
+
+def make_state(step: int, seed: int = 0, **changes: object) -> State:
+    """A valid state with a picture of noise below half brightness."""
+    generator = np.random.default_rng((seed, step))
+    fields: dict = {
+        "session": SESSION,
+        "episode": 0,
+        "step": step,
+        "sim_time_s": round(step * CONTROL_PERIOD_S, 6),
+        "sent_ns": time.time_ns(),
+        "frames": generator.integers(0, 120, FRAMES_SHAPE, dtype=np.uint8).tobytes(),
+        "speed_mps": 3.0,
+        "final": False,
+    }
+    return State(**{**fields, **changes})
+
+
+class Truth(NamedTuple):
+    """What the mock is and does from this moment (monotonic) on, whatever it reports."""
+
+    since_s: float
+    control: str
+    condition: str
+    moves: bool
+
+
+class ChassisProcess:
+    """``python -m hil_tests mock_hunter`` beside a rig: its faults, and what it really did."""
+
+    def __init__(self, bus: str, *arguments: str) -> None:
+        self.truth: list[Truth] = []
+        self.switched: list[tuple[float, str, str]] = []
+        command = ["hil_tests", "mock_hunter", "--bus", bus, *arguments]
+        self.process = Process(*command, told=True, on_line=self._on_line)
+        self.process.wait_for_line("ready")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves now."""
+        return bool(self.truth) and self.truth[-1].moves
+
+    def switch(self, name: str, on: bool) -> float:
+        """Switch a fault; when it took effect, monotonic s."""
+        count, word = len(self.switched), "on" if on else "off"
+        self.process.tell(f"{name} {word}")
+        done = wait_until(
+            lambda: [s for s in self.switched[count:] if s[1:] == (name, word)],
+            f"{name} {word}",
+        )
+        return float(done[0][0])
+
+    def stands_s(self, since_s: float, timeout_s: float) -> float:
+        """When it stood, at or after a moment; TimeoutError where it goes on moving."""
+        wait_until(lambda: not self.moves, "the vehicle to stand", timeout_s)
+        return max(self.truth[-1].since_s, since_s)
+
+    def moved_between(self, begin_s: float, end_s: float) -> bool:
+        """Whether it moved at any moment in between."""
+        before = [one for one in self.truth if one.since_s <= begin_s][-1:]
+        inside = [one for one in self.truth if begin_s < one.since_s < end_s]
+        return any(one.moves for one in before + inside)
+
+    def _on_line(self, seen_s: float, line: str) -> None:
+        told, switched = _TOLD.match(line), _SWITCHED.match(line)
+        if told:
+            moves = told.group(4) == "moves"
+            self.truth.append(Truth(float(told.group(1)), told.group(2), told.group(3), moves))
+        if switched:
+            applied_s, name, word = switched.groups()
+            self.switched.append((float(applied_s), name, word))
+
+
+def free_bus() -> str:
+    """A bus of its own: Linux mixes buses that share a port, whatever their groups."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("", 0))
+        return f"udp_multicast:{multicast.GROUP}:{one.getsockname()[1]}"
+
+
+class Link:
+    """A TCP link that can be cut, stalled and restored, carried by threads.
+
+    It listens at ``endpoint`` and passes everything on to ``target``, both ``tcp/HOST:PORT``.
+    """
+
+    def __init__(self, target: str) -> None:
+        self.endpoint = free_endpoint()
+        self.last_state_s = float("-inf")
+        """When the last bytes of a state went to whoever connected, monotonic s."""
+        self._target = address(target)
+        self._flowing = threading.Event()
+        self._flowing.set()
+        self._is_cut = False
+        self._lock = threading.Lock()
+        self._open: list[socket.socket] = []
+        self._listener = socket.create_server(address(self.endpoint))
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Break every connection and refuse new ones; what was under way is lost."""
+        with self._lock:
+            self._is_cut = True
+            self._break()
+
+    def stall(self) -> None:
+        """Keep the connections and hold what comes, as a radio link that repeats does."""
+        self._flowing.clear()
+
+    def restore(self) -> None:
+        """Be a link again; what was held comes at once."""
+        self._is_cut = False
+        self._flowing.set()
+
+    def close(self) -> None:
+        """Break all and stop listening."""
+        self._flowing.set()
+        self.cut()
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            self._join(near)
+
+    def _join(self, near: socket.socket) -> None:
+        with self._lock:
+            if self._is_cut:
+                near.close()
+                return
+            try:
+                far = socket.create_connection(self._target, timeout=1.0)
+            except OSError:
+                near.close()
+                return
+            far.settimeout(None)
+            for end in (near, far):
+                end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._open += [near, far]
+        threading.Thread(target=self._pump, args=(near, far, False), daemon=True).start()
+        threading.Thread(target=self._pump, args=(far, near, True), daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket, to_caller: bool) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(_CHUNK_BYTES):
+                self._flowing.wait()
+                sink.sendall(data)
+                if to_caller and len(data) > _STATE_BYTES:
+                    self.last_state_s = time.monotonic()
+        _shut(source, sink)
+
+    def _break(self) -> None:
+        _shut(*self._open)
+        self._open.clear()
+
+
+def address(endpoint: str) -> tuple[str, int]:
+    """Host and port of ``tcp/HOST:PORT``."""
+    host, port = endpoint.split("/", 1)[1].rsplit(":", 1)
+    return host, int(port)
+
+
+def _shut(*ends: socket.socket) -> None:
+    for end in ends:
+        with contextlib.suppress(OSError):
+            end.shutdown(socket.SHUT_RDWR)
+        end.close()

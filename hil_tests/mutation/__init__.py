@@ -1,1 +1,1 @@
-"""Proof that the safety tests can fail: every small change of the core must break one of them."""
+"""Proof that the safety tests can fail: cosmic-ray's settings, and what it may leave alive."""

@@ -1,4 +1,4 @@
-"""Mutation operators for cosmic-ray that its own do not cover. Loaded by cosmic-ray itself.
+"""Mutation operators that cosmic-ray does not have: it finds them by pyproject's entry point.
 
 `StatementRemover`: a statement that is not there. `TableTarget`: a row of the transition table
 that leads elsewhere. Neither changes an import, a docstring or a definition.
@@ -16,10 +16,10 @@ _MODES = ("_S", "_D", "_X")
 
 
 class StatementRemover(Operator):
-    """Replaces an assignment or a call by `pass`."""
+    """Replaces an assignment or a call inside a function by `pass`."""
 
     def mutation_positions(self, node: Any) -> Iterator[tuple]:
-        """Each statement inside a function."""
+        """Each of its statements."""
         if node.type != "simple_stmt" or node.search_ancestor("funcdef") is None:
             return
         statement = node.children[0]
@@ -43,7 +43,8 @@ class TableTarget(Operator):
 
     def mutation_positions(self, node: Any) -> Iterator[tuple]:
         """Twice for each target, because there are two other modes."""
-        if self._is_target(node):
+        before = node.get_previous_leaf() if node.type == "name" else None
+        if before is not None and before.value == ":" and node.value in _MODES:
             yield node.start_pos, node.end_pos
             yield node.start_pos, node.end_pos
 
@@ -57,22 +58,9 @@ class TableTarget(Operator):
         """For cosmic-ray's own tests."""
         return (Example("{(_S, 1): _D}", "{(_S, 1): _S}"),)
 
-    @staticmethod
-    def _is_target(node: Any) -> bool:
-        if node.type != "name" or node.value not in _MODES:
-            return False
-        before = node.get_previous_leaf()
-        return before is not None and before.value == ":"
 
-
-_OPERATORS = {operator.__name__: operator for operator in (StatementRemover, TableTarget)}
-
-
-class Provider:
+class Provider(dict):
     """What the entry point `cosmic_ray.operator_providers` names."""
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(_OPERATORS)
-
-    def __getitem__(self, name: str) -> type:
-        return _OPERATORS[name]
+    def __init__(self) -> None:
+        super().__init__(StatementRemover=StatementRemover, TableTarget=TableTarget)

@@ -1,4 +1,4 @@
-"""The latency campaign: what it says of its rows, and that it drives each of them once."""
+"""The latency campaign: what it says of its rows, that it drives each once, and its two files."""
 
 import json
 from itertools import chain, repeat
@@ -8,13 +8,11 @@ import pytest
 
 from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError
+from hil_tests import campaign
 from hil_tests.__main__ import main
-from hil_tests.campaign import command, latency, workers
-from hil_tests.campaign.axes import AXES, Axis
-from hil_tests.campaign.budget import budget, limit_of
-from hil_tests.campaign.chunks import Chunk, Task, chunks_of
-from hil_tests.campaign.latency import agree
-from hil_tests.campaign.rows import make_row
+from hil_tests.campaign import Chunk, Task, agree, chunks_of
+from hil_tests.report import check_report, write_report
+from hil_tests.sweep import NETWORK_AXES, Axis, budget, limit_of, make_row
 
 DELAY = Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms", "none", "{} of delay")
 LOSS = Axis("loss", "loss", "%", (0, 10), "loss={}%", "none", "{} of loss")
@@ -65,12 +63,12 @@ def test_an_axis_whose_own_base_fails_has_no_limit_and_takes_nothing_from_the_ot
 
 
 def test_every_axis_can_be_read_and_begins_without_trouble():
-    for axis in AXES:
+    for axis in NETWORK_AXES:
         assert axis.values[0] == 0
         assert list(axis.values) == sorted(axis.values)
         specs = [axis.spec(value) for value in axis.values]
         assert len(set(specs)) == len(specs)
-    delays = next(axis.values for axis in AXES if axis.name == "delay")
+    delays = next(axis.values for axis in NETWORK_AXES if axis.name == "delay")
     assert {0, 25, 250} <= set(delays)  # 0 to 500 ms there and back
 
 
@@ -135,7 +133,7 @@ def test_a_mistake_is_one_line(options, said, tmp_path, capsys):
 
 
 def test_another_campaigns_sentence_has_the_name_that_it_is_shown_by():
-    name, latency_part = command._other("without_1=results/latency/left_turn/shipped.json")
+    name, latency_part = campaign._other("without_1=results/latency/left_turn/shipped.json")
     assert latency_part["policy"].endswith("left_turn.onnx")
     assert latency_part["budget"]["sentence"].startswith(f"{name} holds at least 98%")
 
@@ -155,7 +153,7 @@ def test_a_key_that_is_not_there_is_said_before_anything_is_driven(tmp_path, cap
 
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
     few = Axis("delay", "delay", "ms", (0, 100), "delay={}ms", "none", "{} of delay")
-    monkeypatch.setattr(command, "AXES", (few,))
+    monkeypatch.setattr(campaign, "NETWORK_AXES", (few,))
     out = tmp_path / "r.json"
     arguments = ["campaign", "--only", "latency", "--runs", "2", "--jobs", "2", "--out", str(out)]
     assert run_cli(main, arguments) == 0
@@ -172,7 +170,7 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
         driven.extend(chunks)
         raise UserError("drives nothing")
 
-    monkeypatch.setattr(latency, "drive_chunks", note)
+    monkeypatch.setattr(campaign, "drive_chunks", note)
     assert run_cli(main, arguments) == 0
     assert json.loads(out.read_text())["latency"]["rows"] == first["rows"]
     Path(next((tmp_path / "r_rows").iterdir())).unlink()
@@ -184,18 +182,34 @@ def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeyp
     policy = Path("results/policies/left_turn.onnx")
     task = Task(policy, "any", "left_turn", "nominal", "lockstep")
     edges, limits_s = [], chain((0.1,), repeat(120.0))
-    start_edge, wait = workers._Worker._start_edge, workers.BackgroundCommand.wait
+    start_edge, wait = campaign.Worker.start_edge, campaign.BackgroundCommand.wait
 
     def note_edge(worker):
         start_edge(worker)
-        edges.append(worker._edge)
+        edges.append(worker.edge)
 
-    monkeypatch.setattr(workers._Worker, "_start_edge", note_edge)
+    monkeypatch.setattr(campaign.Worker, "start_edge", note_edge)
     monkeypatch.setattr(
-        workers.BackgroundCommand, "wait", lambda self, _limit_s: wait(self, next(limits_s))
+        campaign.BackgroundCommand, "wait", lambda self, _limit_s: wait(self, next(limits_s))
     )
     reports = []
     chunk = Chunk("none", 1, 1)
-    workers.drive_chunks(task, [chunk], 1, lambda _chunk, report, _wall_s: reports.append(report))
-    assert [report["episodes"] for report in reports] == [1]
+    campaign.drive_chunks(task, [chunk], 1, lambda _chunk, found: reports.append(found))
+    assert [len(report["episodes"]) for report in reports] == [1]
     assert len(edges) == 2
+
+
+def test_the_markdown_stands_beside_the_json(tmp_path):
+    out = tmp_path / "r.json"
+    check_report(out)
+    write_report(out, {"passed": True}, ["# Campaign", "", "all", ""])
+    assert json.loads(out.read_text()) == {"passed": True}
+    assert (tmp_path / "r.md").read_text() == "# Campaign\n\nall\n"
+
+
+def test_what_could_not_be_written_is_said_before_the_work(tmp_path):
+    with pytest.raises(UserError, match=r"r\.md is for the JSON"):
+        check_report(tmp_path / "r.md")
+    (tmp_path / "r.md").mkdir()
+    with pytest.raises(UserError, match="is a directory"):
+        check_report(tmp_path / "r.json")

@@ -1,17 +1,20 @@
 """The demo, whole but small: every step once, and again from what it kept."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
-from pathlib import Path
+import time
 
 import pytest
 
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
+from hil_tests import demo
 from hil_tests.__main__ import main
-from hil_tests.commands import BackgroundCommand
 from hil_tests.demo import Demo
+from hil_tests.processes import BackgroundCommand
 
 SMALL = (
     "--episodes", "2", "--human-episodes", "20", "--human-minutes", "0.001", "--runs", "1",
@@ -19,17 +22,15 @@ SMALL = (
 )  # fmt: skip
 
 
-def demo(out: Path) -> subprocess.CompletedProcess:
-    """Run the demo as a person would, without a terminal."""
-    arguments = [sys.executable, "-m", "hil_tests", "demo", "--out", str(out), *SMALL]
-    return subprocess.run(
-        arguments, capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False
-    )
-
-
 @pytest.mark.timeout(400)
-def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(tmp_path):
-    first = demo(tmp_path / "demo")
+def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(
+    tmp_path, monkeypatch, capsys
+):
+    words = ["demo", "--out", str(tmp_path / "demo"), *SMALL]
+    first = subprocess.run(  # as a person would, without a terminal
+        [sys.executable, "-m", "hil_tests", *words],
+        capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False,
+    )  # fmt: skip
     # A policy of two episodes may well drive badly (status 1); anything else is a fault.
     assert first.returncode in (0, 1), first.stderr
     made = {path.name for path in (tmp_path / "demo").iterdir()}
@@ -46,10 +47,13 @@ def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(tmp_pa
     for text in ("in process", "over Zenoh", "each way", "safe stops"):
         assert text in first.stdout
     policy = (tmp_path / "demo" / "left_turn.onnx").read_bytes()
-    second = demo(tmp_path / "demo")
-    assert second.returncode == first.returncode
-    assert "is kept" in second.stdout
-    assert "trainer train" not in second.stdout
+    # What the second one does with its policy is what the first one did: only its commands count.
+    commands = []
+    monkeypatch.setattr(demo, "run_command", lambda *words: commands.append(words[:2]))
+    monkeypatch.setattr(demo.Demo, "_simulate", lambda *_: commands.append(("simulate",)))
+    assert main(words) == first.returncode
+    assert "is kept" in capsys.readouterr().out
+    assert commands == [("trainer", "evaluate"), *[("simulate",)] * 3]
     assert (tmp_path / "demo" / "left_turn.onnx").read_bytes() == policy
 
 
@@ -81,3 +85,36 @@ def test_a_background_command_that_fails_says_why(tmp_path):
     missing = str(tmp_path / "none.onnx")
     with pytest.raises(UserError, match="does not exist"):
         BackgroundCommand("edge_runtime", "run", "--policy", missing, ready="ready")
+
+
+CHILD = """
+import signal, sys, time
+from pathlib import Path
+
+def keep(number, frame):
+    time.sleep(1.0)
+    Path("kept").touch()
+    sys.exit(130)
+
+signal.signal(signal.SIGINT, keep)
+Path("ready").touch()
+time.sleep(60)
+"""
+
+
+def test_what_an_interrupted_command_keeps_is_waited_for(tmp_path):
+    (tmp_path / "child.py").write_text(CHILD)
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "from hil_tests.processes import run_command; run_command('child')"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )  # fmt: skip
+    end_s = time.monotonic() + 30.0
+    while not (tmp_path / "ready").exists() and time.monotonic() < end_s:
+        time.sleep(0.02)
+    os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
+    assert parent.wait(30) != 0
+    assert (tmp_path / "kept").exists()

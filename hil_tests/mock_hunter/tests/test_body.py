@@ -4,14 +4,22 @@ import math
 from dataclasses import fields
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import SPECS
-from hil_tests.mock_hunter.battery import Battery
-from hil_tests.mock_hunter.body import Body, Setpoint, advance, curvature
-from hil_tests.mock_hunter.parameters import MODELS, SOURCES, Parameters, make_parameters
+from hil_tests.mock_hunter.body import (
+    MODELS,
+    SOURCES,
+    Battery,
+    Body,
+    Parameters,
+    Setpoint,
+    advance,
+    curvature,
+    make_parameters,
+)
 
 P = MODELS["hunter-2.0"]
 setpoints = st.builds(Setpoint, st.floats(-3, 3), st.floats(-1, 1))
@@ -23,6 +31,7 @@ bodies = st.builds(
 steps_s = st.floats(0.001, 0.02)
 
 
+@settings(deadline=None)  # a busy machine pauses
 @given(bodies, st.one_of(st.none(), setpoints), steps_s)
 def test_nothing_leaps_and_no_limit_is_passed(body, setpoint, step_s):
     after = advance(body, setpoint, step_s, P)
@@ -33,6 +42,7 @@ def test_nothing_leaps_and_no_limit_is_passed(body, setpoint, step_s):
     assert abs(after.inner_rad - body.inner_rad) <= P.steering_rate_radps * step_s + 1e-12
 
 
+@settings(deadline=None)  # a busy machine pauses
 @given(bodies, setpoints, steps_s)
 def test_speed_comes_closer_and_never_overshoots(body, setpoint, step_s):
     wanted = min(max(setpoint.speed_mps, -P.max_speed_mps), P.max_speed_mps)
@@ -42,6 +52,7 @@ def test_speed_comes_closer_and_never_overshoots(body, setpoint, step_s):
     assert before_gap * gap >= -1e-12
 
 
+@settings(deadline=None)  # a busy machine pauses
 @given(bodies, steps_s)
 def test_the_brake_ends_in_a_stand_with_the_steering_held(body, step_s):
     moved = body

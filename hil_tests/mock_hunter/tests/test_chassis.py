@@ -7,6 +7,7 @@ import pytest
 
 from hil_tests.mock_hunter import chassis as rules
 from hil_tests.mock_hunter.chassis import (
+    BITS,
     CONDITION,
     CONTROL,
     Chassis,
@@ -14,7 +15,6 @@ from hil_tests.mock_hunter.chassis import (
     Control,
     Event,
 )
-from hil_tests.mock_hunter.faults import BITS
 
 TIMEOUT_S = 0.5
 CONTROL_EVENTS = [

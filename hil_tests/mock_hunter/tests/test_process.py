@@ -12,11 +12,11 @@ from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
 from hil_tests.__main__ import main
-from hil_tests.faults.chassis import ChassisProcess, free_bus
-from hil_tests.faults.processes import wait_until
+from hil_tests.faults.rig import ChassisProcess, free_bus
+from hil_tests.mock_hunter.body import MODELS
 from hil_tests.mock_hunter.hunter import MockHunter
-from hil_tests.mock_hunter.parameters import MODELS
 from hil_tests.mock_hunter.process import Orders, Server, parse_switch
+from hil_tests.processes import wait_until
 
 PATIENCE_S = 5.0
 

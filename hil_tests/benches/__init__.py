@@ -1,1 +1,0 @@
-"""What ``make bench-loop`` measures, a module for each idea."""

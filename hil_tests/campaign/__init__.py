@@ -1,1 +1,0 @@
-"""How much network a policy bears, and how the loop takes every fault: one report."""

@@ -1,1 +1,0 @@
-"""``python -m hil_tests doctor``: what this machine can do, found out by doing it."""

@@ -1,0 +1,270 @@
+"""What is seen of a drive and when: a timeline, and those who fill it from the wire and the bus.
+
+Times are monotonic seconds: that clock is one for all processes of a machine, so the times of the
+probe, of the edge runtime's log and of the simulated vehicle can be taken from one another.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import statistics
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeVar
+
+import can
+import zenoh
+
+from edge_runtime import wire
+from edge_runtime.transport import open_session
+from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+from edge_runtime.vehicles.hunter.protocol import FRAMES
+from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP
+
+REACTION_LIMIT_S = 2 * CONTROL_PERIOD_S + 0.05
+"""After the last good state a safe stop is out, or the other end brakes by itself."""
+RECOVERY_LIMIT_S = 1.0
+"""From the end of the fault to the first drive command, with no vehicle attached."""
+
+Place = tuple[str, int, int]
+"""Session, episode and step of a state."""
+E = TypeVar("E")
+_POLL_S = 0.1
+
+
+class CommandSeen(NamedTuple):
+    """A command that reached the probe; ``sent_s`` by the edge's wall clock, made monotonic."""
+
+    seen_s: float
+    sent_s: float
+    place: Place
+    mode: str
+    action: list[float]
+    reason: str
+
+
+class ModeSeen(NamedTuple):
+    """A change of mode in the edge runtime's log."""
+
+    seen_s: float
+    mode: str
+    reason: str
+
+
+class BrakeSeen(NamedTuple):
+    """The simulated vehicle's brake, pressed or released."""
+
+    seen_s: float
+    pressed: bool
+
+
+@dataclass
+class Timeline:
+    """Events in order of arrival. Threads only append; a reader sees whole entries."""
+
+    states: dict[Place, float] = field(default_factory=dict)
+    """When the probe saw each acceptable state."""
+    flow_s: list[float] = field(default_factory=list)
+    """When the states of the drive itself came: gaps in it are the machine's, or the fault's."""
+    commands: list[CommandSeen] = field(default_factory=list)
+    modes: list[ModeSeen] = field(default_factory=list)
+    feedback_s: list[float] = field(default_factory=list)
+    named: list[tuple[float, str]] = field(default_factory=list)
+    """When the feedback said what was wrong with the vehicle."""
+    unreadable: int = 0
+    """Commands that no receiver would take: outside their limits, or no commands at all."""
+
+
+def first(events: Iterable[E], wanted: Callable[[E], bool]) -> E | None:
+    """The first event of that kind."""
+    return next((event for event in events if wanted(event)), None)
+
+
+def last_drive_s(timeline: Timeline) -> float:
+    """When the newest drive command came; -inf before the first."""
+    times = (c.seen_s for c in reversed(timeline.commands) if c.mode == DRIVE)
+    return next(times, float("-inf"))
+
+
+def unsafe_commands(
+    commands: Iterable[CommandSeen],
+    states: Mapping[Place, float],
+    by_arrival: bool = False,
+) -> list[str]:
+    """Why each unsafe command is one; empty where all is well.
+
+    A ``drive`` is unsafe outside its limits, in answer to a state that nobody sent or that was
+    to be rejected, and later than the reaction limit after the state that it answers.
+    ``by_arrival`` takes the probe's time in place of the edge's clock, where that was stepped.
+    """
+    found = []
+    for command in commands:
+        if command.mode != DRIVE:
+            continue
+        state_s = states.get(command.place)
+        if not all(-1.0 <= value <= 1.0 for value in command.action):
+            found.append(f"{command.place}: action {command.action}")
+        elif state_s is None:
+            found.append(f"{command.place}: answers no acceptable state")
+        else:
+            age_s = (command.seen_s if by_arrival else command.sent_s) - state_s
+            if age_s > REACTION_LIMIT_S:
+                found.append(f"{command.place}: its state was {age_s:.3f} s old")
+    return found
+
+
+def longest_gap_s(times_s: Iterable[float], begin_s: float, end_s: float) -> float:
+    """The longest stretch within [begin, end] without an event."""
+    inside = [begin_s, *sorted(t for t in times_s if begin_s < t < end_s), end_s]
+    return max(after - before for before, after in pairwise(inside))
+
+
+def stops_between(commands: Iterable[CommandSeen], begin_s: float, end_s: float) -> list[str]:
+    """A line for each reason of the safe stops in between, where the drive was to go on."""
+    seen = [c for c in list(commands) if begin_s < c.seen_s < end_s and c.mode == SAFE_STOP]
+    return [f"safe stop: {reason}" for reason in dict.fromkeys(c.reason for c in seen)]
+
+
+def spread_ms(values_s: Iterable[float]) -> dict[str, float] | None:
+    """Minimum, median and maximum in ms; None of nothing."""
+    values_ms = sorted(value_s * 1e3 for value_s in values_s)
+    if not values_ms:
+        return None
+    found = {"min": values_ms[0], "median": statistics.median(values_ms), "max": values_ms[-1]}
+    return {name: round(value_ms, 1) for name, value_ms in found.items()}
+
+
+class Probe:
+    """A Zenoh router between the two ends that stamps what passes; ``put`` sends anything.
+
+    It listens for the edge runtime and connects to the simulator, so that it still hears the edge
+    when the simulator is gone, and the other way round.
+    """
+
+    def __init__(
+        self, listen: str, connect: str | None, vehicle_id: str, timeline: Timeline
+    ) -> None:
+        self.timeline = timeline
+        self.health: list[wire.Health] = []
+        self._session = open_session(listen=listen, connect=connect, mode="router")
+        handlers: dict[str, Callable[[zenoh.Sample], None]] = {
+            "state": lambda sample: self.note_state(bytes(sample.payload), time.monotonic()),
+            "command": self._on_command,
+            "health": self._on_health,
+            "feedback": self._on_feedback,
+        }
+        # BLOCK: a message that the campaign says it sent has been sent.
+        self._publishers = {
+            topic: self._session.declare_publisher(
+                wire.key(vehicle_id, topic),
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                allowed_destination=zenoh.Locality.REMOTE,  # it hears the others, not itself
+            )
+            for topic in handlers
+        }
+        self._declared: list[Any] = [
+            self._session.declare_subscriber(wire.key(vehicle_id, topic), handler)
+            for topic, handler in handlers.items()
+        ]
+
+    def put(self, topic: str, payload: bytes) -> None:
+        """Send bytes as they are."""
+        self._publishers[topic].put(payload)
+
+    def rejected(self) -> dict[str, int]:
+        """The edge runtime's counts of rejected states, by its newest health message."""
+        return dict(self.health[-1].rejected) if self.health else {}
+
+    def close(self) -> None:
+        """Undeclare all, then close."""
+        for declared in [*self._declared, *self._publishers.values()]:
+            declared.undeclare()
+        self._session.close()
+
+    def note_state(self, payload: bytes, seen_s: float) -> None:
+        """Remember a state that a policy may answer."""
+        state = wire.decode_state(payload)
+        if isinstance(state, wire.State):
+            place = (state.session, state.episode, state.step)
+            self.timeline.states.setdefault(place, seen_s)
+            self.timeline.flow_s.append(seen_s)
+
+    def _on_command(self, sample: zenoh.Sample) -> None:
+        seen_s, offset_ns = time.monotonic(), time.time_ns() - time.monotonic_ns()
+        command = wire.decode_command(bytes(sample.payload))
+        if isinstance(command, wire.Rejection):
+            self.timeline.unreadable += 1
+            return
+        self.timeline.commands.append(
+            CommandSeen(
+                seen_s,
+                (command.sent_ns - offset_ns) * 1e-9,
+                (command.session, command.episode, command.step),
+                command.mode,
+                command.action,
+                command.reason,
+            )
+        )
+
+    def _on_feedback(self, sample: zenoh.Sample) -> None:
+        seen_s = time.monotonic()
+        self.timeline.feedback_s.append(seen_s)
+        feedback = wire.decode_feedback(bytes(sample.payload))
+        if isinstance(feedback, wire.Feedback):
+            self.timeline.named += [(seen_s, words) for words in feedback.faults]
+
+    def _on_health(self, sample: zenoh.Sample) -> None:
+        health = wire.decode_health(bytes(sample.payload))
+        if isinstance(health, wire.Health):
+            self.health.append(health)
+
+
+class Heard(NamedTuple):
+    """A frame, and its monotonic time."""
+
+    seen_s: float
+    can_id: int
+    data: bytes
+
+
+class CanMonitor:
+    """Hears all frames of a CAN bus in a thread, and keeps those of the identifiers asked for."""
+
+    def __init__(self, bus: str, can_ids: tuple[int, ...]) -> None:
+        self.heard: list[Heard] = []
+        self.strange: list[Heard] = []
+        """Frames that are not the Hunter's: nobody should send any."""
+        self._can_ids = frozenset(can_ids)
+        self._bus = open_bus(parse_bus(bus))
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def of(self, can_id: int, since_s: float = float("-inf")) -> list[Heard]:
+        """The frames of an identifier since a moment, in order."""
+        return [one for one in list(self.heard) if one.can_id == can_id and one.seen_s > since_s]
+
+    def close(self) -> None:
+        """End the thread, then close the bus."""
+        self._ending.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+    def _listen(self) -> None:
+        while not self._ending.is_set():
+            with contextlib.suppress(can.CanError):
+                message = self._bus.recv(_POLL_S)
+                if message is not None:
+                    self._note(message)
+
+    def _note(self, message: can.Message) -> None:
+        # The stamp is the kernel's, by the wall clock: how late this thread runs does not count.
+        seen_s = message.timestamp + time.monotonic() - time.time()
+        heard = Heard(seen_s, message.arbitration_id, bytes(message.data))
+        if heard.can_id in self._can_ids:
+            self.heard.append(heard)
+        if heard.can_id not in FRAMES or message.is_extended_id:
+            self.strange.append(heard)

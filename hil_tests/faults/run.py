@@ -1,0 +1,237 @@
+"""Runs rows of the fault table, several rigs at once, and gathers what each try gave."""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_runtime.policy import load_policy
+from edge_runtime.tests.policies import SLOW_LOOPS, write_policy
+from edge_runtime.util import UserError
+from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE
+from hil_tests.faults import ends, hunter, messages  # noqa: F401 (they fill the table)
+from hil_tests.faults.observe import longest_gap_s, spread_ms, unsafe_commands
+from hil_tests.faults.rig import Rig
+from hil_tests.faults.row import ROWS, Row, Try
+from hil_tests.processes import POLICY, PUBLIC_KEY, trusting
+
+SLOW_S = 2.5 * CONTROL_PERIOD_S
+STALLED_S = 1.5 * CONTROL_PERIOD_S
+"""States further apart than this are not the real-time drive that a row is about."""
+MOST_DISTURBED = 100
+OnProgress = Callable[[str, int, int], None]
+"""Told the row, and how many of all tries are done."""
+
+
+def write_slow(path: Path) -> None:
+    """A policy that takes about SLOW_S on white frames on this machine, and no time on others."""
+    trial = path.with_suffix(".trial.onnx")
+    write_policy(trial, "slow")
+    policy = load_policy(trial, allow_unsigned=True)
+    begun_s = time.perf_counter()
+    policy.act(np.full(FRAMES_SHAPE, 255, np.uint8))
+    took_s = time.perf_counter() - begun_s
+    write_policy(path, "slow", loops=max(1, round(SLOW_LOOPS * SLOW_S / took_s)))
+
+
+POLICIES: dict[str, Callable[[Path], object]] = {
+    "slow": write_slow,
+    "steady": lambda path: write_policy(path, "constant", 0.6),
+    "full": lambda path: write_policy(path, "constant", 1.0),
+    # Brightness is its pedal: full throttle on white frames, the brake on all others.
+    "mean": lambda path: write_policy(path, "mean"),
+}
+"""Made for the rows that name them."""
+
+
+@dataclass
+class Outcome:
+    """What all tries of a row gave."""
+
+    tries: list[Try] = field(default_factory=list)
+    unsafe: list[str] = field(default_factory=list)
+    crashes: list[str] = field(default_factory=list)
+    disturbed: int = 0
+    """Tries in which the machine itself stood still, done again."""
+    failures: list[str] = field(default_factory=list)
+    """Tries that came to no end: nothing was seen of what should have come."""
+
+
+def run_faults(
+    tries: int,
+    rows: Sequence[str] | None = None,
+    policy: Path | None = None,
+    on_progress: OnProgress = lambda row, done, total: None,
+    jobs: int = 2,
+    public_key: str | None = None,
+) -> dict[str, Any]:
+    """Do every row ``tries`` times; a report for JSON.
+
+    Args:
+        tries: of each row.
+        rows: names of the table's rows, or patterns of them (``hunter_*``); None for all.
+        policy: an exported policy; None for the repository's own left turn.
+        on_progress: called after every try.
+        jobs: rigs at once; rows that need the machine for themselves run after the others.
+        public_key: what the policy is verified with.
+
+    Raises:
+        UserError: a row that the table does not hold, or no policy.
+    """
+    chosen = choose_rows(rows)
+    trust = trusting(policy, public_key)
+    if policy is None:
+        trust = ("--policy", str(POLICY), "--public-key", public_key or str(PUBLIC_KEY))
+    with tempfile.TemporaryDirectory(prefix="phil-faults-") as work:
+        campaign = _Campaign(Path(work), trust, tries, chosen, on_progress)
+        with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
+            futures = {row.name: pool.submit(campaign.run, row) for row in chosen if not row.alone}
+            outcomes = {name: future.result() for name, future in futures.items()}
+        outcomes |= {row.name: campaign.run(row) for row in chosen if row.alone}
+    found = [report_row(row, outcomes[row.name]) for row in chosen]
+    return {
+        "tries": tries,
+        "rows": found,
+        "crashes": sum(len(row["crashes"]) for row in found),
+        "unsafe_commands": sum(len(row["unsafe"]) for row in found),
+        "passed": all(row["passed"] for row in found),
+    }
+
+
+def choose_rows(names: Sequence[str] | None) -> list[Row]:
+    """The rows of these names or patterns, in the table's order; all for None.
+
+    Raises:
+        UserError: a name that the table does not hold, or a pattern that fits none.
+    """
+    if names is None:
+        return list(ROWS)
+    known = [row.name for row in ROWS]
+    for name in names:
+        if not fnmatch.filter(known, name):
+            raise UserError(f"no fault {name!r}; choose from {', '.join(known)}")
+    return [row for row in ROWS if any(fnmatch.fnmatch(row.name, name) for name in names)]
+
+
+class _Campaign:
+    def __init__(
+        self,
+        work: Path,
+        trust: Sequence[str],
+        tries: int,
+        rows: Sequence[Row],
+        on_progress: OnProgress,
+    ) -> None:
+        self._work, self._tries, self._on_progress = work, tries, on_progress
+        self._done, self._total = 0, tries * len(rows)
+        self._lock = threading.Lock()
+        self._policies = {"given": trust}
+        for kind in {row.policy for row in rows} & set(POLICIES):
+            path = work / f"{kind}.onnx"
+            POLICIES[kind](path)
+            self._policies[kind] = trusting(path, None)
+
+    def run(self, row: Row) -> Outcome:
+        """All tries of a row; a rig in which a try came to no end is replaced."""
+        outcome, number = Outcome(), 0
+        while number < self._tries:
+            with self._rig(row, outcome) as rig:
+                going = True
+                while going and number < self._tries:
+                    disturbed = outcome.disturbed
+                    going = self._try(row, rig, number, outcome) and not row.new_rig_each_try
+                    if outcome.disturbed == disturbed:
+                        number += 1
+                        self._tick(row)
+                _judge(row, rig, outcome)
+        return outcome
+
+    def _try(self, row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
+        """Whether the rig can be used again."""
+        try:
+            rig.wait_until_driving()
+            begin_s = time.monotonic()
+            done = row.run(rig, number)
+        except TimeoutError as error:
+            outcome.failures.append(f"try {number}: {error}")
+            return False
+        gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
+        if row.flows and gap_s > STALLED_S and outcome.disturbed < MOST_DISTURBED:
+            outcome.disturbed += 1
+        else:
+            outcome.tries.append(done)
+        return True
+
+    @contextlib.contextmanager
+    def _rig(self, row: Row, outcome: Outcome) -> Iterator[Rig]:
+        directory = Path(tempfile.mkdtemp(dir=self._work))
+        with Rig(self._policies[row.policy], directory, **row.rig) as rig:
+            yield rig
+        outcome.crashes += rig.crashes
+
+    def _tick(self, row: Row) -> None:
+        with self._lock:
+            self._done += 1
+            self._on_progress(row.name, self._done, self._total)
+
+
+def _judge(row: Row, rig: Rig, outcome: Outcome) -> None:
+    timeline = rig.timeline
+    outcome.unsafe += unsafe_commands(timeline.commands, timeline.states, by_arrival=row.by_arrival)
+    if timeline.unreadable:
+        outcome.unsafe.append(f"{timeline.unreadable} commands that nobody would take")
+
+
+def report_row(row: Row, outcome: Outcome) -> dict[str, Any]:
+    """A row of the report: spreads of the times, how many were late, and what was wrong."""
+    reactions = [t.reaction_s for t in outcome.tries if t.reaction_s is not None]
+    recoveries = [t.recovery_s for t in outcome.tries if t.recovery_s is not None]
+    late = _over(reactions, row.reaction_limit_s), _over(recoveries, row.recovery_limit_s)
+    wrong = [*outcome.failures, *(text for t in outcome.tries for text in t.wrong)]
+    rejected: Counter[str] = Counter()
+    figures: dict[str, float] = {}
+    for one in outcome.tries:
+        rejected.update(one.rejected)
+        for name, value in one.figures.items():
+            figures[name] = max(value, figures.get(name, value))
+    return {
+        "name": row.name,
+        "done": row.done,
+        "expected": row.expected,
+        "measured": row.measured,
+        "tries": len(outcome.tries) + len(outcome.failures),
+        "disturbed": outcome.disturbed,
+        "reaction_ms": spread_ms(reactions),
+        "reaction_limit_ms": _ms(row.reaction_limit_s),
+        "reactions_late": late[0],
+        "recovery_ms": spread_ms(recoveries),
+        "recovery_limit_ms": _ms(row.recovery_limit_s),
+        "recoveries_late": late[1],
+        "reasons": dict(Counter(t.reason for t in outcome.tries if t.reason)),
+        "rejected": dict(rejected),
+        "figures": figures,
+        "notes": [text for t in outcome.tries for text in t.notes],
+        "wrong": wrong,
+        "unsafe": outcome.unsafe,
+        "crashes": outcome.crashes,
+        "passed": not (any(late) or wrong or outcome.unsafe or outcome.crashes),
+    }
+
+
+def _over(values_s: Sequence[float], limit_s: float | None) -> int:
+    return 0 if limit_s is None else sum(value_s > limit_s for value_s in values_s)
+
+
+def _ms(limit_s: float | None) -> float | None:
+    return None if limit_s is None else round(limit_s * 1e3, 1)

@@ -1,1 +1,0 @@
-"""Many vehicles at one router: real edge runtimes over TLS; simulators that only send."""

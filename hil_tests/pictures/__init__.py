@@ -1,1 +1,0 @@
-"""``python -m hil_tests pictures``: every picture of the READMEs, made by commands."""

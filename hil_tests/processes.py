@@ -1,0 +1,369 @@
+"""The repository's own commands as processes, the operator beside a drive, rerun's viewer.
+
+`run_command` is what a person types; `BackgroundCommand` runs beside us and says why it failed;
+`Process` stamps every line that it prints, for who measures or disturbs it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+from edge_runtime.commands import ask
+from edge_runtime.util import UserError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+POLICY = Path("results/policies/left_turn.onnx")
+PUBLIC_KEY = POLICY.with_name("policy.pub")
+"""The policy that ships, and what it is verified with."""
+PATIENCE_S = 30.0
+STOP_TIMEOUT_S = 10.0
+POLL_S = 0.002
+OPERATOR_LOOKS_EVERY_S = 0.5
+VIEWER_SIZE = "1400x900"
+VIEWER_START_S, VIEWER_LOOK_S = 60.0, 0.5
+VIEWER_NEEDS = "it needs Vulkan, in software with apt install mesa-vulkan-drivers"
+_LAST_WORDS_S = 1.0
+_CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Python error")
+
+
+class CommandTimeoutError(UserError):
+    """A command had not ended when its time was over."""
+
+
+class Process:
+    """``python -m ARGUMENTS``; ``lines`` are stdout and stderr with their monotonic times.
+
+    Args:
+        arguments: the module and its arguments.
+        environment: variables beside ours.
+        told: it reads its standard input, and `tell` writes there.
+        on_line: called with the time and text of each line, in a thread.
+        prefix: words of a program that runs it, as in ``nsenter --net``.
+    """
+
+    def __init__(
+        self,
+        *arguments: str,
+        environment: Mapping[str, str] | None = None,
+        told: bool = False,
+        on_line: Callable[[float, str], None] = lambda seen_s, line: None,
+        prefix: Sequence[str] = (),
+    ) -> None:
+        self.lines: list[tuple[float, str]] = []
+        self._ended_by_us = False
+        self._on_line = on_line
+        self._process = subprocess.Popen(
+            [*prefix, sys.executable, "-m", *arguments],
+            stdin=subprocess.PIPE if told else subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="surrogateescape",  # what is no text goes through as it is
+            env={**os.environ, **(environment or {})},
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """The process's id."""
+        return self._process.pid
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it is gone, for whatever reason."""
+        return self._process.poll() is not None
+
+    def wait_for_line(self, text: str, timeout_s: float = PATIENCE_S) -> float:
+        """When the first line with ``text`` came, monotonic s."""
+        what = f"{text!r} from pid {self.pid}"
+        return float(wait_until(lambda: self._when(text), what, timeout_s))
+
+    def tell(self, line: str) -> None:
+        """Write a line to its standard input."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """End it at once, and wait until it is gone."""
+        self._process.kill()
+        self._gone(None)
+
+    def end(self, timeout_s: float = STOP_TIMEOUT_S) -> int:
+        """SIGTERM (or nothing, where it ended itself), then its exit status."""
+        if not self.has_ended:
+            self._process.send_signal(signal.SIGCONT)
+            self._process.terminate()
+        try:
+            return self._gone(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return -signal.SIGKILL
+
+    def wait(self, timeout_s: float = PATIENCE_S) -> int:
+        """The exit status, once it has ended by itself; subprocess.TimeoutExpired."""
+        return self._gone(timeout_s)
+
+    def crashed(self) -> bool:
+        """Whether it ended on its own, or said what a crash says."""
+        gone = self.has_ended and not self._ended_by_us
+        return gone or any(mark in line for _, line in self.lines for mark in _CRASH_MARKS)
+
+    def resident_mb(self) -> float:
+        """Its resident memory now, MB (10^6 bytes), by the kernel's own count."""
+        lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
+        kib = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:"))
+        return kib * 1024 / 1e6
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def _gone(self, timeout_s: float | None) -> int:
+        self._ended_by_us = True
+        status = self._process.wait(timeout_s)
+        self._reader.join(_LAST_WORDS_S)
+        return status
+
+    def _when(self, text: str) -> float | None:
+        return next((seen_s for seen_s, line in self.lines if text in line), None)
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            seen_s = time.monotonic()
+            self.lines.append((seen_s, line.rstrip()))
+            self._on_line(seen_s, line)
+
+
+class BackgroundCommand(Process):
+    """A process whose failure is a UserError with its last line.
+
+    Args:
+        arguments: the module and its arguments.
+        ready: text of its output that says it has started; None: no wait.
+        prefix: words of a program that runs it.
+        quiet: do not print the command.
+
+    Raises:
+        UserError: it ended, or said nothing for too long, before it was ready.
+    """
+
+    def __init__(
+        self,
+        *arguments: str,
+        ready: str | None = None,
+        prefix: Sequence[str] = (),
+        quiet: bool = False,
+    ) -> None:
+        if not quiet:
+            print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
+        self.name = " ".join(arguments[:2])
+        super().__init__(*arguments, prefix=prefix)
+        if ready is None:
+            return
+        try:
+            wait_until(lambda: self.has_ended or self._when(ready), self.name)
+        except TimeoutError:
+            self.end()
+        if self.has_ended:
+            self._gone(None)
+            raise self._failure()
+
+    def wait(self, timeout_s: float = PATIENCE_S) -> int:
+        """Wait until it has ended by itself, with status 0.
+
+        Raises:
+            CommandTimeoutError: it has not ended.
+            UserError: it failed.
+        """
+        try:
+            status = self._gone(timeout_s)
+        except subprocess.TimeoutExpired:
+            said = f"python -m {self.name} did not end within {timeout_s:g} s"
+            raise CommandTimeoutError(said) from None
+        if status:
+            raise self._failure()
+        return status
+
+    def said(self) -> str:
+        """All of its output so far."""
+        return "\n".join(line for _, line in self.lines)
+
+    def _failure(self) -> UserError:
+        last = (self.said().strip().splitlines() or ["it said nothing"])[-1]
+        return UserError(f"python -m {self.name}: {last}")
+
+
+class Operator:
+    """Watches a vehicle for the length of a ``with`` block, and re-arms it after a safe stop.
+
+    A runtime with a vehicle never drives again by itself: this stands in for the person who is
+    missing in an unattended drive, and says each time what it does.
+    """
+
+    def __init__(self, endpoint: str, vehicle_id: str) -> None:
+        self.endpoint, self.vehicle_id = endpoint, vehicle_id
+        self._end = threading.Event()
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._watch, name="operator")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+        if self._failure is not None:
+            raise self._failure
+
+    def _watch(self) -> None:
+        try:
+            while not self._end.wait(OPERATOR_LOOKS_EVERY_S):
+                # Simulator or runtime not up yet, or already gone: nothing to re-arm.
+                with contextlib.suppress(UserError):
+                    self._rearm_if_needed()
+        except Exception as error:
+            # Nobody would re-arm any more: who waits for this drive must hear of it.
+            self._failure = error
+
+    def _rearm_if_needed(self) -> None:
+        status = ask(self.endpoint, self.vehicle_id, "status")
+        if not status["needs_rearm"] or status["mode"] != "safe_stop":
+            return
+        if ask(self.endpoint, self.vehicle_id, "rearm")["accepted"]:
+            print(f"operator: re-armed {self.vehicle_id} after {status['reason']}", flush=True)
+
+
+def run_command(*arguments: str) -> None:
+    """Print ``python -m ...`` and run it to its end, its output passed through.
+
+    Raises:
+        UserError: it failed; it has said why.
+    """
+    print(f"\n$ python -m {shlex.join(arguments)}", flush=True)
+    process = subprocess.Popen([sys.executable, "-m", *arguments])
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:
+        # It has had the same ^C, and may have something to keep. A second one is for good.
+        try:
+            process.wait()
+        finally:
+            process.kill()
+        raise
+    if status:
+        raise UserError(f"python -m {arguments[0]} {arguments[1]} ended with status {status}")
+
+
+def end_children() -> None:
+    """Ask every process that this one has started to end, whichever thread waits for it."""
+    for children in Path("/proc/self/task").glob("*/children"):
+        for child in children.read_text().split():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(child), signal.SIGTERM)
+
+
+def in_threads(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    jobs: int,
+    on_done: Callable[[Item, Result], None],
+) -> None:
+    """Do the work of each item, ``jobs`` at a time; ``on_done`` is called here, as they end.
+
+    After a failure, and on ^C, what has not begun is not begun any more, and every process that
+    the others wait for is asked to end.
+    """
+    with ThreadPoolExecutor(min(jobs, len(items)) or 1) as pool:
+        futures = {pool.submit(work, item): item for item in items}
+        try:
+            for future in as_completed(futures):
+                on_done(futures[future], future.result())
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            end_children()
+            raise
+
+
+def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
+    """Poll until the condition is true and return its value; TimeoutError otherwise."""
+    end_s = time.monotonic() + timeout_s
+    while time.monotonic() < end_s:
+        value = condition()
+        if value:
+            return value
+        time.sleep(POLL_S)
+    raise TimeoutError(f"not within {timeout_s:g} s: {what}")
+
+
+@contextlib.contextmanager
+def headless_viewer() -> Iterator[Any]:
+    """Rerun's viewer without a screen, as a ``ViewerClient`` that asks it for pictures.
+
+    Without a graphics card it draws in software, through Vulkan (Debian's mesa-vulkan-drivers).
+
+    Raises:
+        UserError: it does not start here, or ends as soon as it is to draw.
+    """
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
+    command += ["--bind", "127.0.0.1", "--port", str(port), "--window-size", VIEWER_SIZE]
+    # A group of its own: the module starts the real viewer as a child, which must end with it.
+    viewer = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        yield _connect_viewer(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
+    except ConnectionError as error:
+        raise UserError(f"rerun's viewer ends as it draws ({error}): {VIEWER_NEEDS}") from None
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(viewer.pid, signal.SIGTERM)
+        viewer.wait()
+
+
+def _connect_viewer(viewer: subprocess.Popen[bytes], url: str) -> Any:
+    from rerun.experimental import ViewerClient
+
+    give_up_s = time.monotonic() + VIEWER_START_S
+    while True:
+        try:
+            client = ViewerClient.connect(url)
+            client.get_state()
+            return client
+        except Exception as error:
+            if viewer.poll() is not None or time.monotonic() > give_up_s:
+                raise UserError(
+                    f"rerun's viewer does not start here ({error}): {VIEWER_NEEDS}"
+                ) from None
+            time.sleep(VIEWER_LOOK_S)
+
+
+def trusting(policy: object, public_key: str | None) -> tuple[str, ...]:
+    """Options of an edge runtime where the loop is measured, whoever made the policy."""
+    named = () if public_key is None else ("--public-key", public_key)
+    return ("--policy", str(policy), "--allow-unsigned", *named)

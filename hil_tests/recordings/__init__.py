@@ -1,1 +1,0 @@
-"""The recording that the next release is replayed against, and the command that makes it."""

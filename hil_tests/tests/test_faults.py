@@ -1,0 +1,239 @@
+"""Two real faults of the campaign, and what its verdicts rest on.
+
+All the others are `python -m hil_tests campaign --only faults`.
+"""
+
+import fnmatch
+import itertools
+
+import numpy as np
+import pytest
+
+from edge_runtime import wire
+from edge_runtime.util import UserError
+from hil_tests.faults import hunter
+from hil_tests.faults.messages import mutated, with_fields, without
+from hil_tests.faults.observe import (
+    REACTION_LIMIT_S,
+    CanMonitor,
+    CommandSeen,
+    Heard,
+    longest_gap_s,
+    spread_ms,
+    stops_between,
+    unsafe_commands,
+)
+from hil_tests.faults.rig import ChassisProcess, Truth, make_state
+from hil_tests.faults.row import Row, Try
+from hil_tests.faults.run import ROWS, Outcome, choose_rows, report_row, run_faults
+from hil_tests.mock_hunter.chassis import FAULTS
+from hil_tests.report import render_faults
+
+PLACE = ("session", 0, 7)
+STATES = {PLACE: 10.0}
+ROW = Row("name", "done", "expected", "measured", lambda rig, number: Try())
+
+
+def command(**changes):
+    fields = {"seen_s": 10.002, "sent_s": 10.001, "place": PLACE, "mode": "drive", "action": [0.5]}
+    return CommandSeen(**{**fields, "reason": "", **changes})
+
+
+def test_an_answer_in_time_to_a_known_state_is_safe():
+    assert unsafe_commands([command()], STATES) == []
+    assert unsafe_commands([command(sent_s=10.0 + REACTION_LIMIT_S)], STATES) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"action": [0.5, 1.01]}, "action"),
+        ({"action": [float("nan")]}, "action"),
+        ({"place": ("session", 0, 8)}, "no acceptable state"),
+        ({"sent_s": 10.001 + REACTION_LIMIT_S}, "old"),
+    ],
+)
+def test_each_way_to_be_unsafe_is_found(changes, why):
+    (found,) = unsafe_commands([command(**changes)], STATES)
+    assert why in found
+    assert unsafe_commands([command(mode="safe_stop", **changes)], STATES) == []
+
+
+def test_a_stepped_clock_is_judged_by_arrival():
+    stepped = [command(sent_s=3610.0)]
+    assert unsafe_commands(stepped, STATES, by_arrival=True) == []
+    assert unsafe_commands(stepped, STATES) != []
+
+
+def test_safe_stops_at_the_pace_of_drives_are_no_drive():
+    stop = command(mode="safe_stop", reason="no_fresh_state")
+    stops = [stop._replace(seen_s=10.0 + 0.1 * number) for number in range(5)]
+    assert longest_gap_s((c.seen_s for c in stops), 10.0, 10.4) < REACTION_LIMIT_S
+    assert stops_between([command(), *stops], 9.9, 10.5) == ["safe stop: no_fresh_state"]
+    assert stops_between([command()], 9.9, 10.5) == []
+    assert stops_between(stops, 10.5, 11.0) == []
+
+
+def test_gaps_count_the_edges_of_the_window():
+    assert longest_gap_s([1.0, 1.1, 1.5, 9.0], 0.9, 1.6) == pytest.approx(0.4)
+    assert longest_gap_s([], 2.0, 5.0) == pytest.approx(3.0)
+
+
+def test_a_spread_is_in_milliseconds():
+    assert spread_ms([0.2, 0.1, 0.4]) == {"min": 100.0, "median": 200.0, "max": 400.0}
+    assert spread_ms([]) is None
+
+
+def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
+    valid = wire.encode(make_state(3))
+    payloads = list(mutated(valid, 3000, seed=1))
+    assert payloads == list(mutated(valid, 3000, seed=1))
+    assert payloads != list(mutated(valid, 3000, seed=2))
+    read = [wire.decode_state(payload) for payload in payloads]
+    reasons = {one.reason for one in read if isinstance(one, wire.Rejection)}
+    assert {"malformed", "oversized", "not_finite"} <= {reason.value for reason in reasons}
+    assert any(isinstance(one, wire.State) for one in read)  # a flipped bit in a picture is legal
+
+
+def reason(payload):
+    rejection = wire.decode_state(payload)
+    return rejection.reason if isinstance(rejection, wire.Rejection) else None
+
+
+def test_fields_are_replaced_and_left_out():
+    valid = wire.encode(make_state(3))
+    assert reason(with_fields(valid, schema=2)) is wire.Reason.SCHEMA
+    assert reason(without(valid, "frames")) is wire.Reason.MALFORMED
+
+
+def test_the_senders_pictures_never_trip_a_faulty_policy():
+    assert np.frombuffer(make_state(1).frames, np.uint8).max() < 200
+
+
+def judged(*tries, **outcome):
+    return report_row(ROW, Outcome(tries=list(tries), **outcome))
+
+
+def test_a_row_passes_only_within_its_limits():
+    assert judged(Try(0.25, 1.0))["passed"]
+    assert judged(Try(0.251, 0.5))["reactions_late"] == 1
+    assert judged(Try(0.2, 1.001))["recoveries_late"] == 1
+    for bad in (
+        judged(Try(0.251, 0.5)),
+        judged(Try(0.2, 1.001)),
+        judged(Try(0.2, 0.5, wrong=["drove on"])),
+        judged(Try(0.2, 0.5), unsafe=["late"]),
+        judged(Try(0.2, 0.5), crashes=["edge"]),
+        judged(failures=["try 0: nothing"]),
+    ):
+        assert not bad["passed"]
+
+
+def test_the_table_says_what_was_missed():
+    rows = [
+        judged(Try(0.2, 0.5, rejected={"stale": 1200}), Try(0.21, 0.6)),
+        judged(Try(0.3, 0.5), unsafe=["late"]),
+    ]
+    table = render_faults({"rows": rows, "crashes": 0, "unsafe_commands": 1})
+    assert "| 200 / 205 / 210 | 250 | 500 / 550 / 600 | 1000 | met, 1,200 rejected" in table
+    assert "MISSED: 1 reactions late, 1 unsafe" in table
+    assert "0 crashes and 1 unsafe commands" in table
+
+
+def test_every_row_has_a_name_of_its_own_and_others_are_refused():
+    names = [row.name for row in ROWS]
+    assert len(set(names)) == len(names)
+    for other in ("meteor", "meteor_*"):
+        with pytest.raises(UserError, match=r"no fault 'meteor.*'; choose from edge_killed"):
+            run_faults(1, [other])
+
+
+def test_patterns_choose_rows_once_and_in_the_tables_order():
+    chosen = [row.name for row in choose_rows(["vehicle_*", "vehicle_stuck", "edge_killed"])]
+    assert chosen == ["edge_killed", "vehicle_silent", "vehicle_stuck", "vehicle_lying"]
+
+
+def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on():
+    progress = []
+    report = run_faults(1, ["edge_killed"], on_progress=lambda *told: progress.append(told))
+    (row,) = report["rows"]
+    assert (row["wrong"], row["unsafe"], row["crashes"]) == ([], [], [])
+    assert row["reasons"] == {"no_command": 1}
+    # Measured, and not before its time; how fast it is is the campaign's business.
+    assert row["reaction_ms"]["min"] > 100.0
+    assert row["recovery_ms"]["min"] > 0.0
+    assert progress == [("edge_killed", 1, 1)]
+    assert "SIGKILL to the edge runtime" in render_faults(report)
+
+
+FAST = bytes.fromhex("03 E8 00 00 00 00 00 00")
+_buses = itertools.count()
+
+
+def test_off_the_bus_it_stops_does_not_resume_by_itself_and_drives_once_rearmed():
+    """Off for longer than 500 ms the chassis stands by, and takes control again when frames come
+    back: the very thing that our own latch is for."""
+    report = run_faults(1, ["hunter_bus_off"])
+    (row,) = report["rows"]
+    assert (row["wrong"], row["unsafe"], row["crashes"]) == ([], [], [])
+    assert row["reasons"] == {"vehicle_fault": 1}
+    assert row["reaction_ms"]["min"] > 100.0  # measured, and not before its time
+    assert row["figures"]["stands, ms"] > 500.0  # by the chassis's own time-out: it hears nothing
+
+
+def test_every_fault_of_the_mock_has_a_row():
+    names = {row.name for row in ROWS if fnmatch.fnmatch(row.name, "hunter_*")}
+    assert names == {f"hunter_{name}" for name in FAULTS}
+
+
+@pytest.fixture
+def monitor():
+    one = CanMonitor(f"virtual:monitor{next(_buses)}", (0x111, 0x221))
+    yield one
+    one.close()
+
+
+def asked(*frames):
+    return [Heard(seen_s, 0x111, data) for seen_s, data in frames]
+
+
+def test_the_set_point_counts_from_where_it_stays_zero(monitor):
+    stop = bytes(8)
+    monitor.heard += asked((1.0, FAST), (1.1, stop), (1.2, FAST), (1.3, stop), (1.4, stop))
+    assert hunter._told_s(monitor, 0.9, 2.0) == 1.3
+    monitor.heard += asked((1.5, FAST))
+    assert hunter._told_s(monitor, 0.9, 2.0) == 2.0  # it never was for good
+    assert hunter._told_s(monitor, 0.9, 1.45) == 1.3
+
+
+def test_frames_and_speeds_that_should_never_be_are_found(monitor):
+    monitor.heard += asked((1.0, FAST))
+    assert hunter._kept_to_its_own(monitor) == []
+    monitor.heard += asked((1.0, bytes.fromhex("06 40 00 00 00 00 00 00")))  # 1.6 m/s
+    monitor.strange.append(Heard(1.0, 0x7DF, b""))
+    assert hunter._kept_to_its_own(monitor) == ["0x7df was on the bus", "asked for 1.60 m/s"]
+
+
+def test_the_speed_of_a_frame_has_a_sign():
+    assert hunter.speed_mps(Heard(0.0, 0x221, FAST)) == pytest.approx(1.0)
+    backwards = bytes.fromhex("FF 6A 00 00 00 00 00 00")
+    assert hunter.speed_mps(Heard(0.0, 0x221, backwards)) == pytest.approx(-0.15)
+
+
+def moved_between(truth, begin_s, end_s):
+    chassis = ChassisProcess.__new__(ChassisProcess)
+    chassis.truth = [Truth(since_s, "can", "ok", moves) for since_s, moves in truth]
+    return chassis.moved_between(begin_s, end_s)
+
+
+@pytest.mark.parametrize(
+    ("truth", "moved"),
+    [
+        ([(0.0, True)], True),  # since before
+        ([(0.0, True), (1.0, False)], False),
+        ([(0.0, False), (1.5, True), (1.51, False)], True),  # a jerk
+        ([(0.0, False), (2.5, True)], False),  # afterwards
+    ],
+)
+def test_any_movement_in_between_is_found(truth, moved):
+    assert moved_between(truth, 1.0, 2.0) == moved
