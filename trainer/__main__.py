@@ -8,13 +8,13 @@ from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("trainer.commands.train", "train a policy with human guidance"),
-    "drive": ("trainer.commands.drive", "drive yourself, or take over from a policy; recorded"),
+    "drive": ("trainer.person.drive", "drive yourself, or take over from a policy; recorded"),
     "human": ("trainer.commands.human", "train the DAgger human model from interventions"),
-    "evaluate": ("trainer.commands.evaluate", "drive test episodes and report how well it does"),
-    "export": ("trainer.commands.export", "write a run's actor as the file that a board drives"),
-    "plot": ("trainer.commands.plot", "draw the learning curve of a run"),
-    "picture": ("trainer.commands.picture", "draw a moment of an episode, from above"),
-    "view": ("trainer.commands.view", "show recorded sittings in rerun"),
+    "evaluate": ("trainer.evaluate", "drive test episodes and report how well it does"),
+    "export": ("trainer.export", "write a run's actor as the file that a board drives"),
+    "plot": ("trainer.plots", "draw the learning curve of a run"),
+    "picture": ("trainer.picture", "draw a moment of an episode, from above"),
+    "view": ("trainer.view", "show recorded sittings in rerun"),
     "bench": ("trainer.commands.bench", "measure learner, environment, training, replay, memory"),
     "experiment": ("trainer.commands.experiment", "run the paper's experiments, judge its claims"),
 }

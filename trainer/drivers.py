@@ -1,10 +1,10 @@
-"""Who can drive: the expert, a human model, a run's actor, an exported policy, one action."""
+"""The one action of each scenario, as a policy file describes it (contract section 4)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -12,9 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
-from trainer.actions import ACTIONS
-from trainer.conditions import CONDITIONS
-from trainer.files import load_torch
+from edge_runtime.manifest import Action
 from trainer.human.congestion_expert import CongestionExpert
 from trainer.human.congestion_trigger import CongestionTrigger
 from trainer.human.expert import LeftTurnExpert
@@ -23,6 +21,52 @@ from trainer.human.model import MODEL_FILE, load_human_model
 from trainer.human.trigger import LeftTurnTrigger
 from trainer.learner.networks import Actor
 from trainer.scenarios import SCENARIOS
+from trainer.scenarios.congestion_config import CongestionConfig
+from trainer.scenarios.environment import Scene
+from trainer.util import load_torch
+
+ACTIONS = {
+    "left_turn": Action(
+        name="pedal",
+        meaning="positive opens the throttle, negative brakes",
+        unit="aperture",
+        low=-1.0,
+        high=1.0,
+    ),
+    "congestion": Action(
+        name="steering",
+        meaning="positive turns right, negative left (eq. 29)",
+        unit=f"share of the front wheels' {CongestionConfig().lambda_rad:g} rad",
+        low=-1.0,
+        high=1.0,
+    ),
+}
+"""Scenario -> what its action means to a vehicle."""
+
+
+COMMAND_NOISE = 0.05 * 2.0
+"""Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
+
+
+class Condition(NamedTuple):
+    """How test episodes are driven."""
+
+    scene: Scene
+    noise_std: float
+    """Of Gaussian noise on the command."""
+    meaning: str
+
+
+CONDITIONS = {
+    "nominal": Condition("nominal", 0.0, "the scene that is trained in"),
+    "noise": Condition(
+        "nominal", COMMAND_NOISE, "Gaussian noise of 5 % of the control domain on the command"
+    ),
+    "variant": Condition("variant", 0.0, "more vehicles, and other types of them"),
+    "dense": Condition("dense", 0.0, "closer and less even traffic"),
+}
+"""Only the first is trained and validated in."""
+
 
 CONSTANT = "constant:"
 """Before an action that is kept throughout: what any policy should be better than."""

@@ -22,8 +22,7 @@ from hil_tests.benches.latency import alternate
 from hil_tests.benches.lockstep import lockstep
 from hil_tests.benches.table import show
 from hil_tests.faults.campaign import POLICY, PUBLIC_KEY
-from trainer.benches.machine import processor_model
-from trainer.revision import source_revision
+from trainer.util import processor_model, source_revision
 
 STARTS = 5
 IDLE_S = 10.0

@@ -33,8 +33,7 @@ from hil_tests.faults.ends import spin
 from hil_tests.faults.processes import Process
 from hil_tests.faults.rig import Rig
 from hil_tests.faults.slow_policy import write_steady
-from trainer.benches.machine import processor_model
-from trainer.revision import source_revision
+from trainer.util import processor_model, source_revision
 
 P99_BAR_MS = 25.0
 TIMEOUT_BAR_MS = 500.0

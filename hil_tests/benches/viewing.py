@@ -28,14 +28,13 @@ from edge_runtime.option_types import positive
 from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import State, encode
 from hil_tests.commands import BackgroundCommand
-from trainer.benches.machine import processor_model
-from trainer.commands.options import set_threads
-from trainer.revision import source_revision
+from trainer.options import set_threads
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 from trainer.training.seen import Seen
-from trainer.viewer.command import watched
+from trainer.util import processor_model, source_revision
+from trainer.view import watched
 from viewing.sinks import Sink
 
 LIMIT_MS = 1.0

@@ -19,9 +19,9 @@ from hil_tests.campaign.latency import run_latency
 from hil_tests.campaign.render import render_latency
 from hil_tests.options import several, this_command
 from hil_tests.reports import check_report, write_report
-from trainer.commands.options import add_scenario
-from trainer.parallel import cores
-from trainer.progress import ProgressBar
+from trainer.evaluate import cores
+from trainer.options import add_scenario
+from trainer.util import ProgressBar
 
 PARTS = ("latency", "faults")
 NO_ROWS = "none"

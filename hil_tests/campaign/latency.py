@@ -22,7 +22,7 @@ from hil_tests.campaign.chunks import (
 )
 from hil_tests.campaign.rows import make_row
 from hil_tests.campaign.workers import drive_chunks
-from trainer.progress import ProgressBar
+from trainer.util import ProgressBar
 
 REALTIME_CHUNK = 5
 """In real time an episode takes as long as it takes: small chunks share the work better."""

@@ -21,7 +21,7 @@ from hil_tests.fleet.drive import measure
 from hil_tests.fleet.rules import certificates_ms, measure_rules
 from hil_tests.fleet.scale import per_vehicle, project
 from hil_tests.fleet.usage import why_not_counted
-from trainer.benches.machine import processor_model
+from trainer.util import processor_model
 
 _SIZES = (1, 5, 10, 20)
 _RULES = (10, 100, 1_000)

@@ -10,7 +10,7 @@ from bridge.tests.processes import simulate_undisturbed
 from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.transport import free_endpoint
 from trainer.drivers import OnnxDriver, make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 from trainer.export import export_policy, write_policy
 from trainer.learner.networks import Actor
 

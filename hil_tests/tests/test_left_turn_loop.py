@@ -18,7 +18,7 @@ from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.transport import free_endpoint
 from hil_tests.commands import BackgroundCommand
 from trainer.drivers import OnnxDriver, make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 from trainer.export import export_policy, write_policy
 from trainer.learner.networks import Actor
 

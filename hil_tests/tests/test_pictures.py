@@ -17,9 +17,9 @@ from hil_tests.pictures import command, headless
 from hil_tests.pictures.curves import success_against_latency
 from hil_tests.pictures.loop import Trips
 from hil_tests.pictures.scenes import FILM_POLICY, FILM_SEED, policy_sees
-from trainer.animation import drive_moments
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import HumanGuide
+from trainer.picture import drive_moments
 
 DOCS = Path(__file__).parents[2] / "docs"
 MS = 10**6

@@ -9,7 +9,7 @@ from edge_runtime.latency.model import parse_spec
 from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.transport import free_endpoint
 from trainer.drivers import OnnxDriver, make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 
 POLICY = Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx"
 EPISODES = 3

@@ -23,9 +23,9 @@ from hil_tests.vehicle.lag_axes import LAGS, Lag
 from hil_tests.vehicle.render import lag_sentence, render_comparison, render_sweep, verdict
 from hil_tests.vehicle.rigs import VEHICLE, Drive
 from hil_tests.vehicle.sweep import MODEL, SweepTask, kept_points, run_sweep
-from trainer.commands.options import add_scenario
-from trainer.parallel import cores
-from trainer.progress import ProgressBar
+from trainer.evaluate import cores
+from trainer.options import add_scenario
+from trainer.util import ProgressBar
 
 PARTS = ("compare", "sweep")
 

@@ -22,8 +22,8 @@ from hil_tests.mock_hunter.parameters import make_parameters
 from hil_tests.vehicle.lag_axes import LAG_AXES, Lag
 from hil_tests.vehicle.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
+from trainer.evaluate import die_with_parent, interrupts_blocked
 from trainer.experiments.statistics import Estimate, mean_estimate, success_estimate
-from trainer.parallel import die_with_parent, interrupts_blocked
 
 MODEL = "hunter-2.0"
 FORMAT = 1

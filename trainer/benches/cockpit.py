@@ -26,8 +26,8 @@ from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.option_types import not_negative, positive
 from trainer.benches.chromium import Browser, find_chromium, open_browser
 from trainer.benches.cockpit_run import CockpitRun, cockpit_run
-from trainer.benches.machine import about
 from trainer.person.recording import Step, find_recordings, read_steps
+from trainer.util import about
 
 OPENING_BAR_S, KEY_BAR_MS = 2.0, 150.0
 KEYS = {"left_turn": ("ArrowUp", "ArrowDown"), "congestion": ("ArrowLeft", "ArrowRight")}

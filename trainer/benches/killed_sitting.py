@@ -24,11 +24,10 @@ from edge_runtime.cli import ArgumentParser, examples, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import not_negative, positive, positive_number
-from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
 from trainer.drivers import CHECKPOINT_FILE
-from trainer.files import load_torch
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
+from trainer.util import about, load_torch
 
 CONTROL_PERIOD_S = 0.1
 PATIENCE_S = 120.0

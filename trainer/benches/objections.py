@@ -15,8 +15,8 @@ from edge_runtime.files import check_writable
 from edge_runtime.option_types import positive
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver
-from trainer.revision import source_revision
 from trainer.scenarios import SCENARIOS
+from trainer.util import source_revision
 
 
 def objections(env: Any, driver: Driver, drives: int) -> dict[str, int]:

@@ -23,12 +23,12 @@ from edge_runtime.cli import ArgumentParser, run_cli, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import not_negative, positive_number
-from trainer.benches.machine import about
 from trainer.benches.scripted_person import NOTE, last_seen
-from trainer.commands.options import add_scenario
-from trainer.person.pacing import LATE_S
+from trainer.options import add_scenario
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
+from trainer.person.session import LATE_S
 from trainer.training.metrics import read_metrics
+from trainer.util import about
 
 PATIENCE_S = 120.0
 PERIOD_S = 0.1

@@ -15,8 +15,7 @@ from pathlib import Path
 
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main as trainer
-from trainer.person.interface import Person, Reading, View
-from trainer.person.registry import HUMANS, PersonOptions
+from trainer.person.interface import HUMANS, Person, PersonOptions, Reading, View
 
 NOTE = struct.Struct("<Q")
 HOLD, REST = 12, 8

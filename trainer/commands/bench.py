@@ -13,15 +13,14 @@ from edge_runtime.files import check_writable
 from trainer.benches.effort import FULL, QUICK, Effort
 from trainer.benches.environment import measure_environment
 from trainer.benches.learner import measure_learner
-from trainer.benches.machine import about
 from trainer.benches.memory import measure_memory
 from trainer.benches.replay import measure_replay
 from trainer.benches.table import show
 from trainer.benches.training import measure_training
 from trainer.benches.turns import Tick
-from trainer.commands.options import add_threads, set_threads
-from trainer.progress import ProgressBar
+from trainer.options import add_threads, set_threads
 from trainer.scenarios import SCENARIOS
+from trainer.util import ProgressBar, about
 
 EXAMPLE = examples(
     "python -m trainer bench --quick --threads 1",

@@ -11,7 +11,7 @@ from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.option_types import not_negative, whole_number
-from trainer.commands.time_limit import add_time_limit, deadline_s
+from trainer.evaluate import cores
 from trainer.experiments import run as running
 from trainer.experiments.plan import (
     DEFAULT_SEEDS,
@@ -27,7 +27,7 @@ from trainer.experiments.ray_runner import run_on_ray
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, say
 from trainer.experiments.timing import TIME_FILE, measure
-from trainer.parallel import cores
+from trainer.options import add_time_limit, deadline_s
 
 EXAMPLE = examples(
     "python -m trainer experiment status",

@@ -11,15 +11,19 @@ from typing import Any
 
 from edge_runtime.cli import UserError, examples, write_json_out
 from edge_runtime.option_types import not_negative, positive
-from trainer.commands.options import add_scenario, add_threads, set_threads
-from trainer.commands.time_limit import add_time_limit, deadline_s, until
 from trainer.drivers import make_environment
 from trainer.human.dagger import HumanTraining
 from trainer.human.model import MODEL_FILE, HumanModel, HumanModelConfig, refining_parts
-from trainer.locks import claimed
-from trainer.person.imitation import demonstrate
-from trainer.person.recording import find_recordings
-from trainer.progress import ProgressBar
+from trainer.options import (
+    add_scenario,
+    add_threads,
+    add_time_limit,
+    deadline_s,
+    set_threads,
+    until,
+)
+from trainer.person.recording import demonstrate, find_recordings
+from trainer.util import ProgressBar, claimed
 
 EXAMPLE = examples(
     "python -m trainer human --scenario left_turn --out runs/human",

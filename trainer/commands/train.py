@@ -8,7 +8,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,20 +21,24 @@ from edge_runtime.errors import UserError
 from edge_runtime.latency.model import parse_spec
 from edge_runtime.option_types import not_negative, positive
 from edge_runtime.words import counted
-from trainer.commands.options import add_latency, add_scenario, add_threads, set_threads
-from trainer.commands.resuming import check_directory
-from trainer.commands.settings import DEFAULTS, settings, with_setting
-from trainer.commands.time_limit import add_time_limit, deadline_s
+from trainer.drivers import CHECKPOINT_FILE
 from trainer.learner.algorithms import ALGORITHMS
-from trainer.locks import claimed
-from trainer.person.options import PERSON, add_person, check_no_person
-from trainer.person.registry import HUMANS
+from trainer.learner.config import LearnerConfig
+from trainer.options import (
+    add_latency,
+    add_scenario,
+    add_threads,
+    add_time_limit,
+    deadline_s,
+    read_json,
+    set_threads,
+)
+from trainer.person.interface import HUMANS, PERSON, add_person, check_no_person
 from trainer.plots import write_learning_curve
-from trainer.progress import ProgressBar
-from trainer.signals import quit_on_signals
 from trainer.training.config import PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
-from trainer.training.run import TrainingRun
+from trainer.training.run import CONFIG_FILE, TrainingRun
+from trainer.util import ProgressBar, claimed, quit_on_signals
 
 EXAMPLE = examples(
     "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
@@ -165,7 +169,7 @@ def _training(
 ) -> Iterator[TrainingRun]:
     """The run, and the person in it where one guides."""
     if arguments.human in HUMANS:
-        from trainer.person.command import training_with_person
+        from trainer.person.run import training_with_person
 
         with training_with_person(arguments, config, run_dir) as guided:
             yield guided
@@ -188,7 +192,7 @@ def _sink(word: str | None) -> Any:
     """Where ``--rerun`` shows the run; None, and nothing imported, where it is not asked for."""
     if word is None:
         return None
-    from trainer.viewer.command import check_word
+    from trainer.view import check_word
 
     return check_word(word)
 
@@ -198,7 +202,7 @@ def _watched(training: TrainingRun, sink: Any) -> Iterator[Callable[[EpisodeMetr
     if sink is None:
         yield None
         return
-    from trainer.viewer.command import watched
+    from trainer.view import watched
 
     with watched(training, sink) as on_episode:
         yield on_episode
@@ -260,3 +264,108 @@ def _config(arguments: argparse.Namespace) -> RunConfig:
     for assignment in arguments.set:
         config = with_setting(config, assignment)
     return config
+
+
+DEFAULTS = RunConfig()
+LEARNERS = tuple(field.name for field in fields(LearnerConfig))
+OWN = (
+    "averaged_actor",
+    "guided_share",
+    "guided_until_step",
+    "penalise_stuck",
+    "printed_reward",
+    "poor_guidance_share",
+    "poor_guidance",
+    "evaluate_every_steps",
+    "evaluation_runs",
+    "checkpoint_every",
+)
+"""The run's own that may be set; those of the learner may all be."""
+
+EXPECTED = {bool: "true or false", int: "a whole number", float: "a number"}
+
+
+def settings() -> dict[str, Any]:
+    """Every setting that ``--set`` may change, with its default."""
+    own = {name: getattr(DEFAULTS, name) for name in OWN}
+    return own | {name: getattr(DEFAULTS.learner, name) for name in LEARNERS}
+
+
+def with_setting(config: RunConfig, assignment: str) -> RunConfig:
+    """The config with one NAME=VALUE.
+
+    Raises:
+        UserError: no such setting, or no such value of it.
+    """
+    name, given, text = assignment.partition("=")
+    if not given:
+        raise UserError(f"--set {assignment}: expected NAME=VALUE")
+    known = settings()
+    if name not in known:
+        raise UserError(f"--set {assignment}: no setting {name!r}; there is {', '.join(known)}")
+    kind = type(known[name])
+    try:
+        value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
+    except (ValueError, KeyError):
+        raise UserError(f"--set {assignment}: expected {EXPECTED[kind]}, got {text!r}") from None
+    if name in LEARNERS:
+        return replace(config, learner=replace(config.learner, **{name: value}))
+    return replace(config, **{name: value})
+
+
+OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
+"""What an option of its own decides."""
+EXTENT = ("episodes", "steps")
+"""How long a run is: it may go on for longer."""
+
+
+def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
+    """Refuse to overwrite a run, or to resume one under other settings; raises UserError."""
+    started = (run_dir / CHECKPOINT_FILE).is_file()
+    if started and not resume:
+        raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
+    if resume and not started:
+        raise UserError(f"{run_dir} holds no checkpoint to resume from")
+    if resume:
+        _check_settings(run_dir, config)
+
+
+def _check_settings(run_dir: Path, config: RunConfig) -> None:
+    path = run_dir / CONFIG_FILE
+    saved = _flat(read_json(path, "run config"))
+    wanted = _flat(config.as_dict())
+    if not all(isinstance(saved.get(name), int) for name in EXTENT):
+        raise UserError(f"run config {path} does not say how many episodes and steps")
+    changed = [
+        f"{_given(name, saved)} (now {_value(name, wanted)})"
+        for name in wanted
+        if name not in EXTENT and (name not in saved or saved[name] != wanted[name])
+    ]
+    if changed:
+        raise UserError(f"{run_dir} was trained with {', '.join(changed)}: repeat what it had")
+    for name in EXTENT:
+        if 0 < wanted[name] < saved[name]:
+            raise UserError(f"{run_dir} is a run of {saved[name]} {name}, not fewer")
+
+
+def _flat(values: dict[str, Any]) -> dict[str, Any]:
+    """A config's settings by their names, those of the learner among them."""
+    learner = values.get("learner")
+    own = {name: value for name, value in values.items() if name != "learner"}
+    return {**own, **learner} if isinstance(learner, dict) else own
+
+
+def _given(name: str, values: dict[str, Any]) -> str:
+    """A setting as it is typed."""
+    if name not in values:
+        return f"no {name}"
+    if name in OPTIONS:
+        return f"--{name} {_value(name, values)}"
+    word = "--set " if name in settings() else ""
+    return f"{word}{name}={_value(name, values)}"
+
+
+def _value(name: str, values: dict[str, Any]) -> str:
+    value = values[name]
+    # A run may go on with another device of the person's.
+    return "|".join(HUMANS) if (name, value) == ("human", PERSON) else str(value)

@@ -15,8 +15,7 @@ import numpy as np
 
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
-from trainer.conditions import COMMAND_NOISE, CONDITIONS
-from trainer.drivers import EXPERTS, TRIGGERS, make_environment
+from trainer.drivers import COMMAND_NOISE, CONDITIONS, EXPERTS, TRIGGERS, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
 from trainer.learner.algorithms import ALGORITHMS

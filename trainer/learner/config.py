@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from edge_runtime.errors import UserError
-from trainer.ranges import ABOVE_ZERO, ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
+from trainer.util import ABOVE_ZERO, ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
 
 @dataclass(frozen=True)

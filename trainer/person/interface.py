@@ -7,11 +7,17 @@ browser may be one that is both.
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from edge_runtime.errors import UserError
+from edge_runtime.option_types import positive_number, whole_number
 
 Wish = Literal["pause", "restart", "discard", "quit"]
 """``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard``
@@ -145,3 +151,105 @@ class Person:
         """Close both."""
         self.device.close()
         self.display.close()
+
+
+@dataclass(frozen=True)
+class PersonOptions:
+    """What the command line says about the person's device."""
+
+    scenario: str = "left_turn"
+    profile: Path | None = None
+    """Axes and buttons of a gamepad or wheel; None: the shipped one."""
+    host: str = "127.0.0.1"
+    port: int = 0
+    """Of the browser cockpit; 0: any free one."""
+
+
+def _keyboard(options: PersonOptions) -> Person:
+    from trainer.person.devices import open_keyboard
+
+    return open_keyboard(options)
+
+
+def _gamepad(options: PersonOptions) -> Person:
+    from trainer.person.devices import open_joystick
+
+    return open_joystick(options, "gamepad")
+
+
+def _wheel(options: PersonOptions) -> Person:
+    from trainer.person.devices import open_joystick
+
+    return open_joystick(options, "wheel")
+
+
+def _web(options: PersonOptions) -> Person:
+    from trainer.person.web import open_cockpit
+
+    return open_cockpit(options)
+
+
+HUMANS: dict[str, Callable[[PersonOptions], Person]] = {
+    "keyboard": _keyboard,
+    "gamepad": _gamepad,
+    "wheel": _wheel,
+    "web": _web,
+}
+"""Word -> opens the device and the display; raises UserError where there is none. The libraries
+behind them are imported when they are opened."""
+
+
+PERSON = "person"
+"""``RunConfig.human`` of every device: a run may go on with another one."""
+DEFAULTS = PersonOptions()
+
+
+def add_person(parser: argparse.ArgumentParser) -> None:
+    """Declare them."""
+    group = parser.add_argument_group("a person at the wheel (--human keyboard and so on)")
+    group.add_argument(
+        "--profile",
+        metavar="F.toml",
+        help="what the axes and buttons of --human gamepad or wheel mean (default: as shipped)",
+    )
+    group.add_argument(
+        "--host", default=DEFAULTS.host, help="where --human web listens: this machine only"
+    )
+    group.add_argument(
+        "--port",
+        type=whole_number(0, 65535),
+        default=DEFAULTS.port,
+        help="of --human web; 0: any that is free",
+    )
+    group.add_argument(
+        "--speed",
+        type=positive_number,
+        default=1.0,
+        metavar="X",
+        help="simulated seconds in one of yours: 0.5 is slow motion",
+    )
+
+
+def person_options(arguments: argparse.Namespace) -> PersonOptions:
+    """What the command line says about the device.
+
+    Raises:
+        UserError: an option that the device has no use for.
+    """
+    _refuse(arguments, "profile", arguments.human in ("gamepad", "wheel"))
+    _refuse(arguments, "host", arguments.human == "web")
+    _refuse(arguments, "port", arguments.human == "web")
+    profile = None if arguments.profile is None else Path(arguments.profile)
+    return PersonOptions(arguments.scenario, profile, arguments.host, arguments.port)
+
+
+def check_no_person(arguments: argparse.Namespace) -> None:
+    """Refuse a person's options where there is none; raises UserError."""
+    for name in ("profile", "host", "port", "speed"):
+        _refuse(arguments, name, False)
+
+
+def _refuse(arguments: argparse.Namespace, name: str, useful: bool) -> None:
+    given = getattr(arguments, name) != {"speed": 1.0}.get(name, getattr(DEFAULTS, name, None))
+    if given and not useful:
+        raise UserError(f"--{name} means nothing with --human {arguments.human}")

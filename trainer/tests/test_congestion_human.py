@@ -6,7 +6,7 @@ import pytest
 
 from trainer.benches.objections import objections
 from trainer.drivers import NetworkDriver
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 from trainer.human.congestion_expert import CongestionExpert
 from trainer.human.congestion_trigger import CongestionTrigger
 from trainer.human.dagger import HumanTraining

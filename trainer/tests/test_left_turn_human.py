@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trainer.benches.objections import objections
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 from trainer.human.crossing import Crossing, PedalPlan
 from trainer.human.expert import LeftTurnExpert
 from trainer.human.guide import HumanGuide

@@ -7,7 +7,7 @@ import pytest
 
 from edge_runtime.latency.model import LatencySpec, parse_spec
 from trainer.drivers import make_environment
-from trainer.evaluation import drive_episode
+from trainer.evaluate import drive_episode
 from trainer.remote.vehicle_end import RemoteDriver, VehicleEnd
 from trainer.training.wheel import DirectWheel, RemoteWheel, make_wheel, ticks_late
 

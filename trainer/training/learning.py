@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from edge_runtime.errors import UserError
 from trainer import seeds
-from trainer.files import as_arrays, as_tensors
 from trainer.learner.algorithms import Algorithm
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner
 from trainer.training.wheel import Store
+from trainer.util import as_arrays, as_tensors
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]

@@ -17,12 +17,10 @@ from edge_runtime.files import write_json
 from edge_runtime.latency.model import parse_spec
 from trainer import seeds
 from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, make_environment
-from trainer.files import load_torch, save_torch
 from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
 from trainer.learner.algorithms import ALGORITHMS
 from trainer.learner.config import HUMANS_ACTION
-from trainer.revision import source_revision
 from trainer.training.config import BIASED, RunConfig
 from trainer.training.divergence import check_weights, divergence_said, finite_action
 from trainer.training.learning import Learning, LearningThread
@@ -37,6 +35,7 @@ from trainer.training.seen import OnStep, Seen
 from trainer.training.tally import Tally
 from trainer.training.validation import Validation
 from trainer.training.wheel import make_wheel
+from trainer.util import load_torch, save_torch, source_revision
 
 CONFIG_FILE = "config.json"
 WRONG_ACTIONS = {"left_turn": 1.0, "congestion": 0.5}
