@@ -15,7 +15,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "plot": ("trainer.plots", "draw the learning curve of a run"),
     "picture": ("trainer.picture", "draw a moment of an episode, from above"),
     "view": ("trainer.view", "show recorded sittings in rerun"),
-    "bench": ("trainer.commands.bench", "measure learner, environment, training, replay, memory"),
+    "bench": ("trainer.bench", "measure learner, environments and training beside peers"),
     "experiment": ("trainer.commands.experiment", "run the paper's experiments, judge its claims"),
 }
 

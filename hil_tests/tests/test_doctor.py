@@ -16,7 +16,7 @@ from hil_tests.doctor import links, machine, person, software
 from hil_tests.doctor.check import Check, MissingError, examine, output_of, output_of_python
 from hil_tests.doctor.command import basics_work, lines, summary
 from hil_tests.doctor.table import CHECKS
-from trainer.benches.chromium import find_chromium
+from trainer.util import find_chromium
 
 ROOT = Path(__file__).parents[2]
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trainer.benches.objections import objections
 from trainer.drivers import NetworkDriver
 from trainer.evaluate import drive_episodes
 from trainer.human.congestion_expert import CongestionExpert
@@ -14,6 +13,7 @@ from trainer.human.model import HumanModelConfig
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.congestion_config import CongestionConfig
 from trainer.scenarios.vehicle_types import CAR
+from trainer.tests.humans import objections
 from trainer.tests.test_congestion import CENTRED, LEFT, RIGHT, STRAIGHT
 
 ALONE = replace(CENTRED, side_cars=1, side_front_m=(60.0, 60.0))

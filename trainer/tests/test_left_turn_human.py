@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trainer.benches.objections import objections
 from trainer.evaluate import drive_episodes
 from trainer.human.crossing import Crossing, PedalPlan
 from trainer.human.expert import LeftTurnExpert
 from trainer.human.guide import HumanGuide
 from trainer.human.trigger import LeftTurnTrigger
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes
+from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes, objections
 
 ONE_CAR = LeftTurnConfig(traffic_cars=1, traffic_speed_mps=(5.0, 5.0), ego_speed_mps=(4.0, 4.0))
 

@@ -4,10 +4,11 @@ import asyncio
 
 import pytest
 
-from trainer.benches.chromium import find_chromium, open_browser
+from trainer.person.tests.browser import open_browser, until
 from trainer.person.tests.pages import READY, first_view
 from trainer.person.web import Cockpit
 from trainer.tests.conftest import one_thread
+from trainer.util import find_chromium
 
 __all__ = ["browser", "cockpit", "one_thread", "opened", "runner"]
 
@@ -26,15 +27,15 @@ globalThis.plug = (id, mapping, axes, buttons) => {
 def runner():
     if find_chromium() is None:
         pytest.skip("no Chromium (Debian: apt-get install chromium)")
+    pytest.importorskip("playwright")
     with asyncio.Runner() as runner:
         yield runner
 
 
 @pytest.fixture(scope="module")
 def browser(runner):
-    context = open_browser()
+    context = open_browser([FAKE_PADS])
     browser = runner.run(context.__aenter__())
-    runner.run(browser.call("Page.addScriptToEvaluateOnNewDocument", source=FAKE_PADS))
     yield browser
     runner.run(context.__aexit__(None, None, None))
 
@@ -50,6 +51,6 @@ def cockpit():
 def opened(runner, browser, cockpit):
     """The browser has the cockpit open, with the left turn in view."""
     cockpit.show(first_view())
-    runner.run(browser.open(cockpit.url))
-    runner.run(browser.value("localStorage.clear()"))
-    runner.run(browser.until(READY))
+    runner.run(browser.goto(cockpit.url))
+    runner.run(browser.evaluate("localStorage.clear()"))
+    runner.run(until(browser, READY))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from trainer.person.interface import LET_GO
+from trainer.person.tests.browser import open_browser, touch, until
 from trainer.person.tests.pages import (
     LIVE,
     READY,
@@ -25,13 +26,13 @@ pytestmark = pytest.mark.usefixtures("opened")
 
 def test_a_held_key_takes_over_and_grows_and_its_release_lets_go(runner, browser, cockpit):
     async def drive():
-        await browser.key("ArrowUp", True)
+        await browser.keyboard.down("ArrowUp")
         assert (await reads(cockpit, lambda r: r.engaged)).action >= 0.5
         await reads(cockpit, lambda r: r.action == 1.0)
-        await browser.key("ArrowDown", True)
-        await browser.key("ArrowUp", False)
+        await browser.keyboard.down("ArrowDown")
+        await browser.keyboard.up("ArrowUp")
         await reads(cockpit, lambda r: r.action == -1.0)
-        await browser.key("ArrowDown", False)
+        await browser.keyboard.up("ArrowDown")
         await reads(cockpit, lambda r: r == LET_GO)
 
     runner.run(drive())
@@ -39,11 +40,11 @@ def test_a_held_key_takes_over_and_grows_and_its_release_lets_go(runner, browser
 
 def test_the_space_bar_holds_without_driving_and_presses_no_button(runner, browser, cockpit):
     async def hold():
-        await browser.value("document.querySelector('[data-wish=restart]').focus()")
-        await browser.key("Space", True)
+        await browser.evaluate("document.querySelector('[data-wish=restart]').focus()")
+        await browser.keyboard.down("Space")
         reading = await reads(cockpit, lambda r: r.engaged)
         assert reading.action == 0.0
-        await browser.key("Space", False)
+        await browser.keyboard.up("Space")
         assert not (await reads(cockpit, lambda r: not r.engaged)).wishes
 
     runner.run(hold())
@@ -52,62 +53,65 @@ def test_the_space_bar_holds_without_driving_and_presses_no_button(runner, brows
 def test_in_the_congestion_left_and_right_steer(runner, browser, cockpit):
     async def steer():
         cockpit.show(first_view("congestion"))
-        await browser.until("document.getElementById('pad').className === 'level'")
-        await browser.key("ArrowLeft", True)
+        await until(browser, "document.getElementById('pad').className === 'level'")
+        await browser.keyboard.down("ArrowLeft")
         await reads(cockpit, lambda r: r.action == -1.0)
-        await browser.key("ArrowLeft", False)
+        await browser.keyboard.up("ArrowLeft")
         await reads(cockpit, lambda r: r == LET_GO)
-        await browser.key("ArrowUp", True)
-        await browser.value(TWO_HEARTBEATS)
+        await browser.keyboard.down("ArrowUp")
+        await browser.evaluate(TWO_HEARTBEATS)
         assert not poll(cockpit).engaged
-        await browser.key("ArrowUp", False)
+        await browser.keyboard.up("ArrowUp")
 
     runner.run(steer())
 
 
 def test_a_page_that_loses_the_focus_has_let_go(runner, browser, cockpit):
     async def leave():
-        await browser.key("ArrowUp", True)
+        await browser.keyboard.down("ArrowUp")
         await reads(cockpit, lambda r: r.engaged)
-        await browser.value("dispatchEvent(new Event('blur'))")
+        await browser.evaluate("dispatchEvent(new Event('blur'))")
         await reads(cockpit, lambda r: not r.engaged)
-        await browser.key("ArrowUp", False)
+        await browser.keyboard.up("ArrowUp")
 
     runner.run(leave())
 
 
 def test_a_page_that_hangs_has_let_go_and_must_press_again(runner, browser, cockpit):
     async def hang():
-        await browser.key("ArrowUp", True)
+        await browser.keyboard.down("ArrowUp")
         await reads(cockpit, lambda r: r.engaged)
         busy = asyncio.create_task(
-            browser.value("(() => { const t = Date.now(); while (Date.now() - t < 1000); })()")
+            browser.evaluate("(() => { const t = Date.now(); while (Date.now() - t < 1000); })()")
         )
         await reads(cockpit, lambda r: r == LET_GO)
         assert not cockpit.present
         await busy
-        await browser.until(f"{WHY}.includes('press again')")
+        await until(browser, f"{WHY}.includes('press again')")
         assert not poll(cockpit).engaged
-        await browser.key("ArrowUp", False)
-        await browser.key("ArrowUp", True)
+        await browser.keyboard.up("ArrowUp")
+        await browser.keyboard.down("ArrowUp")
         await reads(cockpit, lambda r: r.engaged)
-        await browser.key("ArrowUp", False)
+        await browser.keyboard.up("ArrowUp")
 
     runner.run(hang())
 
 
 def test_a_finger_on_the_pad_drives(runner, browser, cockpit):
     async def slide():
-        box = await browser.value("document.getElementById('pad').getBoundingClientRect().toJSON()")
+        link = await browser.context.new_cdp_session(browser)
+        box = await browser.evaluate(
+            "document.getElementById('pad').getBoundingClientRect().toJSON()"
+        )
         x, middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        await browser.touch((x, middle))
+        await touch(link, "Start", (x, middle))
         assert abs((await reads(cockpit, lambda r: r.engaged)).action) < 0.05
-        await browser.touch((x, middle - 0.45 * box["height"]))
+        await touch(link, "Move", (x, middle - 0.45 * box["height"]))
         await reads(cockpit, lambda r: r.action == 1.0)
-        await browser.touch((x, middle + 0.225 * box["height"]))
+        await touch(link, "Move", (x, middle + 0.225 * box["height"]))
         reading = await reads(cockpit, lambda r: r.action < 0.0)
         assert reading.action == pytest.approx(-0.5, abs=0.05)
-        await browser.touch()
+        await touch(link, "End")
         await reads(cockpit, lambda r: r == LET_GO)
 
     runner.run(slide())
@@ -119,42 +123,36 @@ TOUCHED = [(844, 390), (667, 375), (932, 430), (390, 844), (360, 640), (1024, 76
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 @pytest.mark.parametrize("size", TOUCHED, ids=str)
-def test_a_thumb_finds_pad_and_buttons_beside_the_road(runner, browser, cockpit, size, scenario):
+def test_a_thumb_finds_pad_and_buttons_beside_the_road(runner, cockpit, size, scenario):
     width, height = size
 
     async def hold():
-        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": True}
-        await browser.call("Emulation.setDeviceMetricsOverride", **metrics)
-        await browser.call("Emulation.setTouchEmulationEnabled", enabled=True)
-        await browser.open(cockpit.url)
-        cockpit.show(first_view(scenario))
-        await browser.until(READY)
-        boxes = await browser.value(
-            "Object.fromEntries(['pad', 'scene', 'control', 'buttons'].map((id) => "
-            "[id, document.getElementById(id).getBoundingClientRect().toJSON()]))"
-        )
-        for box in boxes.values():
-            assert box["left"] >= 0
-            assert box["right"] <= width
-            assert box["bottom"] <= height
-        assert boxes["pad"]["width"] >= 240
-        assert boxes["pad"]["height"] >= 190
-        assert boxes["scene"]["width"] >= 0.55 * width
-        pad, road = boxes["pad"], boxes["scene"]
-        assert pad["left"] >= road["right"] or pad["top"] >= road["bottom"]
+        viewport = {"width": width, "height": height}
+        async with open_browser(viewport=viewport, is_mobile=True, has_touch=True) as page:
+            await page.goto(cockpit.url)
+            cockpit.show(first_view(scenario))
+            await until(page, READY)
+            boxes = await page.evaluate(
+                "Object.fromEntries(['pad', 'scene', 'control', 'buttons'].map((id) => "
+                "[id, document.getElementById(id).getBoundingClientRect().toJSON()]))"
+            )
+            for box in boxes.values():
+                assert box["left"] >= 0
+                assert box["right"] <= width
+                assert box["bottom"] <= height
+            assert boxes["pad"]["width"] >= 240
+            assert boxes["pad"]["height"] >= 190
+            assert boxes["scene"]["width"] >= 0.55 * width
+            pad, road = boxes["pad"], boxes["scene"]
+            assert pad["left"] >= road["right"] or pad["top"] >= road["bottom"]
 
-    try:
-        runner.run(hold())
-    finally:
-        desktop = {"width": 1280, "height": 740, "deviceScaleFactor": 1, "mobile": False}
-        runner.run(browser.call("Emulation.setDeviceMetricsOverride", **desktop))
-        runner.run(browser.call("Emulation.setTouchEmulationEnabled", enabled=False))
+    runner.run(hold())
 
 
 @pytest.mark.parametrize("name", ["policy", "human", "applied"])
 def test_colours_are_those_of_every_view(runner, browser, name):
     shown = f"getComputedStyle(document.querySelector('.bar.{name} u')).backgroundColor"
-    assert runner.run(browser.value(shown)) == f"rgb{BY_NAME[name]}"
+    assert runner.run(browser.evaluate(shown)) == f"rgb{BY_NAME[name]}"
 
 
 def test_a_gamepads_triggers_drive_while_its_button_is_held(runner, browser, cockpit):
@@ -162,12 +160,12 @@ def test_a_gamepads_triggers_drive_while_its_button_is_held(runner, browser, coc
         buttons = [0.0] * 17
         for index, value in ((7, 1.0), (6, 0.0)):
             buttons[index] = value
-        await browser.value(f"plug('Pad', 'standard', [0, 0, 0, 0], {buttons})")
+        await browser.evaluate(f"plug('Pad', 'standard', [0, 0, 0, 0], {buttons})")
         assert not (await reads(cockpit, lambda r: r.action == 1.0)).engaged
         buttons[5] = 1.0
-        await browser.value(f"plug('Pad', 'standard', [0, 0, 0, 0], {buttons})")
+        await browser.evaluate(f"plug('Pad', 'standard', [0, 0, 0, 0], {buttons})")
         assert (await reads(cockpit, lambda r: r.engaged)).action == 1.0
-        await browser.value("delete pads[0]")
+        await browser.evaluate("delete pads[0]")
         await reads(cockpit, lambda r: r == LET_GO)
 
     runner.run(press())
@@ -176,19 +174,19 @@ def test_a_gamepads_triggers_drive_while_its_button_is_held(runner, browser, coc
 def test_a_wheel_takes_over_by_moving_and_its_choices_are_kept(runner, browser, cockpit):
     async def turn():
         cockpit.show(first_view("congestion"))
-        await browser.until("document.getElementById('pad').className === 'level'")
+        await until(browser, "document.getElementById('pad').className === 'level'")
         wheel = f"plug('G29', '', [-0.25, 0, 1, 1], {[0.0] * 24})"
-        await browser.value(wheel)
+        await browser.evaluate(wheel)
         reading = await reads(cockpit, lambda r: r.by_moving)
         assert reading.action == -1.0, "a quarter of its travel is full action"
-        await browser.value(
+        await browser.evaluate(
             "full.value = 1; full.dispatchEvent(new Event('input'));"
             "invert.checked = true; invert.dispatchEvent(new Event('input'))"
         )
         turned = (0.25 - 0.02) / 0.98
         assert (await reads(cockpit, lambda r: r.action > 0.0)).action == pytest.approx(turned)
-        await browser.open(cockpit.url)
-        await browser.value(wheel)
+        await browser.goto(cockpit.url)
+        await browser.evaluate(wheel)
         assert (await reads(cockpit, lambda r: r.by_moving)).action == pytest.approx(turned)
 
     runner.run(turn())
@@ -196,18 +194,18 @@ def test_a_wheel_takes_over_by_moving_and_its_choices_are_kept(runner, browser, 
 
 def test_buttons_and_keys_wish_once_and_quitting_asks_again(runner, browser, cockpit):
     async def wish():
-        await browser.value("document.querySelector('[data-wish=pause]').click()")
+        await browser.evaluate("document.querySelector('[data-wish=pause]').click()")
         await reads(cockpit, lambda r: r.wishes == {"pause"})
-        await browser.tap("KeyR")
+        await browser.keyboard.press("KeyR")
         await reads(cockpit, lambda r: r.wishes == {"restart"})
-        await browser.value("document.querySelector('[data-wish=discard]').click()")
+        await browser.evaluate("document.querySelector('[data-wish=discard]').click()")
         await reads(cockpit, lambda r: r.wishes == {"discard"})
-        await browser.value("dispatchEvent(new KeyboardEvent('keydown', {code: 'Backspace'}))")
+        await browser.evaluate("dispatchEvent(new KeyboardEvent('keydown', {code: 'Backspace'}))")
         await reads(cockpit, lambda r: r.wishes == {"discard"})
-        await browser.tap("KeyQ")
-        await browser.until("document.querySelector('[data-wish=quit]').textContent[0] === 'R'")
+        await browser.keyboard.press("KeyQ")
+        await until(browser, "document.querySelector('[data-wish=quit]').textContent[0] === 'R'")
         assert not poll(cockpit).wishes
-        await browser.tap("KeyQ")
+        await browser.keyboard.press("KeyQ")
         await reads(cockpit, lambda r: r.wishes == {"quit"})
 
     runner.run(wish())
@@ -217,39 +215,39 @@ def test_what_is_shown_is_drawn(runner, browser, cockpit):
     async def look():
         view = replace(first_view(), control="human", speed_mps=4.25, message="saving", episode=7)
         cockpit.show(view)
-        await browser.until("document.body.dataset.control === 'human'")
-        assert await browser.text("#who") == "You drive"
-        assert await browser.text("#speed-value") == "4.3"
-        assert await browser.text("#message") == "saving"
-        assert (await browser.text("#place")).startswith("episode 7")
-        assert await browser.text(".bar.policy output") == "0.25"
+        await until(browser, "document.body.dataset.control === 'human'")
+        assert await browser.text_content("#who") == "You drive"
+        assert await browser.text_content("#speed-value") == "4.3"
+        assert await browser.text_content("#message") == "saving"
+        assert (await browser.text_content("#place")).startswith("episode 7")
+        assert await browser.text_content(".bar.policy output") == "0.25"
         # The newer frame's pixels are the policy's own, and the road is drawn in more than one
         # colour.
         pixel = (
             "[...document.querySelectorAll('#frames canvas')[1].getContext('2d')"
             ".getImageData(0, 0, 80, 45).data].filter((_, i) => i % 4 === 0)"
         )
-        assert await browser.value(pixel) == view.frames[1].ravel().tolist()
+        assert await browser.evaluate(pixel) == view.frames[1].ravel().tolist()
         colours = (
             "new Set(new Uint32Array(scene.getContext('2d')"
             ".getImageData(0, 0, scene.width, scene.height).data.buffer)).size"
         )
-        assert await browser.value(colours) > 10
+        assert await browser.evaluate(colours) > 10
 
     runner.run(look())
 
 
 def test_a_second_page_is_told_that_it_watches(runner, browser, cockpit):
     async def watch():
-        await browser.open("about:blank")
+        await browser.goto("about:blank")
         async with page(cockpit):
-            await browser.open(cockpit.url)
-            await browser.until("document.body.classList.contains('watching')")
-            await browser.key("ArrowUp", True)
-            await browser.until(f"{YOU} === '1.00'")
+            await browser.goto(cockpit.url)
+            await until(browser, "document.body.classList.contains('watching')")
+            await browser.keyboard.down("ArrowUp")
+            await until(browser, f"{YOU} === '1.00'")
             assert not poll(cockpit).engaged
-            await browser.key("ArrowUp", False)
-        await browser.until("!document.body.classList.contains('watching')")
+            await browser.keyboard.up("ArrowUp")
+        await until(browser, "!document.body.classList.contains('watching')")
 
     runner.run(watch())
 
@@ -257,8 +255,8 @@ def test_a_second_page_is_told_that_it_watches(runner, browser, cockpit):
 def test_the_end_of_the_sitting_is_told(runner, browser, cockpit):
     async def end():
         cockpit.close()
-        await browser.until("document.body.dataset.link === 'over'")
-        assert await browser.text("#who") == "The sitting is over"
+        await until(browser, "document.body.dataset.link === 'over'")
+        assert await browser.text_content("#who") == "The sitting is over"
 
     runner.run(end())
 
@@ -269,18 +267,18 @@ def test_a_lost_connection_is_letting_go_and_comes_back(runner, browser, cockpit
 
     async def lose():
         async with Tunnel(cockpit.port) as tunnel:
-            await browser.open(cockpit.url.replace(str(cockpit.port), str(tunnel.port)))
-            await browser.until(READY)
-            await browser.key("ArrowUp", True)
+            await browser.goto(cockpit.url.replace(str(cockpit.port), str(tunnel.port)))
+            await until(browser, READY)
+            await browser.keyboard.down("ArrowUp")
             await reads(cockpit, lambda r: r.engaged)
             tunnel.cut() if how == "closed" else tunnel.swallow()
             await reads(cockpit, lambda r: r == LET_GO)
-            await browser.until("document.body.dataset.link === 'lost'")
-            await browser.until(f"{LIVE} && {WHY}.includes('press again')")
+            await until(browser, "document.body.dataset.link === 'lost'")
+            await until(browser, f"{LIVE} && {WHY}.includes('press again')")
             assert poll(cockpit) == LET_GO, "held all the while"
-            await browser.key("ArrowUp", False)
-            await browser.key("ArrowUp", True)
+            await browser.keyboard.up("ArrowUp")
+            await browser.keyboard.down("ArrowUp")
             await reads(cockpit, lambda r: r.engaged)
-            await browser.key("ArrowUp", False)
+            await browser.keyboard.up("ArrowUp")
 
     runner.run(lose())

@@ -15,14 +15,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trainer.benches.chromium import find_chromium, open_browser
-from trainer.benches.cockpit import PERSON_DRIVES, POLICY_DRIVES, quit_page
-from trainer.benches.cockpit_run import cockpit_run
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.person.recording import DIRECTORY, Step, find_recordings, read_steps, sittings
 from trainer.person.takeover import MAX_SLEW
+from trainer.person.tests.browser import (
+    PERSON_DRIVES,
+    POLICY_DRIVES,
+    address,
+    open_browser,
+    quit_sitting,
+    until,
+)
 from trainer.person.tests.virtual_wheel import load_sdl
-from trainer.util import load_torch
+from trainer.util import find_chromium, load_torch
 
 SOON_S = 60.0
 SMALL = ["--threads", "1", "--set", "batch_size=4", "--set", "evaluate_every_steps=0"]
@@ -206,28 +211,31 @@ def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
 
 
 APPLIED = "document.querySelector('.bar.applied output').textContent"
-QUICK = ("--threads", "1", "--set", "evaluate_every_steps=0", "--set", "warmup_steps=8")
+QUICK = ("--set", "warmup_steps=8")
 
 
 @pytest.mark.skipif(
     find_chromium() is None, reason="no Chromium (Debian: apt-get install chromium)"
 )
 def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path):
+    pytest.importorskip("playwright")
     run_dir = tmp_path / "run"
 
-    async def sit():
-        async with open_browser() as browser, cockpit_run(run_dir, QUICK) as run:
-            await browser.open(run.url)
-            await browser.until(POLICY_DRIVES)
-            await browser.key("ArrowDown", True)
-            await browser.until(f"{PERSON_DRIVES} && {APPLIED} === '-1.00'")
-            await browser.key("ArrowDown", False)
-            await browser.until(POLICY_DRIVES)
-            await quit_page(browser)
-            await browser.until("document.body.dataset.link === 'over'")
-            return await run.ended()
+    async def sit(url):
+        async with open_browser() as page:
+            await page.goto(url)
+            await until(page, POLICY_DRIVES)
+            await page.keyboard.down("ArrowDown")
+            await until(page, f"{PERSON_DRIVES} && {APPLIED} === '-1.00'")
+            await page.keyboard.up("ArrowDown")
+            await until(page, POLICY_DRIVES)
+            await quit_sitting(page)
+            await until(page, "document.body.dataset.link === 'over'")
 
-    assert asyncio.run(sit()) == 0
+    with Training(run_dir, "trainer", ["--human", "web", *QUICK], {}) as training:
+        asyncio.run(sit(address(training.process)))
+        status, errors = training.end()
+    assert status == 0, errors
     [recording] = find_recordings([run_dir])
     steps = list(read_steps(recording))
     ours = [step for step in steps if step.human]
