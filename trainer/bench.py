@@ -56,7 +56,6 @@ TRANSITIONS = 1000
 """In each learner's buffer, not the paper's 100,000: drawing from a full one costs no more."""
 PARTS = ("environment", "acting", "storing", "learning", "waiting")
 FILE_WIDTH = 120
-
 Contender = Callable[[], Sequence[float]]
 """Works for a moment and gives the time of each piece of its work."""
 Rounds = list[list[float]]

@@ -103,6 +103,7 @@ def make_sb3_model(experience: Experience) -> Any:
         seed=0,
     )
     model.set_logger(Logger(folder=None, output_formats=[]))
+    assert model.replay_buffer is not None
     for i in range(count):
         before, after = experience.frames[i, None], experience.frames[i + 1, None]
         action, reward = experience.actions[i, None], experience.rewards[i, None]

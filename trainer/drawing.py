@@ -1,4 +1,7 @@
-"""What goes from the training loop to whoever draws it: plain values, handed over whole."""
+"""What a view of a training is made of, and how rerun draws it.
+
+Entries are plain values, handed over whole by ``view.py``; one thread draws them.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-# First, as it chooses what rerun logs.
-import viewing  # noqa: F401
+from viewing.colours import APPLIED, HUMAN, POLICY  # first: it chooses what rerun logs
 
 # isort: split
 import rerun as rr
@@ -24,7 +26,6 @@ from edge_runtime.words import counted
 from trainer.human.guide import Reason
 from trainer.learner.networks import Critic
 from trainer.training.metrics import EpisodeMetrics
-from viewing.colours import APPLIED, HUMAN, POLICY
 from viewing.layout import frames_view, full_blueprint, road_view
 from viewing.road import draw_cars, draw_ground
 from viewing.scene import Scene, SeenScene, read_scene
@@ -40,6 +41,48 @@ from viewing.series import (
     style_points,
 )
 from viewing.viewer import flush
+
+APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
+TIMELINE = "step"
+RECENT_STEPS = 200
+"""Shown of what changes within an episode."""
+EPISODES = (
+    Plot("return", "Return of an episode, and the mean of 20"),
+    Plot("success", "Success: mean of 20 episodes, and policy alone in validation", (-0.05, 1.05)),
+    Plot("loss", "Losses, means of an episode"),
+    Plot("priority", "Mean priority in the replay buffer: the human's samples, the policy's"),
+    Plot("human", "The human's share of the steps", (-0.05, 1.05)),
+    Plot("advantage", "Q advantage of the human's action, where it took over"),
+)
+"""Of a training, from top to bottom."""
+SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
+"""Of recorded sittings, of which a learner has told nothing."""
+RECENT = (
+    Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
+    Plot("speed", "Speed, m/s, the last 20 s"),
+)
+LINES = {
+    "return/episode": GREY,
+    "return/mean_of_20": BLUE,
+    "success/mean_of_20": BLUE,
+    "success/validation": ORANGE,
+    "loss/critic": PURPLE,
+    "loss/policy": POLICY,
+    "loss/cloning": HUMAN,
+    "priority/human": HUMAN,
+    "priority/policy": POLICY,
+    "human/share": HUMAN,
+    "action/policy": POLICY,
+    "action/applied": APPLIED,
+    "speed/ego": BLUE,
+}
+POINTS = {"advantage/of_the_human": HUMAN}
+ROAD = "Road from above (blue: the policy drives, green: the human)"
+BY_POLICY = "policy"
+DRIVERS = {BY_POLICY: POLICY, **dict.fromkeys(get_args(Reason), HUMAN)}
+"""Who drives: the policy, or the human for one of these reasons; their colours on the time line."""
+WINDOW = 20
+"""Episodes of the moving means."""
 
 
 class StepEntry(NamedTuple):
@@ -109,45 +152,6 @@ def q_advantage(critic: Critic, correction: Correction) -> float:
     return human - policy
 
 
-APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
-TIMELINE = "step"
-RECENT_STEPS = 200
-"""Shown of what changes within an episode."""
-EPISODES = (
-    Plot("return", "Return of an episode, and the mean of 20"),
-    Plot("success", "Success: mean of 20 episodes, and policy alone in validation", (-0.05, 1.05)),
-    Plot("loss", "Losses, means of an episode"),
-    Plot("priority", "Mean priority in the replay buffer: the human's samples, the policy's"),
-    Plot("human", "The human's share of the steps", (-0.05, 1.05)),
-    Plot("advantage", "Q advantage of the human's action, where it took over"),
-)
-"""Of a training, from top to bottom."""
-SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
-"""Of recorded sittings, of which a learner has told nothing."""
-RECENT = (
-    Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
-    Plot("speed", "Speed, m/s, the last 20 s"),
-)
-LINES = {
-    "return/episode": GREY,
-    "return/mean_of_20": BLUE,
-    "success/mean_of_20": BLUE,
-    "success/validation": ORANGE,
-    "loss/critic": PURPLE,
-    "loss/policy": POLICY,
-    "loss/cloning": HUMAN,
-    "priority/human": HUMAN,
-    "priority/policy": POLICY,
-    "human/share": HUMAN,
-    "action/policy": POLICY,
-    "action/applied": APPLIED,
-    "speed/ego": BLUE,
-}
-POINTS = {"advantage/of_the_human": HUMAN}
-
-ROAD = "Road from above (blue: the policy drives, green: the human)"
-
-
 def make_blueprint(scene: Scene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
     left = rrb.Vertical(
@@ -171,13 +175,6 @@ def _recent(plot: Plot) -> rrb.TimeSeriesView:
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
     return plot_view(plot, recent)
-
-
-BY_POLICY = "policy"
-DRIVERS = {BY_POLICY: POLICY, **dict.fromkeys(get_args(Reason), HUMAN)}
-"""Who drives: the policy, or the human for one of these reasons; their colours on the time line."""
-WINDOW = 20
-"""Episodes of the moving means."""
 
 
 class TrainingLog:

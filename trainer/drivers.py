@@ -1,4 +1,7 @@
-"""The one action of each scenario, as a policy file describes it (contract section 4)."""
+"""What can drive and what is driven: actions, test conditions, experts, and policies by name.
+
+A name is the word expert, ``constant:ACTION``, an exported policy, a training run or a human model.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +45,22 @@ ACTIONS = {
     ),
 }
 """Scenario -> what its action means to a vehicle."""
-
-
 COMMAND_NOISE = 0.05 * 2.0
 """Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
+CONSTANT = "constant:"
+"""Before an action that is kept throughout: what any policy should be better than."""
+CHECKPOINT_FILE = "checkpoint.pt"
+BEST_FILE = "best_actor.pt"
+EXPERTS: dict[str, Callable[[Any], Driver]] = {
+    "left_turn": LeftTurnExpert,
+    "congestion": CongestionExpert,
+}
+"""Scenario -> who knows how to drive it, made from its environment."""
+TRIGGERS: dict[str, Callable[[Any], Trigger]] = {
+    "left_turn": LeftTurnTrigger,
+    "congestion": CongestionTrigger,
+}
+"""Scenario -> when that expert, from whom it is made, would take over."""
 
 
 class Condition(NamedTuple):
@@ -66,23 +81,6 @@ CONDITIONS = {
     "dense": Condition("dense", 0.0, "closer and less even traffic"),
 }
 """Only the first is trained and validated in."""
-
-
-CONSTANT = "constant:"
-"""Before an action that is kept throughout: what any policy should be better than."""
-CHECKPOINT_FILE = "checkpoint.pt"
-BEST_FILE = "best_actor.pt"
-
-EXPERTS: dict[str, Callable[[Any], Driver]] = {
-    "left_turn": LeftTurnExpert,
-    "congestion": CongestionExpert,
-}
-"""Scenario -> who knows how to drive it, made from its environment."""
-TRIGGERS: dict[str, Callable[[Any], Trigger]] = {
-    "left_turn": LeftTurnTrigger,
-    "congestion": CongestionTrigger,
-}
-"""Scenario -> when that expert, from whom it is made, would take over."""
 
 
 class NetworkDriver:

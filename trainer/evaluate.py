@@ -1,4 +1,4 @@
-"""Drive test episodes with a policy and report how well it does."""
+"""Drive test episodes with a policy and report how well it does: in one process, or in several."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from edge_runtime.option_types import not_negative, positive
 from edge_runtime.words import counted
 from trainer.drivers import CONDITIONS, load_driver, make_environment
 from trainer.human.guide import Action, Driver
-from trainer.options import add_latency, add_scenario, set_threads
+from trainer.options import add_latency, add_scenario, add_seed, set_threads
 from trainer.remote.vehicle_end import RemoteDriver
 from trainer.util import ProgressBar
 
@@ -40,12 +40,18 @@ EXAMPLE = examples(
     "python -m trainer evaluate runs/phil_1 --runs 50 --out result.json",
     "python -m trainer evaluate runs/phil_1 --condition variant --latency 50ms+-10ms,loss=1%",
 )
+NO_NETWORK = LatencySpec()
+ActTogether = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
+WORTH_STARTING = 200
+"""Episodes from which on processes pay: each spends 2 s on its imports first, and two cores save
+half of the 25 ms that an episode with a network takes (10 ms with the expert)."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "policy",
+        metavar="POLICY",
         help="an .onnx file, a RUN_DIR, a HUMAN_DIR, the word expert, or constant:ACTION for one "
         "action from -1 to 1 throughout",
     )
@@ -59,17 +65,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "%", "%%"
         ),
     )
-    add_latency(parser, "network between policy and vehicle")
-    parser.add_argument("--runs", type=positive, default=50, help="episodes")
+    add_latency(parser, "the network between policy and vehicle")
     parser.add_argument(
-        "--seed", type=not_negative, default=0, help="of the first episode; the next has one more"
+        "--runs", type=positive, default=50, metavar="N", help="how many episodes are driven"
     )
+    add_seed(parser, "the first episode; each next one has one more")
     parser.add_argument(
         "--jobs",
         type=not_negative,
         default=0,
         metavar="N",
-        help="processes; they change the time taken, never a result. "
+        help="how many processes drive; they change the time taken, never a result. "
         f"0: one a core from {WORTH_STARTING} episodes on, below that a single one",
     )
     parser.add_argument(
@@ -123,10 +129,6 @@ def run(arguments: argparse.Namespace) -> int:
         f"surviving distance {distance_m['mean']:.2f} ± {distance_m['std']:.2f} m: {arguments.out}"
     )
     return 0
-
-
-NO_NETWORK = LatencySpec()
-ActTogether = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 
 
 class Drive:
@@ -243,11 +245,6 @@ def drive_episodes(
         results.append(drive_episode(env, driver, seed, noise_std, latency))
         on_episode(results[-1])
     return results
-
-
-WORTH_STARTING = 200
-"""Episodes from which on processes pay: each spends 2 s on its imports first, and two cores save
-half of the 25 ms that an episode with a network takes (10 ms with the expert)."""
 
 
 def choose_jobs(runs: int) -> int:

@@ -1,4 +1,4 @@
-"""Write a run's actor as the policy file that an edge runtime drives."""
+"""Write a trained actor as the policy file that may drive (contract section 4)."""
 
 from __future__ import annotations
 
@@ -31,13 +31,17 @@ from trainer.training.run import CONFIG_FILE
 EXAMPLE = examples(
     "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key",
 )
+OPSET, IR_VERSION = 17, 8
+"""The oldest onnxruntime that a board may have reads these."""
+PARITY_OBSERVATIONS = 1000
+PARITY_TOLERANCE = 1e-5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("run_dir", metavar="RUN_DIR", help="directory of a training run")
+    parser.add_argument("run_dir", metavar="RUN_DIR", help="the directory of a training run")
     parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
-    parser.add_argument("--key", metavar="KEY", help="private key (PEM) to sign with")
+    parser.add_argument("--key", metavar="KEY", help="the private key (PEM) to sign it with")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -57,12 +61,6 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{out}: {len(export.model) / 1e6:.1f} MB, {signed}, policy_id {export.policy_id}")
     print(f"torch and onnxruntime differ by at most {export.max_difference:.1e}")
     return 0
-
-
-OPSET, IR_VERSION = 17, 8
-"""The oldest onnxruntime that a board may have reads these."""
-PARITY_OBSERVATIONS = 1000
-PARITY_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)

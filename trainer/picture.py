@@ -1,4 +1,4 @@
-"""Draw a moment of an episode, or all of it, from above, as a person understands it."""
+"""Draw a moment of an episode from above, or film all of it with its take-overs."""
 
 from __future__ import annotations
 
@@ -14,24 +14,43 @@ from PIL import Image, ImageDraw
 from edge_runtime.cli import add_public_key, examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.option_types import not_negative, positive_number
+from edge_runtime.option_types import positive_number
 from trainer.drivers import ACTIONS, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver, Guide, HumanGuide, Intervention
-from trainer.options import add_scenario, check_picture
+from trainer.options import add_scenario, add_seed, check_suffix
 from trainer.scenarios.scene import COLOURS
 
 EXAMPLE = examples(
     "python -m trainer picture expert --seed 8 --time 3.4 --out scene.png",
     "python -m trainer picture runs/phil_1 --human expert --time 15 --out take_over.gif",
 )
+BAND_PIXELS = 58
+"""Above the scene: who drives, and both actions."""
+GAUGE_PIXELS = (150, 14)
+PILL_PIXELS = (310, 34)
+FACTS = {
+    "collision": "the human drives: a crash ahead",
+    "lane": "the human drives: no stopping in the lane",
+    "stuck": "the human drives: the way is clear",
+    "heading": "the human drives: it turned aside",
+    "offset": "the human drives: it drifted aside",
+    "person": "the human drives",
+    None: "the policy drives",
+}
+"""What is said, by the reason of the intervention."""
+POLICY, HUMAN, GAUGE = COLOURS["ego"], (46, 139, 76), (200, 206, 196)
+COLOUR_COUNT = 64
+"""Of a GIF's palette: the scene has few colours, and letters some shades."""
+LAST_S = 1.5
+"""How long the last picture stays before it begins anew."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("policy", help="who drives: see `trainer evaluate`")
+    parser.add_argument("policy", metavar="POLICY", help="what drives: see `trainer evaluate`")
     add_public_key(parser)
     add_scenario(parser)
-    parser.add_argument("--seed", type=not_negative, default=0, help="of the episode")
+    add_seed(parser, "the episode")
     parser.add_argument(
         "--time",
         type=positive_number,
@@ -42,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--human",
         metavar="expert|HUMAN_DIR",
-        help="who takes over, where the scripted human would; in a film (default: nobody)",
+        help="what takes over in a film, where the scripted human would (default: nothing)",
     )
     parser.add_argument(
         "--out",
@@ -54,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Drive to the moment and draw it, or film the way there; returns the exit status."""
-    check_picture(arguments.out, film=True)
+    check_suffix(arguments.out, "a picture is a .png, a film a .gif", ".png", ".gif")
     is_film = arguments.out.endswith(".gif")
     if arguments.human is not None and not is_film:
         raise UserError("--human takes over in a film: --out F.gif")
@@ -90,27 +109,6 @@ def _film(arguments: argparse.Namespace, env: Any, driver: Driver) -> bytes:
     moments = drive_moments(env, driver, guide, arguments.seed, arguments.time)
     pictures = [draw_moment(moment, ACTIONS[env.scenario].name) for moment in moments]
     return encode_gif(pictures, env.config.control_period_s)
-
-
-BAND_PIXELS = 58
-"""Above the scene: who drives, and both actions."""
-GAUGE_PIXELS = (150, 14)
-PILL_PIXELS = (310, 34)
-FACTS = {
-    "collision": "the human drives: a crash ahead",
-    "lane": "the human drives: no stopping in the lane",
-    "stuck": "the human drives: the way is clear",
-    "heading": "the human drives: it turned aside",
-    "offset": "the human drives: it drifted aside",
-    "person": "the human drives",
-    None: "the policy drives",
-}
-"""What is said, by the reason of the intervention."""
-POLICY, HUMAN, GAUGE = COLOURS["ego"], (46, 139, 76), (200, 206, 196)
-COLOUR_COUNT = 64
-"""Of a GIF's palette: the scene has few colours, and letters some shades."""
-LAST_S = 1.5
-"""How long the last picture stays before it begins anew."""
 
 
 @dataclass(frozen=True)

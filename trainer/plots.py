@@ -1,4 +1,4 @@
-"""Draw the learning curve of a run, or of several."""
+"""Draw the learning curve of a run, or of several that differ in their seeds."""
 
 from __future__ import annotations
 
@@ -16,13 +16,25 @@ from edge_runtime.cli import examples
 from edge_runtime.episode_report import GOAL
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable, write_atomic
-from trainer.options import check_picture, existing_directory
+from trainer.options import check_suffix, existing_directory
 from trainer.training.metrics import read_metrics
 
 EXAMPLE = examples(
     "python -m trainer plot runs/phil_1",
     "python -m trainer plot runs/phil_1 runs/phil_2 runs/phil_3 --out curves.png",
 )
+CURVE_FILE = "learning_curve.png"
+WINDOW = 20
+"""Episodes of the moving average."""
+Values = NDArray[np.float64]
+PANELS = (
+    ("episode_return", "return (without shaping)"),
+    ("distance_m", "surviving distance, m"),
+    ("success", "success"),
+    ("human_share", "share of steps driven by the human"),
+)
+"""Column -> title."""
+SUCCESS = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,26 +58,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None and len(run_dirs) > 1:
         raise UserError("several runs go into one picture: --out F.png")
     if arguments.out is not None:
-        check_picture(arguments.out)
+        check_suffix(arguments.out, "a picture is a .png", ".png")
     out = run_dirs[0] / CURVE_FILE if arguments.out is None else Path(arguments.out)
     check_writable(out)
     write_learning_curves(run_dirs, out)
     print(out)
     return 0
-
-
-CURVE_FILE = "learning_curve.png"
-WINDOW = 20
-"""Episodes of the moving average."""
-Values = NDArray[np.float64]
-PANELS = (
-    ("episode_return", "return (without shaping)"),
-    ("distance_m", "surviving distance, m"),
-    ("success", "success"),
-    ("human_share", "share of steps driven by the human"),
-)
-"""Column -> title."""
-SUCCESS = 2
 
 
 def write_learning_curve(run_dir: Path) -> Path:

@@ -1,8 +1,12 @@
-"""Checks of settings: every number of a config has a range, and a wrong one gets one line."""
+"""Small things that several parts of the trainer need.
+
+In this order: ranges of settings, torch files, one process in a directory, ending in order,
+progress, and what made a result. torch takes two seconds to load, so it is imported only where a
+function needs it: ``--help`` and the configs need none of it.
+"""
 
 from __future__ import annotations
 
-import fcntl
 import io
 import json
 import math
@@ -21,13 +25,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from edge_runtime.errors import UserError
+from edge_runtime.file_lock import try_to_hold
 from edge_runtime.files import make_directory, open_regular, write_atomic
 
+LOCK_FILE = ".lock"
+"""In a directory that is claimed, for as long as it is."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+LINE_INTERVAL_S = 15.0
+"""Between two lines of progress where stderr is no terminal."""
+WRITTEN = ("results/paper",)
+"""What the experiments write themselves. Human models, which decide trainings, count as source."""
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
 FROM_ONE: Range = (1, math.inf)
@@ -55,6 +67,8 @@ def _text(low: float, high: float) -> str:
 
 def save_torch(path: Path, state: Any) -> None:
     """Write ``state`` so that a kill at any moment leaves the old file or the new one."""
+    import torch
+
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_atomic(path, buffer.getbuffer())
@@ -66,6 +80,8 @@ def load_torch(path: Path) -> Any:
     Raises:
         UserError: not such a file. Only tensors and plain values are unpickled.
     """
+    import torch
+
     try:
         with open_regular(path) as stream:
             return torch.load(stream, map_location="cpu", weights_only=True)
@@ -78,6 +94,8 @@ def load_torch(path: Path) -> Any:
 
 def as_tensors(values: dict[str, Any]) -> dict[str, Any]:
     """The same with arrays as tensors: what ``load_torch`` reads without arbitrary unpickling."""
+    import torch
+
     return {
         name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
         for name, value in values.items()
@@ -86,14 +104,12 @@ def as_tensors(values: dict[str, Any]) -> dict[str, Any]:
 
 def as_arrays(values: dict[str, Any]) -> dict[str, Any]:
     """The inverse of ``as_tensors``."""
+    import torch
+
     return {
         name: value.numpy() if isinstance(value, torch.Tensor) else value
         for name, value in values.items()
     }
-
-
-LOCK_FILE = ".lock"
-"""In a directory that is claimed, for as long as it is."""
 
 
 @contextmanager
@@ -157,23 +173,18 @@ def _locked(path: Path, end_s: float) -> int | None:
     """The locked file, opened and with this process's name in it; None where another has it."""
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Whoever lets go removes the file. A lock on one without a name keeps nobody out.
-            if _is(path, descriptor):
-                os.ftruncate(descriptor, 0)
-                os.pwrite(descriptor, json.dumps(_me()).encode(), 0)
-                return descriptor
-        except BlockingIOError:
-            os.close(descriptor)
+        mine = try_to_hold(descriptor)
+        # The process that lets go removes the file. A lock on one without a name excludes nobody.
+        if mine and _is(path, descriptor):
+            os.ftruncate(descriptor, 0)
+            me = {"pid": os.getpid(), "host": socket.gethostname()}
+            os.pwrite(descriptor, json.dumps(me).encode(), 0)
+            return descriptor
+        os.close(descriptor)
+        if not mine:
             if time.monotonic() >= end_s:
                 return None
             time.sleep(0.01)
-            continue
-        except OSError:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)
 
 
 def _is(path: Path, descriptor: int) -> bool:
@@ -182,13 +193,6 @@ def _is(path: Path, descriptor: int) -> bool:
         return os.path.samestat(path.stat(), os.fstat(descriptor))
     except FileNotFoundError:
         return False
-
-
-def _me() -> dict[str, object]:
-    return {"pid": os.getpid(), "host": socket.gethostname()}
-
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
@@ -215,9 +219,6 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-LINE_INTERVAL_S = 15.0
 
 
 class ProgressBar:
@@ -268,11 +269,6 @@ class ProgressBar:
         return elapsed_s / max(self.done - self._began_at, 1) * (self.total - self.done)
 
 
-HERE = Path(__file__).parent
-WRITTEN = ("results/paper",)
-"""What the experiments write themselves. Human models, which decide trainings, count as source."""
-
-
 @cache
 def source_revision() -> str:
     """The repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
@@ -280,7 +276,7 @@ def source_revision() -> str:
     As it was when first asked for: what is committed later is not what this process runs. Results
     that a run has just written make no other source.
     """
-    return revision_of(HERE)
+    return revision_of(Path(__file__).parent)
 
 
 def revision_of(directory: Path) -> str:
@@ -306,6 +302,8 @@ def _git(directory: Path, *arguments: str) -> str | None:
 
 def about() -> dict[str, Any]:
     """Machine, threads and versions; no date, so that equal runs write equal words."""
+    import torch
+
     return {
         "machine": {"processor": processor_model(), "cores": os.cpu_count()},
         "threads": torch.get_num_threads(),
@@ -322,9 +320,6 @@ def processor_model() -> str:
         lines = []
     models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(models, "") or platform.processor() or platform.machine()
-
-
-CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 
 def find_chromium() -> str | None:

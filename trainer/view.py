@@ -1,4 +1,9 @@
-"""Show recorded sittings in rerun: the road, both actions, who drove, and what the policy saw."""
+"""Show a training in rerun as it goes on (``train --rerun``), or recorded sittings (``view``).
+
+The training loop only gathers what must be taken while it is there, and never waits; a thread of
+its own does everything that takes time, rerun's calls and the critic's. A sitting's recording does
+not hold the road: the same seed and the same actions drive it again.
+"""
 
 from __future__ import annotations
 
@@ -51,6 +56,14 @@ EXAMPLE = examples(
 )
 LOOK_S = 0.2
 """The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
+OnEpisode = Callable[[EpisodeMetrics], None]
+STEPS_TOGETHER = 50
+"""Numbers are handed over with a picture, or when there are so many."""
+CORRECTIONS = 32
+"""Of an episode whose Q advantage is shown: evenly spread, as the critic's time is not for free."""
+MOST_WAITING = 500
+"""Entries, some 50 s of pictures: a view that is slower loses some, and the loop nothing."""
+Draw = Callable[[Entry], None]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,9 +97,6 @@ def run(arguments: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             pass
     return 0
-
-
-OnEpisode = Callable[[EpisodeMetrics], None]
 
 
 def check_word(word: str) -> Sink:
@@ -130,12 +140,6 @@ def show_sittings(paths: Iterable[Path], sink: Sink) -> Iterator[Shown]:
             log.draw(entry)
         flush(recording)
         yield shown
-
-
-STEPS_TOGETHER = 50
-"""Numbers are handed over with a picture, or when there are so many."""
-CORRECTIONS = 32
-"""Of an episode whose Q advantage is shown: evenly spread, as the critic's time is not for free."""
 
 
 class Watcher:
@@ -200,13 +204,6 @@ def _spread(corrections: list[Correction], most: int) -> list[Correction]:
     """At most so many, evenly spread, the first among them."""
     stride = -(-len(corrections) // most) or 1
     return corrections[::stride]
-
-
-MOST_WAITING = 500
-"""Entries, some 50 s of pictures: a view that is slower loses some, and the loop nothing."""
-
-
-Draw = Callable[[Entry], None]
 
 
 class Background:

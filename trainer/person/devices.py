@@ -1,8 +1,7 @@
-"""Keyboard, gamepad and wheel through SDL (pygame), with their window."""
+"""Keyboard, gamepad and wheel through SDL (pygame): from its events to what the hands say."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from typing import Any, Protocol
 
@@ -12,13 +11,6 @@ from edge_runtime.errors import UserError
 from trainer.person.interface import KEY_HELP, LET_GO, WISHES, Person, PersonOptions, Reading, Wish
 from trainer.person.profile import SHIPPED, Profile, read_profile
 from trainer.person.window import Window
-
-# Before SDL starts: no greeting on stdout, its signal handlers would eat ^C, and a wheel must work
-# while another window has the focus.
-os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
-os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
-
 
 WISH_KEYS: dict[int, Wish] = {
     pygame.K_p: "pause",
@@ -32,6 +24,13 @@ WISH_HELP = (
     "    Q / Esc: quit, all is kept"
 )
 SHIPPED_PROFILES = {"gamepad": SHIPPED / "gamepad.toml", "wheel": SHIPPED / "g29.toml"}
+PERIOD_S = 0.1
+KEYS = {
+    "left_turn": {pygame.K_UP: 1.0, pygame.K_w: 1.0, pygame.K_DOWN: -1.0, pygame.K_s: -1.0},
+    "congestion": {pygame.K_LEFT: -1.0, pygame.K_a: -1.0, pygame.K_RIGHT: 1.0, pygame.K_d: 1.0},
+}
+RATES_PER_S = {"left_turn": 5.0, "congestion": 2.5}
+"""How quickly a key presses: a pedal is down in 0.2 s; a wheel is turned by a tap, not thrown."""
 
 
 class WindowDevice:
@@ -102,15 +101,6 @@ def open_joystick(options: PersonOptions, word: str) -> Person:
             f"`python -m trainer drive --human {word} --calibrate F.toml` makes a profile"
         )
     return Person(WindowDevice(hands), window, profile.moving)
-
-
-PERIOD_S = 0.1
-KEYS = {
-    "left_turn": {pygame.K_UP: 1.0, pygame.K_w: 1.0, pygame.K_DOWN: -1.0, pygame.K_s: -1.0},
-    "congestion": {pygame.K_LEFT: -1.0, pygame.K_a: -1.0, pygame.K_RIGHT: 1.0, pygame.K_d: 1.0},
-}
-RATES_PER_S = {"left_turn": 5.0, "congestion": 2.5}
-"""How quickly a key presses: a pedal is down in 0.2 s; a wheel is turned by a tap, not thrown."""
 
 
 class Hands(Protocol):

@@ -1,4 +1,4 @@
-"""Drive yourself, or take over from a policy; every step is recorded, nothing is learned."""
+"""Drive yourself, or take over from a policy: every step is recorded, and nothing is learned."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the loop knows of a person: a device that is asked, a display that is shown.
+"""A person as the loop and the command line know one: a device to ask, a display to show.
 
 The loop's thread calls everything here, once a control period while driving and about as often
 while paused; nothing may block for longer than a few milliseconds. A window is two objects, a
@@ -27,12 +27,13 @@ WISHES: tuple[Wish, ...] = ("pause", "restart", "discard", "quit")
 Control = Literal["policy", "human", "returning"]
 """Who decides the applied action; ``returning``: the person has let go and the action is on its way
 back to the policy's, which still counts as the person's."""
-
 KEY_HELP = {
     "left_turn": "Up / W: throttle    Down / S: brake",
     "congestion": "Left / A, Right / D: steer",
 }
 """Scenario -> what its keys do, in a window and in the browser alike."""
+PERSON = "person"
+"""``RunConfig.human`` of every device: a run may go on with another one."""
 
 
 @dataclass(frozen=True)
@@ -199,8 +200,6 @@ HUMANS: dict[str, Callable[[PersonOptions], Person]] = {
 behind them are imported when they are opened."""
 
 
-PERSON = "person"
-"""``RunConfig.human`` of every device: a run may go on with another one."""
 DEFAULTS = PersonOptions()
 
 

@@ -1,4 +1,4 @@
-"""What the axes and buttons of a wheel or a gamepad mean: a TOML file, checked when it is read."""
+"""What the axes and buttons of a wheel or gamepad mean: a TOML file, and asking for its values."""
 
 from __future__ import annotations
 
@@ -23,6 +23,16 @@ SHORTEST = 0.02
 """The least way of a wheel or pedal: its noise must not be a full action."""
 DeadZone = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 Share = Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)]
+MOVED = 0.2
+"""How far an axis must go to be the one that was asked for."""
+STEADY, STEADY_S = 0.02, 0.7
+"""How still it must then be held, and for how long."""
+FIRST_S = 2.0
+"""For pressing and turning everything once."""
+LOOK_S = 0.02
+PATIENCE_S = 60.0
+"""How long a question is asked."""
+Say = Callable[[str], None]
 
 
 class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -133,18 +143,6 @@ def read_profile(path: Path) -> Profile:
 def _beyond(share: float, dead_zone: float) -> float:
     """The share of the way beyond the dead zone, in [0, 1]."""
     return min(max((share - dead_zone) / (1.0 - dead_zone), 0.0), 1.0)
-
-
-MOVED = 0.2
-"""How far an axis must go to be the one that was asked for."""
-STEADY, STEADY_S = 0.02, 0.7
-"""How still it must then be held, and for how long."""
-FIRST_S = 2.0
-"""For pressing and turning everything once."""
-LOOK_S = 0.02
-PATIENCE_S = 60.0
-"""How long a question is asked."""
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)

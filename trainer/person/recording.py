@@ -40,6 +40,12 @@ DISCARDED = "discarded"
 """Outcome of an episode that the person threw away: it is shown, and nothing learns from it."""
 FRAME_SHAPE = (45, 80)
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
+Position = tuple[int, int]
+"""Sitting and index of a recorded step."""
+Shape = Callable[[float, Intervention | None], float]
+"""The reward to store (eq. 17), from the environment's and what the person did."""
+Penalises = Callable[[Intervention | None], bool]
+"""Whether what the person did costs the policy the penalty."""
 
 
 class Step(msgspec.Struct, frozen=True):
@@ -221,14 +227,6 @@ def _number(path: Path) -> int:
     match = NAME.fullmatch(path.name)
     assert match is not None
     return int(match.group(1))
-
-
-Position = tuple[int, int]
-"""Sitting and index of a recorded step."""
-Shape = Callable[[float, Intervention | None], float]
-"""The reward to store (eq. 17), from the environment's and what the person did."""
-Penalises = Callable[[Intervention | None], bool]
-"""Whether what the person did costs the policy the penalty."""
 
 
 def steps_since(directory: Path, position: Position) -> Iterator[Step]:

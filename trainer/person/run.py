@@ -1,4 +1,10 @@
-"""``trainer train --human keyboard`` and so on: the person, opened and closed around the run."""
+"""A training that a person guides: paced, recorded, and never waiting for an update.
+
+The policy acts in the loop's thread, from a copy of the actor as of the last finished update. The
+next update begins in the first control period after the last one's end. An episode's steps are
+stored at its end, when it is known whether the person discards it. A run with a person is not
+repeatable anyway; all others learn as before.
+"""
 
 from __future__ import annotations
 
@@ -33,6 +39,11 @@ from trainer.training.learning import Action, EpisodeLearning, Learning, Learnin
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
 from trainer.training.wheel import Store, make_wheel, ticks_late
+
+NICENESS = 10
+"""Of the updates' thread, and of those that torch starts from it: the person's loop goes first."""
+LOOK_S = 0.002
+"""How often it is asked whether an update is done, where that must be waited for."""
 
 
 @contextmanager
@@ -258,12 +269,6 @@ class KeptBack:
         calls, self._calls = self._calls, []
         for store in () if discarded else calls:
             store()
-
-
-NICENESS = 10
-"""Of the updates' thread, and of those that torch starts from it: the person's loop goes first."""
-LOOK_S = 0.002
-"""How often it is asked whether an update is done, where that must be waited for."""
 
 
 class UnhurriedLearning:

@@ -1,4 +1,4 @@
-"""The driver's seat: which page has it, and what is believed of what that page says.
+"""The driver's seat: which page has it, what pages say, and what of that counts.
 
 Pure but for its lock: pages are numbers, and time is passed in. The server's thread sits pages down
 and hears them, the loop's thread polls.
@@ -17,6 +17,14 @@ from trainer.scenarios.scene import HEIGHT_M, VIEW, WIDTH_M
 
 SILENCE_S = 0.5
 """A driver who is not heard for this long has let go."""
+MAX_INPUT_BYTES = 1024
+"""Of a message from a page; the longest honest one is a fifth of this."""
+Share = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
+_ENCODER = msgspec.json.Encoder(
+    enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+)
+END = _ENCODER.encode({"kind": "end"}).decode()
+"""The sitting is over; a page does not come back."""
 
 
 class Seat:
@@ -101,11 +109,6 @@ def _hands_are_off(said: Input) -> bool:
     return resting and not said.engaged
 
 
-MAX_INPUT_BYTES = 1024
-"""Of a message from a page; the longest honest one is a fifth of this."""
-Share = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
-
-
 class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a page says, at least every 100 ms; saying nothing is letting go."""
 
@@ -121,9 +124,6 @@ class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 _DECODER = msgspec.json.Decoder(Input)
-_ENCODER = msgspec.json.Encoder(
-    enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-)
 
 
 def decode_input(text: str) -> Input:
@@ -161,7 +161,3 @@ def encode_echo(at_ms: float, driving: bool, refused: bool) -> str:
     """
     echo = {"kind": "echo", "at_ms": at_ms, "driving": driving, "refused": refused}
     return _ENCODER.encode(echo).decode()
-
-
-END = _ENCODER.encode({"kind": "end"}).decode()
-"""The sitting is over; a page does not come back."""

@@ -1,4 +1,4 @@
-"""One sitting: a person, a pace and a recording around whatever drives the environment.
+"""One sitting: a person, a pace and a recording around what drives the environment.
 
 The loop calls ``begin`` after a reset, ``decide`` before and ``moved`` after each of the
 environment's steps, and ``rest`` after an episode.
@@ -25,6 +25,8 @@ REST_S = 1.0
 """Between two episodes: time to see how it ended, and to take the hands to rest."""
 STOPPED, RESTARTED = "stopped", "restarted"
 """Outcomes of an episode that the person ended; or ``recording.DISCARDED``."""
+LATE_S = 0.02
+"""A period that begins later than this is counted: a fifth of it is about what a person feels."""
 
 
 class SittingOver(Exception):  # noqa: N818 (no error: it was asked for)
@@ -277,10 +279,6 @@ class Sitting:
             speed_mps=float(env.ego.speed),
             outcome=outcome or "",
         )
-
-
-LATE_S = 0.02
-"""A period that begins later than this is counted: a fifth of it is about what a person feels."""
 
 
 class Pacer:

@@ -1,4 +1,7 @@
-"""``--human web``: device and display in one, served by a thread of its own."""
+"""The browser cockpit (``--human web``): a small page behind a token, a WebSocket for each page.
+
+A thread of its own serves it; the loop only hands over. ``seat.py`` decides which page drives.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,6 @@ from viewing.colours import BY_NAME
 
 if TYPE_CHECKING:
     from trainer.person.interface import PersonOptions
-
 TOKEN_BYTES = 16
 KEEP_ALIVE_S = 10.0
 """How long a connection stays open for another request."""
@@ -41,9 +43,31 @@ HELP = (
     "P: pause    R: restart the episode    Q: quit",
     "Backspace: discard the episode, or the one that has just ended",
 )
-
-
 LOGGER = logging.getLogger(__name__)
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+GONE_S = 2.0
+"""A page that is not heard for this long is shown out, and the next one may drive."""
+CLOSING_S = 0.5
+"""How long a page may take to say good-bye."""
+VIEWS_UNDERWAY = 2
+"""Views sent before the page says that it has drawn one: a slow page gets fewer, never old ones."""
+TYPES = MappingProxyType({"html": "text/html", "css": "text/css", "js": "text/javascript"})
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+"""The address holds the token: it shall not be kept, passed on, or framed."""
+NO_TOKEN = "This address holds no token, or an old one: open the one that the trainer printed.\n"
+NO_NAME = "The cockpit has another name: open the address that the trainer printed.\n"
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+MAX_CONNECTIONS = 32
+"""A page opens some six for its files, and keeps one."""
+HEADERS_S = 5.0
+"""Within which a connection must have shown the token."""
+ACCEPT_AGAIN_S = 0.5
+"""After the process has run out of descriptors, whoever holds them."""
 
 
 def _is_ours(record: logging.LogRecord) -> bool:
@@ -177,26 +201,6 @@ def _listen(host: str, port: int) -> socket.socket:
 def _name(host: str) -> str:
     """By what name a browser elsewhere finds the cockpit."""
     return socket.gethostname() if host in ("0.0.0.0", "::") else host
-
-
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
-GONE_S = 2.0
-"""A page that is not heard for this long is shown out, and the next one may drive."""
-CLOSING_S = 0.5
-"""How long a page may take to say good-bye."""
-VIEWS_UNDERWAY = 2
-"""Views sent before the page says that it has drawn one: a slow page gets fewer, never old ones."""
-TYPES = MappingProxyType({"html": "text/html", "css": "text/css", "js": "text/javascript"})
-HEADERS = {
-    "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-}
-"""The address holds the token: it shall not be kept, passed on, or framed."""
-NO_TOKEN = "This address holds no token, or an old one: open the one that the trainer printed.\n"
-NO_NAME = "The cockpit has another name: open the address that the trainer printed.\n"
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 @dataclass
@@ -374,14 +378,6 @@ def _page_files() -> dict[str, bytes]:
     found = {entry.name: entry.read_bytes() for entry in folder.iterdir() if "." in entry.name}
     colours = "".join(f"--{name}: rgb{colour}; " for name, colour in BY_NAME.items())
     return {**found, "colours.css": f":root {{ {colours}}}".encode()}
-
-
-MAX_CONNECTIONS = 32
-"""A page opens some six for its files, and keeps one."""
-HEADERS_S = 5.0
-"""Within which a connection must have shown the token."""
-ACCEPT_AGAIN_S = 0.5
-"""After the process has run out of descriptors, whoever holds them."""
 
 
 class Door:

@@ -35,6 +35,7 @@ COLOURS = {
 UNSEEN = ("offscreen", "dummy", "evdev")
 """Drivers of SDL that it takes by itself where nobody could see anything."""
 CONTROL_TEXT = {"policy": "the policy drives", "human": "YOU drive", "returning": "giving back"}
+STDERR = 2
 
 
 def _check_visible() -> None:
@@ -178,9 +179,6 @@ class Window:
         height, width = picture.shape[:2]
         surface: Any = pygame.image.frombuffer(picture.tobytes(), (width, height), "RGB")
         self._screen.blit(surface, place)
-
-
-STDERR = 2
 
 
 @contextmanager

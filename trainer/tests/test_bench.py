@@ -8,6 +8,7 @@ import os
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,7 +89,7 @@ def test_environment_figures():
 def test_training_figures_scale_to_10000_steps():
     parts_s = {"environment": 0.1, "acting": 0.2, "storing": 0.3, "learning": 6.0, "waiting": 0.0}
     named = {f"{name}_s": value for name, value in parts_s.items()}
-    episodes = [SimpleNamespace(steps=100, **named), SimpleNamespace(steps=300, **named)]
+    episodes: list[Any] = [SimpleNamespace(steps=100, **named), SimpleNamespace(steps=300, **named)]
     figures = training_figures(episodes, 16.0)
     assert figures["steps"] == 400
     assert figures["s_per_10k_steps"] == pytest.approx(
@@ -112,7 +113,8 @@ def test_an_update_draws_learns_and_sets_the_new_priorities():
             self.seen.append(batch)
             return Losses(0.0, 0.0, 0.0, 0.0, np.full(len(batch.indices), 7.0))
 
-    recorder, experience = Recorder(), gather(50)
+    recorder: Any = Recorder()
+    experience = gather(50)
     buffer = filled(experience)
     times_ms = Updates(recorder, buffer, batch_size=8).run(3)
     assert len(times_ms) == 3

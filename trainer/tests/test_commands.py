@@ -14,7 +14,7 @@ from edge_runtime.errors import UserError
 from edge_runtime.tests.commands import exit_status
 from edge_runtime.tests.policies import public_pem
 from trainer.__main__ import main
-from trainer.commands.train import with_setting
+from trainer.commands.train import settings, with_setting
 from trainer.options import add_time_limit, deadline_s, until
 from trainer.training.config import RunConfig
 from trainer.util import save_torch
@@ -78,7 +78,6 @@ WRONG = [
     ("bench", "--out", ""),
     ("experiment", "status", "--results", ""),
     ("bench", "--out", "/dev/null/b.json"),
-    (),
 ]
 
 
@@ -321,3 +320,25 @@ def test_a_human_model_whose_time_is_up_is_refined_in_proportion_and_kept(tmp_pa
     assert "the time is over after 1 of 50 episodes" in said
     assert "refining: 2/2" in said  # 100 steps are for 50 episodes
     assert (out / "human_model.pt").is_file()
+
+
+def test_the_settings_are_listed_with_defaults_and_meanings(capsys):
+    status, out, _ = call(capsys, "train", "--set")
+    assert status == 0
+    lines = out.splitlines()
+    assert all(len(line) <= 98 for line in lines)
+    assert "  batch_size=128                    transitions in a minibatch (table A5: N)" in lines
+    assert [name for name in settings() if f"  {name}=" not in out] == []
+
+
+def test_a_misspelt_setting_or_command_is_told_what_comes_near(capsys, tmp_path):
+    given = ("train", "--out", str(tmp_path / "x"), "--set", "bach_size=4")
+    status, _, err = call(capsys, *given)
+    assert (status, "did you mean batch_size?" in err) == (2, True)
+    status, _, err = call(capsys, "trian")
+    assert (status, "did you mean train?" in err, len(err.splitlines())) == (2, True, 1)
+
+
+def test_a_bare_command_prints_its_help(capsys):
+    status, out, _ = call(capsys)
+    assert (status, "experiment" in out) == (0, True)
