@@ -37,7 +37,7 @@ from trainer.options import (
     read_json,
     set_threads,
 )
-from trainer.person.interface import HUMANS, PERSON, add_person, check_no_person
+from trainer.person.interface import HUMANS, PERSON, add_person, check_person_options
 from trainer.plots import write_learning_curve
 from trainer.training.config import PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
@@ -185,7 +185,7 @@ def _training(
         with training_with_person(arguments, config, run_dir) as guided:
             yield guided
     else:
-        check_no_person(arguments)
+        check_person_options(arguments)
         yield TrainingRun(config, run_dir, arguments.resume)
 
 

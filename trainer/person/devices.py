@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import pygame
 
@@ -40,7 +40,7 @@ class WindowDevice:
         hands: the device proper.
     """
 
-    def __init__(self, hands: Hands) -> None:
+    def __init__(self, hands: KeyboardHands | JoystickHands) -> None:
         self._hands = hands
 
     @property
@@ -101,27 +101,6 @@ def open_joystick(options: PersonOptions, word: str) -> Person:
             f"`python -m trainer drive --human {word} --calibrate F.toml` makes a profile"
         )
     return Person(WindowDevice(hands), window, profile.moving)
-
-
-class Hands(Protocol):
-    """A source of readings."""
-
-    @property
-    def help(self) -> tuple[str, ...]:
-        """What to press for what."""
-        ...
-
-    @property
-    def present(self) -> bool:
-        """Whether the device is there."""
-        ...
-
-    def handle(self, event: Any) -> None:
-        """Take one of SDL's events."""
-
-    def read(self, now_s: float) -> Reading:
-        """What the hands do now."""
-        ...
 
 
 class KeyboardHands:

@@ -10,12 +10,12 @@ import numpy as np
 
 from edge_runtime.cli import add_public_key, examples
 from edge_runtime.errors import UserError
-from edge_runtime.option_types import not_negative, positive
+from edge_runtime.option_types import positive
 from edge_runtime.words import counted
 from trainer import seeds
 from trainer.drivers import load_driver, make_environment
 from trainer.human.guide import Driver
-from trainer.options import add_scenario, add_threads, set_threads
+from trainer.options import add_scenario, add_seed, add_threads, set_threads
 from trainer.person.interface import HUMANS, add_person, person_options
 from trainer.person.recording import Recorder
 from trainer.person.session import Sitting, SittingOver, WatchedEnv
@@ -38,12 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="human",
         choices=list(HUMANS),
         default="keyboard",
-        help="what your hands are on",
+        help="the device that your hands are on",
     )
     parser.add_argument(
         "--policy",
         metavar="POLICY",
-        help="who drives until you take over: see `trainer evaluate` (default: you drive alone)",
+        help="what drives until you take over: see `trainer evaluate` (default: you drive alone)",
     )
     add_public_key(parser)
     goal = parser.add_mutually_exclusive_group()
@@ -51,19 +51,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="REC_DIR",
         default="runs/drives",
-        help="directory of the recordings; sittings add up there",
+        help="the directory of the recordings; sittings add up there",
     )
     goal.add_argument(
         "--calibrate",
         metavar="F.toml",
-        help="do not drive: ask for a wheel's or gamepad's axes and buttons, write a profile",
+        help="instead of driving, ask for a wheel's or gamepad's axes and buttons, and write a "
+        "profile",
     )
     parser.add_argument(
-        "--episodes", type=positive, default=None, help="stop after so many (default: no end)"
+        "--episodes",
+        type=positive,
+        metavar="N",
+        help="stop after so many episodes (default: no end)",
     )
-    parser.add_argument(
-        "--seed", type=not_negative, default=0, help="of the episodes, others in every sitting"
-    )
+    add_seed(parser, "the episodes, which are others in every sitting")
     add_person(parser)
     add_threads(parser)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -166,64 +167,57 @@ class PersonOptions:
     """Of the browser cockpit; 0: any free one."""
 
 
-def _keyboard(options: PersonOptions) -> Person:
-    from trainer.person.devices import open_keyboard
+def _opener(module: str, name: str, *more: str) -> Callable[[PersonOptions], Person]:
+    """Opens a device; the libraries behind it are imported only then."""
 
-    return open_keyboard(options)
+    def open_device(options: PersonOptions) -> Person:
+        opened: Person = getattr(import_module(module), name)(options, *more)
+        return opened
 
-
-def _gamepad(options: PersonOptions) -> Person:
-    from trainer.person.devices import open_joystick
-
-    return open_joystick(options, "gamepad")
+    return open_device
 
 
-def _wheel(options: PersonOptions) -> Person:
-    from trainer.person.devices import open_joystick
-
-    return open_joystick(options, "wheel")
-
-
-def _web(options: PersonOptions) -> Person:
-    from trainer.person.web import open_cockpit
-
-    return open_cockpit(options)
-
-
-HUMANS: dict[str, Callable[[PersonOptions], Person]] = {
-    "keyboard": _keyboard,
-    "gamepad": _gamepad,
-    "wheel": _wheel,
-    "web": _web,
+HUMANS = {
+    "keyboard": _opener("trainer.person.devices", "open_keyboard"),
+    "gamepad": _opener("trainer.person.devices", "open_joystick", "gamepad"),
+    "wheel": _opener("trainer.person.devices", "open_joystick", "wheel"),
+    "web": _opener("trainer.person.web", "open_cockpit"),
 }
-"""Word -> opens the device and the display; raises UserError where there is none. The libraries
-behind them are imported when they are opened."""
-
-
-DEFAULTS = PersonOptions()
+"""Word of ``--human`` -> opens device and display; raises UserError where there is none."""
+USEFUL = {
+    "profile": ("gamepad", "wheel"),
+    "host": ("web",),
+    "port": ("web",),
+    "speed": tuple(HUMANS),
+}
+"""Option of a person -> the devices that have a use for it."""
+DEFAULTS = {"profile": None, "host": PersonOptions.host, "port": PersonOptions.port, "speed": 1.0}
 
 
 def add_person(parser: argparse.ArgumentParser) -> None:
-    """Declare them."""
-    group = parser.add_argument_group("a person at the wheel (--human keyboard and so on)")
+    """Declare the person's options of ``drive`` and ``train``."""
+    group = parser.add_argument_group(f"a person at the wheel (--human {'|'.join(HUMANS)})")
     group.add_argument(
         "--profile",
         metavar="F.toml",
         help="what the axes and buttons of --human gamepad or wheel mean (default: as shipped)",
     )
     group.add_argument(
-        "--host", default=DEFAULTS.host, help="where --human web listens: this machine only"
+        "--host",
+        default=DEFAULTS["host"],
+        help="the address at which --human web listens; by default this machine's alone",
     )
     group.add_argument(
         "--port",
         type=whole_number(0, 65535),
-        default=DEFAULTS.port,
-        help="of --human web; 0: any that is free",
+        default=DEFAULTS["port"],
+        metavar="N",
+        help="the port of --human web; 0: any that is free",
     )
     group.add_argument(
         "--speed",
         type=positive_number,
-        default=1.0,
+        default=DEFAULTS["speed"],
         metavar="X",
         help="simulated seconds in one of yours: 0.5 is slow motion",
     )
@@ -235,20 +229,13 @@ def person_options(arguments: argparse.Namespace) -> PersonOptions:
     Raises:
         UserError: an option that the device has no use for.
     """
-    _refuse(arguments, "profile", arguments.human in ("gamepad", "wheel"))
-    _refuse(arguments, "host", arguments.human == "web")
-    _refuse(arguments, "port", arguments.human == "web")
+    check_person_options(arguments)
     profile = None if arguments.profile is None else Path(arguments.profile)
     return PersonOptions(arguments.scenario, profile, arguments.host, arguments.port)
 
 
-def check_no_person(arguments: argparse.Namespace) -> None:
-    """Refuse a person's options where there is none; raises UserError."""
-    for name in ("profile", "host", "port", "speed"):
-        _refuse(arguments, name, False)
-
-
-def _refuse(arguments: argparse.Namespace, name: str, useful: bool) -> None:
-    given = getattr(arguments, name) != {"speed": 1.0}.get(name, getattr(DEFAULTS, name, None))
-    if given and not useful:
-        raise UserError(f"--{name} means nothing with --human {arguments.human}")
+def check_person_options(arguments: argparse.Namespace) -> None:
+    """Refuse what ``--human``, a device or not, has no use for; raises UserError."""
+    for name, devices in USEFUL.items():
+        if getattr(arguments, name) != DEFAULTS[name] and arguments.human not in devices:
+            raise UserError(f"--{name} means nothing with --human {arguments.human}")

@@ -103,7 +103,7 @@ def test_restarting_begins_another_episode(tmp_path):
 
 
 def test_an_episode_that_is_thrown_away_ends_and_is_marked(tmp_path):
-    readings = [hold(1.0), hold(1.0), wish("discard"), *[LET_GO] * 4]
+    readings = [hold(1.0), hold(1.0), wish("discard"), *[LET_GO] * 14]
     sitting, _ = make_sitting(tmp_path, readings)
     outcomes = drive(sitting, Steady(0.5), 0, None)
     sitting.close()
