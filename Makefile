@@ -3,8 +3,6 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-PEERS := .venv-peers
-PEERS_STAMP := $(PEERS)/.installed
 MUTATION := .venv-mutation
 MUTATION_STAMP := $(MUTATION)/.installed
 CONTAINER := .venv-container
@@ -67,19 +65,12 @@ format: $(STAMP)  ## mend what ruff can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Peers have an environment of their own: what they need is no dependency of ours.
-$(PEERS_STAMP): requirements/peers.txt | $(STAMP)
-	$(PYTHON) -m venv $(PEERS)
-	$(PEERS)/bin/python -m pip install --quiet --requirement requirements/peers.txt
-	@touch $@
-
-bench: $(STAMP) $(PEERS_STAMP)  ## speed and memory beside peers: tables, and JSON in results/bench
+bench: $(STAMP)  ## speed beside Stable-Baselines3 and highway-env: tables, and JSON in results/bench
 	for threads in 1 2; do \
-		$(BIN)/python -m trainer bench --threads $$threads --peers $(PEERS)/bin/python \
-			--out $(BENCH)/threads_$$threads.json || exit; \
+		$(BIN)/python -m trainer bench --threads $$threads --out $(BENCH)/threads_$$threads.json || exit; \
 	done
 
-bench-quick: $(STAMP)  ## a look at the same without Stable-Baselines3: a table only
+bench-quick: $(STAMP)  ## a look at the same: a table only
 	$(BIN)/python -m trainer bench --quick --threads 1
 
 board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
@@ -117,4 +108,4 @@ lock: $(STAMP)  ## rewrite the lock from what is installed
 	mv requirements/workstation.txt.new requirements/workstation.txt
 
 clean:  ## remove caches and the virtual environments; trained runs stay
-	rm -rf $(VENV) $(PEERS) $(MUTATION) $(CONTAINER) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(MUTATION) $(CONTAINER) build *.egg-info edge_runtime/build edge_runtime/*.egg-info .mypy_cache .ruff_cache .pytest_cache

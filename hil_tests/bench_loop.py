@@ -32,8 +32,7 @@ from edge_runtime.transport import open_session
 from hil_tests.bench_floor import STEP_BYTES
 from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
-from trainer.benches.machine import processor_model
-from trainer.revision import source_revision
+from trainer.util import processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
 PICTURES = 64

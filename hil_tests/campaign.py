@@ -44,8 +44,8 @@ from hil_tests.sweep import (
     simulate,
     this_command,
 )
-from trainer.parallel import cores
-from trainer.progress import ProgressBar
+from trainer.evaluate import cores
+from trainer.util import ProgressBar
 
 PARTS = ("latency", "faults")
 NO_ROWS = "none"

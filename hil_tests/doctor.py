@@ -395,10 +395,10 @@ check("person", "xdotool", "tests that press real keys skip", "apt install xdoto
 )  # fmt: skip
 def chromium() -> str:
     """A browser that runs without a screen."""
-    from trainer.benches.chromium import NAMES, find_chromium
+    from trainer.util import CHROMIUM, find_chromium
 
     if (path := find_chromium()) is None:
-        raise MissingError(f"none of {', '.join(NAMES)} is installed")
+        raise MissingError(f"none of {', '.join(CHROMIUM)} is installed")
     return output_of(path, "--version")
 
 

@@ -131,7 +131,7 @@ def take_over(out: Path, _work: Path) -> None:
 
 def cockpit(out: Path, _work: Path) -> None:
     """The browser cockpit in the middle of a take-over; needs Chromium."""
-    run_command("trainer.benches.cockpit", "--picture", str(out))
+    run_command("trainer.person.tests.browser", "--picture", str(out))
 
 
 def _row(scenario: str, seed: int, time_s: float) -> Image.Image:

@@ -25,10 +25,10 @@ from edge_runtime.files import make_directory, write_json
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError, read_json
 from hil_tests.processes import BackgroundCommand
-from trainer.commands.options import add_scenario
 from trainer.drivers import make_environment
 from trainer.experiments.plan import digest
 from trainer.experiments.statistics import Estimate, mean_estimate, success_estimate
+from trainer.options import add_scenario
 
 LOOPS = POLICY, VEHICLE = ("policy", "vehicle")
 """What may be in the loop."""

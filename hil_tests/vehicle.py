@@ -57,9 +57,9 @@ from hil_tests.sweep import (
 )
 from hil_tests.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
+from trainer.evaluate import cores, die_with_parent, interrupts_blocked
 from trainer.experiments.statistics import mean_estimate
-from trainer.parallel import cores, die_with_parent, interrupts_blocked
-from trainer.progress import ProgressBar
+from trainer.util import ProgressBar
 
 PARTS = ("compare", "sweep")
 MODEL = "hunter-2.0"

@@ -1,27 +1,29 @@
-"""``python -m trainer``: train, evaluate, export."""
+"""``python -m trainer``: train, evaluate, export, and all else that a learner needs."""
 
 from __future__ import annotations
 
+import difflib
 import sys
 
+from edge_runtime import __version__
 from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("trainer.commands.train", "train a policy with human guidance"),
-    "drive": ("trainer.commands.drive", "drive yourself, or take over from a policy; recorded"),
-    "human": ("trainer.commands.human", "train the DAgger human model from interventions"),
-    "evaluate": ("trainer.commands.evaluate", "drive test episodes and report how well it does"),
-    "export": ("trainer.commands.export", "write a run's actor as the file that a board drives"),
-    "plot": ("trainer.commands.plot", "draw the learning curve of a run"),
-    "picture": ("trainer.commands.picture", "draw a moment of an episode, from above"),
-    "view": ("trainer.commands.view", "show recorded sittings in rerun"),
-    "bench": ("trainer.commands.bench", "measure learner, environment, training, replay, memory"),
+    "drive": ("trainer.person.drive", "drive yourself, or take over from a policy; recorded"),
+    "human": ("trainer.commands.human", "train the human model from interventions (DAgger)"),
+    "evaluate": ("trainer.evaluate", "drive test episodes and report how well it does"),
+    "export": ("trainer.export", "write a run's actor as the file that a board drives"),
+    "plot": ("trainer.plots", "draw the learning curve of a run"),
+    "picture": ("trainer.picture", "draw a moment of an episode from above, or film it"),
+    "view": ("trainer.view", "show recorded sittings in rerun"),
+    "bench": ("trainer.bench", "measure learner, environments and training beside peers"),
     "experiment": ("trainer.commands.experiment", "run the paper's experiments, judge its claims"),
 }
 
 
 def main(argv: list[str]) -> int:
-    """Run one command; the exit status."""
+    """Run one command; the exit status. Without one, print the help."""
     parser = ArgumentParser(
         prog="python -m trainer",
         description="Trains driving policies with human guidance, evaluates and exports them.",
@@ -30,7 +32,12 @@ def main(argv: list[str]) -> int:
             "python -m trainer evaluate runs/phil_1 --runs 50",
         ),
     )
-    return dispatch(parser, COMMANDS, argv)
+    parser.add_argument("--version", action="version", version=__version__)
+    word = argv[0] if argv else "--help"
+    near = difflib.get_close_matches(word, COMMANDS, 1)
+    if near and near[0] != word:
+        parser.error(f"there is no command {word!r}; did you mean {near[0]}?")
+    return dispatch(parser, COMMANDS, argv or ["--help"])
 
 
 if __name__ == "__main__":

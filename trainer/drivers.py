@@ -1,32 +1,54 @@
-"""Who can drive: the expert, a human model, a run's actor, an exported policy, one action."""
+"""What can drive and what is driven: actions, test conditions, experts, and policies by name.
+
+A name is the word expert, ``constant:ACTION``, an exported policy, a training run or a human model.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edge_runtime.policy_file import Action
 from edge_runtime.util import UserError
-from trainer.actions import ACTIONS
-from trainer.conditions import CONDITIONS
-from trainer.files import load_torch
 from trainer.human.congestion import CongestionExpert, CongestionTrigger
 from trainer.human.guide import Driver, Trigger
 from trainer.human.left_turn import LeftTurnExpert, LeftTurnTrigger
 from trainer.human.model import MODEL_FILE, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios import SCENARIOS
+from trainer.scenarios.congestion import CongestionConfig
+from trainer.scenarios.environment import Scene
+from trainer.util import load_torch
 
+ACTIONS = {
+    "left_turn": Action(
+        name="pedal",
+        meaning="positive opens the throttle, negative brakes",
+        unit="aperture",
+        low=-1.0,
+        high=1.0,
+    ),
+    "congestion": Action(
+        name="steering",
+        meaning="positive turns right, negative left (eq. 29)",
+        unit=f"share of the front wheels' {CongestionConfig().lambda_rad:g} rad",
+        low=-1.0,
+        high=1.0,
+    ),
+}
+"""Scenario -> what its action means to a vehicle."""
+COMMAND_NOISE = 0.05 * 2.0
+"""Standard deviation of the noise condition: 5 % of the whole control domain (section VII-D)."""
 CONSTANT = "constant:"
 """Before an action that is kept throughout: what any policy should be better than."""
 CHECKPOINT_FILE = "checkpoint.pt"
 BEST_FILE = "best_actor.pt"
-
 EXPERTS: dict[str, Callable[[Any], Driver]] = {
     "left_turn": LeftTurnExpert,
     "congestion": CongestionExpert,
@@ -37,6 +59,26 @@ TRIGGERS: dict[str, Callable[[Any], Trigger]] = {
     "congestion": CongestionTrigger,
 }
 """Scenario -> when that expert, from whom it is made, would take over."""
+
+
+class Condition(NamedTuple):
+    """How test episodes are driven."""
+
+    scene: Scene
+    noise_std: float
+    """Of Gaussian noise on the command."""
+    meaning: str
+
+
+CONDITIONS = {
+    "nominal": Condition("nominal", 0.0, "the scene that is trained in"),
+    "noise": Condition(
+        "nominal", COMMAND_NOISE, "Gaussian noise of 5 % of the control domain on the command"
+    ),
+    "variant": Condition("variant", 0.0, "more vehicles, and other types of them"),
+    "dense": Condition("dense", 0.0, "closer and less even traffic"),
+}
+"""Only the first is trained and validated in."""
 
 
 class NetworkDriver:

@@ -1,7 +1,8 @@
-"""From a trained actor to the policy file that may drive (contract section 4)."""
+"""Write a trained actor as the policy file that may drive (contract section 4)."""
 
 from __future__ import annotations
 
+import argparse
 import warnings
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -15,6 +16,7 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
+from edge_runtime.cli import examples
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.policy import policy_id_of
 from edge_runtime.policy_file import (
@@ -26,14 +28,44 @@ from edge_runtime.policy_file import (
 )
 from edge_runtime.tls import read_signing_key
 from edge_runtime.util import UserError
-from trainer.actions import ACTIONS
-from trainer.drivers import make_environment
+from trainer.drivers import ACTIONS, load_actor, make_environment
 from trainer.learner.networks import Actor
+from trainer.options import existing_directory, read_json
+from trainer.training.run import CONFIG_FILE
 
+EXAMPLE = examples(
+    "python -m trainer export runs/phil_1 --out left_turn.onnx --key keys/policy.key",
+)
 OPSET, IR_VERSION = 17, 8
 """The oldest onnxruntime that a board may have reads these."""
 PARITY_OBSERVATIONS = 1000
 PARITY_TOLERANCE = 1e-5
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("run_dir", metavar="RUN_DIR", help="the directory of a training run")
+    parser.add_argument("--out", required=True, metavar="POLICY.onnx", help="the policy file")
+    parser.add_argument("--key", metavar="KEY", help="the private key (PEM) to sign it with")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Export, check, sign; returns the exit status."""
+    run_dir = existing_directory(arguments.run_dir, "run directory")
+    out, key = Path(arguments.out), Path(arguments.key) if arguments.key else None
+    if out.suffix != ".onnx":
+        raise UserError(f"--out {out}: a policy file's name ends in .onnx")
+    check_writable(out)
+    if key:
+        read_signing_key(key)
+    actor, label = load_actor(run_dir)
+    training = read_json(run_dir / CONFIG_FILE, "run config")
+    export = export_policy(actor, label, training)
+    write_policy(export, out, key)
+    signed = "signed" if key else "not signed"
+    print(f"{out}: {len(export.model) / 1e6:.1f} MB, {signed}, policy_id {export.policy_id}")
+    print(f"torch and onnxruntime differ by at most {export.max_difference:.1e}")
+    return 0
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
-"""Pictures of a run, or of several that differ in their seeds."""
+"""Draw the learning curve of a run, or of several that differ in their seeds."""
 
 from __future__ import annotations
 
+import argparse
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,10 +13,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bridge.report import GOAL
-from edge_runtime.files import write_atomic
+from edge_runtime.cli import examples
+from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError
+from trainer.options import check_suffix, existing_directory
 from trainer.training.metrics import read_metrics
 
+EXAMPLE = examples(
+    "python -m trainer plot runs/phil_1",
+    "python -m trainer plot runs/phil_1 runs/phil_2 runs/phil_3 --out curves.png",
+)
 CURVE_FILE = "learning_curve.png"
 WINDOW = 20
 """Episodes of the moving average."""
@@ -28,6 +35,35 @@ PANELS = (
 )
 """Column -> title."""
 SUCCESS = 2
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "run_dirs",
+        metavar="RUN_DIR",
+        nargs="+",
+        help="directory of a training run; several are drawn thinly, and their mean",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="F.png",
+        help=f"the picture (default: RUN_DIR/{CURVE_FILE})",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw; returns the exit status."""
+    run_dirs = [existing_directory(path, "run directory") for path in arguments.run_dirs]
+    if arguments.out is None and len(run_dirs) > 1:
+        raise UserError("several runs go into one picture: --out F.png")
+    if arguments.out is not None:
+        check_suffix(arguments.out, "a picture is a .png", ".png")
+    out = run_dirs[0] / CURVE_FILE if arguments.out is None else Path(arguments.out)
+    check_writable(out)
+    write_learning_curves(run_dirs, out)
+    print(out)
+    return 0
 
 
 def write_learning_curve(run_dir: Path) -> Path:

@@ -18,7 +18,7 @@ from hil_tests.board import emulation
 from hil_tests.board.proof import prove_emulated, prove_twin
 from hil_tests.board.rootfs import DEFAULT_CACHE
 from hil_tests.board.service import prove_booted, why_not_booted
-from trainer.benches.machine import processor_model
+from trainer.util import processor_model
 
 BOARDS = ("aarch64", "python38", "systemd")
 FIRST_COMMAND_LIMIT_S, INSTALL_LIMIT_S = 180.0, 20.0

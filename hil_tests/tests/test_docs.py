@@ -20,9 +20,9 @@ from hil_tests import pictures, processes
 from hil_tests.__main__ import main
 from hil_tests.loop_picture import Trips
 from hil_tests.pictures import FILM_POLICY, FILM_SEED, policy_sees, success_against_latency
-from trainer.animation import drive_moments
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import HumanGuide
+from trainer.picture import drive_moments
 
 ROOT = Path(__file__).parents[2]
 READMES = sorted(

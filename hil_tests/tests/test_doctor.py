@@ -24,7 +24,7 @@ from hil_tests.doctor import (
     output_of_python,
     summary,
 )
-from trainer.benches.chromium import find_chromium
+from trainer.util import find_chromium
 
 ROOT = Path(__file__).parents[2]
 

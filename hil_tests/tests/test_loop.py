@@ -23,7 +23,7 @@ from edge_runtime.tests.policies import write_policy as write_toy_policy
 from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand
 from hil_tests.recording import LEFT_TURN
 from trainer.drivers import OnnxDriver, make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 from trainer.export import export_policy, write_policy
 from trainer.learner.networks import Actor
 

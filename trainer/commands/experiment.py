@@ -10,7 +10,7 @@ from pathlib import Path
 from edge_runtime.cli import examples, not_negative, whole_number
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError
-from trainer.commands.time_limit import add_time_limit, deadline_s
+from trainer.evaluate import cores
 from trainer.experiments import run as running
 from trainer.experiments.plan import (
     DEFAULT_SEEDS,
@@ -26,7 +26,7 @@ from trainer.experiments.ray_runner import run_on_ray
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, say
 from trainer.experiments.timing import TIME_FILE, measure
-from trainer.parallel import cores
+from trainer.options import add_time_limit, deadline_s
 
 EXAMPLE = examples(
     "python -m trainer experiment status",

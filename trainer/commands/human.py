@@ -9,18 +9,24 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edge_runtime.cli import examples, not_negative, positive
+from edge_runtime.cli import examples
 from edge_runtime.files import write_json_out
 from edge_runtime.util import UserError
-from trainer.commands.options import add_scenario, add_threads, set_threads
-from trainer.commands.time_limit import add_time_limit, deadline_s, until
 from trainer.drivers import make_environment
 from trainer.human.dagger import HumanTraining
 from trainer.human.model import MODEL_FILE, HumanModel, HumanModelConfig, refining_parts
-from trainer.locks import claimed
-from trainer.person.imitation import demonstrate
-from trainer.person.recording import find_recordings
-from trainer.progress import ProgressBar
+from trainer.options import (
+    add_fields,
+    add_scenario,
+    add_seed,
+    add_threads,
+    add_time_limit,
+    deadline_s,
+    set_threads,
+    until,
+)
+from trainer.person.recording import demonstrate, find_recordings
+from trainer.util import ProgressBar, claimed
 
 EXAMPLE = examples(
     "python -m trainer human --scenario left_turn --out runs/human",
@@ -28,55 +34,26 @@ EXAMPLE = examples(
     "python -m trainer human --from runs/drives --out runs/me",
 )
 DEFAULTS = HumanModelConfig()
+FIELDS = (
+    "episodes",
+    "frames",
+    "updates_per_episode",
+    "demonstrated_share",
+    "label_every_step",
+    "unaided_share",
+    "refining_updates",
+)
+"""Settings that are options."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_scenario(parser)
-    parser.add_argument("--out", required=True, metavar="HUMAN_DIR", help="directory of the model")
-    parser.add_argument("--seed", type=not_negative, default=0, help="of everything")
     parser.add_argument(
-        "--episodes", type=positive, default=DEFAULTS.episodes, help="episodes (table A7)"
+        "--out", required=True, metavar="HUMAN_DIR", help="the directory of the model"
     )
-    parser.add_argument(
-        "--frames",
-        type=int,
-        choices=[1, 2],
-        default=DEFAULTS.frames,
-        help="frames that the model sees: table A4 has 1; 2 show speed as a person sees it",
-    )
-    parser.add_argument(
-        "--updates-per-episode",
-        type=positive,
-        default=DEFAULTS.updates_per_episode,
-        help="gradient steps after each episode",
-    )
-    parser.add_argument(
-        "--demonstrated-share",
-        type=not_negative,
-        default=DEFAULTS.demonstrated_share,
-        metavar="N",
-        help="the person drives the whole of one episode in N; 0: interventions only, as the paper",
-    )
-    parser.add_argument(
-        "--label-every-step",
-        action="store_true",
-        help="the person also says what they would do while the model drives, as an expert can",
-    )
-    parser.add_argument(
-        "--unaided-share",
-        type=not_negative,
-        default=DEFAULTS.unaided_share,
-        metavar="N",
-        help="nobody takes over in one episode in N, though every step is labelled; 0: never; "
-        "episodes that the person drives alone stay theirs",
-    )
-    parser.add_argument(
-        "--refining-updates",
-        type=not_negative,
-        default=DEFAULTS.refining_updates,
-        help="gradient steps after the last episode, under a learning rate that falls to zero",
-    )
+    add_seed(parser, "everything that is drawn at random")
+    add_fields(parser, DEFAULTS, *FIELDS)
     parser.add_argument(
         "--from",
         dest="recordings",
@@ -90,13 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=_place,
         metavar="SITTING[:EPISODE]",
-        help="of --from: what is not to be imitated, as 3 (sitting-0003.mcap) or 3:7 (its episode "
-        "7, as the window shows it); an episode discarded at the wheel is left out anyway",
+        help="what is not to be imitated of --from: 3 is sitting-0003.mcap, 3:7 its episode 7, as "
+        "the window shows it; an episode that was discarded at the wheel is left out anyway",
     )
     add_time_limit(
         parser,
-        "begin no episode after this time; those refining steps are taken that the episodes driven "
-        "are worth",
+        "begin no episode after this time; the refining steps shrink in proportion to the episodes",
     )
     add_threads(parser)
 
@@ -119,15 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if scripted and arguments.leave_out:
         raise UserError("--leave-out names recorded episodes: it goes with --from")
-    config = HumanModelConfig(
-        frames=arguments.frames,
-        episodes=arguments.episodes,
-        updates_per_episode=arguments.updates_per_episode,
-        demonstrated_share=arguments.demonstrated_share,
-        label_every_step=arguments.label_every_step,
-        unaided_share=arguments.unaided_share,
-        refining_updates=arguments.refining_updates,
-    )
+    config = HumanModelConfig(**{name: getattr(arguments, name) for name in FIELDS})
     directory = Path(arguments.out)
     with claimed(directory):
         if (directory / MODEL_FILE).exists():

@@ -1,14 +1,16 @@
-"""Train a policy with human guidance."""
+"""Train a policy with human guidance: options, settings, and whether a run may begin or go on."""
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import sys
+import textwrap
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,22 +19,28 @@ import torch
 
 from bridge.network import parse_spec
 from bridge.report import GOAL
-from edge_runtime.cli import INTERRUPTED, examples, not_negative, positive
+from edge_runtime.cli import INTERRUPTED, examples
 from edge_runtime.util import UserError, counted
-from trainer.commands.options import add_latency, add_scenario, add_threads, set_threads
-from trainer.commands.resuming import check_directory
-from trainer.commands.settings import DEFAULTS, settings, with_setting
-from trainer.commands.time_limit import add_time_limit, deadline_s
-from trainer.learner.config import ALGORITHMS
-from trainer.locks import claimed
-from trainer.person.options import PERSON, add_person, check_no_person
-from trainer.person.registry import HUMANS
+from trainer.drivers import CHECKPOINT_FILE
+from trainer.learner.config import ALGORITHMS, LearnerConfig
+from trainer.options import (
+    add_fields,
+    add_latency,
+    add_scenario,
+    add_seed,
+    add_threads,
+    add_time_limit,
+    deadline_s,
+    meanings,
+    read_json,
+    set_threads,
+)
+from trainer.person.interface import HUMANS, PERSON, add_person, check_person_options
 from trainer.plots import write_learning_curve
-from trainer.progress import ProgressBar
-from trainer.signals import quit_on_signals
 from trainer.training.config import PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
-from trainer.training.run import TrainingRun
+from trainer.training.run import CONFIG_FILE, TrainingRun
+from trainer.util import ProgressBar, claimed, quit_on_signals
 
 EXAMPLE = examples(
     "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",
@@ -40,60 +48,73 @@ EXAMPLE = examples(
     "python -m trainer train --human keyboard --rerun mine.rrd --out runs/mine",
     "python -m trainer train --scenario congestion --algorithm phil_td3 --seed 1 \\\n"
     "    --human runs/human_congestion --set batch_size=64 --max-minutes 30 --out runs/phil_2",
+    "python -m trainer train --set    # lists the settings",
 )
-
+DEFAULTS = RunConfig()
+OPTIONS = ("scenario", "algorithm", "seed", "human", "latency", "device", "threads")
+"""What an option of its own decides."""
+EXTENT = ("episodes", "steps")
+"""How long a run is: it may go on for longer."""
+LEARNERS = tuple(field.name for field in fields(LearnerConfig))
+OWN = tuple(
+    field.name for field in fields(RunConfig) if field.name not in (*OPTIONS, *EXTENT, "learner")
+)
+"""The run's own settings for ``--set``, besides the learner's."""
+EXPECTED = {bool: "true or false", int: "a whole number", float: "a number"}
 _STDERR = 2
 _ENDING = b"ending after this episode; a second time: at once, back to the last checkpoint\n"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_scenario(parser)
-    parser.add_argument(
-        "--algorithm", choices=list(ALGORITHMS), default=DEFAULTS.algorithm, help="which learner"
+    what = parser.add_argument_group("what is trained")
+    add_scenario(what)
+    what.add_argument(
+        "--algorithm",
+        choices=list(ALGORITHMS),
+        default=DEFAULTS.algorithm,
+        metavar="NAME",
+        help=f"the learner: {', '.join(ALGORITHMS)}",
     )
-    parser.add_argument("--seed", type=not_negative, default=DEFAULTS.seed, help="of everything")
-    parser.add_argument(
-        "--episodes", type=positive, default=DEFAULTS.episodes, help="episodes to train in all"
-    )
-    parser.add_argument(
-        "--steps",
-        type=not_negative,
-        default=DEFAULTS.steps,
-        metavar="N",
-        help="environment steps to train in all, if the episodes last so long; 0: no limit",
-    )
-    parser.add_argument(
+    add_seed(what, "everything that is drawn at random")
+    add_fields(what, DEFAULTS, *EXTENT)
+    what.add_argument(
         "--preset",
         choices=list(PRESETS),
         default="ours",
-        help="settings to start from: this project's, or the paper's as they are printed",
+        help="the settings to start from: this project's, or the paper's as they are printed",
     )
-    parser.add_argument(
+    what.add_argument(
+        "--set",
+        action=_Set,
+        nargs="?",
+        default=[],
+        metavar="NAME=VALUE",
+        help="change a setting, as often as you like; without a value: list all with their "
+        "defaults and meanings",
+    )
+    add_latency(what, "the network between policy and vehicle, also in validation")
+    who = parser.add_argument_group("who guides")
+    who.add_argument(
         "--human",
         default=DEFAULTS.human,
         metavar=f"expert|HUMAN_DIR|{'|'.join(HUMANS)}",
-        help="who guides: the scripted expert, a model trained by `trainer human`, or you",
+        help="the scripted expert, a model trained by `trainer human`, or you",
     )
     add_person(parser)
-    parser.add_argument("--out", required=True, metavar="RUN_DIR", help="directory of the run")
-    parser.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
-    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="learner's device")
-    add_latency(parser, "network between policy and vehicle, also in validation")
-    add_time_limit(parser, "stop after the episode that passes this time")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help=f"change a setting: {', '.join(settings())}",
+    how = parser.add_argument_group("the run")
+    how.add_argument("--out", required=True, metavar="RUN_DIR", help="the directory of the run")
+    how.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
+    add_time_limit(how, "stop after the episode that passes this time")
+    how.add_argument(
+        "--device", choices=["cpu", "cuda"], default="cpu", help="where the learner computes"
     )
-    parser.add_argument(
+    add_threads(how)
+    how.add_argument(
         "--rerun",
         metavar="spawn|serve|F.rrd",
         help="show the run in rerun: in a window, on a page on this machine, or into a file",
     )
-    add_threads(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -109,6 +130,22 @@ def run(arguments: argparse.Namespace) -> int:
         return _train(arguments, config, run_dir)
 
 
+def _check_human(human: str) -> None:
+    if human != DEFAULTS.human and human not in HUMANS and not Path(human).exists():
+        words = ", ".join([DEFAULTS.human, *HUMANS])
+        raise UserError(f"--human {human} is none of {words}, nor a human model's directory")
+
+
+def _config(arguments: argparse.Namespace) -> RunConfig:
+    given = {name: getattr(arguments, name) for name in (*OPTIONS, *EXTENT)}
+    given["human"] = PERSON if arguments.human in HUMANS else arguments.human
+    given["latency"] = str(parse_spec(arguments.latency))
+    config = replace(PRESETS[arguments.preset], **given)
+    for assignment in arguments.set:
+        config = with_setting(config, assignment)
+    return config
+
+
 def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> int:
     sink = _sink(arguments.rerun)
     with _training(arguments, config, run_dir) as training:
@@ -119,7 +156,13 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
             # The last: behind the first signal is what a viewer makes of them.
             quit_on_signals(partial(_quit, training)),
         ):
-            training.train(_both(_Reporter(bar, bool(config.steps)), watch), end_s)
+            report = _Reporter(bar, bool(config.steps))
+
+            def on_episode(metrics: EpisodeMetrics) -> None:
+                report(metrics)
+                watch(metrics)
+
+            training.train(on_episode, end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
     print(f"{_summary(run_dir)}: {run_dir}")
@@ -127,6 +170,60 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+@contextmanager
+def _training(
+    arguments: argparse.Namespace, config: RunConfig, run_dir: Path
+) -> Iterator[TrainingRun]:
+    """The run, and the person in it where one guides."""
+    if arguments.human in HUMANS:
+        from trainer.person.run import training_with_person
+
+        with training_with_person(arguments, config, run_dir) as guided:
+            yield guided
+    else:
+        check_person_options(arguments)
+        yield TrainingRun(config, run_dir, arguments.resume)
+
+
+def _sink(word: str | None) -> Any:
+    """Where ``--rerun`` shows the run; None, and nothing imported, where it is not asked for."""
+    if word is None:
+        return None
+    from trainer.view import check_word
+
+    return check_word(word)
+
+
+@contextmanager
+def _watched(training: TrainingRun, sink: Any) -> Iterator[Callable[[EpisodeMetrics], None]]:
+    """Show the run for as long as it lasts; what it yields is to be called after each episode."""
+    if sink is None:
+        yield lambda metrics: None
+        return
+    from trainer.view import watched
+
+    with watched(training, sink) as on_episode:
+        yield on_episode
+
+
+def _extent(training: TrainingRun) -> tuple[int, int]:
+    """What the progress bar counts to, and from: steps where they are limited, else episodes."""
+    config = training.config
+    if config.steps:
+        return config.steps, training.steps
+    return config.episodes, training.episode
+
+
+def _quit(training: TrainingRun) -> bool:
+    heeded = training.quit()
+    if training.quitting:
+        # Not print: a signal may come in the midst of one, which takes no other. And whoever read
+        # it, as `tee`, may have had the same ^C.
+        with suppress(OSError):
+            os.write(_STDERR, _ENDING)
+    return heeded
 
 
 def _summary(run_dir: Path) -> str:
@@ -143,76 +240,6 @@ def _summary(run_dir: Path) -> str:
     return ", ".join(parts)
 
 
-def _extent(training: TrainingRun) -> tuple[int, int]:
-    """What the progress bar counts to, and from: steps where they are limited, else episodes."""
-    config = training.config
-    if config.steps:
-        return config.steps, training.steps
-    return config.episodes, training.episode
-
-
-def _check_human(human: str) -> None:
-    if human != DEFAULTS.human and human not in HUMANS and not Path(human).exists():
-        words = ", ".join([DEFAULTS.human, *HUMANS])
-        raise UserError(f"--human {human} is none of {words}, nor a human model's directory")
-
-
-@contextmanager
-def _training(
-    arguments: argparse.Namespace, config: RunConfig, run_dir: Path
-) -> Iterator[TrainingRun]:
-    """The run, and the person in it where one guides."""
-    if arguments.human in HUMANS:
-        from trainer.person.command import training_with_person
-
-        with training_with_person(arguments, config, run_dir) as guided:
-            yield guided
-    else:
-        check_no_person(arguments)
-        yield TrainingRun(config, run_dir, arguments.resume)
-
-
-def _quit(training: TrainingRun) -> bool:
-    heeded = training.quit()
-    if training.quitting:
-        # Not print: a signal may come in the midst of one, which takes no other. And whoever read
-        # it, as `tee`, may have had the same ^C.
-        with suppress(OSError):
-            os.write(_STDERR, _ENDING)
-    return heeded
-
-
-def _sink(word: str | None) -> Any:
-    """Where ``--rerun`` shows the run; None, and nothing imported, where it is not asked for."""
-    if word is None:
-        return None
-    from trainer.viewer.command import check_word
-
-    return check_word(word)
-
-
-@contextmanager
-def _watched(training: TrainingRun, sink: Any) -> Iterator[Callable[[EpisodeMetrics], None] | None]:
-    if sink is None:
-        yield None
-        return
-    from trainer.viewer.command import watched
-
-    with watched(training, sink) as on_episode:
-        yield on_episode
-
-
-def _both(
-    first: Callable[[EpisodeMetrics], None], second: Callable[[EpisodeMetrics], None] | None
-) -> Callable[[EpisodeMetrics], None]:
-    def on_episode(metrics: EpisodeMetrics) -> None:
-        first(metrics)
-        if second is not None:
-            second(metrics)
-
-    return on_episode
-
-
 class _Reporter:
     """Feeds the progress bar from the episodes' metrics: means over the last twenty.
 
@@ -221,7 +248,7 @@ class _Reporter:
         by_steps: whether it counts environment steps.
     """
 
-    def __init__(self, bar: ProgressBar, by_steps: bool = False) -> None:
+    def __init__(self, bar: ProgressBar, by_steps: bool) -> None:
         self.bar, self.by_steps = bar, by_steps
         self.recent: deque[EpisodeMetrics] = deque(maxlen=20)
         self.validation = "-"
@@ -242,19 +269,106 @@ class _Reporter:
         )
 
 
-def _config(arguments: argparse.Namespace) -> RunConfig:
-    config = replace(
-        PRESETS[arguments.preset],
-        scenario=arguments.scenario,
-        algorithm=arguments.algorithm,
-        seed=arguments.seed,
-        episodes=arguments.episodes,
-        steps=arguments.steps,
-        human=PERSON if arguments.human in HUMANS else arguments.human,
-        latency=str(parse_spec(arguments.latency)),
-        device=arguments.device,
-        threads=arguments.threads,
-    )
-    for assignment in arguments.set:
-        config = with_setting(config, assignment)
-    return config
+class _Set(argparse.Action):
+    """``--set NAME=VALUE``, collected; ``--set`` alone lists the settings, as --help does options.
+
+    Other options need not be there for that.
+    """
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: Any, value: Any, option: str | None = None
+    ) -> None:
+        if value is None:
+            print("\n".join(setting_lines()))
+            parser.exit()
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
+
+
+def settings() -> dict[str, Any]:
+    """Every setting that ``--set`` may change, with its default."""
+    own = {name: getattr(DEFAULTS, name) for name in OWN}
+    return own | {name: getattr(DEFAULTS.learner, name) for name in LEARNERS}
+
+
+def setting_lines() -> Iterator[str]:
+    """Every setting as it is typed by default, and what it means."""
+    said = meanings(RunConfig) | meanings(LearnerConfig)
+    for name, default in settings().items():
+        typed = str(default).lower() if isinstance(default, bool) else str(default)
+        begin, indent = f"  {f'{name}={typed}':<33} ", 36 * " "
+        yield textwrap.fill(said.get(name, ""), 98, initial_indent=begin, subsequent_indent=indent)
+
+
+def with_setting(config: RunConfig, assignment: str) -> RunConfig:
+    """The config with one NAME=VALUE.
+
+    Raises:
+        UserError: no such setting, or no such value of it.
+    """
+    name, given, text = assignment.partition("=")
+    if not given:
+        raise UserError(f"--set {assignment}: expected NAME=VALUE")
+    known = settings()
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1)
+        guess = f"did you mean {near[0]}?" if near else "--set alone lists them"
+        raise UserError(f"--set {assignment}: there is no setting {name!r}; {guess}")
+    kind = type(known[name])
+    try:
+        value: Any = {"true": True, "false": False}[text.lower()] if kind is bool else kind(text)
+    except (ValueError, KeyError):
+        raise UserError(f"--set {assignment}: expected {EXPECTED[kind]}, got {text!r}") from None
+    if name in LEARNERS:
+        return replace(config, learner=replace(config.learner, **{name: value}))
+    return replace(config, **{name: value})
+
+
+def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
+    """Refuse to overwrite a run, or to resume one under other settings; raises UserError."""
+    started = (run_dir / CHECKPOINT_FILE).is_file()
+    if started and not resume:
+        raise UserError(f"{run_dir} holds a run; add --resume, or choose another --out")
+    if resume and not started:
+        raise UserError(f"{run_dir} holds no checkpoint to resume from")
+    if resume:
+        _check_settings(run_dir, config)
+
+
+def _check_settings(run_dir: Path, config: RunConfig) -> None:
+    path = run_dir / CONFIG_FILE
+    saved = _flat(read_json(path, "run config"))
+    wanted = _flat(config.as_dict())
+    if not all(isinstance(saved.get(name), int) for name in EXTENT):
+        raise UserError(f"run config {path} does not say how many episodes and steps")
+    changed = [
+        f"{_given(name, saved)} (now {_value(name, wanted)})"
+        for name in wanted
+        if name not in EXTENT and (name not in saved or saved[name] != wanted[name])
+    ]
+    if changed:
+        raise UserError(f"{run_dir} was trained with {', '.join(changed)}: repeat what it had")
+    for name in EXTENT:
+        if 0 < wanted[name] < saved[name]:
+            raise UserError(f"{run_dir} is a run of {saved[name]} {name}, not fewer")
+
+
+def _flat(values: dict[str, Any]) -> dict[str, Any]:
+    """A config's settings by their names, those of the learner among them."""
+    learner = values.get("learner")
+    own = {name: value for name, value in values.items() if name != "learner"}
+    return {**own, **learner} if isinstance(learner, dict) else own
+
+
+def _given(name: str, values: dict[str, Any]) -> str:
+    """A setting as it is typed."""
+    if name not in values:
+        return f"no {name}"
+    if name in OPTIONS:
+        return f"--{name} {_value(name, values)}"
+    return f"--set {name}={_value(name, values)}"
+
+
+def _value(name: str, values: dict[str, Any]) -> str:
+    value = values[name]
+    # A run may go on with another device of the person's.
+    return "|".join(HUMANS) if (name, value) == ("human", PERSON) else str(value)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bridge.report import GOAL
 from edge_runtime.util import UserError
-from trainer.conditions import CONDITIONS
+from trainer.drivers import CONDITIONS
 from trainer.experiments.plan import (
     FULL_PATH_M,
     HUMAN_MODEL,

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from edge_runtime.util import UserError, read_bytes
-from trainer.conditions import COMMAND_NOISE, CONDITIONS
-from trainer.drivers import EXPERTS, TRIGGERS, make_environment
+from trainer.drivers import COMMAND_NOISE, CONDITIONS, EXPERTS, TRIGGERS, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE
 from trainer.learner.config import ALGORITHMS

@@ -31,17 +31,16 @@ from bridge.report import GOAL, EpisodeResult
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
 from trainer import seeds
-from trainer.benches.machine import processor_model
-from trainer.conditions import CONDITIONS
 from trainer.drivers import (
     BEST_FILE,
     CHECKPOINT_FILE,
+    CONDITIONS,
     NetworkDriver,
     load_actor,
     load_driver,
     make_environment,
 )
-from trainer.evaluation import ActTogether, drive_together
+from trainer.evaluate import ActTogether, die_with_parent, drive_together, interrupts_blocked
 from trainer.experiments.plan import (
     CONSTANT,
     DEFAULT_SEEDS,
@@ -58,12 +57,9 @@ from trainer.experiments.plan import (
 )
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import multiplies_bfloat16
-from trainer.locks import held, holder
-from trainer.parallel import die_with_parent, interrupts_blocked
-from trainer.progress import ProgressBar
-from trainer.revision import source_revision
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
+from trainer.util import ProgressBar, held, holder, processor_model, source_revision
 
 TRAINING_COLUMNS = {
     "end_step": "total_steps",

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from edge_runtime.files import make_directory
-from trainer.benches.machine import about
 from trainer.experiments.plan import FOUR, NORMAL, TIME, Unit, run_config, training_id
 from trainer.experiments.run import Store, one_thread
 from trainer.experiments.statistics import RESAMPLES, Estimate, bootstrap
-from trainer.progress import ProgressBar
 from trainer.training.run import TrainingRun
+from trainer.util import ProgressBar, about
 
 TIME_FILE = f"{TIME}.json"
 PAPER_S = dict(zip(FOUR, (360.70, 348.71, 328.93, 329.39), strict=True))

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
 from trainer import seeds
-from trainer.files import load_torch, save_torch
 from trainer.learner.networks import Actor
-from trainer.ranges import FROM_ONE, FROM_ZERO, check_ranges
+from trainer.util import FROM_ONE, FROM_ZERO, check_ranges, load_torch, save_torch
 
 MODEL_FILE = "human_model.pt"
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from edge_runtime.util import UserError
-from trainer.ranges import ABOVE_ZERO, ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
+from trainer.util import ABOVE_ZERO, ANY, FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,9 @@
 """A person at the wheel: drives, takes over from a policy, and is recorded."""
+
+import os
+
+# Before SDL starts: no greeting on stdout, its signal handlers would eat ^C, and a wheel must work
+# while another window has the focus.
+os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
+os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")

@@ -1,4 +1,4 @@
-"""What the loop knows of a person: a device that is asked, a display that is shown.
+"""A person as the loop and the command line know one: a device to ask, a display to show.
 
 The loop's thread calls everything here, once a control period while driving and about as often
 while paused; nothing may block for longer than a few milliseconds. A window is two objects, a
@@ -7,11 +7,18 @@ browser may be one that is both.
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from edge_runtime.cli import positive_number, whole_number
+from edge_runtime.util import UserError
 
 Wish = Literal["pause", "restart", "discard", "quit"]
 """``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard``
@@ -21,12 +28,13 @@ WISHES: tuple[Wish, ...] = ("pause", "restart", "discard", "quit")
 Control = Literal["policy", "human", "returning"]
 """Who decides the applied action; ``returning``: the person has let go and the action is on its way
 back to the policy's, which still counts as the person's."""
-
 KEY_HELP = {
     "left_turn": "Up / W: throttle    Down / S: brake",
     "congestion": "Left / A, Right / D: steer",
 }
 """Scenario -> what its keys do, in a window and in the browser alike."""
+PERSON = "person"
+"""``RunConfig.human`` of every device: a run may go on with another one."""
 
 
 @dataclass(frozen=True)
@@ -145,3 +153,89 @@ class Person:
         """Close both."""
         self.device.close()
         self.display.close()
+
+
+@dataclass(frozen=True)
+class PersonOptions:
+    """What the command line says about the person's device."""
+
+    scenario: str = "left_turn"
+    profile: Path | None = None
+    """Axes and buttons of a gamepad or wheel; None: the shipped one."""
+    host: str = "127.0.0.1"
+    port: int = 0
+    """Of the browser cockpit; 0: any free one."""
+
+
+def _opener(module: str, name: str, *more: str) -> Callable[[PersonOptions], Person]:
+    """Opens a device; the libraries behind it are imported only then."""
+
+    def open_device(options: PersonOptions) -> Person:
+        opened: Person = getattr(import_module(module), name)(options, *more)
+        return opened
+
+    return open_device
+
+
+HUMANS = {
+    "keyboard": _opener("trainer.person.devices", "open_keyboard"),
+    "gamepad": _opener("trainer.person.devices", "open_joystick", "gamepad"),
+    "wheel": _opener("trainer.person.devices", "open_joystick", "wheel"),
+    "web": _opener("trainer.person.web", "open_cockpit"),
+}
+"""Word of ``--human`` -> opens device and display; raises UserError where there is none."""
+USEFUL = {
+    "profile": ("gamepad", "wheel"),
+    "host": ("web",),
+    "port": ("web",),
+    "speed": tuple(HUMANS),
+}
+"""Option of a person -> the devices that have a use for it."""
+DEFAULTS = {"profile": None, "host": PersonOptions.host, "port": PersonOptions.port, "speed": 1.0}
+
+
+def add_person(parser: argparse.ArgumentParser) -> None:
+    """Declare the person's options of ``drive`` and ``train``."""
+    group = parser.add_argument_group(f"a person at the wheel (--human {'|'.join(HUMANS)})")
+    group.add_argument(
+        "--profile",
+        metavar="F.toml",
+        help="what the axes and buttons of --human gamepad or wheel mean (default: as shipped)",
+    )
+    group.add_argument(
+        "--host",
+        default=DEFAULTS["host"],
+        help="the address at which --human web listens; by default this machine's alone",
+    )
+    group.add_argument(
+        "--port",
+        type=whole_number(0, 65535),
+        default=DEFAULTS["port"],
+        metavar="N",
+        help="the port of --human web; 0: any that is free",
+    )
+    group.add_argument(
+        "--speed",
+        type=positive_number,
+        default=DEFAULTS["speed"],
+        metavar="X",
+        help="simulated seconds in one of yours: 0.5 is slow motion",
+    )
+
+
+def person_options(arguments: argparse.Namespace) -> PersonOptions:
+    """What the command line says about the device.
+
+    Raises:
+        UserError: an option that the device has no use for.
+    """
+    check_person_options(arguments)
+    profile = None if arguments.profile is None else Path(arguments.profile)
+    return PersonOptions(arguments.scenario, profile, arguments.host, arguments.port)
+
+
+def check_person_options(arguments: argparse.Namespace) -> None:
+    """Refuse what ``--human``, a device or not, has no use for; raises UserError."""
+    for name, devices in USEFUL.items():
+        if getattr(arguments, name) != DEFAULTS[name] and arguments.human not in devices:
+            raise UserError(f"--{name} means nothing with --human {arguments.human}")

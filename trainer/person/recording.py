@@ -10,7 +10,7 @@ ever overwritten: sittings add up.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import IO
@@ -25,7 +25,10 @@ from bridge.recording import Records
 from edge_runtime import __version__
 from edge_runtime.files import lock_file, make_directory
 from edge_runtime.util import UserError, open_regular
+from trainer.human.guide import Action, Intervention
+from trainer.human.model import HumanModel
 from trainer.person.interface import Control
+from trainer.training.delayed import Store
 
 TOPIC = "person/step"
 WIRE = ("phil/", "view/")
@@ -36,6 +39,12 @@ DISCARDED = "discarded"
 """Outcome of an episode that the person threw away: it is shown, and nothing learns from it."""
 FRAME_SHAPE = (45, 80)
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
+Position = tuple[int, int]
+"""Sitting and index of a recorded step."""
+Shape = Callable[[float, Intervention | None], float]
+"""The reward to store (eq. 17), from the environment's and what the person did."""
+Penalises = Callable[[Intervention | None], bool]
+"""Whether what the person did costs the policy the penalty."""
 
 
 class Step(msgspec.Struct, frozen=True):
@@ -217,3 +226,108 @@ def _number(path: Path) -> int:
     match = NAME.fullmatch(path.name)
     assert match is not None
     return int(match.group(1))
+
+
+def steps_since(directory: Path, position: Position) -> Iterator[Step]:
+    """The recorded steps from ``position`` on, over all sittings."""
+    for path in sittings(directory):
+        yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)
+
+
+def store_again(
+    store: Store,
+    steps: Iterable[Step],
+    shape: Shape,
+    penalises: Penalises,
+    ticks_late: int = 0,
+) -> tuple[int, int]:
+    """Put recorded steps into the replay buffer as the run had put them there.
+
+    Episodes that the person discarded are left out.
+
+    Args:
+        store: the learner, or its buffer.
+        steps: in their order.
+        shape: the run's reward shaping.
+        penalises: whether the run charges an intervention to the overruled action.
+        ticks_late: how many ticks old the observation is that an action answers, behind a network
+            (``training/wheel.py``).
+
+    Returns:
+        How many steps were stored, and how many of them are the person's.
+    """
+    stored = human = 0
+    for episode in read_episodes(steps):
+        for known, step in zip(episode, episode[ticks_late:], strict=False):
+            if step is episode[ticks_late]:
+                store.start_episode(known.observation)
+            action = np.array([step.action], np.float32)
+            by_person = Intervention(action, "person", step.first) if step.human else None
+            store.add(
+                action,
+                shape(step.reward, by_person),
+                known.next_observation,
+                step.terminated,
+                step.human,
+                overruled=_array(step.policy_action, action),
+                penalised=penalises(by_person),
+            )
+            stored += 1
+            human += step.human
+    return stored, human
+
+
+def _array(value: float | None, otherwise: Action) -> Action:
+    return otherwise if value is None else np.array([value], np.float32)
+
+
+def demonstrate(
+    model: HumanModel, recordings: Sequence[Path], scenario: str, left_out: Sequence[str] = ()
+) -> int:
+    """Give the model every recorded step in which the person was in control.
+
+    Of a hand-over, the model gets what the hands said, not the blend that was applied; on the way
+    back to the policy the hands have let go, and say nothing. Episodes that the person discarded
+    are left out.
+
+    Args:
+        model: learns from it.
+        recordings: the files.
+        scenario: that was driven.
+        left_out: sittings, and episodes of them, that do not count: ``3``, or ``3:7`` for
+            episode 7 of sitting 3.
+
+    Returns:
+        How many take-overs the recordings hold; a whole episode driven alone is one.
+
+    Raises:
+        UserError: a recording of another scenario, none in which a person drove, or something left
+            out that is not there.
+    """
+    interventions, unknown = 0, set(left_out)
+    for path in recordings:
+        for episode in read_episodes(_of_scenario(path, scenario)):
+            names = {f"{episode[0].sitting}", f"{episode[0].sitting}:{episode[0].episode}"}
+            unknown -= names
+            if names.isdisjoint(left_out):
+                interventions += _learn(model, episode)
+    if unknown:
+        raise UserError(f"--leave-out {min(unknown)}: there is no such episode in these recordings")
+    if not model.demonstrations:
+        raise UserError("nobody took over in these recordings: there is nothing to imitate")
+    return interventions
+
+
+def _learn(model: HumanModel, episode: Sequence[Step]) -> int:
+    """Add what the person did in an episode; how often they took over."""
+    for step in episode:
+        if step.control == "human":
+            model.add(step.observation, np.array([step.human_action], np.float32))
+    return sum(step.first for step in episode)
+
+
+def _of_scenario(path: Path, scenario: str) -> Iterator[Step]:
+    for step in read_steps(path):
+        if step.scenario != scenario:
+            raise UserError(f"{path} was driven in {step.scenario}, not in {scenario}")
+        yield step

@@ -1,30 +1,84 @@
-"""A training run that a person guides: paced, recorded, and never waiting for an update."""
+"""A training that a person guides: paced, recorded, and never waiting for an update.
+
+The policy acts in the loop's thread, from a copy of the actor as of the last finished update. The
+next update begins in the first control period after the last one's end. An episode's steps are
+stored at its end, when it is known whether the person discards it. A run with a person is not
+repeatable anyway; all others learn as before.
+"""
 
 from __future__ import annotations
 
+import argparse
+import copy
 import math
+import os
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
+from edge_runtime.files import make_directory
 from edge_runtime.util import UserError, counted
-from trainer.human.guide import Guide
+from trainer.human.guide import Guide, Intervention
 from trainer.learner.config import ALGORITHMS
-from trainer.person.episode import KeptBack
-from trainer.person.guide import PersonGuide
-from trainer.person.interface import Person
-from trainer.person.recording import DIRECTORY, DISCARDED, Recorder
-from trainer.person.recovery import steps_since, store_again
-from trainer.person.sitting import Sitting, SittingOver
-from trainer.person.unhurried import UnhurriedLearning
-from trainer.person.watched import WatchedEnv
+from trainer.learner.td3 import TD3Learner
+from trainer.person.interface import HUMANS, Person, person_options
+from trainer.person.recording import DIRECTORY, DISCARDED, Recorder, steps_since, store_again
+from trainer.person.session import Sitting, SittingOver, WatchedEnv
 from trainer.training.config import RunConfig
-from trainer.training.delayed import make_wheel, ticks_late
-from trainer.training.learning import Learning, LearningThread
+from trainer.training.delayed import Store, make_wheel, ticks_late
+from trainer.training.learning import Action, EpisodeLearning, Learning, LearningThread, Observation
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun, divergence_said
+
+NICENESS = 10
+"""Of the updates' thread, and of those that torch starts from it: the person's loop goes first."""
+LOOK_S = 0.002
+"""How often it is asked whether an update is done, where that must be waited for."""
+
+
+@contextmanager
+def training_with_person(
+    arguments: argparse.Namespace, config: RunConfig, run_dir: Path
+) -> Iterator[PersonRun]:
+    """A run with a person in it, who keeps everything whatever ends it."""
+    check_settings(config)
+    person = HUMANS[arguments.human](person_options(arguments))
+    try:
+        make_directory(run_dir)
+        training = PersonRun(config, run_dir, person, arguments.resume, arguments.speed)
+        steps, human = training.recovered
+        if steps:
+            print(
+                f"{steps} recorded steps after the checkpoint, {human} of them yours, are back",
+                file=sys.stderr,
+            )
+        yield training
+        print(summary(training), file=sys.stderr)
+    finally:
+        person.close()
+
+
+def summary(training: PersonRun) -> str:
+    """What the sitting amounts to, in a line."""
+    sitting = training.sitting
+    if not sitting.recorder.index:
+        return "nothing was driven, and nothing recorded"
+    discarded = f"{counted(sitting.discarded, 'episode')} discarded, " * bool(sitting.discarded)
+    return (
+        f"{counted(sitting.episodes, 'episode')}, {discarded}"
+        f"{counted(sitting.interventions, 'intervention')}, "
+        f"{counted(sitting.human_steps, 'step')} yours; "
+        f"{counted(sitting.pacer.late, 'control period')} late, "
+        f"checkpoints in {training.longest_save_s:.2f} s at most: {sitting.recorder.path}"
+    )
 
 
 class PersonRun(TrainingRun):
@@ -161,3 +215,157 @@ def check_settings(config: RunConfig) -> None:
         raise UserError("a person watches every episode: guided_share is 1")
     if config.poor_guidance_share:
         raise UserError("a person's actions are not replaced: poor_guidance_share is 0")
+
+
+class PersonGuide:
+    """Asks the person each control period, and waits for it to begin.
+
+    Args:
+        sitting: whoever sits there.
+    """
+
+    def __init__(self, sitting: Sitting) -> None:
+        self._sitting = sitting
+
+    def reset(self) -> None:
+        """The sitting begins an episode by itself when the environment is reset."""
+
+    def watch(self, observation: Observation, policy_action: Action) -> Intervention | None:
+        """What the person does about ``policy_action``: None lets it pass. Once a step.
+
+        The action is the one that is carried out: in a hand-over neither the person's nor the
+        policy's, and the person's in the replay buffer.
+        """
+        applied = self._sitting.decide(observation, float(policy_action[0]))
+        if not applied.human:
+            return None
+        action = np.array([applied.action], np.float32)
+        return Intervention(action, "person", applied.first)
+
+
+class KeptBack:
+    """A ``Store`` that stores when it is told to.
+
+    Args:
+        store: where the transitions of an episode go that is not discarded.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._calls: list[Callable[[], None]] = []
+
+    def start_episode(self, observation: Observation) -> None:
+        """Take an episode's first observation."""
+        self._calls.append(partial(self._store.start_episode, observation))
+
+    def add(self, *transition: Any, **guidance: Any) -> None:
+        """Take a transition; arguments as ``Store.add``."""
+        self._calls.append(partial(self._store.add, *transition, **guidance))
+
+    def release(self, discarded: bool) -> None:
+        """Store what was taken since the last call, or forget it."""
+        calls, self._calls = self._calls, []
+        for store in () if discarded else calls:
+            store()
+
+
+class UnhurriedLearning:
+    """``Learning`` whose ``act``, ``begin`` and ``finish`` never wait for an update.
+
+    Args:
+        inner: where it learns.
+    """
+
+    def __init__(self, inner: LearningThread) -> None:
+        self._inner = inner
+        self._actor = copy.deepcopy(inner.learner.actor).eval()
+        inner.in_thread(_step_aside)
+
+    @property
+    def added(self) -> int:
+        """Transitions stored since the run began."""
+        return self._inner.added
+
+    @property
+    def learner(self) -> TD3Learner:
+        """The networks, as of the last finished update: waits for one that is under way."""
+        self.settle()
+        return self._inner.learner
+
+    @property
+    def idle(self) -> bool:
+        """Whether no update is under way."""
+        return not self._inner.updating
+
+    @torch.no_grad()
+    def act(self, observation: Observation) -> Action:
+        """The action of the actor's copy, float32 [action size]."""
+        return self._actor(torch.from_numpy(observation)[None])[0].numpy()
+
+    def act_together(self, observations: Observation, averaged: bool) -> Action:
+        """For validation between sittings: waits for the update, as ``Learning.act_together``."""
+        self.settle()
+        return self._inner.act_together(observations, averaged)
+
+    def start_episode(self, observation: Observation) -> None:
+        """Take an episode's first observation. Waits for the update."""
+        self.settle()
+        self._inner.start_episode(observation)
+
+    def add(self, *transition: Any, **guidance: Any) -> None:
+        """Store a transition; arguments as ``Store.add``. Waits for the update."""
+        self.settle()
+        self._inner.add(*transition, **guidance)
+
+    def begin(self, beta: float) -> None:
+        """Start an update on what is stored, unless the last one is still under way."""
+        if self._tidy():
+            self._inner.begin(beta)
+
+    def finish(self) -> float:
+        """Nothing is waited for: 0 seconds."""
+        return 0.0
+
+    def end_episode(self) -> EpisodeLearning:
+        """What was learned since the last call; learning rates decay. Waits for the update."""
+        self.settle()
+        return self._inner.end_episode()
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is needed to go on. Waits for the update."""
+        self.settle()
+        return self._inner.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave."""
+        self.settle()
+        self._inner.load_state_dict(state)
+        self._copy_actor()
+
+    def close(self) -> None:
+        """Stop the updates' thread."""
+        self._inner.close()
+
+    def settle(self) -> None:
+        """Wait for the update that is under way."""
+        # In short waits: a signal that another thread took does not wake the main thread.
+        while not self._tidy():
+            time.sleep(LOOK_S)
+
+    def _tidy(self) -> bool:
+        """Finish an update that is done; False where one is not."""
+        if self._inner.updating:
+            return False
+        if self._inner.begun:
+            self._inner.finish()
+            self._copy_actor()
+        return True
+
+    def _copy_actor(self) -> None:
+        self._actor.load_state_dict(self._inner.learner.actor.state_dict())
+
+
+def _step_aside() -> None:
+    """Lower the priority of the thread that calls this, where threads have one (Linux)."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

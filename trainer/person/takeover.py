@@ -23,7 +23,6 @@ from trainer.person.interface import Control, Moving, Reading
 MAX_SLEW = 0.5
 """The most that the action changes in a control period of a hand-over. From full throttle to full
 brake takes four of them, 0.4 s: about what a foot needs from pedal to pedal."""
-
 State = Literal["policy", "taking", "human", "returning"]
 CONTROL: dict[State, Control] = {
     "policy": "policy",
@@ -32,7 +31,6 @@ CONTROL: dict[State, Control] = {
     "returning": "returning",
 }
 """What a state is to everybody else."""
-
 NEXT: dict[tuple[State, bool, bool], State] = {
     ("policy", False, True): "policy",
     ("policy", False, False): "policy",

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -12,7 +15,6 @@ from numpy.typing import NDArray
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.interface import View
-from trainer.person.quiet import quiet_stderr
 from trainer.scenarios.scene import draw_scene
 
 SIZE = (1040, 680)
@@ -33,6 +35,7 @@ COLOURS = {
 UNSEEN = ("offscreen", "dummy", "evdev")
 """Drivers of SDL that it takes by itself where nobody could see anything."""
 CONTROL_TEXT = {"policy": "the policy drives", "human": "YOU drive", "returning": "giving back"}
+STDERR = 2
 
 
 def _check_visible() -> None:
@@ -176,3 +179,25 @@ class Window:
         height, width = picture.shape[:2]
         surface: Any = pygame.image.frombuffer(picture.tobytes(), (width, height), "RGB")
         self._screen.blit(surface, place)
+
+
+@contextmanager
+def quiet_stderr() -> Iterator[None]:
+    """Drop what is written to stderr meanwhile, by any thread: keep it short.
+
+    SDL and what it tries say more than one line where there is no screen; ours says it all.
+    """
+    sys.stderr.flush()
+    try:
+        kept = os.dup(STDERR)
+    except OSError:  # It was closed, and nobody would read it.
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, STDERR)
+        yield
+    finally:
+        os.dup2(kept, STDERR)
+        os.close(kept)
+        os.close(nowhere)

@@ -11,7 +11,7 @@ import numpy as np
 
 from bridge.report import COLLISION, GOAL
 from trainer.drivers import MODEL_FILE
-from trainer.evaluation import CONDITIONS
+from trainer.evaluate import CONDITIONS
 from trainer.experiments.data import Result, Results
 from trainer.experiments.plan import CONSTANT, FULL_PATH_M, HUMAN_MODEL, QUICK, SCENARIOS, Unit
 from trainer.experiments.run import Store

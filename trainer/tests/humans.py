@@ -1,6 +1,9 @@
-"""Pedals, and a driver who knows only one of them."""
+"""Pedals, a driver who knows only one of them, and drives to which a human may object."""
 
 import numpy as np
+
+from bridge.report import GOAL
+from trainer.drivers import EXPERTS, TRIGGERS
 
 FULL, NOTHING, BRAKE = (np.array([pedal], np.float32) for pedal in (1.0, 0.0, -1.0))
 
@@ -13,3 +16,21 @@ class Brakes:
 
     def act(self, observation):
         return BRAKE
+
+
+def objections(env, driver, drives):
+    """Drives with the seeds 0, 1, ...; how many arrived, and to how many of those it objected."""
+    trigger = TRIGGERS[env.scenario](EXPERTS[env.scenario](env))
+    arrived = objected = 0
+    for seed in range(drives):
+        observation, info = env.reset(seed=seed)
+        driver.reset()
+        trigger.reset()
+        reasons = set()
+        while "outcome" not in info:
+            action = driver.act(observation)
+            reasons.add(trigger.judge(action))
+            observation, _, _, _, info = env.step(action)
+        arrived += info["outcome"] == GOAL
+        objected += info["outcome"] == GOAL and reasons != {None}
+    return {"drives": drives, "arrived": arrived, "objected_of_these": objected}

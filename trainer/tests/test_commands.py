@@ -1,7 +1,10 @@
 """The command line as a user meets it, mistakes included."""
 
+import argparse
 import json
+import math
 import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -11,9 +14,10 @@ from edge_runtime.tests.harness import exit_status
 from edge_runtime.tests.policies import public_pem
 from edge_runtime.util import UserError
 from trainer.__main__ import main
-from trainer.commands.settings import with_setting
-from trainer.files import save_torch
+from trainer.commands.train import settings, with_setting
+from trainer.options import add_time_limit, deadline_s, until
 from trainer.training.config import RunConfig
+from trainer.util import save_torch
 
 POLICY = str(Path(__file__).parents[2] / "results" / "policies" / "left_turn.onnx")
 
@@ -74,7 +78,6 @@ WRONG = [
     ("bench", "--out", ""),
     ("experiment", "status", "--results", ""),
     ("bench", "--out", "/dev/null/b.json"),
-    (),
 ]
 
 
@@ -226,3 +229,116 @@ def test_a_foreign_torch_file_is_said_in_one_line(name, capsys, tmp_path):
 def test_a_wrong_setting_is_told_what_would_be_right(assignment, expected):
     with pytest.raises(UserError, match=f"^--set {assignment}: {expected}$"):
         with_setting(RunConfig(), assignment)
+
+
+@pytest.fixture
+def run_dir(tmp_path):
+    (tmp_path / "checkpoint.pt").write_bytes(b"none that could be read")
+    values = RunConfig(seed=3, episodes=4, evaluate_every_steps=7, human="person").as_dict()
+    values["learner"]["batch_size"] = 8
+    (tmp_path / "config.json").write_text(json.dumps(values))
+    return tmp_path
+
+
+GIVEN = (
+    "--resume", "--seed", "3", "--episodes", "4", "--human", "keyboard", "--set", "batch_size=8",
+    "--set", "evaluate_every_steps=7",
+)  # fmt: skip
+
+
+def test_changed_settings_are_named_as_they_are_given(run_dir, capsys):
+    status, _, err = call(capsys, "train", "--out", str(run_dir), "--resume")
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert (
+        "was trained with --seed 3 (now 0), --human keyboard|gamepad|wheel|web (now expert), "
+        "--set evaluate_every_steps=7 (now 500), --set batch_size=8 (now 128): repeat"
+    ) in err
+
+
+def test_the_same_settings_are_let_in_as_far_as_the_checkpoint(run_dir, capsys):
+    path = run_dir / "config.json"
+    values = json.loads(path.read_text())
+    values["human"] = "expert"
+    path.write_text(json.dumps(values))
+    given = tuple("expert" if word == "keyboard" else word for word in GIVEN)
+    _, _, err = call(capsys, "train", "--out", str(run_dir), *given)
+    assert "is not a checkpoint of this project" in err
+
+
+def test_a_setting_that_the_run_did_not_have_is_named(run_dir, capsys):
+    path = run_dir / "config.json"
+    values = json.loads(path.read_text())
+    del values["learner"]["gamma"], values["averaged_actor"]
+    path.write_text(json.dumps(values))
+    _, _, err = call(capsys, "train", "--out", str(run_dir), *GIVEN)
+    assert "no averaged_actor (now True), no gamma (now 0.95): repeat" in err
+
+
+@pytest.mark.parametrize("spoilt", [{"learner": 3}, {"episodes": None}, {"episodes": "many"}])
+def test_a_config_that_is_none_is_one_line(spoilt, run_dir, capsys):
+    path = run_dir / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **spoilt}))
+    status, _, err = call(capsys, "train", "--out", str(run_dir), *GIVEN)
+    assert (status, len(err.splitlines())) == (2, 1)
+
+
+def limit(*arguments: str) -> float:
+    parser = argparse.ArgumentParser()
+    add_time_limit(parser, "stop")
+    return deadline_s(parser.parse_args(arguments))
+
+
+def test_minutes_count_from_now_and_none_is_no_limit():
+    before_s = time.monotonic()
+    end_s = limit("--max-minutes", "2")
+    assert before_s + 120.0 <= end_s <= time.monotonic() + 120.0
+    assert limit() == math.inf
+
+
+def test_nothing_is_begun_after_the_deadline():
+    begun = []
+
+    def parts():
+        for part in range(3):
+            begun.append(part)
+            yield part
+
+    assert list(until(math.inf, parts())) == [0, 1, 2]
+    begun.clear()
+    assert list(until(time.monotonic() - 1.0, parts())) == [0]
+    assert begun == [0]
+
+
+def test_a_human_model_whose_time_is_up_is_refined_in_proportion_and_kept(tmp_path, capsys):
+    out = tmp_path / "human"
+    arguments = ["human", "--out", str(out), "--max-minutes", "1e-6", "--updates-per-episode", "1"]
+    assert main([*arguments, "--refining-updates", "100"]) == 0
+    report = json.loads((out / "human.json").read_text())
+    assert report["episodes"] == 1
+    assert report["config"]["episodes"] == 50
+    said = capsys.readouterr().err
+    assert "the time is over after 1 of 50 episodes" in said
+    assert "refining: 2/2" in said  # 100 steps are for 50 episodes
+    assert (out / "human_model.pt").is_file()
+
+
+def test_the_settings_are_listed_with_defaults_and_meanings(capsys):
+    status, out, _ = call(capsys, "train", "--set")
+    assert status == 0
+    lines = out.splitlines()
+    assert all(len(line) <= 98 for line in lines)
+    assert "  batch_size=128                    transitions in a minibatch (table A5: N)" in lines
+    assert [name for name in settings() if f"  {name}=" not in out] == []
+
+
+def test_a_misspelt_setting_or_command_is_told_what_comes_near(capsys, tmp_path):
+    given = ("train", "--out", str(tmp_path / "x"), "--set", "bach_size=4")
+    status, _, err = call(capsys, *given)
+    assert (status, "did you mean batch_size?" in err) == (2, True)
+    status, _, err = call(capsys, "trian")
+    assert (status, "did you mean train?" in err, len(err.splitlines())) == (2, True, 1)
+
+
+def test_a_bare_command_prints_its_help(capsys):
+    status, out, _ = call(capsys)
+    assert (status, "experiment" in out) == (0, True)

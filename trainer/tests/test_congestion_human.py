@@ -4,14 +4,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trainer.benches.objections import objections
 from trainer.drivers import NetworkDriver
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 from trainer.human.congestion import CongestionExpert, CongestionTrigger
 from trainer.human.dagger import HumanTraining
 from trainer.human.model import HumanModelConfig
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.traffic import CAR
+from trainer.tests.humans import objections
 from trainer.tests.test_congestion import CENTRED, LEFT, RIGHT, STRAIGHT
 
 ALONE = replace(CENTRED, side_cars=1, side_front_m=(60.0, 60.0))

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from bridge.environments import CONDITIONS as SERVED
-from trainer.conditions import CONDITIONS
-from trainer.drivers import EXPERTS, make_environment
-from trainer.evaluation import drive_episodes
+from trainer.drivers import CONDITIONS, EXPERTS, make_environment
+from trainer.evaluate import drive_episodes
 from trainer.scenarios.picture import overlap
 from trainer.scenarios.traffic import CAR
 

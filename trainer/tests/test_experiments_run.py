@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
-from trainer.evaluation import CONDITIONS
+from trainer.evaluate import CONDITIONS
 from trainer.experiments import plan as planned
 from trainer.experiments import run as running
 from trainer.experiments.plan import (

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trainer.benches.objections import objections
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 from trainer.human.guide import HumanGuide
 from trainer.human.left_turn import Crossing, LeftTurnExpert, LeftTurnTrigger, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes
+from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes, objections
 
 ONE_CAR = LeftTurnConfig(traffic_cars=1, traffic_speed_mps=(5.0, 5.0), ego_speed_mps=(4.0, 4.0))
 

@@ -7,7 +7,7 @@ import pytest
 
 from bridge.network import LatencySpec, parse_spec
 from trainer.drivers import make_environment
-from trainer.evaluation import drive_episode
+from trainer.evaluate import drive_episode
 from trainer.training.delayed import (
     DirectWheel,
     RemoteDriver,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from trainer.actions import ACTIONS
-from trainer.drivers import make_environment
+from trainer.drivers import ACTIONS, make_environment
 from trainer.scenarios import SCENARIOS
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)

@@ -19,7 +19,6 @@ from edge_runtime.util import UserError
 from trainer import seeds
 from trainer.commands.train import _quit as ask_to_quit
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
-from trainer.files import load_torch, save_torch
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import ReplayBuffer
 from trainer.plots import moving_average, write_learning_curve
@@ -28,6 +27,7 @@ from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import TrainingRun
+from trainer.util import load_torch, save_torch
 
 TINY = RunConfig(
     seed=3,

@@ -9,7 +9,7 @@ import pytest
 
 from trainer.__main__ import main
 from trainer.drivers import EXPERTS, make_environment
-from trainer.evaluation import drive_episodes
+from trainer.evaluate import drive_episodes
 from trainer.scenarios.traffic import CAR, CARS_ONLY, MIXED, draw_types, idm_acceleration
 
 SCENARIOS = ("left_turn", "congestion")

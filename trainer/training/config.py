@@ -8,7 +8,7 @@ from typing import Any
 
 from edge_runtime.util import UserError
 from trainer.learner.config import PRINTED_LEARNER, LearnerConfig
-from trainer.ranges import FROM_ONE, FROM_ZERO, SHARE, check_ranges
+from trainer.util import FROM_ONE, FROM_ZERO, SHARE, check_ranges
 
 MOST_THREADS = 1024
 """More than a machine could use. Torch dies where the system has fewer than it asks for."""

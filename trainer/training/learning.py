@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
 from trainer import seeds
-from trainer.files import as_arrays, as_tensors
 from trainer.learner.config import Algorithm, LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.training.delayed import Store
+from trainer.util import as_arrays, as_tensors
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]

@@ -18,12 +18,10 @@ from edge_runtime.files import write_json
 from edge_runtime.util import UserError
 from trainer import seeds
 from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, make_environment
-from trainer.files import load_torch, save_torch
 from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
 from trainer.learner.config import ALGORITHMS, HUMANS_ACTION
 from trainer.learner.td3 import TD3Learner
-from trainer.revision import source_revision
 from trainer.training.config import BIASED, RunConfig
 from trainer.training.delayed import make_wheel
 from trainer.training.learning import Action, Learning, LearningThread
@@ -36,6 +34,7 @@ from trainer.training.metrics import (
     totals,
 )
 from trainer.training.validation import Validation
+from trainer.util import load_torch, save_torch, source_revision
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 

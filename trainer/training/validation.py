@@ -12,11 +12,11 @@ from bridge.network import LatencySpec
 from bridge.report import GOAL, EpisodeResult
 from trainer import seeds
 from trainer.drivers import BEST_FILE, make_environment
-from trainer.evaluation import NO_NETWORK, drive_episodes, drive_together
-from trainer.files import save_torch
+from trainer.evaluate import NO_NETWORK, drive_episodes, drive_together
 from trainer.training.config import RunConfig
 from trainer.training.learning import Learning, LearningDriver
 from trainer.training.metrics import EpisodeMetrics
+from trainer.util import save_torch
 
 
 class Validation:

@@ -1,3 +1,56 @@
-from trainer.tests.conftest import one_thread
+"""A cockpit, and one Chromium for all tests of the page."""
 
-__all__ = ["one_thread"]
+import asyncio
+
+import pytest
+
+from trainer.person.tests.browser import open_browser, until
+from trainer.person.tests.pages import READY, first_view
+from trainer.person.web import Cockpit
+from trainer.tests.conftest import one_thread
+from trainer.util import find_chromium
+
+__all__ = ["browser", "cockpit", "one_thread", "opened", "runner"]
+
+FAKE_PADS = """
+globalThis.pads = {};
+navigator.getGamepads = () => [0, 1, 2, 3].map((index) => globalThis.pads[index] ?? null);
+globalThis.plug = (id, mapping, axes, buttons) => {
+  globalThis.pads[0] = { id, mapping, axes, index: 0, connected: true,
+    buttons: buttons.map((value) => ({ value, pressed: value > 0.5 })) };
+};
+"""
+"""Headless Chromium has no gamepad: the page is given one that says what the test wants."""
+
+
+@pytest.fixture(scope="module")
+def runner():
+    if find_chromium() is None:
+        pytest.skip("no Chromium (Debian: apt-get install chromium)")
+    pytest.importorskip("playwright")
+    with asyncio.Runner() as runner:
+        yield runner
+
+
+@pytest.fixture(scope="module")
+def browser(runner):
+    context = open_browser([FAKE_PADS])
+    browser = runner.run(context.__aenter__())
+    yield browser
+    runner.run(context.__aexit__(None, None, None))
+
+
+@pytest.fixture
+def cockpit():
+    cockpit = Cockpit()
+    yield cockpit
+    cockpit.close()
+
+
+@pytest.fixture
+def opened(runner, browser, cockpit):
+    """The browser has the cockpit open, with the left turn in view."""
+    cockpit.show(first_view())
+    runner.run(browser.goto(cockpit.url))
+    runner.run(browser.evaluate("localStorage.clear()"))
+    runner.run(until(browser, READY))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from trainer.drivers import make_environment
 from trainer.person.interface import LET_GO, Person, Reading, View, Wish
-from trainer.person.recording import Recorder
-from trainer.person.sitting import Sitting
+from trainer.person.recording import Recorder, Step
+from trainer.person.session import Sitting
 
 QUICK = 1000.0
 """Simulated seconds in one of a test's."""
@@ -86,3 +89,35 @@ def make_sitting(
     person = Person(Hands(readings, then), eyes)
     env = make_environment("left_turn")
     return Sitting(person, Recorder(directory), env, alone, QUICK), eyes
+
+
+def picture(value: int) -> bytes:
+    """A frame that is hard to compress, a different one for each value."""
+    return np.random.default_rng(value).integers(0, 255, (45, 80), np.uint8).tobytes()
+
+
+def recorded_step(sitting: int, index: int, **changes: Any) -> Step:
+    """Step ``index`` of an episode that began with the sitting."""
+    values: dict[str, Any] = {
+        "sitting": sitting,
+        "index": index,
+        "scenario": "left_turn",
+        "seed": 1,
+        "episode": 0,
+        "step": index,
+        "time_ns": 10**9 + index * 10**8,
+        "time_s": 0.1 * index,
+        "frames": picture(index) + picture(index + 1),
+        "next_frame": picture(index + 2),
+        "policy_action": 0.25,
+        "human_action": -0.5,
+        "action": 0.25,
+        "control": "policy",
+        "human": False,
+        "first": False,
+        "reward": float(index),
+        "terminated": False,
+        "truncated": False,
+        "speed_mps": 3.0,
+    }
+    return Step(**{**values, **changes})

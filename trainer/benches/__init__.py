@@ -1,1 +1,0 @@
-"""What ``python -m trainer bench`` measures, a module for each idea."""

@@ -1,0 +1,155 @@
+"""Options that several commands share; options and their meanings from a config's own fields."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import inspect
+import math
+import re
+import textwrap
+import time
+from collections.abc import Callable, Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+from bridge.network import GRAMMAR
+from edge_runtime import util
+from edge_runtime.cli import not_negative, positive_number, whole_number
+from edge_runtime.util import UserError
+from trainer.scenarios import SCENARIOS
+from trainer.training.config import MOST_THREADS
+
+Part = TypeVar("Part")
+Group = argparse.ArgumentParser | argparse._ArgumentGroup
+
+
+def add_scenario(parser: Group) -> None:
+    """``--scenario``."""
+    parser.add_argument(
+        "--scenario", choices=list(SCENARIOS), default="left_turn", help="what is driven"
+    )
+
+
+def add_seed(parser: Group, what: str) -> None:
+    """``--seed``; ``what`` says of what."""
+    parser.add_argument(
+        "--seed", type=not_negative, default=0, metavar="N", help=f"the seed of {what}"
+    )
+
+
+def add_threads(parser: Group) -> None:
+    """``--threads``."""
+    parser.add_argument(
+        "--threads",
+        # torch asks the system for as many at once, and dies where it has none.
+        type=whole_number(0, MOST_THREADS),
+        default=0,
+        metavar="N",
+        help="processor threads of the learner; 0: all cores",
+    )
+
+
+def add_latency(parser: Group, what: str) -> None:
+    """``--latency``, as it is typed: a run's config keeps the text."""
+    parser.add_argument(
+        "--latency",
+        metavar="SPEC",
+        default="none",
+        help=f"{what}, in virtual time: {GRAMMAR}".replace("%", "%%"),
+    )
+
+
+def add_time_limit(parser: Group, what: str) -> None:
+    """``--max-minutes``; ``what`` says what becomes of the work then."""
+    parser.add_argument(
+        "--max-minutes",
+        type=positive_number,
+        metavar="MIN",
+        help=f"{what} (default: no limit)",
+    )
+
+
+def deadline_s(arguments: argparse.Namespace, clock: Callable[[], float] = time.monotonic) -> float:
+    """When the minutes from now are over, as of ``clock``; infinity without a limit."""
+    limit = arguments.max_minutes
+    return math.inf if limit is None else clock() + 60.0 * limit
+
+
+def until(end_s: float, parts: Iterable[Part]) -> Iterator[Part]:
+    """The parts that begin by then, as of ``time.monotonic()``, and the first in any case."""
+    for part in parts:
+        yield part
+        if time.monotonic() > end_s:
+            return
+
+
+def add_fields(parser: Group, config: Any, *names: str) -> None:
+    """An option for each named field of a config: its default and meaning are the field's.
+
+    The config itself checks the ranges, once it is made of the options.
+    """
+    said = meanings(type(config))
+    for name in names:
+        option, default = f"--{name.replace('_', '-')}", getattr(config, name)
+        if isinstance(default, bool):
+            said_of_flag = said[name].removeprefix("whether ")
+            parser.add_argument(option, action="store_true", help=said_of_flag)
+        else:
+            parser.add_argument(
+                option, type=not_negative, default=default, metavar="N", help=said[name]
+            )
+
+
+def meanings(config: type) -> dict[str, str]:
+    """Field of a dataclass -> the first sentence of the docstring that stands below it."""
+    (made,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
+    assert isinstance(made, ast.ClassDef)
+    found = {}
+    for field, text in pairwise(made.body):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+            assert isinstance(field.target, ast.Name)
+            docstring = " ".join(ast.literal_eval(text.value).replace("``", "").split())
+            sentence = re.split(r"\. (?=[A-Z(])|\.$", docstring)[0]
+            is_word = sentence[1:2].islower() or sentence[1:2] == " "
+            found[field.target.id] = sentence[0].lower() + sentence[1:] if is_word else sentence
+    return found
+
+
+def set_threads(count: int) -> None:
+    """Limit torch's threads; 0 leaves them as they are."""
+    if count:
+        import torch  # takes two seconds, which whoever asks for help need not wait
+
+        torch.set_num_threads(count)
+
+
+def check_suffix(out: str, what: str, *suffixes: str) -> None:
+    """Refuse a name that says something else than what will be in the file; raises UserError."""
+    if not out.endswith(suffixes):
+        raise UserError(f"--out {out}: {what}")
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Raises:
+        UserError: no file, or something else in it.
+    """
+    value = util.read_json(path, what)
+    if not isinstance(value, dict):
+        raise UserError(f"{what} {path} holds no JSON object")
+    return value
+
+
+def existing_directory(path: str, what: str) -> Path:
+    """A directory that is there.
+
+    Raises:
+        UserError: it is not.
+    """
+    directory = Path(path)
+    if not directory.is_dir():
+        raise UserError(f"{what} {path} does not exist")
+    return directory

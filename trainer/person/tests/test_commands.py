@@ -1,0 +1,251 @@
+"""The person's commands as a user meets them, mistakes included."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trainer.drivers import CHECKPOINT_FILE, load_driver, make_environment
+from trainer.person.interface import HUMANS, LET_GO, Person
+from trainer.person.recording import Recorder, find_recordings, read_steps
+from trainer.person.session import STOPPED
+from trainer.person.tests.people import QUIT, Discarding, Eyes, Hands, recorded_step
+from trainer.tests.test_commands import call
+from trainer.training.metrics import read_metrics
+from trainer.training.run import TrainingRun
+from trainer.util import load_torch
+
+DRIVE = ("drive", "--out", "{tmp}/rec")
+TRAIN = ("train", "--out", "{tmp}/run")
+SHIPPED = str(Path(__file__).parents[3] / "results/policies/left_turn.onnx")
+WIRE = str(Path(__file__).parents[3] / "hil_tests/recordings/left_turn.mcap")
+WRONG = [
+    (DRIVE, ("--human", "telepathy"), "invalid choice"),
+    (DRIVE, ("--human", "wheel", "--profile", "{tmp}/none.toml"), "does not exist"),
+    (DRIVE, ("--human", "wheel", "--profile", "{tmp}/bad.toml"), "missing required field"),
+    (DRIVE, ("--human", "wheel"), "no wheel that fits the profile g29.toml (G29)"),
+    (DRIVE, ("--human", "gamepad"), "none is plugged in"),
+    (DRIVE, ("--human", "keyboard", "--profile", "x"), "--profile means nothing"),
+    (DRIVE, ("--human", "keyboard", "--port", "80"), "--port means nothing"),
+    (DRIVE, ("--human", "web", "--port", "70000"), "not a whole number from 0 to 65535"),
+    (DRIVE, ("--human", "web", "--port", "http"), "'http' is not a whole number"),
+    (DRIVE, ("--human", "web", "--host", "a..b"), "the cockpit cannot listen on a..b"),
+    (DRIVE, ("--speed", "0"), "not a finite number above 0"),
+    (DRIVE, ("--policy", "{tmp}/nobody"), "is no policy"),
+    (DRIVE, ("--scenario", "congestion", "--policy", SHIPPED), "and congestion asks for steering"),
+    (("drive", "--out", "{tmp}/file"), (), "cannot create the directory"),
+    (("drive", "--scenario", "congestion"), ("--device", "gamepad"), "none is plugged in"),
+    (DRIVE, ("--calibrate", "{tmp}/p.toml"), "not allowed with argument --out"),
+    (("drive", "--calibrate", "{tmp}/p.toml"), (), "--calibrate asks a --human gamepad or wheel"),
+    (("drive", "--calibrate", "{tmp}/p.toml"), ("--human", "wheel"), "no wheel is plugged in"),
+    (("drive", "--calibrate", "{tmp}/file/p.toml"), ("--human", "wheel"), "cannot write"),
+    (TRAIN, ("--human", "keyboard", "--algorithm", "per_td3"), "takes no guidance"),
+    (TRAIN, ("--human", "keyboard", "--set", "guided_share=0.5"), "watches every episode"),
+    (TRAIN, ("--human", "keyboard", "--set", "poor_guidance_share=0.3"), "not replaced"),
+    (TRAIN, ("--speed", "2"), "--speed means nothing with --human expert"),
+    (TRAIN, ("--human", "keyboard", "--resume"), "no checkpoint"),
+    (("human", "--out", "{tmp}/h", "--from", "{tmp}"), (), "no recording in"),
+    (("human", "--out", "{tmp}/h", "--from", "{tmp}/file"), (), "no recording of a sitting"),
+    (("human", "--out", "{tmp}/h", "--from", WIRE), (), f"`python -m bridge view {WIRE}` shows it"),
+    (("view", WIRE, "--save", "{tmp}/v.rrd"), (), "is a recording of the wire"),
+]
+
+
+@pytest.mark.parametrize(("command", "more", "complaint"), WRONG)
+def test_a_mistake_is_one_line_and_status_2(
+    capsys, tmp_path, monkeypatch, command, more, complaint
+):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    (tmp_path / "file").write_text("not a recording")
+    (tmp_path / "bad.toml").write_text('name = "half"\n')
+    arguments = [word.format(tmp=tmp_path) for word in (*command, *more)]
+    status, _, errors = call(capsys, *arguments)
+    assert status == 2
+    assert complaint in errors
+    assert errors.count("\n") == 1
+    assert {path.name for path in tmp_path.iterdir()} <= {"bad.toml", "file"}
+
+
+@pytest.mark.parametrize("driver", ["x11", None])
+def test_without_a_screen_it_says_what_to_do(capfd, tmp_path, monkeypatch, driver):
+    """Left to itself, SDL would draw into memory, and nobody would see it drive."""
+    if driver is None:
+        monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    else:
+        monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":9999")
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    status, _, errors = call(capfd, "drive", "--out", str(tmp_path / "rec"))
+    assert status == 2
+    assert "--human web needs none" in errors
+    assert errors.count("\n") == 1
+
+
+def test_whoever_quits_before_the_first_episode_has_lost_nothing(
+    capsys, tmp_path, monkeypatch, one_thread
+):
+    hands = Hands([], then=QUIT)
+    hands.present = False
+    monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, Eyes()))
+    command = ["train", "--human", "keyboard", "--out", str(tmp_path / "run"), "--speed", "1000"]
+    status, out, errors = call(capsys, *command)
+    assert (status, errors.strip()) == (0, "nothing was driven, and nothing recorded")
+    assert "no episodes" in out
+    assert call(capsys, *command, "--resume")[0] == 0
+
+
+def test_a_device_and_a_scenario_are_all_that_must_be_said(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    person = Person(Hands([LET_GO] * 3, then=QUIT), Eyes())
+    monkeypatch.setitem(HUMANS, "keyboard", lambda options: person)
+    command = ("drive", "--scenario", "left_turn", "--device", "keyboard", "--speed", "1000")
+    status, out, _ = call(capsys, *command)
+    assert status == 0
+    (recording,) = (tmp_path / "runs" / "drives").iterdir()
+    assert str(recording.relative_to(tmp_path)) in out
+
+
+def test_a_validation_that_is_left_out_costs_nothing_else(
+    capsys, tmp_path, monkeypatch, one_thread
+):
+    def interrupted(*_arguments):
+        raise KeyboardInterrupt
+
+    person = Person(Hands([LET_GO] * 3, then=QUIT), Eyes())
+    monkeypatch.setitem(HUMANS, "keyboard", lambda options: person)
+    monkeypatch.setattr(TrainingRun, "_validate", interrupted)
+    run_dir = tmp_path / "run"
+    command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
+    status, out, errors = call(capsys, *command)
+    assert status == 0
+    assert "validation left out" in errors
+    assert "1 episode, 4 steps" in out
+    assert [row["outcome"] for row in read_metrics(run_dir)] == [STOPPED]
+    assert (run_dir / "learning_curve.png").is_file()
+
+
+def record(directory, steps):
+    recorder = Recorder(directory)
+    for step in steps:
+        recorder.write(step)
+    recorder.close()
+
+
+def demonstrated(index: int):
+    """Bright pictures are answered with throttle, dark ones with brake."""
+    bright = index % 2 == 0
+    value = bytes([200 if bright else 20]) * 3600
+    return recorded_step(
+        1,
+        index,
+        frames=value + value,
+        control="human",
+        human=True,
+        first=index == 0,
+        human_action=0.8 if bright else -0.8,
+        action=0.0,
+    )
+
+
+def test_a_human_model_learns_what_the_hands_did(capsys, tmp_path, one_thread):
+    letting_go = recorded_step(1, 8, control="returning", human=True, human_action=0.0)
+    record(tmp_path / "a", [*map(demonstrated, range(8)), letting_go, recorded_step(1, 9)])
+    record(tmp_path / "b", [demonstrated(0)])
+    command = ["human", "--from", str(tmp_path / "a"), str(tmp_path / "b"), "--episodes", "3"]
+    status, out, errors = call(capsys, *command, "--out", str(tmp_path / "me"))
+    assert (status, errors.count("error")) == (0, 0)
+    assert "human model from 9 demonstrated steps" in out
+    about = json.loads((tmp_path / "me" / "human.json").read_text())
+    assert (about["demonstrations"], about["interventions"]) == (9, 2)
+    driver, _ = load_driver(str(tmp_path / "me"), make_environment("left_turn"))
+    assert driver.act(np.full((2, 45, 80), 200, np.uint8))[0] > 0.3
+    assert driver.act(np.full((2, 45, 80), 20, np.uint8))[0] < -0.3
+
+
+def episodes_of_two_steps(directory):
+    """Sitting 1: episodes 0 to 2, all the person's; the last was thrown away."""
+    record(
+        directory,
+        [
+            recorded_step(
+                1,
+                index,
+                episode=index // 2,
+                step=index % 2,
+                control="human",
+                human=True,
+                first=index % 2 == 0,
+                outcome="discarded" if index == 5 else "",
+            )
+            for index in range(6)
+        ],
+    )
+
+
+@pytest.mark.parametrize(
+    ("left_out", "steps"), [((), 4), (("1:0",), 2), (("1:1", "1:01"), 2), (("1:0", "1:1"), 0)]
+)
+def test_what_was_thrown_away_or_is_left_out_is_not_imitated(
+    capsys, tmp_path, one_thread, left_out, steps
+):
+    episodes_of_two_steps(tmp_path / "rec")
+    command = ["human", "--from", str(tmp_path / "rec"), "--episodes", "1"]
+    more = ["--leave-out", *left_out] if left_out else []
+    status, out, errors = call(capsys, *command, "--out", str(tmp_path / "me"), *more)
+    if steps:
+        assert (status, f"from {steps} demonstrated steps" in out) == (0, True)
+    else:
+        assert (status, "nobody took over" in errors) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "complaint"),
+    [("1:9", "no such episode"), ("2", "no such episode"), ("1:2:3", "no SITTING"), ("-1", "")],
+)
+def test_leaving_out_what_is_not_there_is_one_line(capsys, tmp_path, left_out, complaint):
+    episodes_of_two_steps(tmp_path / "rec")
+    command = ["human", "--from", str(tmp_path / "rec"), "--out", str(tmp_path / "me")]
+    status, _, errors = call(capsys, *command, "--leave-out", left_out)
+    assert (status, complaint in errors, errors.count("\n")) == (2, True, 1)
+    assert not (tmp_path / "me" / "human.pt").exists()
+
+
+def test_a_person_is_not_imitated_in_what_they_threw_away(
+    capsys, tmp_path, monkeypatch, one_thread
+):
+    """Three episodes, the second thrown away after its end: neither stored nor brought back."""
+    eyes, run_dir = Eyes(), tmp_path / "run"
+    hands = Discarding(eyes, discarded={1}, episodes=3)
+    monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, eyes))
+    command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
+    quick = ["--threads", "1", "--set", "evaluate_every_steps=0", "--set", "warmup_steps=8"]
+    status, out, errors = call(capsys, *command, *quick)
+    assert status == 0, errors
+    assert "2 episodes, 1 episode discarded" in errors
+    rows = read_metrics(run_dir)
+    assert [row["outcome"] == "discarded" for row in rows] == [False, True, False]
+    lengths = [int(row["steps"]) for row in rows]
+    kept = lengths[0] + lengths[2]
+    assert [int(row["total_steps"]) for row in rows] == [lengths[0], lengths[0], kept]
+    assert f"{kept} steps" in out
+    replay = load_torch(run_dir / CHECKPOINT_FILE)["learning"]["replay"]
+    assert int(replay["human"].sum()) == sum(int(rows[n]["human_steps"]) for n in (0, 2))
+    (recording,) = find_recordings([run_dir])
+    assert len(list(read_steps(recording))) == sum(lengths), "all of it is recorded"
+
+
+def test_recordings_that_teach_nothing_are_refused(capsys, tmp_path):
+    record(tmp_path / "policy", [recorded_step(1, 0)])
+    record(tmp_path / "other", [demonstrated(0)])
+    command = ["human", "--out", str(tmp_path / "me"), "--from"]
+    assert "nobody took over" in call(capsys, *command, str(tmp_path / "policy"))[2]
+    wrong = call(capsys, *command, str(tmp_path / "other"), "--scenario", "congestion")
+    assert "was driven in left_turn, not in congestion" in wrong[2]
+    label = call(capsys, *command, str(tmp_path / "other"), "--label-every-step")
+    unaided = call(capsys, *command, str(tmp_path / "other"), "--unaided-share", "4")
+    assert all("ask the scripted expert" in refused[2] for refused in (label, unaided))
+    assert {wrong[0], label[0], unaided[0]} == {2}

@@ -1,0 +1,230 @@
+"""Keys, axes and buttons: SDL's own events, and SDL's own virtual wheel."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from bridge import rerun
+from trainer.drivers import load_driver, make_environment
+from trainer.person.devices import JoystickHands, KeyboardHands, WindowDevice, pygame
+from trainer.person.profile import SHIPPED, read_profile
+from trainer.person.tests.pages import first_view
+from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
+from trainer.person.window import SIZE, Window
+
+G29 = read_profile(SHIPPED / "g29.toml")
+
+
+def key(down: bool, code: int):
+    return pygame.event.Event(pygame.KEYDOWN if down else pygame.KEYUP, key=code)
+
+
+def test_a_held_key_takes_over_and_its_action_grows():
+    hands = KeyboardHands("left_turn")
+    assert not hands.read(0.0).engaged
+    hands.handle(key(True, pygame.K_DOWN))
+    readings = [hands.read(0.1 * period) for period in range(1, 4)]
+    assert [r.action for r in readings] == pytest.approx([-0.5, -1.0, -1.0])
+    assert all(r.engaged for r in readings)
+    hands.handle(key(False, pygame.K_DOWN))
+    assert hands.read(0.5) == KeyboardHands("left_turn").read(0.0)
+
+
+def test_a_tap_between_two_readings_is_not_missed():
+    hands = KeyboardHands("congestion")
+    hands.read(0.0)
+    hands.handle(key(True, pygame.K_LEFT))
+    hands.handle(key(False, pygame.K_LEFT))
+    reading = hands.read(0.1)
+    assert reading.engaged
+    assert reading.action == pytest.approx(-0.25)
+    assert not hands.read(0.2).engaged
+
+
+def test_turning_round_does_not_first_undo():
+    hands = KeyboardHands("congestion")
+    hands.handle(key(True, pygame.K_RIGHT))
+    for period in range(5):
+        hands.read(0.1 * period)
+    hands.handle(key(False, pygame.K_RIGHT))
+    hands.handle(key(True, pygame.K_LEFT))
+    assert hands.read(0.5).action == pytest.approx(-0.25)
+
+
+def test_the_space_bar_holds_without_driving():
+    hands = KeyboardHands("left_turn")
+    hands.handle(key(True, pygame.K_SPACE))
+    reading = hands.read(0.0)
+    assert (reading.engaged, reading.action) == (True, 0.0)
+
+
+def test_keys_of_the_other_scenario_do_nothing():
+    hands = KeyboardHands("left_turn")
+    hands.handle(key(True, pygame.K_LEFT))
+    assert not hands.read(0.0).engaged
+
+
+def test_a_window_without_focus_holds_nothing():
+    hands = KeyboardHands("left_turn")
+    hands.handle(key(True, pygame.K_UP))
+    hands.read(0.0)
+    hands.handle(pygame.event.Event(pygame.WINDOWFOCUSLOST))
+    assert not hands.read(0.1).engaged
+
+
+def keys_for(wanted: float, action: float, keys: tuple[int, int], down: int | None) -> int | None:
+    """The key that a hand presses which wants an action and knows what its keys give now."""
+    if abs(wanted - action) > 0.12 and abs(wanted) > 0.08:
+        return keys[wanted > action]
+    return down if abs(wanted) > 0.3 and wanted * action > 0.0 else None
+
+
+@pytest.mark.parametrize(
+    ("scenario", "keys"),
+    [
+        ("left_turn", (pygame.K_DOWN, pygame.K_UP)),
+        ("congestion", (pygame.K_LEFT, pygame.K_RIGHT)),
+    ],
+)
+def test_keys_are_enough_to_drive(scenario, keys):
+    """Eyes that know the expert's mind, and a hand that is two tenths of a second behind."""
+    env = make_environment(scenario)
+    expert, _ = load_driver("expert", env)
+    outcomes = []
+    for seed in range(6):
+        observation, info = env.reset(seed=seed)
+        expert.reset()
+        hands, down, now_s, wanted, action = KeyboardHands(scenario), None, 0.0, [0.0, 0.0], 0.0
+        ended = False
+        while not ended:
+            wanted.append(float(expert.act(observation)[0]))
+            pressed = keys_for(wanted[-3], action, keys, down)
+            if pressed != down:
+                for code, is_down in ((down, False), (pressed, True)):
+                    if code is not None:
+                        hands.handle(key(is_down, code))
+                down = pressed
+            now_s += 0.1
+            action = hands.read(now_s).action
+            observation, _, terminated, truncated, info = env.step(np.array([action], np.float32))
+            ended = terminated or truncated
+        outcomes.append(info["outcome"])
+    assert outcomes == ["goal"] * 6
+
+
+@pytest.fixture
+def wheel(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    if load_sdl() is None:
+        pytest.skip("this pygame has no SDL of its own with virtual joysticks")
+    pygame.display.init()
+    pygame.joystick.init()
+    yield VirtualWheel()
+    pygame.quit()
+
+
+def read(device: WindowDevice):
+    """SDL tells axes on the next look at its devices."""
+    device.poll(time.monotonic())
+    return device.poll(time.monotonic())
+
+
+def test_pedals_nobody_has_touched_are_not_half_pressed(wheel):
+    device = WindowDevice(JoystickHands(G29, "left_turn"))
+    assert read(device).action == 0.0
+
+
+def test_axes_and_buttons_of_a_wheel(wheel):
+    device = WindowDevice(JoystickHands(G29, "congestion"))
+    wheel.axis(0, 0.25)
+    reading = read(device)
+    assert reading.action == pytest.approx(1.0, abs=1e-3)
+    assert reading.by_moving
+    assert not reading.engaged
+    wheel.button(4, True)
+    assert read(device).engaged
+    wheel.button(9, True)
+    readings = [device.poll(0.0) for _ in range(3)]
+    assert [r.wishes for r in readings].count(frozenset({"pause"})) == 1
+
+
+def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
+    device = WindowDevice(JoystickHands(G29, "congestion"))
+    wheel.axis(0, 0.25)
+    assert read(device).action > 0.9
+    wheel.unplug()
+    reading = read(device)
+    assert not device.present
+    assert (reading.action, reading.by_moving) == (0.0, False)
+    again = VirtualWheel()
+    read(device)
+    assert device.present
+    again.axis(0, -0.25)
+    assert read(device).action < -0.9
+
+
+def test_another_device_is_not_taken_for_the_profiles(wheel):
+    other = msgspec.structs.replace(G29, match="Thrustmaster")
+    assert not JoystickHands(other, "left_turn").present
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Opens a window on a screen of a size."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+    def opened(*screen):
+        monkeypatch.setattr(pygame.display, "get_desktop_sizes", lambda: [screen])
+        return Window()
+
+    yield opened
+    pygame.quit()
+
+
+def shown() -> pygame.Surface:
+    """What is in the window."""
+    surface = pygame.display.get_surface()
+    assert surface is not None
+    return surface
+
+
+def found(colour):
+    """Where a colour is seen, as (left, top, right, bottom)."""
+    mask = pygame.mask.from_threshold(shown(), colour, (12, 12, 12, 255))
+    boxes = mask.get_bounding_rects()
+    assert boxes, "not seen"
+    return boxes[0].unionall(boxes[1:])
+
+
+@pytest.mark.parametrize("screen", [(800, 480), (480, 800), (1024, 600), (3840, 2160)])
+def test_all_of_it_is_seen_on_any_screen(opened, screen):
+    window = opened(*screen)
+    window.show(replace(first_view(), applied_action=1.0, human_action=1.0))
+    width, height = pygame.display.get_window_size()
+    assert width <= min(screen[0], SIZE[0])
+    assert height <= min(screen[1], SIZE[1])
+    bar = found(rerun.APPLIED)  # Also the other car's colour, further up.
+    assert bar.bottom / height == pytest.approx((400 + 16 + 24 + 2 * 42 + 18) / SIZE[1], abs=0.01)
+
+
+def test_a_window_that_is_resized_shows_all_of_it_in_its_shape(opened):
+    window = opened(1920, 1080)
+    pygame.display.set_mode((520, 680), pygame.RESIZABLE)
+    window.show(replace(first_view(), human_action=1.0, control="policy"))
+    assert found(rerun.HUMAN).width == pytest.approx(200 / 2, abs=3)
+    assert found(rerun.HUMAN).top > 170, "in the middle"
+
+
+@pytest.mark.parametrize("control", ["policy", "human", "returning"])
+def test_the_car_has_the_colour_of_who_drives(opened, control):
+    opened(1920, 1080).show(replace(first_view(), control=control, human_action=0.0))
+    car = shown().subsurface((0, 0, 736, 400))
+    seen = {tuple(car.get_at((x, y)))[:3] for x in range(736) for y in range(400)}
+    others = {rerun.POLICY, rerun.HUMAN, rerun.RETURNING} - {rerun.BY_NAME[control]}
+    assert rerun.BY_NAME[control] in seen
+    assert not seen & others

@@ -1,0 +1,254 @@
+"""Real key events, through an X server, take over in a real training process."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trainer.drivers import CHECKPOINT_FILE
+from trainer.person.recording import DIRECTORY, Step, find_recordings, read_steps, sittings
+from trainer.person.takeover import MAX_SLEW
+from trainer.person.tests.browser import (
+    PERSON_DRIVES,
+    POLICY_DRIVES,
+    address,
+    open_browser,
+    quit_sitting,
+    until,
+)
+from trainer.person.tests.virtual_wheel import load_sdl
+from trainer.util import find_chromium, load_torch
+
+SOON_S = 60.0
+SMALL = ["--threads", "1", "--set", "batch_size=4", "--set", "evaluate_every_steps=0"]
+"""A learner that leaves the processor to the others."""
+
+
+class Training:
+    """A ``trainer train`` with a person in it.
+
+    Args:
+        run_dir: its directory.
+        module: whose command line begins with the trainer's command.
+        arguments: more of the command's.
+        environment: more variables.
+    """
+
+    def __init__(
+        self, run_dir: Path, module: str, arguments: Sequence[str], environment: dict[str, str]
+    ) -> None:
+        self.run_dir = run_dir
+        command = [sys.executable, "-m", module, "train", "--out", str(run_dir)]
+        self.process = subprocess.Popen(
+            [*command, *SMALL, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **environment},
+        )
+
+    def __enter__(self) -> Training:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+    def tell(self, line: str) -> int:
+        """Have the virtual wheel do something; when it was done, ns since 1970."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        print(line, file=self.process.stdin, flush=True)
+        answer = self.process.stdout.readline()
+        assert answer.startswith(f"did {line} "), answer
+        return int(answer.split()[-1])
+
+    def wait_for_step(self, wanted: Callable[[Step], bool]) -> Step:
+        """The first step of the newest sitting that is as wanted."""
+        end_s = time.monotonic() + SOON_S
+        while time.monotonic() < end_s and self.process.poll() is None:
+            for step in newest_sitting(self.run_dir):
+                if wanted(step):
+                    return step
+            time.sleep(0.05)
+        raise AssertionError(f"no such step: {self.process.poll()}")
+
+    def end(self) -> tuple[int, str]:
+        """Wait for its end: exit status, and stderr."""
+        _, errors = self.process.communicate(timeout=SOON_S)
+        return self.process.returncode, errors
+
+
+def newest_sitting(run_dir: Path) -> list[Step]:
+    """The steps of the sitting that is going on, or was last."""
+    there = sittings(run_dir / DIRECTORY)
+    return list(read_steps(there[-1])) if there else []
+
+
+def all_steps(run_dir: Path) -> list[Step]:
+    """The steps of all sittings."""
+    return [step for path in sittings(run_dir / DIRECTORY) for step in read_steps(path)]
+
+
+def assert_all_in_replay(run_dir: Path) -> None:
+    """The saved replay buffer holds the recorded steps, each with its mask and its action."""
+    replay: dict[str, Any] = load_torch(run_dir / CHECKPOINT_FILE)["learning"]["replay"]
+    steps = all_steps(run_dir)
+    assert replay["human"].tolist() == [step.human for step in steps]
+    actions = np.array([step.action for step in steps], np.float32)
+    np.testing.assert_array_equal(replay["actions"].numpy()[:, 0], actions)
+    assert replay["terminals"].tolist() == [float(step.terminated) for step in steps]
+
+
+def assert_taken_over_at_once(steps: Sequence[Step], began_ns: int, done_ns: int) -> None:
+    """The first control period that asked the hands after ``done_ns`` is already the person's.
+
+    One between ``began_ns`` and ``done_ns`` may be: a key is down before who presses it says so.
+    """
+    taken = next(number for number, step in enumerate(steps) if step.human)
+    before, after = steps[:taken], steps[taken:]
+    assert before
+    assert after[0].time_ns >= began_ns
+    assert before[-1].time_ns < done_ns
+    assert after[0].first
+    assert after[0].action != after[0].policy_action
+    # It has moved from what was applied before towards what the person wants, as far as it may.
+    together = before[-1].episode == after[0].episode
+    last = before[-1].action if together else after[0].policy_action
+    wanted = after[0].human_action
+    assert last is not None
+    assert after[0].action == last + min(max(wanted - last, -MAX_SLEW), MAX_SLEW)
+
+
+@pytest.fixture
+def display():
+    """A screen without a screen."""
+    for program in ("Xvfb", "xdotool"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is not installed (Debian packages xvfb and xdotool)")
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
+        pass_fds=[write],
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(write)
+    with os.fdopen(read) as pipe:
+        number = pipe.readline().strip()
+    yield {"DISPLAY": f":{number}", "SDL_VIDEODRIVER": "x11"}
+    server.terminate()
+    server.wait()
+
+
+def xdotool(display, *words) -> int:
+    """Do something as a person would; when it was done, ns since 1970."""
+    subprocess.run(["xdotool", *words], env={**os.environ, **display}, check=True, timeout=30)
+    return time.time_ns()
+
+
+def test_a_key_takes_over_at_once_and_everything_is_kept(tmp_path, display):
+    run_dir = tmp_path / "run"
+    with Training(run_dir, "trainer", ["--human", "keyboard"], display) as training:
+        training.wait_for_step(lambda step: step.step >= 2)
+        began_ns = time.time_ns()
+        done_ns = xdotool(display, "keydown", "Down")
+        training.wait_for_step(lambda step: step.human and step.action < -0.99)
+        let_go_ns = xdotool(display, "keyup", "Down")
+        back = training.wait_for_step(lambda step: step.time_ns > let_go_ns and not step.human)
+        steps = newest_sitting(run_dir)
+        assert_taken_over_at_once(steps, began_ns, done_ns)
+        after = next(step for step in steps if step.time_ns > let_go_ns)
+        assert after.control != "human"
+        assert back.action == back.policy_action
+        xdotool(display, "key", "q")
+        status, errors = training.end()
+    assert status == 0, errors
+    assert_all_in_replay(run_dir)
+
+
+WHEEL = "trainer.person.tests.virtual_wheel"
+WITHOUT_SCREEN = {"SDL_VIDEODRIVER": "dummy"}
+
+
+def train(run_dir, *more):
+    return Training(run_dir, WHEEL, ["--human", "wheel", *more], WITHOUT_SCREEN)
+
+
+def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
+    if load_sdl() is None:
+        pytest.skip("this pygame has no SDL of its own with virtual joysticks")
+    run_dir = tmp_path / "run"
+    with train(run_dir) as training:
+        training.wait_for_step(lambda step: step.step >= 2)
+        began_ns = time.time_ns()
+        done_ns = training.tell("axis 3 -1")
+        training.wait_for_step(lambda step: step.human and step.action < -0.99)
+        training.process.kill()
+        training.process.wait()
+    killed = newest_sitting(run_dir)
+    assert_taken_over_at_once(killed, began_ns, done_ns)
+
+    with train(run_dir, "--resume") as training:
+        training.wait_for_step(lambda step: step.sitting == 2 and step.step >= 1)
+        training.process.terminate()  # Which is quitting, too.
+        status, errors = training.end()
+    assert status == 0, errors
+    human = sum(step.human for step in killed)
+    assert f"{len(killed)} recorded steps after the checkpoint, {human} of them yours" in errors
+    assert len(all_steps(run_dir)) > len(killed)
+    assert_all_in_replay(run_dir)
+
+
+APPLIED = "document.querySelector('.bar.applied output').textContent"
+QUICK = ("--set", "warmup_steps=8")
+
+
+@pytest.mark.skipif(
+    find_chromium() is None, reason="no Chromium (Debian: apt-get install chromium)"
+)
+def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path):
+    pytest.importorskip("playwright")
+    run_dir = tmp_path / "run"
+
+    async def sit(url):
+        async with open_browser() as page:
+            await page.goto(url)
+            await until(page, POLICY_DRIVES)
+            await page.keyboard.down("ArrowDown")
+            await until(page, f"{PERSON_DRIVES} && {APPLIED} === '-1.00'")
+            await page.keyboard.up("ArrowDown")
+            await until(page, POLICY_DRIVES)
+            await quit_sitting(page)
+            await until(page, "document.body.dataset.link === 'over'")
+
+    with Training(run_dir, "trainer", ["--human", "web", *QUICK], {}) as training:
+        asyncio.run(sit(address(training.process)))
+        status, errors = training.end()
+    assert status == 0, errors
+    [recording] = find_recordings([run_dir])
+    steps = list(read_steps(recording))
+    ours = [step for step in steps if step.human]
+    assert sum(step.first for step in steps) == 1
+    assert ours[0].first
+    # Towards the brake within the first period, by no more than a hand-over may.
+    first = ours[0]
+    before = steps[steps.index(first) - 1].action if first.step else first.policy_action
+    assert before is not None
+    towards = min(max(first.human_action - before, -MAX_SLEW), MAX_SLEW)
+    assert first.human_action < 0.0
+    assert first.action == pytest.approx(before + towards)
+    assert -1.0 in [step.action for step in ours]
+    assert steps[-1].outcome == "stopped"
+    replay = load_torch(run_dir / CHECKPOINT_FILE)["learning"]["replay"]
+    assert int(replay["human"].sum()) == len(ours)

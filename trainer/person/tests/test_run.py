@@ -1,0 +1,143 @@
+"""A learner that nobody waits for, whatever its update takes."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from trainer.learner.config import ALGORITHMS, LearnerConfig
+from trainer.person.run import KeptBack, PersonRun, UnhurriedLearning
+from trainer.training.config import RunConfig
+from trainer.training.learning import LearningThread
+
+CONFIG = LearnerConfig(batch_size=2, replay_capacity=50, warmup_steps=1)
+SOON_S = 30.0
+ACTION = np.array([0.5], np.float32)
+
+
+def frames(value: int):
+    return np.full((2, 45, 80), value, np.uint8)
+
+
+class Gate:
+    """Holds updates up until it is opened."""
+
+    def __init__(self, learning: LearningThread, monkeypatch) -> None:
+        self.open, self.begun = threading.Event(), 0
+        update = learning.learner.update
+
+        def held_up(batch, beta=0.0):
+            self.begun += 1
+            assert self.open.wait(SOON_S)
+            return update(batch, beta)
+
+        monkeypatch.setattr(learning.learner, "update", held_up)
+
+
+@pytest.fixture
+def learning(one_thread):
+    inner = LearningThread(CONFIG, ALGORITHMS["phil_td3"], 0, 1)
+    unhurried = UnhurriedLearning(inner)
+    unhurried.start_episode(frames(0))
+    for value in range(3):
+        unhurried.add(ACTION, float(value), frames(value + 1), False, False)
+    yield inner, unhurried
+    unhurried.close()
+
+
+def test_while_an_update_hangs_everything_goes_on(learning, monkeypatch):
+    inner, unhurried = learning
+    gate = Gate(inner, monkeypatch)
+    before = unhurried.act(frames(7))
+    unhurried.begin(0.0)
+    for _ in range(5):
+        np.testing.assert_array_equal(unhurried.act(frames(7)), before)
+        unhurried.begin(0.0)
+        assert unhurried.finish() == 0.0
+    assert not unhurried.idle
+    assert gate.begun <= 1
+    gate.open.set()
+    unhurried.settle()
+    assert np.any(unhurried.act(frames(7)) != before)
+
+
+def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(learning, monkeypatch):
+    inner, unhurried = learning
+    gate, episode = Gate(inner, monkeypatch), KeptBack(unhurried)
+    unhurried.begin(0.0)
+    for discarded, reward in ((True, 9.0), (False, 3.0)):
+        episode.start_episode(frames(10))
+        episode.add(ACTION, reward, frames(11), False, True)
+        episode.add(-ACTION, reward + 1.0, frames(12), True, False)
+        assert unhurried.added == 3
+        if discarded:
+            episode.release(discarded)
+    threading.Timer(0.05, gate.open.set).start()
+    episode.release(discarded=False)
+    episode.release(discarded=False)
+    state = unhurried.state_dict()["replay"]
+    assert state["rewards"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert state["human"].tolist() == [False, False, False, True, False]
+    assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_the_next_update_begins_when_the_last_is_done(learning, monkeypatch):
+    inner, unhurried = learning
+    gate = Gate(inner, monkeypatch)
+    gate.open.set()
+    for _ in range(3):
+        unhurried.begin(0.0)
+        end_s = time.monotonic() + SOON_S
+        while not unhurried.idle and time.monotonic() < end_s:
+            time.sleep(0.001)
+    unhurried.settle()
+    assert gate.begun == 3
+
+
+def test_what_an_update_raises_comes_out(learning, monkeypatch):
+    inner, unhurried = learning
+
+    def fail(batch, beta=0.0):
+        raise RuntimeError("no more memory")
+
+    monkeypatch.setattr(inner.learner, "update", fail)
+    unhurried.begin(0.0)
+    with pytest.raises(RuntimeError, match="no more memory"):
+        unhurried.settle()
+
+
+def test_a_restored_learner_acts_as_the_one_that_was_saved(learning):
+    _, unhurried = learning
+    unhurried.begin(0.0)
+    unhurried.settle()
+    state, action = unhurried.state_dict(), unhurried.act(frames(7))
+    other = UnhurriedLearning(LearningThread(CONFIG, ALGORITHMS["phil_td3"], 5, 1))
+    assert np.any(other.act(frames(7)) != action)
+    other.load_state_dict(state)
+    np.testing.assert_array_equal(other.act(frames(7)), action)
+    np.testing.assert_array_equal(
+        unhurried.act_together(frames(7)[None], averaged=True).shape, (1, 1)
+    )
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("added", "loss", "said"),
+    [
+        (0, math.nan, "not learning yet (0 of 256 steps)"),
+        (255, math.nan, "not learning yet (255 of 256 steps)"),
+        (256, math.nan, "critic loss –"),
+        (900, 0.1239, "critic loss 0.124"),
+    ],
+)
+def test_before_it_learns_it_says_so_instead_of_nan(added, loss, said):
+    config = RunConfig()
+    assert config.learner.warmup_steps == 256
+    run: Any = SimpleNamespace(config=config, learning=SimpleNamespace(added=added))
+    assert PersonRun._learned(cast(PersonRun, run), loss) == said

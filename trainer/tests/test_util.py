@@ -1,0 +1,189 @@
+"""One training in a directory at a time, and no human model over another."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+
+import pytest
+
+from edge_runtime.util import UserError
+from trainer.learner.config import LearnerConfig
+from trainer.tests.test_commands import call
+from trainer.util import (
+    LOCK_FILE,
+    SIGNALS,
+    claimed,
+    held,
+    holder,
+    quit_on_signals,
+    revision_of,
+    source_revision,
+)
+
+
+@pytest.mark.parametrize("command", ["train", "human"])
+def test_a_second_training_in_a_directory_is_refused(command, capsys, tmp_path):
+    run_dir = tmp_path / "run"
+    with claimed(run_dir):
+        (run_dir / "metrics.csv").write_text("the first's")
+        status, out, err = call(capsys, command, "--out", str(run_dir), "--episodes", "1")
+        assert (status, out, len(err.splitlines())) == (2, "", 1)
+        assert f"{run_dir} is being trained in by process {os.getpid()} on " in err
+    assert [path.name for path in run_dir.iterdir()] == ["metrics.csv"]
+    assert (run_dir / "metrics.csv").read_text() == "the first's"
+
+
+def test_a_directory_that_nothing_came_into_goes_again(tmp_path):
+    with pytest.raises(UserError, match="no"), claimed(tmp_path / "a" / "b"):
+        raise UserError("no")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "mine").mkdir()
+    with claimed(tmp_path / "mine"):
+        pass
+    assert (tmp_path / "mine").is_dir()
+
+
+def test_what_a_killed_process_leaves_keeps_nobody_out(tmp_path):
+    (tmp_path / LOCK_FILE).write_text('{"pid": 1, "host": "elsewhere", "more": "than we write"}')
+    with claimed(tmp_path):
+        assert holder(tmp_path / LOCK_FILE).startswith(f"process {os.getpid()} on ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_whose_file_was_taken_away_is_no_lock(tmp_path, monkeypatch):
+    """Between opening and locking, the one before may have let go, and the file with it."""
+    path = tmp_path / "lock"
+    opened = []
+
+    def open_late(*arguments):
+        opened.append(os_open(*arguments))
+        if len(opened) == 1:
+            path.unlink()
+        return opened[-1]
+
+    os_open = os.open
+    monkeypatch.setattr("trainer.util.os.open", open_late)
+    with held(path) as mine, held(path) as second:
+        assert (mine, second) == (True, False)
+    assert len(opened) == 3
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff", b"[]", b"{}"])
+def test_a_holder_without_a_name_is_another_process(content, tmp_path):
+    (tmp_path / "lock").write_bytes(content)
+    assert holder(tmp_path / "lock") == "another process"
+
+
+def test_a_lock_that_cannot_be_had_is_one_line(tmp_path):
+    (tmp_path / LOCK_FILE).mkdir()
+    with pytest.raises(UserError, match="cannot lock"), claimed(tmp_path):
+        pass
+
+
+def test_a_human_model_is_not_written_over(capsys, tmp_path):
+    (tmp_path / "human_model.pt").write_bytes(b"mine")
+    (tmp_path / "nominal.json").write_text("{}")
+    status, out, err = call(capsys, "human", "--out", str(tmp_path), "--episodes", "1")
+    assert (status, out, len(err.splitlines())) == (2, "", 1)
+    assert "holds a human model; choose another --out" in err
+    assert (tmp_path / "human_model.pt").read_bytes() == b"mine"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+class Work:
+    """Notes that it was asked to end."""
+
+    def __init__(self, over: bool = False) -> None:
+        self.over, self.asked = over, 0
+
+    def quit(self) -> bool:
+        self.asked += 1
+        return not self.over
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_the_first_signal_asks_to_stop(number):
+    work = Work()
+    with quit_on_signals(work.quit):
+        signal.raise_signal(number)
+        assert work.asked == 1
+
+
+def test_the_second_interrupt_is_one():
+    work = Work()
+    with quit_on_signals(work.quit):
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert work.asked == 1
+
+
+def test_when_the_work_is_over_the_first_interrupt_is_one():
+    with quit_on_signals(Work(over=True).quit), pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_afterwards_all_is_as_it_was():
+    before = [signal.getsignal(number) for number in SIGNALS]
+    with quit_on_signals(Work().quit):
+        assert [signal.getsignal(number) for number in SIGNALS] != before
+    assert [signal.getsignal(number) for number in SIGNALS] == before
+
+
+@pytest.mark.parametrize("offset", [0.0, -1e-3, 1e-45, float("inf"), float("nan")])
+def test_the_constant_that_keeps_transitions_drawable_is_above_zero(offset):
+    with pytest.raises(UserError, match=r"priority_offset = .* out of range: it must be above 0"):
+        LearnerConfig(priority_offset=offset)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "range_"),
+    [
+        ("gamma", 1.5, "0 to 1"),
+        ("batch_size", 0, "at least 1"),
+        ("intervention_penalty", float("nan"), "it must be a finite number"),
+    ],
+)
+def test_what_is_out_of_range_is_told_the_range(name, value, range_):
+    with pytest.raises(UserError, match=f"{name} = {value} is out of range: {range_}"):
+        LearnerConfig(**{name: value})
+    LearnerConfig(priority_offset=1e-30, gamma=1.0, batch_size=1)
+
+
+def git(directory, *arguments: str) -> str:
+    named = ("-c", "user.name=a", "-c", "user.email=a@b")
+    command = ["git", *named, *arguments]
+    done = subprocess.run(command, cwd=directory, check=True, capture_output=True, text=True)
+    return done.stdout.strip()
+
+
+def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
+    code, human = tmp_path / "trainer" / "code.py", tmp_path / "results" / "humans" / "human.pt"
+    paper = tmp_path / "results" / "paper"
+    table, unit = paper / "README.md", paper / "left_turn.jsonl"
+    for path in (code, human, table, unit):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("as committed")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", "-A")
+    git(tmp_path, "commit", "-qm", "all")
+    commit = git(tmp_path, "rev-parse", "HEAD")
+    table.write_text("a run has written")
+    unit.write_text("another one")
+    (unit.parent / "fig7.png").write_text("new")
+    assert revision_of(code.parent) == commit
+    for path in (human, code):
+        path.write_text("changed")
+        assert revision_of(code.parent) == f"{commit}-dirty"
+        path.write_text("as committed")
+
+
+def test_outside_of_a_repository_it_is_unknown(tmp_path):
+    assert revision_of(tmp_path) == "unknown"
+
+
+def test_a_process_names_the_code_that_it_began_with():
+    assert source_revision() is source_revision()

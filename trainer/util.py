@@ -1,0 +1,326 @@
+"""Small things that several parts of the trainer need.
+
+In this order: ranges of settings, torch files, one process in a directory, ending in order,
+progress, and what made a result. torch takes two seconds to load, so it is imported only where a
+function needs it: ``--help`` and the configs need none of it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import platform
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from edge_runtime.files import make_directory, try_to_lock_file, write_atomic
+from edge_runtime.util import UserError, open_regular
+
+LOCK_FILE = ".lock"
+"""In a directory that is claimed, for as long as it is."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+LINE_INTERVAL_S = 15.0
+"""Between two lines of progress where stderr is no terminal."""
+WRITTEN = ("results/paper",)
+"""What the experiments write themselves. Human models, which decide trainings, count as source."""
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+Range = tuple[float, float]
+ANY: Range = (-math.inf, math.inf)
+FROM_ONE: Range = (1, math.inf)
+FROM_ZERO: Range = (0, math.inf)
+ABOVE_ZERO: Range = (2.0**-126, math.inf)
+"""From float32's smallest normal number on: what is less may become zero on its way."""
+SHARE: Range = (0, 1)
+
+
+def check_ranges(config: Any, ranges: Mapping[str, Range]) -> None:
+    """Raise UserError unless every named field of ``config`` is finite and within its range."""
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name)
+        if not (math.isfinite(value) and low <= value <= high):
+            raise UserError(f"{name} = {value} is out of range: {_text(low, high)}")
+
+
+def _text(low: float, high: float) -> str:
+    if math.isinf(low):
+        return "it must be a finite number"
+    if (low, high) == ABOVE_ZERO:
+        return "it must be above 0"
+    return f"at least {low}" if math.isinf(high) else f"{low} to {high}"
+
+
+def save_torch(path: Path, state: Any) -> None:
+    """Write ``state`` so that a kill at any moment leaves the old file or the new one."""
+    import torch
+
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    write_atomic(path, buffer.getbuffer())
+
+
+def load_torch(path: Path) -> Any:
+    """Read what ``save_torch`` wrote.
+
+    Raises:
+        UserError: not such a file. Only tensors and plain values are unpickled.
+    """
+    import torch
+
+    try:
+        with open_regular(path) as stream:
+            return torch.load(stream, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError) as error:
+        raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
+    except Exception as error:
+        # torch raises its own unpickling errors for foreign files.
+        raise UserError(f"{path} is not a checkpoint of this project") from error
+
+
+def as_tensors(values: dict[str, Any]) -> dict[str, Any]:
+    """The same with arrays as tensors: what ``load_torch`` reads without arbitrary unpickling."""
+    import torch
+
+    return {
+        name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+        for name, value in values.items()
+    }
+
+
+def as_arrays(values: dict[str, Any]) -> dict[str, Any]:
+    """The inverse of ``as_tensors``."""
+    import torch
+
+    return {
+        name: value.numpy() if isinstance(value, torch.Tensor) else value
+        for name, value in values.items()
+    }
+
+
+@contextmanager
+def claimed(directory: Path) -> Iterator[None]:
+    """Be the only process that trains in a directory.
+
+    It is made where it is not there, and goes again if nothing has come into it.
+
+    Raises:
+        UserError: another process trains there, or the directory cannot be made or written.
+    """
+    made = [path for path in (directory, *directory.parents) if not os.path.lexists(path)]
+    make_directory(directory)
+    try:
+        with held(directory / LOCK_FILE) as mine:
+            if not mine:
+                who = holder(directory / LOCK_FILE)
+                raise UserError(f"{directory} is being trained in by {who}")
+            yield
+    finally:
+        with suppress(OSError):  # It holds something.
+            for path in made:
+                path.rmdir()
+
+
+@contextmanager
+def held(path: Path, patience_s: float = 0.0) -> Iterator[bool]:
+    """Hold a lock against other processes; gives whether that was possible within so many seconds.
+
+    The lock is the kernel's: when a process dies, however it dies, its lock is gone with it, and
+    the file that it leaves behind keeps nobody out. Its directory must be there.
+
+    Raises:
+        UserError: the file cannot be written or locked.
+    """
+    try:
+        descriptor = _locked(path, time.monotonic() + patience_s)
+    except OSError as error:
+        raise UserError(f"cannot lock {path}: {error.strerror}") from None
+    if descriptor is None:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        if _is(path, descriptor):
+            path.unlink()
+        os.close(descriptor)
+
+
+def holder(path: Path) -> str:
+    """Who holds a lock, in words."""
+    try:
+        who = json.loads(path.read_bytes())
+        return f"process {who['pid']} on {who['host']}"
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return "another process"
+
+
+def _locked(path: Path, end_s: float) -> int | None:
+    """The locked file, opened and with this process's name in it; None where another has it."""
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        mine = try_to_lock_file(descriptor)
+        # The process that lets go removes the file. A lock on one without a name excludes nobody.
+        if mine and _is(path, descriptor):
+            os.ftruncate(descriptor, 0)
+            me = {"pid": os.getpid(), "host": socket.gethostname()}
+            os.pwrite(descriptor, json.dumps(me).encode(), 0)
+            return descriptor
+        os.close(descriptor)
+        if not mine:
+            if time.monotonic() >= end_s:
+                return None
+            time.sleep(0.01)
+
+
+def _is(path: Path, descriptor: int) -> bool:
+    """Whether the open file is the one that has the name."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+@contextmanager
+def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
+    """Let the first signal ask for the end.
+
+    A second one ends the process as ever, and so does the first if nobody heeds it any more.
+
+    Args:
+        ask: asks for it; whether somebody will heed.
+    """
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+
+    def stop(number: int, frame: Any) -> None:
+        for name, handler in before.items():
+            signal.signal(name, handler)
+        if not ask():
+            os.kill(os.getpid(), number)
+
+    for number in SIGNALS:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class ProgressBar:
+    """Counts to ``total`` and shows a few live figures; written to stderr.
+
+    Use as a context manager and call ``advance`` with the figures, e.g. ``{"success": "0.85"}``.
+    """
+
+    def __init__(self, what: str, total: int, done: int = 0) -> None:
+        self.what, self.total, self.done = what, total, done
+        self._began_s = self._line_s = time.monotonic()
+        self._began_at = done
+        self._bar: Progress | None = None
+        if sys.stderr.isatty():
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[figures]}"),
+                TextColumn("ETA"),
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+            )
+            self._task = self._bar.add_task(what, total=total, completed=done, figures="")
+
+    def __enter__(self) -> ProgressBar:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def advance(self, figures: dict[str, str], count: int = 1) -> None:
+        """``count`` more are done; ``figures`` are shown as name and value."""
+        self.done += count
+        text = "  ".join(f"{name} {value}" for name, value in figures.items())
+        if self._bar:
+            self._bar.update(self._task, completed=self.done, figures=text)
+        elif time.monotonic() - self._line_s > LINE_INTERVAL_S or self.done == self.total:
+            self._line_s = time.monotonic()
+            line = f"{self.what}: {self.done}/{self.total}  {text}  ETA {self._eta_s():.0f} s"
+            print(line, file=sys.stderr, flush=True)
+
+    def _eta_s(self) -> float:
+        elapsed_s = time.monotonic() - self._began_s
+        return elapsed_s / max(self.done - self._began_at, 1) * (self.total - self.done)
+
+
+@cache
+def source_revision() -> str:
+    """The repository's commit, ``-dirty`` where files differ from it, or ``unknown``.
+
+    As it was when first asked for: what is committed later is not what this process runs. Results
+    that a run has just written make no other source.
+    """
+    return revision_of(Path(__file__).parent)
+
+
+def revision_of(directory: Path) -> str:
+    """The revision of the repository that a directory belongs to, as it is now."""
+    commit = _git(directory, "rev-parse", "HEAD")
+    if commit is None:
+        return "unknown"
+    source = (":/", *(f":(top,exclude){path}" for path in WRITTEN))
+    dirty = _git(directory, "diff", "--quiet", "HEAD", "--", *source) is None
+    return f"{commit}-dirty" if dirty else commit
+
+
+def _git(directory: Path, *arguments: str) -> str | None:
+    """What git says; None where it fails."""
+    try:
+        done = subprocess.run(
+            ["git", *arguments], cwd=directory, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def about() -> dict[str, Any]:
+    """Machine, threads and versions; no date, so that equal runs write equal words."""
+    import torch
+
+    return {
+        "machine": {"processor": processor_model(), "cores": os.cpu_count()},
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "source_revision": source_revision(),
+    }
+
+
+def processor_model() -> str:
+    """The processor's name; on Linux ``platform`` knows no more than its instruction set."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:
+        lines = []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(models, "") or platform.processor() or platform.machine()
+
+
+def find_chromium() -> str | None:
+    """The path of the browser that the cockpit is tested with, or None where there is none."""
+    return next((path for name in CHROMIUM if (path := shutil.which(name))), None)
