@@ -64,12 +64,12 @@ class LearnerConfig:
     batch_size: int = 128
     """Transitions in a minibatch (table A5: N)."""
     actor_learning_rate: float = 2e-4
-    """As in the authors' code, which has the two rates of table A5 the other way round. Chosen on
-    single runs; the experiment ``switches`` compares the two over seeds."""
+    """Of the actor's optimiser. As in the authors' code, which has the two rates of table A5 the
+    other way round: an actor should follow a critic that is ahead of it."""
     critic_learning_rate: float = 5e-4
-    """As above."""
+    """Of the critics' optimiser. As in the authors' code, see ``actor_learning_rate``."""
     learning_rate_decay: float = 0.996
-    """Factor on both rates, once an episode (table A5)."""
+    """Factor on both learning rates, once an episode (table A5)."""
     gamma: float = 0.95
     """Discount factor of one control period (table A5)."""
     return_steps: int = 8
@@ -94,9 +94,10 @@ class LearnerConfig:
     that lasts shows what an action is worth (Ornstein-Uhlenbeck, as in DDPG; Lillicrap et al.,
     2016)."""
     exploration_final: float = 0.05
-    """What it falls to (table A5)."""
+    """Least standard deviation of the exploration noise (table A5)."""
     exploration_decay: float = 0.985
-    """Factor on it, once an episode: 0.05 is reached after 153 episodes. Not in the paper."""
+    """Factor on the exploration's standard deviation, once an episode: 0.05 is reached after 119
+    episodes. Not in the paper."""
     exploration_bound: float = 1.0
     """Bound of the exploration noise (table A5: c)."""
     replay_capacity: int = 100_000
@@ -125,9 +126,10 @@ class LearnerConfig:
     intervention_penalty: float = -10.0
     """What an intervention costs (eq. 17: r_pen = r_fail)."""
     penalty_on: str = "overruled"
-    """What it is charged to: ``overruled``, the policy's action that made the human take over,
-    whose value it becomes; or ``human``, the reward of the human's own first action, as printed,
-    which teaches the critic that rescuing is as bad as crashing."""
+    """What an intervention's penalty is charged to: ``overruled``, the policy's action that made
+    the human take over, whose value it becomes; a return of several steps ends there, too. Or
+    ``human``, the reward of the human's own first action, as printed, which teaches the critic that
+    rescuing is as bad as crashing."""
     action_bound: float = 0.25
     """Bound of the initial weights with which the action joins the picture in the critics' first
     connected layer; 0: that of one more feature among 1,792 (0.02), as the paper's networks begin.
