@@ -165,7 +165,7 @@ def test_a_damaged_recording_is_shown_without_what_is_broken(tmp_path, capsys):
     [
         (["none.mcap"], "cannot be read"),
         ([str(LEFT_TURN), "--vehicle-id", "other"], "holds no vehicle other"),
-        ([str(LEFT_TURN.with_name("make.py"))], "no MCAP recording"),
+        ([__file__], "no MCAP recording"),
     ],
 )
 def test_a_recording_that_cannot_be_shown_is_one_line_and_no_file(options, part, capsys, tmp_path):

@@ -33,7 +33,7 @@ READMES = sorted(
 
 
 def test_every_folder_has_one():
-    folders = ("edge_runtime", "viewing", "bridge", "trainer", "hil_tests", "deploy")
+    folders = ("edge_runtime", "bridge", "trainer", "hil_tests", "deploy")
     assert {Path(folder) / "README.md" for folder in folders} <= set(READMES)
 
 

@@ -17,10 +17,9 @@ ROOT = Path(__file__).parents[2]
 
 ARROWS = {
     "edge_runtime": set(),
-    "viewing": {"edge_runtime"},
-    "bridge": {"edge_runtime", "viewing"},
-    "trainer": {"edge_runtime", "viewing"},
-    "hil_tests": {"edge_runtime", "viewing", "bridge", "trainer", "deploy"},
+    "bridge": {"edge_runtime"},
+    "trainer": {"edge_runtime", "bridge"},
+    "hil_tests": {"edge_runtime", "bridge", "trainer", "deploy"},
     "deploy": {"edge_runtime"},
 }
 EDGE_LIBRARIES = {
