@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from deploy import bundle_command, certs_command, push, router_command
+from deploy import bundle, certs, push, router
 from deploy.keys import DEFAULT_DIRECTORY, write_key_pair
 from edge_runtime.cli import ArgumentParser, examples, run_cli
 
@@ -16,10 +16,10 @@ def main(argv: list[str]) -> int:
     arguments = build_parser().parse_args(argv)
     return {
         "keys": _keys,
-        "certs": certs_command.certs,
-        "bundle": bundle_command.bundle,
+        "certs": certs.certs,
+        "bundle": bundle.bundle,
         "push": push.push,
-        "router": router_command.router,
+        "router": router.router,
     }[arguments.command](arguments)
 
 
@@ -51,10 +51,10 @@ def build_parser() -> ArgumentParser:
         "--out", default=DEFAULT_DIRECTORY, help="directory for policy.key and policy.pub"
     )
     for name, module, text in (
-        ("certs", certs_command, "make an authority and certificates for TLS"),
-        ("bundle", bundle_command, "make one signed archive for one board and vehicle"),
+        ("certs", certs, "make an authority and certificates for TLS"),
+        ("bundle", bundle, "make one signed archive for one board and vehicle"),
         ("push", push, "bring a bundle to a board and install it"),
-        ("router", router_command, "write a fleet's router settings, for zenohd"),
+        ("router", router, "write a fleet's router settings, for zenohd"),
     ):
         module.add_arguments(add(name, text, module.EXAMPLE))
     return parser

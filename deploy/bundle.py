@@ -1,34 +1,77 @@
-"""A bundle: everything that a board needs to drive one policy, in one signed archive.
+"""``python -m deploy bundle``: all that a board needs to drive one policy, in one signed archive.
 
-The same inputs give the same bytes: the archive says nothing of when, where and by whom.
+The same inputs give the same bytes: the archive holds no time, place or user name.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import hashlib
+import io
 import os
 import tempfile
 import tomllib
+import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+import deploy.installer
 import edge_runtime
-from deploy.installer import errors as installer_errors
-from deploy.installer.archive import CONTEXT, END, MANIFEST, SIGNATURE, header, padding
-from deploy.installer.manifest import FileEntry, Manifest, Target, to_json
-from deploy.installer.release import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
-from deploy.pyz import NAME, build_installer
+from deploy import keys
+from deploy.installer import verify as installer_errors
+from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
+from deploy.installer.verify import (
+    CONTEXT,
+    END,
+    MANIFEST,
+    SIGNATURE,
+    FileEntry,
+    Manifest,
+    Target,
+    header,
+    padding,
+    to_json,
+)
+from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, find_target, gather, lock_path
 from edge_runtime import access
+from edge_runtime.cli import examples
 from edge_runtime.config import Config, load_config
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
 from edge_runtime.policy import Policy, load_policy
 from edge_runtime.private_keys import read_signing_key
+from edge_runtime.signature import DEFAULT_PUBLIC_KEY
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE, load_tls
 from edge_runtime.vehicles.registry import NONE
+
+NAME = "install.pyz"
+_FIRST_DAY = (1980, 1, 1, 0, 0, 0)
+_MAIN = (
+    "import sys\n\nif sys.version_info < (3, 8):\n"
+    '    sys.stderr.write("error: Python 3.8 or newer is needed: try python3.8\\n")\n'
+    "    sys.exit(2)\n\n"
+    "from deploy.installer.__main__ import main\n\n"
+    'if __name__ == "__main__":\n    sys.exit(main(sys.argv[1:]))\n'
+)
+
+
+def build_installer() -> bytes:
+    """The bytes of `install.pyz`."""
+    folder = Path(deploy.installer.__file__).parent
+    members = {"__main__.py": _MAIN, "deploy/__init__.py": ""}
+    for path in sorted(folder.glob("*.py")):
+        members[f"deploy/installer/{path.name}"] = path.read_text()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
+        for name, text in members.items():
+            info = zipfile.ZipInfo(name, _FIRST_DAY)
+            info.external_attr = 0o100644 << 16
+            archive.writestr(info, text)
+    return packed.getvalue()
+
 
 UNITS = Path(__file__).parent / "systemd"
 _DIGITS = 8
@@ -192,3 +235,86 @@ def _write(path: Path, manifest: Manifest, key: Ed25519PrivateKey, contents: dic
     finally:  # ^C, too: half a bundle holds a private key as well
         with contextlib.suppress(OSError):
             draft.unlink()
+
+
+DEFAULT_OUT = "build/bundles"
+DEFAULT_KEY = f"{keys.DEFAULT_DIRECTORY}/policy.key"
+
+EXAMPLE = examples(
+    "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
+    "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
+    "    --config edge.toml --tls certs/edge-hunter01",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--policy", metavar="POLICY.onnx", required=True, help="signed policy file")
+    parser.add_argument(
+        "--target", metavar="|".join(TARGETS), required=True, help="the board's kind"
+    )
+    parser.add_argument("--out", metavar="DIR", default=DEFAULT_OUT, help="where the archive goes")
+    parser.add_argument(
+        "--config",
+        metavar="FILE.toml",
+        help="settings of `edge_runtime run`: connect, vehicle, ...",
+    )
+    parser.add_argument(
+        "--tls",
+        metavar="DIR",
+        help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01",
+    )
+    parser.add_argument(
+        "--public-key",
+        metavar="FILE",
+        default=str(DEFAULT_PUBLIC_KEY),
+        help="of whoever signed the policy",
+    )
+    parser.add_argument(
+        "--key", metavar="FILE", default=DEFAULT_KEY, help="private key that signs the bundle"
+    )
+    parser.add_argument(
+        "--wheels", metavar="DIR", default=DEFAULT_FOLDER, help="wheels are kept here"
+    )
+
+
+def bundle(arguments: argparse.Namespace) -> int:
+    """Make a bundle and print its size and contents."""
+    target = find_target(arguments.target)
+    with tempfile.TemporaryDirectory() as place:
+        inputs = Inputs(
+            policy=Path(arguments.policy),
+            public_key=Path(arguments.public_key),
+            key=Path(arguments.key),
+            config=Path(arguments.config) if arguments.config else None,
+            tls=Path(arguments.tls) if arguments.tls else None,
+            wheels=[],
+        )
+        check_inputs(inputs)  # Before minutes of downloads.
+        _check_out(Path(arguments.out))
+        wheels = gather(target, lock_path(target), Path(arguments.wheels) / target.name)
+        inputs = inputs._replace(wheels=[*wheels, build_edge_wheel(Path(place))])
+        made = make_bundle(inputs, target, Path(arguments.out))
+    print("\n".join(_lines(made)))
+    return 0
+
+
+def _check_out(out: Path) -> None:
+    """Raise UserError where the folder cannot be made, without making it."""
+    whole = out.absolute()
+    there = next(place for place in (whole, *whole.parents) if place.exists())
+    if not there.is_dir():
+        raise UserError(f"--out {out}: {there} is a file, not a directory")
+
+
+def _lines(made: Made) -> list[str]:
+    manifest, size = made.manifest, made.path.stat().st_size
+    rows = [f"{entry.size:>12,}  {entry.path}" for entry in manifest.files]
+    wheels = sum(entry.size for entry in manifest.files if entry.path.startswith(WHEELS))
+    return [
+        *rows,
+        f"{wheels:>12,}  of it wheels",
+        f"{size:>12,}  {made.path}  ({size / 1e6:.1f} MB)",
+        f"version {manifest.version}, for {manifest.vehicle_id}, Python {manifest.target.python}"
+        f" on {manifest.target.machine} with glibc {manifest.target.glibc} or newer",
+    ]

@@ -1,27 +1,37 @@
-"""An authority of one's own, and a certificate for each party on the wire.
+"""``python -m deploy certs``: an authority of one's own, and a certificate for each party.
 
-Who is who goes by the common name; what a name may say and hear is `edge_runtime.access`.
-Only listeners' certificates are servers', so that no viewer or operator can pose as a simulator.
+The common name of a certificate says which party it is; `edge_runtime.access` says what each party
+may send and hear. Only the certificates of parties that listen may act as servers, so no viewer
+or operator can pose as a simulator. Each party gets a folder with the three files that it needs.
 """
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import datetime
 import ipaddress
-from collections.abc import Iterable
+import os
+import re
+import shutil
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from edge_runtime.access import ROLES, common_name
+from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
-from edge_runtime.files import read_bytes
+from edge_runtime.files import read_bytes, write_atomic
+from edge_runtime.option_types import whole_number
 from edge_runtime.private_keys import read_private_key
-from edge_runtime.tls import CA_FILE
+from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
+from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 
 CA_KEY_FILE = "ca.key.pem"
 CA_DAYS = 3650
@@ -148,3 +158,153 @@ def _usage(signs_certificates: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
+
+
+CA_FOLDER = "ca"
+DEFAULT_OUT = "certs"
+DEFAULT_DAYS = 365
+MAX_NAME_CHARS = 64
+"""Of a certificate's common name (RFC 5280)."""
+_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
+_HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
+
+
+class Request(NamedTuple):
+    """What the command line asks for, checked."""
+
+    out: Path
+    vehicle_ids: list[str]
+    hosts: list[str]
+    days: int
+
+
+EXAMPLE = examples(
+    "python -m deploy certs --vehicle-id hunter01 --host workstation.local --out certs",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out", metavar="DIR", default=DEFAULT_OUT, help="directory of all folders"
+    )
+    parser.add_argument(
+        "--vehicle-id",
+        metavar="ID",
+        action="append",
+        help="a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
+        f" (default: {DEFAULT_VEHICLE_ID})",
+    )
+    parser.add_argument(
+        "--host",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="a name or address at which simulator or router are reached; may be repeated"
+        f" (always: {', '.join(LOOPBACK_HOSTS)})",
+    )
+    parser.add_argument(
+        "--days",
+        metavar="N",
+        type=whole_number(1, CA_DAYS),
+        default=DEFAULT_DAYS,
+        help="how long they are valid, days",
+    )
+
+
+def certs(arguments: argparse.Namespace) -> int:
+    """Make what is missing of the authority and of the parties' folders.
+
+    Raises UserError, with nothing written, where nothing is missing.
+    """
+    request = _check(arguments)
+    roles = _missing(request)
+    now = datetime.datetime.now(datetime.UTC)
+    ca_folder = request.out / CA_FOLDER
+    is_new = not ca_folder.exists()
+    authority = make_authority(now) if is_new else read_authority(ca_folder)
+    _check_lifetime(authority, now, request.days)
+    if is_new:
+        with _new_folder(ca_folder) as draft:
+            write_atomic(draft / CA_FILE, _pem(authority.certificate))
+            _write_key(draft / CA_KEY_FILE, authority.key)
+    for name, role in roles.items():
+        issued = issue(authority, name, role, request.hosts, now, request.days)
+        with _new_folder(request.out / name) as draft:
+            write_atomic(draft / CA_FILE, _pem(authority.certificate))
+            write_atomic(draft / CERTIFICATE_FILE, _pem(issued.certificate))
+            _write_key(draft / KEY_FILE, issued.key)
+    print(f"authority (keep {ca_folder / CA_KEY_FILE} off every board): {ca_folder}")
+    for name in roles:
+        print(f"--tls {request.out / name}")
+    print(f"valid until {now + datetime.timedelta(days=request.days):%Y-%m-%d}")
+    return 0
+
+
+def _check(arguments: argparse.Namespace) -> Request:
+    vehicle_ids = arguments.vehicle_id or [DEFAULT_VEHICLE_ID]
+    for vehicle_id in vehicle_ids:
+        check_vehicle_id(vehicle_id)
+    for name in party_roles(vehicle_ids):
+        if len(name) > MAX_NAME_CHARS:
+            raise UserError(
+                f"no certificate can name {name}: its {len(name)} characters are over"
+                f" {MAX_NAME_CHARS}; choose a shorter --vehicle-id"
+            )
+    for host in arguments.host:
+        if not _is_host(host):
+            raise UserError(f"host {host!r} is not valid: write a name or an address, without port")
+    hosts = [*LOOPBACK_HOSTS, *arguments.host]
+    return Request(Path(arguments.out), list(dict.fromkeys(vehicle_ids)), hosts, arguments.days)
+
+
+def _is_host(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(text)
+        return True
+    return _HOST_NAME.fullmatch(text) is not None
+
+
+def _missing(request: Request) -> dict[str, str]:
+    """The role of each party that has no folder yet, by name; UserError where all have one."""
+    roles = party_roles(request.vehicle_ids)
+    missing = {name: role for name, role in roles.items() if not (request.out / name).exists()}
+    if not missing:
+        raise UserError(
+            f"{request.out} has {', '.join(roles)} already and nothing is overwritten; move away"
+            " what is to be made new, or choose another --vehicle-id or --out"
+        )
+    for name in sorted(roles.keys() - missing.keys()):
+        print(f"kept as it is: {request.out / name}")
+    return missing
+
+
+def _check_lifetime(authority: Authority, now: datetime.datetime, days: int) -> None:
+    left = authority.certificate.not_valid_after_utc - now
+    if left < datetime.timedelta(days=days):
+        raise UserError(f"--days {days} is longer than the authority's own {left.days} days")
+
+
+@contextlib.contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """Fill a draft beside it and move it there, so that the folder is whole or absent."""
+    draft = folder.with_name(f".{folder.name}.{os.getpid()}")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        draft.mkdir(mode=0o700)
+        yield draft
+        draft.rename(folder)  # Fails where somebody has filled it meanwhile.
+    except OSError as error:
+        raise UserError(f"cannot create {folder}: {error.strerror}") from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """PKCS8 PEM, mode 0600. The folder is the owner's alone, so it never was open to others."""
+    write_atomic(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    path.chmod(0o600)
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(Encoding.PEM)

@@ -14,12 +14,11 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from deploy.installer import ed25519
-from deploy.installer import errors as installer_errors
-from deploy.installer.archive import open_bundle
+from deploy.bundle import NAME, build_installer
+from deploy.installer import verify
+from deploy.installer import verify as installer_errors
 from deploy.installer.layout import DEFAULT_ROOT
-from deploy.installer.manifest import Manifest
-from deploy.pyz import NAME, build_installer
+from deploy.installer.verify import Manifest, open_bundle
 from edge_runtime.cli import examples
 from edge_runtime.errors import UserError
 from edge_runtime.files import read_bytes
@@ -125,7 +124,7 @@ def _verify(arguments: argparse.Namespace) -> Manifest:
     """The bundle's manifest: what the board would refuse is not sent."""
     pem = read_bytes(arguments.trust, "public key")
     try:
-        key = ed25519.parse_public_key(pem)
+        key = verify.parse_public_key(pem)
     except installer_errors.UserError as error:
         raise UserError(f"public key {arguments.trust}: {error}") from None
     try:

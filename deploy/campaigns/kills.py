@@ -18,8 +18,7 @@ from collections import Counter
 from pathlib import Path
 
 from deploy.campaigns.rig import Board, Kit, kit_of, make_kit, unless_busy
-from deploy.installer.archive import MANIFEST
-from deploy.installer.manifest import parse_manifest
+from deploy.installer.verify import MANIFEST, parse_manifest
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
 from edge_runtime.files import check_writable
 from edge_runtime.option_types import not_negative, positive

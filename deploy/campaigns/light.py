@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy
 
-from deploy.installer.manifest import Target
+from deploy.installer.verify import Target
 
 HERE = Target(
     name="here",

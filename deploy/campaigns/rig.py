@@ -13,13 +13,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from deploy.bundle import Inputs, make_bundle
+from deploy.bundle import NAME, Inputs, build_installer, make_bundle
 from deploy.campaigns.light import HERE, host_wheel
-from deploy.installer.release import LAUNCHER, POLICY, PUBLIC_KEY
+from deploy.installer.layout import LAUNCHER, POLICY, PUBLIC_KEY
 from deploy.keys import write_key_pair
-from deploy.pyz import NAME, build_installer
-from deploy.targets import ROOT
-from deploy.wheelhouse import build_edge_wheel
+from deploy.wheels import ROOT, build_edge_wheel
 from edge_runtime.errors import UserError
 from edge_runtime.transport import free_endpoint
 

@@ -17,7 +17,7 @@ from collections import Counter
 from pathlib import Path
 
 from deploy.campaigns.rig import Board, Kit, kit_of, make_kit
-from deploy.installer.archive import BLOCK
+from deploy.installer.verify import BLOCK
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli
 from edge_runtime.files import check_writable, write_json
 from edge_runtime.option_types import not_negative, positive

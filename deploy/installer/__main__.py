@@ -11,15 +11,12 @@ import signal
 import sys
 from typing import Any, Callable, NoReturn
 
-from deploy.installer import ed25519
-from deploy.installer.errors import UnhealthyError, UserError
-from deploy.installer.health import Limits
-from deploy.installer.layout import DEFAULT_ROOT, Layout
-from deploy.installer.manifest import parse_manifest
-from deploy.installer.release import MANIFEST, why_not_whole
-from deploy.installer.service import WAYS, choose
+from deploy.installer import verify
+from deploy.installer.layout import DEFAULT_ROOT, MANIFEST, Layout, why_not_whole
 from deploy.installer.steps import Way, install, rollback, uninstall
 from deploy.installer.supervise import supervise
+from deploy.installer.systemd import WAYS, Limits, choose
+from deploy.installer.verify import UnhealthyError, UserError, parse_manifest
 
 LIMITS = Limits()
 EXAMPLES = {
@@ -191,7 +188,7 @@ def _status(layout: Layout, service: Any, as_json: bool) -> int:
         "vehicle_id": manifest.vehicle_id,
         "policy_id": manifest.policy_id,
         "service": service.describe(),
-        "trusts": hashlib.sha256(ed25519.parse_public_key(layout.trusted.read_bytes())).hexdigest()[
+        "trusts": hashlib.sha256(verify.parse_public_key(layout.trusted.read_bytes())).hexdigest()[
             :16
         ],
     }

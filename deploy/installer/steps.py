@@ -14,16 +14,26 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from deploy.installer import ed25519
-from deploy.installer.archive import Bundle, open_bundle, open_file
-from deploy.installer.errors import UnhealthyError, UserError
-from deploy.installer.fits import check_fits
-from deploy.installer.health import Limits
-from deploy.installer.layout import Layout, write_whole
-from deploy.installer.manifest import parse_manifest
-from deploy.installer.release import MANIFEST, check_policy, make_release, why_not_whole
-from deploy.installer.service import remember
+from deploy.installer import verify
+from deploy.installer.layout import (
+    MANIFEST,
+    Layout,
+    check_policy,
+    make_release,
+    why_not_whole,
+    write_whole,
+)
+from deploy.installer.systemd import Limits, remember
 from deploy.installer.trial import try_release
+from deploy.installer.verify import (
+    Bundle,
+    UnhealthyError,
+    UserError,
+    check_fits,
+    open_bundle,
+    open_file,
+    parse_manifest,
+)
 
 _MAX_KEY_BYTES = 65536
 _ENDS_A_SWITCH = (UnhealthyError, UserError, OSError, KeyboardInterrupt)
@@ -43,7 +53,7 @@ def install(bundle_path: str, trust: str | None, layout: Layout, way: Way) -> st
     Raises UserError where it may not be installed here, UnhealthyError where it was and went back.
     """
     pem = trusted_key(layout, trust)
-    with open_bundle(bundle_path, ed25519.parse_public_key(pem)) as bundle:
+    with open_bundle(bundle_path, verify.parse_public_key(pem)) as bundle:
         _say(f"verified {bundle.manifest.version} for {bundle.manifest.vehicle_id}")
         check_fits(bundle.manifest.target)
         with layout.locked():
@@ -115,7 +125,7 @@ def trusted_key(layout: Layout, trust: str | None) -> bytes:
             raise UserError("this board trusts no key yet: name your public key with --trust")
         return given
     kept = layout.trusted.read_bytes()
-    if given is not None and ed25519.parse_public_key(given) != ed25519.parse_public_key(kept):
+    if given is not None and verify.parse_public_key(given) != verify.parse_public_key(kept):
         raise UserError(
             f"this board trusts another key than {trust}; whoever owns the board may replace"
             f" {layout.trusted}"
@@ -127,7 +137,7 @@ def _read_key(path: str) -> bytes:
     with open_file(path, "public key") as stream:
         pem = stream.read(_MAX_KEY_BYTES)
     try:
-        ed25519.parse_public_key(pem)
+        verify.parse_public_key(pem)
     except UserError as error:
         raise UserError(f"public key {path}: {error}") from None
     return pem

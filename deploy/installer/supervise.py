@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from deploy.installer.apart import before_exec
-from deploy.installer.errors import UserError
-from deploy.installer.layout import Layout
+from deploy.installer.layout import CONFIG, LAUNCHER, Layout
 from deploy.installer.notify import NotifySocket
-from deploy.installer.release import CONFIG, LAUNCHER
+from deploy.installer.verify import UserError
 
 WATCHDOG_S = 3.0
 RESTART_PAUSE_S = 0.5

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import TextIO
 
 from deploy.installer.apart import Account, before_exec, can_isolate
-from deploy.installer.errors import UnhealthyError
-from deploy.installer.health import Limits, settle
+from deploy.installer.layout import CONFIG, LAUNCHER, TLS, last_line
 from deploy.installer.notify import NotifySocket
-from deploy.installer.release import CONFIG, LAUNCHER, TLS, last_line
+from deploy.installer.systemd import Limits, settle
+from deploy.installer.verify import UnhealthyError
 
 WATCHDOG_S = 1.0
 """The runtime says that it works twice in this time."""

@@ -14,10 +14,9 @@ import sys
 import zipfile
 from pathlib import Path
 
-from deploy.bundle import Inputs, Made, make_bundle
+from deploy.bundle import NAME, Inputs, Made, build_installer, make_bundle
 from deploy.campaigns.light import HERE, host_wheel
 from deploy.keys import write_key_pair
-from deploy.pyz import NAME, build_installer
 from edge_runtime.tests.policies import public_pem, write_policy
 from edge_runtime.transport import free_endpoint
 

@@ -8,12 +8,11 @@ import tarfile
 
 import pytest
 
-from deploy import bundle_command
+from deploy import bundle
 from deploy.__main__ import main
-from deploy.bundle import make_bundle
+from deploy.bundle import build_installer, make_bundle
 from deploy.campaigns.light import HERE
-from deploy.pyz import build_installer
-from deploy.wheelhouse import build_edge_wheel
+from deploy.wheels import build_edge_wheel
 from edge_runtime.config import load_config
 from edge_runtime.errors import UserError
 from edge_runtime.tests.commands import exit_status
@@ -140,7 +139,7 @@ def test_a_mistake_is_one_line_before_anything_is_downloaded(
 ):
     monkeypatch.chdir(tmp_path)
     if "--wheels" not in arguments:
-        monkeypatch.setattr(bundle_command, "gather", lambda *_: pytest.fail("downloads"))
+        monkeypatch.setattr(bundle, "gather", lambda *_: pytest.fail("downloads"))
     inputs = workshop.inputs()
     good = ["--policy", inputs.policy, "--public-key", inputs.public_key, "--key", inputs.key]
     status = exit_status(main, ["bundle", *map(str, good), *arguments])

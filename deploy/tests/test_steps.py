@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from deploy.installer import steps
-from deploy.installer.errors import UnhealthyError, UserError
-from deploy.installer.health import Limits
 from deploy.installer.layout import Layout
+from deploy.installer.systemd import Limits
+from deploy.installer.verify import UnhealthyError, UserError
 
 OLD, NEW = "0.1.0-old", "0.1.0-new"
 

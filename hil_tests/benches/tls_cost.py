@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from deploy.certs_command import add_arguments, certs
+from deploy.certs import add_arguments, certs
 from edge_runtime import wire
 from edge_runtime.access import rules_for_listener
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.signals import sigterm_as_interrupt
-from deploy.wheelhouse import DEFAULT_FOLDER
+from deploy.wheels import DEFAULT_FOLDER
 from edge_runtime.cli import ArgumentParser, examples, write_json_out
 from edge_runtime.errors import UserError
 from edge_runtime.files import check_writable

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from deploy.__main__ import main as deploy
-from deploy.pyz import NAME, build_installer
+from deploy.bundle import NAME, build_installer
 from edge_runtime.errors import UserError
 from hil_tests.board.emulation import emulated
 from hil_tests.board.place import Place

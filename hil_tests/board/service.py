@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from deploy.installer.systemctl import MAIN_UNIT
+from deploy.installer.systemd import MAIN_UNIT
 from edge_runtime.errors import UserError
 from hil_tests.board.booted import BootedPlace, control_group
 from hil_tests.board.proof import Site, pack, prove, remove

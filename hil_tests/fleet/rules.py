@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from deploy.router_config import router_config
+from deploy.router import router_config
 from edge_runtime import access
 from edge_runtime.tls import load_tls
 from edge_runtime.transport import free_endpoint

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.targets import TARGETS
+from deploy.wheels import TARGETS
 from edge_runtime.ros2.endpoint import DEFAULT_ROS2_ENDPOINT
 
 ROOT = Path(__file__).parents[2]
