@@ -14,7 +14,7 @@ import ipaddress
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,28 +33,148 @@ from edge_runtime.private_keys import read_private_key
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE
 from edge_runtime.topics import DEFAULT_VEHICLE_ID, check_vehicle_id
 
+CA_FOLDER = "ca"
 CA_KEY_FILE = "ca.key.pem"
 CA_DAYS = 3650
+DEFAULT_OUT = "certs"
+DEFAULT_DAYS = 365
 CLOCK_SLACK = datetime.timedelta(days=1)
 """A certificate is valid from a day ago: boards' clocks are behind until they are set."""
 LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
+MAX_NAME_CHARS = 64
+"""Of a certificate's common name (RFC 5280)."""
+_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
+_HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
+
+EXAMPLE = examples(
+    "python -m deploy certs --vehicle-id hunter01 --host workstation.local --out certs",
+)
 
 
-class Authority(NamedTuple):
-    """The certificate that everybody believes, and the key that makes others."""
+class Pair(NamedTuple):
+    """A certificate and its private key: a party's, or the authority's that makes others."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
 
-class Issued(NamedTuple):
-    """A party's own pair."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out", metavar="DIR", default=DEFAULT_OUT, help="directory of all folders"
+    )
+    parser.add_argument(
+        "--vehicle-id",
+        metavar="ID",
+        action="append",
+        help="a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
+        f" (default: {DEFAULT_VEHICLE_ID})",
+    )
+    parser.add_argument(
+        "--host",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="a name or address at which simulator or router are reached; may be repeated"
+        f" (always: {', '.join(LOOPBACK_HOSTS)})",
+    )
+    parser.add_argument(
+        "--days",
+        metavar="N",
+        type=whole_number(1, CA_DAYS),
+        default=DEFAULT_DAYS,
+        help="how long they are valid, days",
+    )
 
-    certificate: x509.Certificate
-    key: ec.EllipticCurvePrivateKey
+
+def run(arguments: argparse.Namespace) -> int:
+    """Make what is missing of the authority and of the parties' folders.
+
+    Raises UserError, with nothing written, where nothing is missing.
+    """
+    out, days = Path(arguments.out), arguments.days
+    hosts = [*LOOPBACK_HOSTS, *map(_check_host, arguments.host)]
+    roles = _missing(out, _check_parties(arguments.vehicle_id or [DEFAULT_VEHICLE_ID]))
+    now = datetime.datetime.now(datetime.UTC)
+    ca_folder = out / CA_FOLDER
+    is_new = not ca_folder.exists()
+    authority = make_authority(now) if is_new else read_authority(ca_folder)
+    left = authority.certificate.not_valid_after_utc - now
+    if left < datetime.timedelta(days=days):
+        raise UserError(f"--days {days} is longer than the authority's own {left.days} days")
+    if is_new:
+        _write_folder(ca_folder, authority, {CA_KEY_FILE: _pem(authority.key)})
+    for name, role in roles.items():
+        issued = issue(authority, name, role, hosts, now, days)
+        files = {CERTIFICATE_FILE: _pem(issued.certificate), KEY_FILE: _pem(issued.key)}
+        _write_folder(out / name, authority, files)
+    print(f"authority (keep {ca_folder / CA_KEY_FILE} off every board): {ca_folder}")
+    for name in roles:
+        print(f"--tls {out / name}")
+    print(f"valid until {now + datetime.timedelta(days=days):%Y-%m-%d}")
+    return 0
 
 
-def make_authority(now: datetime.datetime, days: int = CA_DAYS) -> Authority:
+def _check_parties(vehicle_ids: list[str]) -> dict[str, str]:
+    """The role of each party of these vehicles, by name; UserError for ids that name none."""
+    roles = party_roles(map(check_vehicle_id, vehicle_ids))
+    for name in roles:
+        if len(name) > MAX_NAME_CHARS:
+            raise UserError(
+                f"no certificate can name {name}: its {len(name)} characters are over"
+                f" {MAX_NAME_CHARS}; choose a shorter --vehicle-id"
+            )
+    return roles
+
+
+def _check_host(text: str) -> str:
+    with contextlib.suppress(ValueError):
+        return str(ipaddress.ip_address(text))
+    if _HOST_NAME.fullmatch(text) is None:
+        raise UserError(f"host {text!r} is not valid: write a name or an address, without port")
+    return text
+
+
+def _missing(out: Path, roles: dict[str, str]) -> dict[str, str]:
+    """Those that have no folder yet; UserError where all have one."""
+    missing = {name: role for name, role in roles.items() if not (out / name).exists()}
+    if not missing:
+        raise UserError(
+            f"{out} has {', '.join(roles)} already and nothing is overwritten; move away"
+            " what is to be made new, or choose another --vehicle-id or --out"
+        )
+    for name in sorted(roles.keys() - missing.keys()):
+        print(f"kept as it is: {out / name}")
+    return missing
+
+
+def _write_folder(folder: Path, authority: Pair, files: dict[str, bytes]) -> None:
+    """Fill a draft beside it and move it there, so that the folder is whole or absent.
+
+    It is the owner's alone, and so are the keys in it, from the first moment on.
+    """
+    draft = folder.with_name(f".{folder.name}.{os.getpid()}")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        draft.mkdir(mode=0o700)
+        for name, data in {CA_FILE: _pem(authority.certificate), **files}.items():
+            write_atomic(draft / name, data)
+            if name in (KEY_FILE, CA_KEY_FILE):
+                (draft / name).chmod(0o600)
+        draft.rename(folder)  # Fails where somebody has filled it meanwhile.
+    except OSError as error:
+        raise UserError(f"cannot create {folder}: {error.strerror}") from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _pem(each: x509.Certificate | ec.EllipticCurvePrivateKey) -> bytes:
+    if isinstance(each, x509.Certificate):
+        return each.public_bytes(Encoding.PEM)
+    return each.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def make_authority(now: datetime.datetime, days: int = CA_DAYS) -> Pair:
     """A new authority that may issue certificates of parties and no further authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name("PHIL-TD3 hardware-in-the-loop authority")
@@ -63,10 +183,10 @@ def make_authority(now: datetime.datetime, days: int = CA_DAYS) -> Authority:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs_certificates=True), critical=True)
     )
-    return Authority(builder.sign(key, hashes.SHA256()), key)
+    return Pair(builder.sign(key, hashes.SHA256()), key)
 
 
-def read_authority(folder: Path) -> Authority:
+def read_authority(folder: Path) -> Pair:
     """The authority that `make_authority` made before. UserError where its files do not fit."""
     pem = read_bytes(folder / CA_FILE, "authority")
     try:
@@ -78,7 +198,7 @@ def read_authority(folder: Path) -> Authority:
         raise UserError(f"{folder / CA_KEY_FILE} is not a key of an elliptic curve")
     if key.public_key() != certificate.public_key():
         raise UserError(f"{folder / CA_KEY_FILE} does not fit {CA_FILE} beside it")
-    return Authority(certificate, key)
+    return Pair(certificate, key)
 
 
 def party_roles(vehicle_ids: Iterable[str]) -> dict[str, str]:
@@ -89,13 +209,13 @@ def party_roles(vehicle_ids: Iterable[str]) -> dict[str, str]:
 
 
 def issue(
-    authority: Authority,
+    authority: Pair,
     party: str,
     role: str,
     hosts: Iterable[str],
     now: datetime.datetime,
     days: int,
-) -> Issued:
+) -> Pair:
     """A certificate for a party; ``hosts`` are the names under which a listener is reached."""
     key = ec.generate_private_key(ec.SECP256R1())
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -113,7 +233,7 @@ def issue(
             critical=False,
         )
     )
-    return Issued(builder.sign(authority.key, hashes.SHA256()), key)
+    return Pair(builder.sign(authority.key, hashes.SHA256()), key)
 
 
 def _builder(
@@ -158,153 +278,3 @@ def _usage(signs_certificates: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
-
-
-CA_FOLDER = "ca"
-DEFAULT_OUT = "certs"
-DEFAULT_DAYS = 365
-MAX_NAME_CHARS = 64
-"""Of a certificate's common name (RFC 5280)."""
-_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
-_HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
-
-
-class Request(NamedTuple):
-    """What the command line asks for, checked."""
-
-    out: Path
-    vehicle_ids: list[str]
-    hosts: list[str]
-    days: int
-
-
-EXAMPLE = examples(
-    "python -m deploy certs --vehicle-id hunter01 --host workstation.local --out certs",
-)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "--out", metavar="DIR", default=DEFAULT_OUT, help="directory of all folders"
-    )
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        action="append",
-        help="a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
-        f" (default: {DEFAULT_VEHICLE_ID})",
-    )
-    parser.add_argument(
-        "--host",
-        metavar="NAME",
-        action="append",
-        default=[],
-        help="a name or address at which simulator or router are reached; may be repeated"
-        f" (always: {', '.join(LOOPBACK_HOSTS)})",
-    )
-    parser.add_argument(
-        "--days",
-        metavar="N",
-        type=whole_number(1, CA_DAYS),
-        default=DEFAULT_DAYS,
-        help="how long they are valid, days",
-    )
-
-
-def certs(arguments: argparse.Namespace) -> int:
-    """Make what is missing of the authority and of the parties' folders.
-
-    Raises UserError, with nothing written, where nothing is missing.
-    """
-    request = _check(arguments)
-    roles = _missing(request)
-    now = datetime.datetime.now(datetime.UTC)
-    ca_folder = request.out / CA_FOLDER
-    is_new = not ca_folder.exists()
-    authority = make_authority(now) if is_new else read_authority(ca_folder)
-    _check_lifetime(authority, now, request.days)
-    if is_new:
-        with _new_folder(ca_folder) as draft:
-            write_atomic(draft / CA_FILE, _pem(authority.certificate))
-            _write_key(draft / CA_KEY_FILE, authority.key)
-    for name, role in roles.items():
-        issued = issue(authority, name, role, request.hosts, now, request.days)
-        with _new_folder(request.out / name) as draft:
-            write_atomic(draft / CA_FILE, _pem(authority.certificate))
-            write_atomic(draft / CERTIFICATE_FILE, _pem(issued.certificate))
-            _write_key(draft / KEY_FILE, issued.key)
-    print(f"authority (keep {ca_folder / CA_KEY_FILE} off every board): {ca_folder}")
-    for name in roles:
-        print(f"--tls {request.out / name}")
-    print(f"valid until {now + datetime.timedelta(days=request.days):%Y-%m-%d}")
-    return 0
-
-
-def _check(arguments: argparse.Namespace) -> Request:
-    vehicle_ids = arguments.vehicle_id or [DEFAULT_VEHICLE_ID]
-    for vehicle_id in vehicle_ids:
-        check_vehicle_id(vehicle_id)
-    for name in party_roles(vehicle_ids):
-        if len(name) > MAX_NAME_CHARS:
-            raise UserError(
-                f"no certificate can name {name}: its {len(name)} characters are over"
-                f" {MAX_NAME_CHARS}; choose a shorter --vehicle-id"
-            )
-    for host in arguments.host:
-        if not _is_host(host):
-            raise UserError(f"host {host!r} is not valid: write a name or an address, without port")
-    hosts = [*LOOPBACK_HOSTS, *arguments.host]
-    return Request(Path(arguments.out), list(dict.fromkeys(vehicle_ids)), hosts, arguments.days)
-
-
-def _is_host(text: str) -> bool:
-    with contextlib.suppress(ValueError):
-        ipaddress.ip_address(text)
-        return True
-    return _HOST_NAME.fullmatch(text) is not None
-
-
-def _missing(request: Request) -> dict[str, str]:
-    """The role of each party that has no folder yet, by name; UserError where all have one."""
-    roles = party_roles(request.vehicle_ids)
-    missing = {name: role for name, role in roles.items() if not (request.out / name).exists()}
-    if not missing:
-        raise UserError(
-            f"{request.out} has {', '.join(roles)} already and nothing is overwritten; move away"
-            " what is to be made new, or choose another --vehicle-id or --out"
-        )
-    for name in sorted(roles.keys() - missing.keys()):
-        print(f"kept as it is: {request.out / name}")
-    return missing
-
-
-def _check_lifetime(authority: Authority, now: datetime.datetime, days: int) -> None:
-    left = authority.certificate.not_valid_after_utc - now
-    if left < datetime.timedelta(days=days):
-        raise UserError(f"--days {days} is longer than the authority's own {left.days} days")
-
-
-@contextlib.contextmanager
-def _new_folder(folder: Path) -> Iterator[Path]:
-    """Fill a draft beside it and move it there, so that the folder is whole or absent."""
-    draft = folder.with_name(f".{folder.name}.{os.getpid()}")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        draft.mkdir(mode=0o700)
-        yield draft
-        draft.rename(folder)  # Fails where somebody has filled it meanwhile.
-    except OSError as error:
-        raise UserError(f"cannot create {folder}: {error.strerror}") from None
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
-def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """PKCS8 PEM, mode 0600. The folder is the owner's alone, so it never was open to others."""
-    write_atomic(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
-    path.chmod(0o600)
-
-
-def _pem(certificate: x509.Certificate) -> bytes:
-    return certificate.public_bytes(Encoding.PEM)

@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE.json5", required=True, help="the settings' file")
 
 
-def router(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Write the file. Raises UserError where anything in it would not hold."""
     check_writable(arguments.out)
     for endpoint in arguments.listen:

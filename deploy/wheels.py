@@ -25,7 +25,7 @@ from edge_runtime.files import read_bytes, write_atomic
 
 ROOT = Path(__file__).parents[1]
 LOCKS = ROOT / "requirements"
-
+DEFAULT_FOLDER = "build/wheels"
 TARGETS = {
     target.name: target
     for target in (
@@ -37,21 +37,6 @@ TARGETS = {
         Target(name="linux-x86_64", python="3.8", machine="x86_64", glibc="2.31"),
     )
 }
-
-
-def find_target(name: str) -> Target:
-    """The row of a name. Raises UserError with the known ones."""
-    if name not in TARGETS:
-        raise UserError(f"target {name!r} is not known; choose from {', '.join(TARGETS)}")
-    return TARGETS[name]
-
-
-def lock_path(target: Target) -> Path:
-    """The file that names every wheel of a target by version and hash."""
-    return LOCKS / f"bundle-{target.name}.txt"
-
-
-DEFAULT_FOLDER = "build/wheels"
 _MANYLINUX = (5, 12, 17, 24, 26, 27, 28, 31)
 """The minor versions of glibc 2 that wheels are tagged with, up to the boards' own."""
 _PATCH = 2
@@ -68,6 +53,18 @@ class Pin(NamedTuple):
     name: str
     version: str
     sha256: str
+
+
+def find_target(name: str) -> Target:
+    """The row of a name. Raises UserError with the known ones."""
+    if name not in TARGETS:
+        raise UserError(f"target {name!r} is not known; choose from {', '.join(TARGETS)}")
+    return TARGETS[name]
+
+
+def lock_path(target: Target) -> Path:
+    """The file that names every wheel of a target by version and hash."""
+    return LOCKS / f"bundle-{target.name}.txt"
 
 
 def read_lock(path: Path) -> list[Pin]:

@@ -29,7 +29,7 @@ import multiprocessing
 import os
 import shlex
 import shutil
-import subprocess
+import signal
 import sys
 import time
 import zipfile
@@ -37,14 +37,30 @@ from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Iterator, TextIO
 
-from deploy.installer.apart import end_with_parent
-from deploy.installer.verify import MANIFEST, SIGNATURE, Bundle, UnhealthyError, UserError
+from deploy.installer.verify import Bundle, UserError
 
 DEFAULT_ROOT = "/opt/phil"
+SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"
+WHEELS, TLS = "wheels/", "tls/"
+POLICY, PUBLIC_KEY, CONFIG = "policy.onnx", "policy.pub", "config.toml"
 _MAKING = ".making-"
 _LINKS = ("current", "previous")
 _HOLD_LIMIT_S = 2.0
 """A runtime that asks whether it may send has the lock for microseconds."""
+_NOT_COMPILED = "tests"
+"""numpy's own tests are a quarter of all files, and nobody imports them here."""
+_SET_PARENT_DEATH_SIGNAL = 1  # sys/prctl.h
+_LAUNCH = """\
+import os
+import runpy
+import site
+import sys
+
+# The packages of this release and the standard library; nothing else of this computer (-I -S).
+site.addsitedir(os.path.join(os.path.dirname(os.path.abspath(__file__)), "site-packages"))
+sys.argv[0] = "phil-edge"
+runpy.run_module("edge_runtime", run_name="__main__")
+"""
 
 
 class Layout:
@@ -187,83 +203,10 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def sync_all(folder: Path) -> None:
-    """Put everything on the folder's file system on the disk: one call for thousands of files."""
-    descriptor = os.open(str(folder), os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        if ctypes.CDLL(None, use_errno=True).syncfs(descriptor) != 0:
-            raise OSError(ctypes.get_errno(), "syncfs failed")
-    except AttributeError:  # a C library without it
-        os.sync()
-    finally:
-        os.close(descriptor)
-
-
 def remove_tree(path: Path) -> None:
     """Remove a folder and all in it, if it is there."""
     with contextlib.suppress(FileNotFoundError):
         shutil.rmtree(str(path))
-
-
-_LIBRARIES = ("purelib", "platlib")
-
-
-def unpack_wheel(data: bytes, name: str, site: Path) -> None:
-    """Write a wheel's packages into `site`. Raises UserError for names that leave it or meet.
-
-    Scripts, headers and data files have no use on the board and stay out.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as wheel:
-            for member in wheel.infolist():
-                if not member.is_dir():
-                    place = _place(member.filename, name)
-                    if place is not None:
-                        _write_new(site / place, wheel.read(member), name)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
-        raise UserError(f"{name} is not a wheel: {error}") from None
-
-
-def _place(path: str, wheel: str) -> PurePosixPath | None:
-    """Where a member goes below site-packages; None where it does not go there."""
-    parts = PurePosixPath(path).parts
-    if not parts or path.startswith("/") or "\\" in path or ".." in parts:
-        raise UserError(f"{wheel} would write outside of its folder: {path}")
-    if not parts[0].endswith(".data"):
-        return PurePosixPath(*parts)
-    if len(parts) > 2 and parts[1] in _LIBRARIES:
-        return PurePosixPath(*parts[2:])
-    return None
-
-
-def _write_new(path: Path, data: bytes, wheel: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(str(path), "xb") as stream:
-            stream.write(data)
-    except (FileExistsError, NotADirectoryError):
-        raise UserError(
-            f"{wheel} holds a file that another wheel holds, too: {path.name}"
-        ) from None
-
-
-SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"
-WHEELS, TLS = "wheels/", "tls/"
-POLICY, PUBLIC_KEY, CONFIG = "policy.onnx", "policy.pub", "config.toml"
-_NOT_COMPILED = "tests"
-"""numpy's own tests are a quarter of all files, and nobody imports them here."""
-CHECK_LIMIT_S = 120.0
-_LAUNCH = """\
-import os
-import runpy
-import site
-import sys
-
-# The packages of this release and the standard library; nothing else of this computer (-I -S).
-site.addsitedir(os.path.join(os.path.dirname(os.path.abspath(__file__)), "site-packages"))
-sys.argv[0] = "phil-edge"
-runpy.run_module("edge_runtime", run_name="__main__")
-"""
 
 
 def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
@@ -278,7 +221,7 @@ def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
     try:
         _fill(bundle, draft, folder, group)
         _write(draft / CONTENTS, json.dumps(hashes(draft), indent=0).encode())
-        sync_all(draft)
+        os.sync()
         draft.rename(folder)
         sync_folder(layout.releases)
     except OSError as error:
@@ -313,37 +256,47 @@ def hashes(folder: Path) -> dict[str, str]:
     return found
 
 
-def check_policy(folder: Path) -> None:
-    """`edge_runtime check` by the release's own runtime. UnhealthyError with its last line."""
-    command = [str(folder / LAUNCHER), "check", POLICY, "--public-key", PUBLIC_KEY]
+def unpack_wheel(data: bytes, name: str, site: Path) -> None:
+    """Write a wheel's packages into `site`, without pip, which a board may lack (PEP 427).
+
+    Scripts, headers and data files have no use on the board and stay out. Raises UserError for
+    names that leave `site`, and for a file that another wheel holds too.
+    """
     try:
-        done = subprocess.run(
-            command, cwd=str(folder), timeout=CHECK_LIMIT_S, check=False,
-            capture_output=True, text=True,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        raise UnhealthyError(f"edge_runtime check took over {CHECK_LIMIT_S:.0f} s") from None
-    if done.returncode != 0:
-        raise UnhealthyError(f"edge_runtime check: {last_line(done.stderr, done.returncode)}")
+        with zipfile.ZipFile(io.BytesIO(data)) as wheel:
+            for member in wheel.infolist():
+                place = None if member.is_dir() else _place(member.filename, name)
+                if place is not None:
+                    (site / place).parent.mkdir(parents=True, exist_ok=True)
+                    with open(str(site / place), "xb") as stream:
+                        stream.write(wheel.read(member))
+    except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
+        raise UserError(f"{name} is not a wheel: {error}") from None
+    except (FileExistsError, NotADirectoryError) as error:
+        raise UserError(f"{name} holds a file that another wheel holds: {error.filename}") from None
 
 
-def last_line(text: str, status: int) -> str:
-    """What a process said last, or how it ended."""
-    lines = text.strip().splitlines()
-    return lines[-1] if lines else f"exit status {status}"
+def _place(path: str, wheel: str) -> PurePosixPath | None:
+    """Where a member goes below site-packages; None where it does not go there."""
+    parts = PurePosixPath(path).parts
+    if not parts or path.startswith("/") or "\\" in path or ".." in parts:
+        raise UserError(f"{wheel} would write outside of its folder: {path}")
+    if not parts[0].endswith(".data"):
+        return PurePosixPath(*parts)
+    if len(parts) > 2 and parts[1] in ("purelib", "platlib"):
+        return PurePosixPath(*parts[2:])
+    return None
 
 
 def _fill(bundle: Bundle, draft: Path, folder: Path, group: int | None) -> None:
     draft.mkdir(mode=0o755)
-    _write(draft / MANIFEST, bundle.manifest_json)
-    _write(draft / SIGNATURE, bundle.signature)
-    for entry in bundle.manifest.files:
-        data = bundle.read(entry)
-        if entry.path.startswith(WHEELS):
-            unpack_wheel(data, entry.path, draft / SITE)
+    for path, data in bundle.files.items():
+        if path.startswith(WHEELS):
+            unpack_wheel(data, path, draft / SITE)
+        elif path.startswith(TLS):
+            _write(draft / path, data, 0o600 if group is None else 0o640, group)
         else:
-            secret = entry.path.startswith(TLS)
-            _write(draft / entry.path, data, 0o640 if secret else 0o644, group if secret else None)
+            _write(draft / path, data)
     _write(draft / "launch.py", _LAUNCH.encode())
     _write(draft / LAUNCHER, _launcher(folder).encode(), 0o755)
     _compile(draft / SITE)
@@ -355,7 +308,7 @@ def _compile(site: Path) -> None:
     # Forked, so that they are this thread's own children and end with it.
     pool = ProcessPoolExecutor(
         mp_context=multiprocessing.get_context("fork"),
-        initializer=end_with_parent,
+        initializer=_end_with_parent,
         initargs=(os.getpid(),),
     )
     try:
@@ -367,8 +320,15 @@ def _compile(site: Path) -> None:
         ) from None
 
 
+def _end_with_parent(parent: int) -> None:
+    """Let the kernel kill this process when its parent, of that process id, has ended."""
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
+    if os.getppid() != parent:  # It had ended before it was asked for.
+        os._exit(1)
+
+
 def _launcher(folder: Path) -> str:
-    parts: list[str] = [sys.executable, "-I", "-S", "-B", str(folder / "launch.py")]
+    parts = [sys.executable, "-I", "-S", "-B", str(folder / "launch.py")]
     return "#!/bin/sh\nexec " + " ".join(map(shlex.quote, parts)) + ' "$@"\n'
 
 
@@ -379,14 +339,12 @@ def _write(path: Path, data: bytes, mode: int = 0o644, group: int | None = None)
         stream.write(data)
     if group is not None:
         os.chown(str(path), -1, group)
-    elif mode == 0o640:
-        mode = 0o600
     os.chmod(str(path), mode)
 
 
 def _check_room(bundle: Bundle, layout: Layout) -> None:
     """Unpacked and compiled, wheels take some four times their size."""
-    needed = 5 * sum(entry.size for entry in bundle.manifest.files)
+    needed = 5 * sum(map(len, bundle.files.values()))
     free = shutil.disk_usage(str(layout.releases)).free
     if free < needed:
         raise UserError(

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from deploy.installer import systemd as systemctl
-from deploy.installer.systemd import MAIN_UNIT, Limits, Systemd
+from deploy.installer.systemd import MAIN_UNIT, TRIAL_UNIT, Limits, Systemd
 from deploy.installer.verify import UnhealthyError
 
 UNITS = Path(__file__).parents[1] / "systemd"
@@ -112,6 +112,16 @@ if sys.argv[1] == "show":
 elif sys.argv[1] == "start" and "refuse" in open({state!r}).read():
     sys.exit("Job for phil-edge.service failed.")
 """
+FAKE_RUN = """\
+#!{python}
+import sys
+with open({log!r}, "a") as log:
+    log.write("systemd-run " + " ".join(sys.argv[1:]) + "\\n")
+(said,) = [word.split("=file:")[1] for word in sys.argv if "StandardError=" in word]
+with open(said, "w") as out:
+    out.write(open({log!r} + ".said").read())
+sys.exit("Job failed." if "refuse" in open({state!r}).read() else 0)
+"""
 ACTIVE = "ActiveState=active\nSubState=running\nNRestarts=0\nResult=success\nStatusText=standby"
 
 
@@ -121,8 +131,9 @@ def systemd(tmp_path, monkeypatch):
     programs = tmp_path / "programs"
     programs.mkdir()
     names = {"python": sys.executable, "log": str(tmp_path / "log"), "state": str(tmp_path / "s")}
-    (programs / "systemctl").write_text(FAKE.format(**names))
-    (programs / "systemctl").chmod(0o755)
+    for name, text in (("systemctl", FAKE), ("systemd-run", FAKE_RUN)):
+        (programs / name).write_text(text.format(**names))
+        (programs / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
     (tmp_path / "s").write_text(ACTIVE)
     for folder in ("state", "etc"):
@@ -200,3 +211,39 @@ def test_systemd_is_not_taken_for_there_where_it_is_not(tmp_path, monkeypatch):
     assert not systemctl.is_there()
     (tmp_path / "run").mkdir()
     assert systemctl.is_there()
+
+
+def try_release(systemd, tmp_path, said: str, state: str = ACTIVE) -> list[str]:
+    """A trial of a runtime that says so; what systemd was told."""
+    (tmp_path / "log.said").write_text(said)
+    (tmp_path / "s").write_text(state)
+    systemd.try_release(tmp_path / "one", "abc", Limits(0.2, 0.1))
+    return told(tmp_path)
+
+
+def test_a_trial_runs_without_vehicle_and_network_and_is_taken_away(systemd, tmp_path):
+    before, after = [f"stop {TRIAL_UNIT}", f"reset-failed {TRIAL_UNIT}"], []
+    *after, run, left, gone = try_release(systemd, tmp_path, "loaded policy_id=abc\n")
+    assert (after, [left, gone]) == (before, before)
+    words = run.split()
+    assert words[0] == "systemd-run"
+    for name in ("PrivateNetwork=yes", "User=phil", "TimeoutStartSec=0.2", "NotifyAccess=main"):
+        assert f"--property={name}" in words
+    assert "--service-type=notify" in words
+    assert {w.split("=")[1] for w in words if "WatchdogSec" in w or "RuntimeMaxSec" in w}
+    assert run.endswith("--vehicle none --connect tcp/127.0.0.1:9 --log-level warning")
+
+
+@pytest.mark.parametrize(
+    ("said", "state", "match"),
+    [
+        ("policy_id=other\n", ACTIVE, "has loaded this policy"),
+        ("ready\nerror: no such file\n", "refuse\nResult=exit-code", "exit-code: error: no such"),
+        ("policy_id=abc\n", "ActiveState=failed\nResult=watchdog", "trial: watchdog"),
+        ("policy_id=abc\n", "ActiveState=inactive\nResult=success", "trial: success"),
+    ],
+)
+def test_a_trial_that_fails_says_why_and_is_taken_away(systemd, tmp_path, said, state, match):
+    with pytest.raises(UnhealthyError, match=match):
+        try_release(systemd, tmp_path, said, state)
+    assert told(tmp_path)[-2:] == [f"stop {TRIAL_UNIT}", f"reset-failed {TRIAL_UNIT}"]

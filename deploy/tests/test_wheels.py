@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from deploy import wheels
-from deploy.campaigns.light import HERE
 from deploy.installer.layout import unpack_wheel
 from deploy.installer.verify import UserError as InstallerError
+from deploy.tests.boards import HERE
 from deploy.wheels import TARGETS, Pin, gather, lock_path, read_lock
 from edge_runtime.errors import UserError
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from deploy.certs import add_arguments, certs
+from deploy.certs import add_arguments, run
 from edge_runtime import wire
 from edge_runtime.access import rules_for_listener
 from edge_runtime.cli import ArgumentParser, UserError, examples, run_cli, write_json_out
@@ -119,7 +119,7 @@ def measure(policy: Path, blocks: int) -> dict[str, Any]:
         parser = ArgumentParser()
         add_arguments(parser)
         with contextlib.redirect_stdout(sys.stderr):
-            certs(parser.parse_args(["--out", str(certificates), "--vehicle-id", VEHICLE_ID]))
+            run(parser.parse_args(["--out", str(certificates), "--vehicle-id", VEHICLE_ID]))
         with edge_and_bench(policy, None) as plain, edge_and_bench(policy, certificates) as tls:
             for bench in (plain, tls):
                 bench.block(BLOCK, keep=False)
