@@ -89,10 +89,9 @@ network: $(STAMP)  ## TCP, UDP, relay and virtual time on the same network; need
 	$(BIN)/python -m hil_tests network --out results/network/network.json --report results/network
 	$(BIN)/python -m hil_tests.network.variants --out results/network/variants.json
 
-board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
+board: $(STAMP)  ## a bundle onto an emulated aarch64 computer and onto Python 3.8, and driven; needs root
 	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
 	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
-	$(BIN)/python -m hil_tests board --boards systemd --out results/deploy/systemd.json
 
 fleet: $(STAMP)  ## a router with 1, 5, 10 and 20 edge runtimes: processor, memory, bandwidth each
 	$(BIN)/python -m hil_tests fleet --out results/deploy/fleet.json

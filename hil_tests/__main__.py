@@ -23,7 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "policy in the loop against vehicle in the loop, and the lag it may have",
     ),
     "board": (
-        "hil_tests.board.command",
+        "hil_tests.board",
         "a bundle installed and driven on boards that are not there; needs root",
     ),
     "fleet": (
