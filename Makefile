@@ -76,7 +76,6 @@ bench-quick: $(STAMP)  ## a look at the same: a table only
 board: $(STAMP)  ## a bundle onto emulated aarch64 and onto Python 3.8, offline, and driven; needs root
 	$(BIN)/python -m hil_tests board --boards aarch64 --out results/deploy/aarch64.json
 	$(BIN)/python -m hil_tests board --boards python38 --out results/deploy/python38.json
-	$(BIN)/python -m hil_tests board --boards systemd --out results/deploy/systemd.json
 
 bench-loop: $(STAMP)  ## the loop against the least that could answer: latency, memory, start, lock-step
 	$(BIN)/python -m hil_tests bench --out $(BENCH)/loop.json

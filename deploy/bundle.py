@@ -1,37 +1,62 @@
-"""A bundle: everything that a board needs to drive one policy, in one signed archive.
+"""``python -m deploy bundle``: all that a board needs to drive one policy, in one signed archive.
 
-The same inputs give the same bytes: the archive says nothing of when, where and by whom.
+The same inputs give the same bytes: the archive holds no time, place or user name.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import hashlib
+import io
 import os
+import subprocess
+import tarfile
 import tempfile
 import tomllib
+import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
+import deploy.installer
 import edge_runtime
-from deploy.installer import errors as installer_errors
-from deploy.installer.archive import CONTEXT, END, MANIFEST, SIGNATURE, header, padding
-from deploy.installer.manifest import FileEntry, Manifest, Target, to_json
-from deploy.installer.release import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
-from deploy.pyz import NAME, build_installer
+from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
+from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
+from deploy.keys import DEFAULT_DIRECTORY
+from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, find_target, gather, lock_path
 from edge_runtime import tls as access
+from edge_runtime.cli import examples
 from edge_runtime.config import NONE, Config, load_config
 from edge_runtime.policy import Policy, load_policy
+from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
 from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE, load_tls, read_signing_key
 from edge_runtime.util import UserError, read_bytes
 
+NAME = "install.pyz"
+DEFAULT_OUT = "build/bundles"
+DEFAULT_KEY = f"{DEFAULT_DIRECTORY}/policy.key"
 UNITS = Path(__file__).parent / "systemd"
-_DIGITS = 8
 HOLD = "../../state/hold"
 """Seen from a release's folder: what the installer locks while it judges."""
 _OF_THE_BUNDLE = ("policy", "tls", "public_key", "allow_unsigned", "hold")
+_DIGITS = 8
+_FIRST_DAY = (1980, 1, 1, 0, 0, 0)
+_MAIN = (
+    "import sys\n\nif sys.version_info < (3, 8):\n"
+    '    sys.stderr.write("error: Python 3.8 or newer is needed: try python3.8\\n")\n'
+    "    sys.exit(2)\n\n"
+    "from deploy.installer.__main__ import main\n\n"
+    'if __name__ == "__main__":\n    sys.exit(main(sys.argv[1:]))\n'
+)
+
+EXAMPLE = examples(
+    "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
+    "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
+    "    --config edge.toml --tls certs/edge-hunter01",
+)
 
 
 class Inputs(NamedTuple):
@@ -51,14 +76,87 @@ class Inputs(NamedTuple):
 
 
 class Made(NamedTuple):
-    """A bundle on the disk, and what it holds: size by name, in bytes."""
+    """A bundle on the disk, and the size of each file in it, bytes."""
 
     path: Path
     manifest: Manifest
+    sizes: dict[str, int]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--policy", metavar="POLICY.onnx", required=True, help="signed policy file")
+    parser.add_argument(
+        "--target", metavar="|".join(TARGETS), required=True, help="the board's kind"
+    )
+    parser.add_argument("--out", metavar="DIR", default=DEFAULT_OUT, help="where the archive goes")
+    parser.add_argument(
+        "--config",
+        metavar="FILE.toml",
+        help="settings of `edge_runtime run`: connect, vehicle, ...",
+    )
+    parser.add_argument(
+        "--tls",
+        metavar="DIR",
+        help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01",
+    )
+    parser.add_argument(
+        "--public-key",
+        metavar="FILE",
+        default=str(DEFAULT_PUBLIC_KEY),
+        help="of whoever signed the policy",
+    )
+    parser.add_argument(
+        "--key", metavar="FILE", default=DEFAULT_KEY, help="private key that signs the bundle"
+    )
+    parser.add_argument(
+        "--wheels", metavar="DIR", default=DEFAULT_FOLDER, help="wheels are kept here"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Make a bundle and print its size and contents."""
+    target = find_target(arguments.target)
+    with tempfile.TemporaryDirectory() as place:
+        inputs = Inputs(
+            policy=Path(arguments.policy),
+            public_key=Path(arguments.public_key),
+            key=Path(arguments.key),
+            config=Path(arguments.config) if arguments.config else None,
+            tls=Path(arguments.tls) if arguments.tls else None,
+            wheels=[],
+        )
+        check_inputs(inputs)  # Before minutes of downloads.
+        _check_out(Path(arguments.out))
+        wheels = gather(target, lock_path(target), Path(arguments.wheels) / target.name)
+        inputs = inputs._replace(wheels=[*wheels, build_edge_wheel(Path(place))])
+        made = make_bundle(inputs, target, Path(arguments.out))
+    print("\n".join(_lines(made)))
+    return 0
+
+
+def _check_out(out: Path) -> None:
+    """Raise UserError where the folder cannot be made, without making it."""
+    whole = out.absolute()
+    there = next(place for place in (whole, *whole.parents) if place.exists())
+    if not there.is_dir():
+        raise UserError(f"--out {out}: {there} is a file, not a directory")
+
+
+def _lines(made: Made) -> list[str]:
+    manifest, size = made.manifest, made.path.stat().st_size
+    wheels = sum(size for path, size in made.sizes.items() if path.startswith(WHEELS))
+    return [
+        *(f"{size:>12,}  {path}" for path, size in made.sizes.items()),
+        f"{wheels:>12,}  of it wheels",
+        f"{size:>12,}  {made.path}  ({size / 1e6:.1f} MB), signed by {made.path.name}.sig",
+        f"version {manifest.version}, for {manifest.vehicle_id}, Python {manifest.target.python}"
+        f" on {manifest.target.machine} with glibc {manifest.target.glibc} or newer",
+    ]
 
 
 def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
-    """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, into `out`.
+    """Write `phil-TARGET-VEHICLE-VERSION.tar`, mode 0600, and its signature into `out`.
 
     Raises UserError, with nothing written, for a policy that may not drive or was not signed by
     the public key's owner, settings that do not hold, certificates of another party, and a key
@@ -78,8 +176,11 @@ def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
         contents |= _tls(inputs.tls, config.vehicle_id)
     manifest = _manifest(contents, target, config.vehicle_id, policy.policy_id)
     path = out / f"phil-{target.name}-{config.vehicle_id}-{manifest.version}.tar"
-    _write(path, manifest, key, contents)
-    return Made(path, manifest)
+    packed = _pack({MANIFEST: to_json(manifest), **contents})
+    signature = _sign(packed, key)
+    _write(Path(f"{path}.sig"), signature, 0o644)
+    _write(path, packed, 0o600)  # it holds a private key, so nobody else may read it
+    return Made(path, manifest, {name: len(data) for name, data in sorted(contents.items())})
 
 
 def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str]:
@@ -103,14 +204,49 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
 
 def _manifest(contents: dict[str, bytes], target: Target, vehicle: str, policy: str) -> Manifest:
     """The version ends with a hash of all the rest, so it always means the same bytes."""
-    files = [
-        FileEntry(path, len(data), hashlib.sha256(data).hexdigest())
-        for path, data in sorted(contents.items())
-    ]
-    draft = Manifest("draft", target, vehicle, policy, files)
-    digest = hashlib.sha256(to_json(draft)).hexdigest()
-    version = f"{edge_runtime.__version__}-{policy[:_DIGITS]}-{digest[:_DIGITS]}"
+    draft = Manifest("draft", target, vehicle, policy)
+    digest = hashlib.sha256(to_json(draft))
+    for name, data in sorted(contents.items()):
+        digest.update(f"{name} {hashlib.sha256(data).hexdigest()}\n".encode())
+    version = f"{edge_runtime.__version__}-{policy[:_DIGITS]}-{digest.hexdigest()[:_DIGITS]}"
     return draft._replace(version=version)
+
+
+def _pack(contents: dict[str, bytes]) -> bytes:
+    """A tar of files in the order of their names: owner 0, time 0, mode 0600."""
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for name, data in sorted(contents.items()):
+            member = tarfile.TarInfo(name)
+            member.size, member.mode = len(data), 0o600
+            try:
+                tar.addfile(member, io.BytesIO(data))
+            except ValueError:
+                raise UserError(f"the name {name} is too long for a bundle") from None
+    return packed.getvalue()
+
+
+def _sign(data: bytes, key: Ed25519PrivateKey) -> bytes:
+    """The signature that the board's `ssh-keygen -Y verify` takes; the same one each time.
+
+    ssh-keygen reads the key from a file in memory: no copy of it comes onto the disk.
+    """
+    pem = key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption())
+    with open(os.memfd_create("key"), "wb") as file:
+        os.fchmod(file.fileno(), 0o600)  # it takes no key that others could read
+        file.write(pem)
+        file.flush()
+        command = ["ssh-keygen", "-q", "-Y", "sign", "-n", NAMESPACE, "-f",
+                   f"/proc/self/fd/{file.fileno()}"]  # fmt: skip
+        try:
+            done = subprocess.run(
+                command, input=data, capture_output=True, check=False, pass_fds=[file.fileno()]
+            )
+        except FileNotFoundError:
+            raise UserError("ssh-keygen is not installed here (openssh-client)") from None
+    if done.returncode != 0:
+        raise UserError(f"ssh-keygen does not sign: {done.stderr.decode(errors='replace')}")
+    return done.stdout
 
 
 def _config(inputs: Inputs) -> tuple[Config, str]:
@@ -169,23 +305,31 @@ def _tls(folder: Path, vehicle_id: str) -> dict[str, bytes]:
     }
 
 
-def _write(path: Path, manifest: Manifest, key: Ed25519PrivateKey, contents: dict) -> None:
-    """Write it beside and move it there: it holds a private key, so nobody else may read it."""
-    raw = to_json(manifest)
-    members = {MANIFEST: raw, SIGNATURE: key.sign(CONTEXT + raw)}
-    members |= {entry.path: contents[entry.path] for entry in manifest.files}
+def _write(path: Path, data: bytes, mode: int) -> None:
+    """Write a file beside it and move it there."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:
-            for name, data in members.items():
-                stream.write(header(name, len(data)) + data + padding(len(data)))
-            stream.write(END)
+        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as stream:
+            stream.write(data)
         draft.replace(path)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from None
-    except installer_errors.UserError as error:  # a name that no archive takes
-        raise UserError(str(error)) from None
     finally:  # ^C, too: half a bundle holds a private key as well
         with contextlib.suppress(OSError):
             draft.unlink()
+
+
+def build_installer() -> bytes:
+    """The bytes of `install.pyz`."""
+    folder = Path(deploy.installer.__file__).parent
+    members = {"__main__.py": _MAIN, "deploy/__init__.py": ""}
+    for path in sorted(folder.glob("*.py")):
+        members[f"deploy/installer/{path.name}"] = path.read_text()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
+        for name, text in members.items():
+            info = zipfile.ZipInfo(name, _FIRST_DAY)
+            info.external_attr = 0o100644 << 16
+            archive.writestr(info, text)
+    return packed.getvalue()

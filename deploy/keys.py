@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 from pathlib import Path
 
@@ -13,11 +14,31 @@ from cryptography.hazmat.primitives.serialization import (
     PublicFormat,
 )
 
+from edge_runtime.cli import examples
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
 from edge_runtime.util import UserError
 
 DEFAULT_DIRECTORY = str(DEFAULT_PUBLIC_KEY.parent)
+EXAMPLE = examples("python -m deploy keys --out keys")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        default=DEFAULT_DIRECTORY,
+        help="directory for policy.key and policy.pub",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Make a pair and say where each half belongs."""
+    private, public = write_key_pair(Path(arguments.out))
+    print(f"private key (keep it on the workstation): {private}")
+    print(f"public key (goes onto the board):         {public}")
+    return 0
 
 
 def write_key_pair(directory: Path) -> tuple[Path, Path]:

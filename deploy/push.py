@@ -14,12 +14,11 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from deploy.installer import ed25519
-from deploy.installer import errors as installer_errors
-from deploy.installer.archive import open_bundle
+from deploy.bundle import NAME, build_installer
+from deploy.installer import verify
 from deploy.installer.layout import DEFAULT_ROOT
-from deploy.installer.manifest import Manifest
-from deploy.pyz import NAME, build_installer
+from deploy.installer.systemd import WAYS
+from deploy.installer.verify import Manifest
 from edge_runtime.cli import examples
 from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
 from edge_runtime.util import UserError, read_bytes
@@ -58,14 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="public half of the key that signed the bundle; a new board will trust it",
     )
     parser.add_argument("--root", metavar="DIR", default=DEFAULT_ROOT, help="where on the board")
-    parser.add_argument(
-        "--service", metavar="WAY", choices=("systemd", "process", "none"), help="who runs it there"
-    )
+    parser.add_argument("--service", metavar="WAY", choices=WAYS, help="who runs it there")
     parser.add_argument("--no-sudo", action="store_true", help="the user there needs no sudo")
     parser.add_argument("--dry-run", action="store_true", help="print each step and do nothing")
 
 
-def push(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Copy, install, and clean up; the installer's exit status."""
     if not _HOST.fullmatch(arguments.host):
         raise UserError(f"host {arguments.host!r} is not valid: write name or user@name")
@@ -76,6 +73,7 @@ def push(arguments: argparse.Namespace) -> int:
         files[_TRUST].write_bytes(read_bytes(arguments.trust, "public key"))
         # Absolute: scp would take "a:b" for a file of the host a.
         files[_BUNDLE] = Path(arguments.bundle).absolute()
+        files[f"{_BUNDLE}.sig"] = Path(f"{files[_BUNDLE]}.sig")
         before, install, after = steps(arguments, manifest, files)
         if arguments.dry_run:
             for step in (*before, install, after):
@@ -122,15 +120,10 @@ def steps(
 
 def _verify(arguments: argparse.Namespace) -> Manifest:
     """The bundle's manifest: what the board would refuse is not sent."""
-    pem = read_bytes(arguments.trust, "public key")
     try:
-        key = ed25519.parse_public_key(pem)
-    except installer_errors.UserError as error:
-        raise UserError(f"public key {arguments.trust}: {error}") from None
-    try:
-        with open_bundle(arguments.bundle, key) as bundle:
-            return bundle.manifest
-    except installer_errors.UserError as error:
+        key = verify.read_public_key(arguments.trust)
+        return verify.read_bundle(arguments.bundle, key).manifest
+    except verify.UserError as error:
         raise UserError(str(error)) from None
 
 

@@ -28,7 +28,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "drive and record anew what the next release is replayed against",
     ),
     "board": (
-        "hil_tests.board.command",
+        "hil_tests.board",
         "a bundle installed and driven on boards that are not there; needs root",
     ),
 }

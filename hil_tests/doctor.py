@@ -525,7 +525,7 @@ def board(name: str) -> Callable[[], str]:
     """A probe: this machine can be the board, as `hil_tests board` would find out."""
 
     def probe() -> str:
-        from hil_tests.board.command import why_not
+        from hil_tests.board import why_not
 
         if reason := why_not(name):
             raise MissingError(reason)

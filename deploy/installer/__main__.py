@@ -1,9 +1,8 @@
-"""`python3 install.pyz install | status | rollback | uninstall | supervise` (deploy/README.md)."""
+"""`python3 install.pyz install | status | rollback | uninstall` (deploy/README.md)."""
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import math
 import os
@@ -11,15 +10,10 @@ import signal
 import sys
 from typing import Any, Callable, NoReturn
 
-from deploy.installer import ed25519
-from deploy.installer.errors import UnhealthyError, UserError
-from deploy.installer.health import Limits
-from deploy.installer.layout import DEFAULT_ROOT, Layout
-from deploy.installer.manifest import parse_manifest
-from deploy.installer.release import MANIFEST, why_not_whole
-from deploy.installer.service import WAYS, choose
+from deploy.installer.layout import DEFAULT_ROOT, Layout, why_not_whole
 from deploy.installer.steps import Way, install, rollback, uninstall
-from deploy.installer.supervise import supervise
+from deploy.installer.systemd import WAYS, Limits, NoService, choose
+from deploy.installer.verify import MANIFEST, UnhealthyError, UserError, key_name, parse_manifest
 
 LIMITS = Limits()
 EXAMPLES = {
@@ -27,7 +21,6 @@ EXAMPLES = {
     "status": "status --json",
     "rollback": "rollback --health-limit 20",
     "uninstall": "uninstall",
-    "supervise": "supervise --root /opt/phil",
 }
 UNHEALTHY, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -81,20 +74,18 @@ def _parser() -> argparse.ArgumentParser:
         ("status", "what is installed here, and whether it is whole"),
         ("rollback", "go back to the release before"),
         ("uninstall", "stop the service and remove everything"),
-        ("supervise", "run the service without systemd, until SIGTERM"),
     )
     for name, text in texts:
         command = commands.add_parser(name, help=text, description=text, epilog=_example(name))
         command.add_argument(
             "--root", metavar="DIR", default=DEFAULT_ROOT, help=f"default: {DEFAULT_ROOT}"
         )
-        if name != "supervise":
-            command.add_argument(
-                "--service",
-                metavar="|".join(WAYS),
-                choices=WAYS,
-                help="who runs it (default: systemd where it runs this computer, else none)",
-            )
+        command.add_argument(
+            "--service",
+            metavar="|".join(WAYS),
+            choices=WAYS,
+            help="who runs it (default: systemd where it runs this computer, else none)",
+        )
         if name in ("install", "rollback"):
             for option, kind, default, text in (
                 ("--health-limit", _seconds(True), LIMITS.within_s, "healthy by then, or back"),
@@ -134,8 +125,6 @@ def _example(name: str) -> str:
 
 def _dispatch(arguments: argparse.Namespace) -> int:
     layout = Layout(arguments.root)
-    if arguments.command == "supervise":
-        return supervise(layout)
     if arguments.command == "status":
         service = choose(arguments.service, layout.root, only_look=True)
         return _status(layout, service, arguments.json)
@@ -173,7 +162,7 @@ def _interrupt_on(*numbers: int) -> None:
         signal.signal(number, handle)
 
 
-def _status(layout: Layout, service: Any, as_json: bool) -> int:
+def _status(layout: Layout, service: NoService, as_json: bool) -> int:
     """Print what is here; status 1 where the current release is damaged."""
     current = layout.linked("current")
     if current is None:
@@ -191,9 +180,7 @@ def _status(layout: Layout, service: Any, as_json: bool) -> int:
         "vehicle_id": manifest.vehicle_id,
         "policy_id": manifest.policy_id,
         "service": service.describe(),
-        "trusts": hashlib.sha256(ed25519.parse_public_key(layout.trusted.read_bytes())).hexdigest()[
-            :16
-        ],
+        "trusts": key_name(layout.trusted.read_bytes()),
     }
     print(json.dumps(rows) if as_json else "\n".join(f"{k:<11} {v}" for k, v in rows.items()))
     return UNHEALTHY if fault else 0

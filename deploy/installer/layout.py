@@ -5,27 +5,62 @@ ROOT/releases/VERSION/      whole releases only: made beside, named when all of 
 ROOT/current -> releases/V  what the service runs; changed by one rename
 ROOT/previous -> releases/V where `rollback` goes
 ROOT/.lock                  one installer at a time
-ROOT/releases/.making-*     rubbish of a run that was cut off; the next run removes it
+ROOT/releases/.making-*     what a run that was cut off left; the next run removes it
+
+A release holds what the bundle holds (manifest.json, install.pyz, policy.*, config.toml, tls/,
+units/), and besides
+
+site-packages/              the wheels, unpacked and compiled
+launch.py, bin/phil-edge    start the runtime with this Python and these packages alone
+contents.json               the SHA-256 of every file, by which a release is known to be whole
 """
 
 from __future__ import annotations
 
+import compileall
 import contextlib
 import ctypes
 import fcntl
+import functools
+import hashlib
+import io
+import json
+import multiprocessing
 import os
+import shlex
 import shutil
+import signal
+import sys
 import time
-from pathlib import Path
+import zipfile
+from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
+from pathlib import Path, PurePosixPath
 from typing import Iterator, TextIO
 
-from deploy.installer.errors import UserError
+from deploy.installer.verify import Bundle, UserError
 
 DEFAULT_ROOT = "/opt/phil"
+SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"
+WHEELS, TLS = "wheels/", "tls/"
+POLICY, PUBLIC_KEY, CONFIG = "policy.onnx", "policy.pub", "config.toml"
 _MAKING = ".making-"
 _LINKS = ("current", "previous")
 _HOLD_LIMIT_S = 2.0
 """A runtime that asks whether it may send has the lock for microseconds."""
+_NOT_COMPILED = "tests"
+"""numpy's own tests are a quarter of all files, and nobody imports them here."""
+_SET_PARENT_DEATH_SIGNAL = 1  # sys/prctl.h
+_LAUNCH = """\
+import os
+import runpy
+import site
+import sys
+
+# The packages of this release and the standard library; nothing else of this computer (-I -S).
+site.addsitedir(os.path.join(os.path.dirname(os.path.abspath(__file__)), "site-packages"))
+sys.argv[0] = "phil-edge"
+runpy.run_module("edge_runtime", run_name="__main__")
+"""
 
 
 class Layout:
@@ -168,19 +203,151 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def sync_all(folder: Path) -> None:
-    """Put everything on the folder's file system on the disk: one call for thousands of files."""
-    descriptor = os.open(str(folder), os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        if ctypes.CDLL(None, use_errno=True).syncfs(descriptor) != 0:
-            raise OSError(ctypes.get_errno(), "syncfs failed")
-    except AttributeError:  # a C library without it
-        os.sync()
-    finally:
-        os.close(descriptor)
-
-
 def remove_tree(path: Path) -> None:
     """Remove a folder and all in it, if it is there."""
     with contextlib.suppress(FileNotFoundError):
         shutil.rmtree(str(path))
+
+
+def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
+    """Unpack a bundle; the folder appears under its name when all of it is on the disk.
+
+    `group` is the id of the group that may read the TLS key, None for the owner alone.
+    """
+    version = bundle.manifest.version
+    folder, draft = layout.release(version), layout.making(version)
+    remove_tree(draft)
+    _check_room(bundle, layout)
+    try:
+        _fill(bundle, draft, folder, group)
+        _write(draft / CONTENTS, json.dumps(hashes(draft), indent=0).encode())
+        os.sync()
+        draft.rename(folder)
+        sync_folder(layout.releases)
+    except OSError as error:
+        remove_tree(draft)
+        raise UserError(f"cannot write {folder}: {error.strerror}") from None
+    except UserError:
+        remove_tree(draft)
+        raise
+    return folder
+
+
+def why_not_whole(folder: Path) -> str:
+    """What is missing or changed in a release; empty where every file is as it was made."""
+    try:
+        wanted = json.loads((folder / CONTENTS).read_bytes())
+    except (OSError, ValueError):
+        return f"{CONTENTS} cannot be read"
+    found = hashes(folder)
+    wrong = sorted(p for p in wanted.keys() | found.keys() if wanted.get(p) != found.get(p))
+    return f"{len(wrong)} files are missing or changed, {wrong[0]} first" if wrong else ""
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below a release but `contents.json`, by path."""
+    found = {}
+    for place, _, names in os.walk(str(folder)):
+        for name in names:
+            path = Path(place, name)
+            relative = path.relative_to(folder).as_posix()
+            if relative != CONTENTS:
+                found[relative] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def unpack_wheel(data: bytes, name: str, site: Path) -> None:
+    """Write a wheel's packages into `site`, without pip, which a board may lack (PEP 427).
+
+    Scripts, headers and data files have no use on the board and stay out. Raises UserError for
+    names that leave `site`, and for a file that another wheel holds too.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as wheel:
+            for member in wheel.infolist():
+                place = None if member.is_dir() else _place(member.filename, name)
+                if place is not None:
+                    (site / place).parent.mkdir(parents=True, exist_ok=True)
+                    with open(str(site / place), "xb") as stream:
+                        stream.write(wheel.read(member))
+    except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
+        raise UserError(f"{name} is not a wheel: {error}") from None
+    except (FileExistsError, NotADirectoryError) as error:
+        raise UserError(f"{name} holds a file that another wheel holds: {error.filename}") from None
+
+
+def _place(path: str, wheel: str) -> PurePosixPath | None:
+    """Where a member goes below site-packages; None where it does not go there."""
+    parts = PurePosixPath(path).parts
+    if not parts or path.startswith("/") or "\\" in path or ".." in parts:
+        raise UserError(f"{wheel} would write outside of its folder: {path}")
+    if not parts[0].endswith(".data"):
+        return PurePosixPath(*parts)
+    if len(parts) > 2 and parts[1] in ("purelib", "platlib"):
+        return PurePosixPath(*parts[2:])
+    return None
+
+
+def _fill(bundle: Bundle, draft: Path, folder: Path, group: int | None) -> None:
+    draft.mkdir(mode=0o755)
+    for path, data in bundle.files.items():
+        if path.startswith(WHEELS):
+            unpack_wheel(data, path, draft / SITE)
+        elif path.startswith(TLS):
+            _write(draft / path, data, 0o600 if group is None else 0o640, group)
+        else:
+            _write(draft / path, data)
+    _write(draft / "launch.py", _LAUNCH.encode())
+    _write(draft / LAUNCHER, _launcher(folder).encode(), 0o755)
+    _compile(draft / SITE)
+
+
+def _compile(site: Path) -> None:
+    """Now, because the service may not write here, and compiling at each start takes seconds."""
+    sources = [str(p) for p in site.rglob("*.py") if _NOT_COMPILED not in p.relative_to(site).parts]
+    # Forked, so that they are this thread's own children and end with it.
+    pool = ProcessPoolExecutor(
+        mp_context=multiprocessing.get_context("fork"),
+        initializer=_end_with_parent,
+        initargs=(os.getpid(),),
+    )
+    try:
+        with pool:
+            list(pool.map(functools.partial(compileall.compile_file, quiet=2), sources))
+    except BrokenProcessPool:
+        raise UserError(
+            "a process that compiled the release was killed; is there too little memory?"
+        ) from None
+
+
+def _end_with_parent(parent: int) -> None:
+    """Let the kernel kill this process when its parent, of that process id, has ended."""
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
+    if os.getppid() != parent:  # It had ended before it was asked for.
+        os._exit(1)
+
+
+def _launcher(folder: Path) -> str:
+    parts = [sys.executable, "-I", "-S", "-B", str(folder / "launch.py")]
+    return "#!/bin/sh\nexec " + " ".join(map(shlex.quote, parts)) + ' "$@"\n'
+
+
+def _write(path: Path, data: bytes, mode: int = 0o644, group: int | None = None) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
+    descriptor = os.open(str(path), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with open(descriptor, "wb") as stream:
+        stream.write(data)
+    if group is not None:
+        os.chown(str(path), -1, group)
+    os.chmod(str(path), mode)
+
+
+def _check_room(bundle: Bundle, layout: Layout) -> None:
+    """Unpacked and compiled, wheels take some four times their size."""
+    needed = 5 * sum(map(len, bundle.files.values()))
+    free = shutil.disk_usage(str(layout.releases)).free
+    if free < needed:
+        raise UserError(
+            f"not enough room in {layout.root}: {needed // 10**6} MB are needed,"
+            f" {free // 10**6} MB are free"
+        )

@@ -10,22 +10,34 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from deploy.installer import ed25519
-from deploy.installer.archive import Bundle, open_bundle, open_file
-from deploy.installer.errors import UnhealthyError, UserError
-from deploy.installer.fits import check_fits
-from deploy.installer.health import Limits
-from deploy.installer.layout import Layout, write_whole
-from deploy.installer.manifest import parse_manifest
-from deploy.installer.release import MANIFEST, check_policy, make_release, why_not_whole
-from deploy.installer.service import remember
-from deploy.installer.trial import try_release
+from deploy.installer.layout import (
+    LAUNCHER,
+    POLICY,
+    PUBLIC_KEY,
+    Layout,
+    make_release,
+    why_not_whole,
+    write_whole,
+)
+from deploy.installer.systemd import Limits, NoService, remember
+from deploy.installer.verify import (
+    MANIFEST,
+    Bundle,
+    UnhealthyError,
+    UserError,
+    check_fits,
+    parse_manifest,
+    read_bundle,
+    read_public_key,
+    same_key,
+)
 
-_MAX_KEY_BYTES = 65536
+_CHECK_LIMIT_S = 120.0
 _ENDS_A_SWITCH = (UnhealthyError, UserError, OSError, KeyboardInterrupt)
 """The old service is stopped then, so whatever goes wrong, somebody must start it again."""
 
@@ -33,7 +45,7 @@ _ENDS_A_SWITCH = (UnhealthyError, UserError, OSError, KeyboardInterrupt)
 class Way(NamedTuple):
     """How the service runs, and what is healthy."""
 
-    service: Any
+    service: NoService
     limits: Limits
 
 
@@ -42,18 +54,18 @@ def install(bundle_path: str, trust: str | None, layout: Layout, way: Way) -> st
 
     Raises UserError where it may not be installed here, UnhealthyError where it was and went back.
     """
-    pem = trusted_key(layout, trust)
-    with open_bundle(bundle_path, ed25519.parse_public_key(pem)) as bundle:
-        _say(f"verified {bundle.manifest.version} for {bundle.manifest.vehicle_id}")
-        check_fits(bundle.manifest.target)
-        with layout.locked():
-            layout.tidy()
-            if not layout.trusted.exists():
-                write_whole(layout.trusted, pem)
-            remember(way.service.name, layout.root)
-            version = bundle.manifest.version
-            _unpack(bundle, layout, way)
-            activate(version, layout, way, is_new=True)
+    key = trusted_key(layout, trust)
+    bundle = read_bundle(bundle_path, key)
+    version = bundle.manifest.version
+    _say(f"verified {version} for {bundle.manifest.vehicle_id}")
+    check_fits(bundle.manifest.target)
+    with layout.locked():
+        layout.tidy()
+        if not layout.trusted.exists():
+            write_whole(layout.trusted, key)
+        remember(way.service.name, layout.root)
+        _unpack(bundle, layout, way)
+        activate(version, layout, way, is_new=True)
     return version
 
 
@@ -109,28 +121,18 @@ def uninstall(layout: Layout, way: Way) -> None:
 
 def trusted_key(layout: Layout, trust: str | None) -> bytes:
     """The key that bundles must be signed with, in PEM: the board's own, or the first one named."""
-    given = _read_key(trust) if trust is not None else None
+    given = read_public_key(trust) if trust is not None else None
     if not layout.trusted.exists():
         if given is None:
             raise UserError("this board trusts no key yet: name your public key with --trust")
         return given
-    kept = layout.trusted.read_bytes()
-    if given is not None and ed25519.parse_public_key(given) != ed25519.parse_public_key(kept):
+    kept = read_public_key(str(layout.trusted))
+    if given is not None and not same_key(given, kept):
         raise UserError(
             f"this board trusts another key than {trust}; whoever owns the board may replace"
             f" {layout.trusted}"
         )
     return kept
-
-
-def _read_key(path: str) -> bytes:
-    with open_file(path, "public key") as stream:
-        pem = stream.read(_MAX_KEY_BYTES)
-    try:
-        ed25519.parse_public_key(pem)
-    except UserError as error:
-        raise UserError(f"public key {path}: {error}") from None
-    return pem
 
 
 def _unpack(bundle: Bundle, layout: Layout, way: Way) -> None:
@@ -144,18 +146,32 @@ def _unpack(bundle: Bundle, layout: Layout, way: Way) -> None:
         if layout.linked("current") == version:
             way.service.stop()
         layout.remove_release(version)
-    account = way.service.account()
-    folder = make_release(bundle, layout, account.gid if account else None)
+    folder = make_release(bundle, layout, way.service.group())
     _say(f"unpacked {folder}")
 
 
 def _prove(folder: Path, way: Way) -> None:
-    check_policy(folder)
+    _check_policy(folder)
     _say("edge_runtime check: the policy may drive")
     if way.service.name != "none":
         policy_id = parse_manifest((folder / MANIFEST).read_bytes()).policy_id
-        how = try_release(folder, policy_id, way.service.account(), way.limits)
-        _say(f"trial: healthy, kept apart {how}")
+        way.service.try_release(folder, policy_id, way.limits)
+        _say("trial: healthy, in a network of its own")
+
+
+def _check_policy(folder: Path) -> None:
+    """`edge_runtime check` by the release's own runtime. UnhealthyError with its last line."""
+    command = [str(folder / LAUNCHER), "check", POLICY, "--public-key", PUBLIC_KEY]
+    try:
+        done = subprocess.run(
+            command, cwd=str(folder), timeout=_CHECK_LIMIT_S, check=False,
+            capture_output=True, text=True,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise UnhealthyError(f"edge_runtime check took over {_CHECK_LIMIT_S:.0f} s") from None
+    if done.returncode != 0:
+        lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        raise UnhealthyError(f"edge_runtime check: {lines[-1]}")
 
 
 def _switch(version: str, before: str | None, layout: Layout, way: Way) -> None:
@@ -182,8 +198,7 @@ def _start(version: str, layout: Layout, way: Way) -> None:
     """Let the service run; the vehicle hears nothing of it until it is healthy."""
     if way.service.name == "none":
         return  # Whoever runs it could not be watched, and might not be allowed to read the hold.
-    account = way.service.account()
-    with layout.holding(account.gid if account else None):
+    with layout.holding(way.service.group()):
         try:
             way.service.start(layout.release(version))
             way.service.watch(way.limits)
@@ -193,11 +208,12 @@ def _start(version: str, layout: Layout, way: Way) -> None:
 
 
 def _go_back(version: str, good: str | None, earlier: str | None, layout: Layout, way: Way) -> None:
-    way.service.stop()
     if good is None:
+        way.service.remove()
         layout.unlink("current")
         layout.remove_release(version)
         return
+    way.service.stop()
     layout.link("current", good)
     if earlier is not None and earlier != good:
         layout.link("previous", earlier)

@@ -9,19 +9,35 @@ from __future__ import annotations
 import io
 import json
 import os
+import platform
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
-from deploy.bundle import Inputs, Made, make_bundle
-from deploy.campaigns.light import HERE, host_wheel
+import numpy
+
+from deploy.bundle import NAME, Inputs, Made, build_installer, make_bundle
+from deploy.installer.verify import Target
 from deploy.keys import write_key_pair
-from deploy.pyz import NAME, build_installer
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.policies import public_pem, write_policy
 
 QUICK = ("--settle", "0.2")
+HERE = Target(
+    name="here",
+    python=f"{sys.version_info[0]}.{sys.version_info[1]}",
+    machine=platform.machine(),
+    glibc="2.17",
+)
+
+
+def host_wheel(folder: Path) -> Path:
+    """A wheel that holds a path file only."""
+    path = folder / "host-1.0-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as wheel:
+        wheel.writestr("host.pth", f"{Path(numpy.__file__).parents[1]}\n")
+    return path
 
 
 def changed_wheel(wheel: Path, out: Path, member: str, old: str, new: str) -> Path:
@@ -77,11 +93,15 @@ class Board:
     def __init__(self, root: Path, workshop: Workshop) -> None:
         self.root = root
         self.workshop = workshop
+        self.installer = ["-I", str(workshop.folder / NAME)]
+
+    def runs_a_process(self) -> None:
+        """From now on the installer knows `--service process` (process_service.py)."""
+        self.installer = ["-m", "deploy.tests.process_service"]
 
     def command(self, command: str, *arguments: object) -> list[str]:
         """The installer's command line."""
-        installer = str(self.workshop.folder / NAME)
-        head = [sys.executable, "-I", installer, command, "--root", str(self.root)]
+        head = [sys.executable, *self.installer, command, "--root", str(self.root)]
         return [*head, *map(str, arguments)]
 
     def run(self, command: str, *arguments: object) -> subprocess.CompletedProcess[str]:

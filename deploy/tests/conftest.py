@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from deploy.tests.boards import Board, Workshop
-from deploy.wheelhouse import build_edge_wheel
+from deploy.wheels import build_edge_wheel
 
 
 @pytest.fixture(scope="session")

@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 import stat
 import tarfile
+from pathlib import Path
 
 import pytest
 
-from deploy import bundle_command
+from deploy import bundle
 from deploy.__main__ import main
-from deploy.bundle import make_bundle
-from deploy.campaigns.light import HERE
-from deploy.pyz import build_installer
-from deploy.wheelhouse import build_edge_wheel
+from deploy.bundle import build_installer, make_bundle
+from deploy.tests.boards import HERE
+from deploy.wheels import build_edge_wheel
 from edge_runtime.config import load_config
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
@@ -42,6 +42,8 @@ def test_the_same_inputs_give_the_same_bytes(workshop, tmp_path):
     two = make_bundle(inputs._replace(wheels=[again, workshop.host]), HERE, tmp_path / "two")
     assert one.path.name == two.path.name
     assert one.path.read_bytes() == two.path.read_bytes()
+    signatures = [made.path.with_name(f"{made.path.name}.sig") for made in (one, two)]
+    assert signatures[0].read_bytes() == signatures[1].read_bytes()
     assert build_installer() == build_installer()
 
 
@@ -58,7 +60,7 @@ def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_pat
     contents = read(made)
     assert stat.S_IMODE(made.path.stat().st_mode) == 0o600
     assert {name for name in contents if not name.startswith("units/")} == {
-        "manifest.json", "manifest.sig", "install.pyz", "config.toml", "policy.onnx",
+        "manifest.json", "install.pyz", "config.toml", "policy.onnx",
         "policy.onnx.sig", "policy.pub", "tls/ca.pem", "tls/cert.pem", "tls/key.pem",
         "wheels/phil_edge_runtime-0.1.0.whl", "wheels/host-1.0.whl",
     }  # fmt: skip
@@ -140,7 +142,7 @@ def test_a_mistake_is_one_line_before_anything_is_downloaded(
 ):
     monkeypatch.chdir(tmp_path)
     if "--wheels" not in arguments:
-        monkeypatch.setattr(bundle_command, "gather", lambda *_: pytest.fail("downloads"))
+        monkeypatch.setattr(bundle, "gather", lambda *_: pytest.fail("downloads"))
     inputs = workshop.inputs()
     good = ["--policy", inputs.policy, "--public-key", inputs.public_key, "--key", inputs.key]
     status = exit_status(main, ["bundle", *map(str, good), *arguments])
@@ -156,7 +158,7 @@ def test_an_out_that_is_a_file_is_said(workshop, tmp_path):
 
 
 def test_a_name_that_no_archive_takes_is_said(workshop, tmp_path):
-    long = tmp_path / f"{'a' * 90}-1-py3-none-any.whl"
+    long = tmp_path / f"{'a' * 190}-1-py3-none-any.whl"
     long.write_bytes(workshop.host.read_bytes())
     inputs = workshop.inputs(wheels=[workshop.edge_wheel, long])
     with pytest.raises(UserError, match="too long for a bundle"):
@@ -164,10 +166,10 @@ def test_a_name_that_no_archive_takes_is_said(workshop, tmp_path):
 
 
 def test_a_bundle_that_is_interrupted_leaves_no_key_behind(workshop, tmp_path, monkeypatch):
-    def interrupted(size: int) -> bytes:
+    def interrupted(path, target) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("deploy.bundle.padding", interrupted)
+    monkeypatch.setattr(Path, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         make_bundle(workshop.inputs(), HERE, tmp_path / "out")
     assert list((tmp_path / "out").iterdir()) == []

@@ -1,4 +1,4 @@
-"""The Dockerfile: linted where the linter is there, and its health check run as it stands."""
+"""The Dockerfile: linted where the linter is there, and read line by line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -75,15 +74,8 @@ def test_no_private_key_is_left_and_its_folder_is_there_to_be_mounted(tmp_path):
     assert list((release / "tls").iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("shown", "healthy"),
-    [({"ready": True}, True), ({"ready": False}, False), ({}, False), (None, False)],
-)
-def test_the_health_check(tmp_path, shown, healthy):
-    command = json.loads(only("HEALTHCHECK").partition(" CMD ")[2])
-    if shown is not None:
-        (tmp_path / "service.json").write_text(json.dumps(shown))
-    command = [sys.executable if word == "python3" else word for word in command]
-    command[-1] = command[-1].replace("/opt/phil/state", str(tmp_path))
-    done = subprocess.run(command, capture_output=True, timeout=60, check=False)
-    assert (done.returncode == 0) == healthy
+def test_the_runtime_is_the_first_process_as_a_unit_starts_it():
+    """With the words and the folder of the systemd unit, which are proven on a board."""
+    unit = (ROOT / "deploy/systemd/phil-edge.service").read_text().splitlines()
+    assert f"ExecStart={' '.join(json.loads(only('ENTRYPOINT')))}" in unit
+    assert f"WorkingDirectory={only('WORKDIR')}" in unit

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.installer.layout import Layout
-from deploy.installer.release import why_not_whole
+from deploy.installer.layout import Layout, why_not_whole
 from deploy.tests.boards import Board
 from edge_runtime.tests.harness import wait_until
 

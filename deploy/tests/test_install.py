@@ -2,38 +2,51 @@
 
 from __future__ import annotations
 
-import json
+import fcntl
 import os
+import platform
 import queue
 import signal
 import subprocess
 import threading
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
-from deploy.tests.boards import Board, changed_wheel
+from deploy.bundle import make_bundle
+from deploy.installer import __main__ as installer
+from deploy.installer import layout as layout_module
+from deploy.installer import systemd
+from deploy.installer.layout import Layout
+from deploy.installer.systemd import choose
+from deploy.installer.verify import UserError, read_bundle
+from deploy.keys import write_key_pair
+from deploy.tests.boards import HERE, Board, changed_wheel
 from edge_runtime.tests.harness import Simulator, make_state, wait_until
 
-NOTIFY, RUN = "edge_runtime/service.py", "edge_runtime/run.py"
+RUN = "edge_runtime/run.py"
 MOCK = "edge_runtime/vehicles/mock.py"
 WITH_VEHICLE = """\
-            if config.vehicle != "none":
-                import threading
+                if self._config.vehicle != "none":
+                    import threading
 
-                threading.Timer(0.3, os._exit, (5,)).start()
-            loop.run()"""
-IN_TRIAL = {
-    "it is ready and then silent": (NOTIFY, 'self._send("WATCHDOG=1")', "pass"),
-    "it never says that it is ready": (NOTIFY, "READY=1\\n", ""),
-    "it ends as soon as it is ready": (RUN, "            loop.run()", "            os._exit(3)"),
-    "it has loaded another policy": (RUN, "policy_id={policy.policy_id}", "policy_id=0"),
-}
-AS_SERVICE = {
-    "it answers for a while, then ends": (RUN, "            loop.run()", WITH_VEHICLE),
+                    threading.Timer(0.3, os._exit, (5,)).start()
+                self.loop.run()"""
+FAULTS = {
+    "it answers for a while, then ends": (RUN, "                self.loop.run()", WITH_VEHICLE),
     "it cannot open the vehicle": (MOCK, "self._state = MockState()", "1 / 0"),
+    "it never says that it is ready": (
+        RUN,
+        "            self._say_ready()",
+        "            pass",
+    ),
+    "it ends as soon as it is ready": (
+        RUN,
+        "                self.loop.run()",
+        "                os._exit(3)",
+    ),
 }
-"""Faults that show only with the vehicle, which the trial does without."""
 
 
 def lines(text: str) -> list[str]:
@@ -43,6 +56,7 @@ def lines(text: str) -> list[str]:
 def test_install_upgrade_back_and_away(board: Board):
     """A whole life on one board: each release answers the simulator with its own policy."""
     one, two = board.workshop.make(0.1), board.workshop.make(0.2)
+    board.runs_a_process()
     with Simulator(board.workshop.endpoint) as simulator:
 
         def drives(step: int) -> float:
@@ -58,14 +72,9 @@ def test_install_upgrade_back_and_away(board: Board):
         assert drives(2) == 0.2
         shown = board.status()
         assert (shown["current"], shown["previous"]) == (two.manifest.version, one.manifest.version)
-        assert shown["service"] == "active restarts=0"
-        # It ends, as by a fault of its own: the supervisor starts it again.
-        state = board.root / "state" / "service.json"
-        os.kill(json.loads(state.read_bytes())["pid"], signal.SIGKILL)
-        wait_until(lambda: board.status()["service"] == "active restarts=1", "a new start")
-        assert drives(3) == 0.2
+        assert shown["service"] == "active"
         assert board.run("rollback", "--settle", "0.2").returncode == 0
-        assert drives(4) == 0.1
+        assert drives(3) == 0.1
     assert board.status()["current"] == one.manifest.version
     assert board.run("uninstall").returncode == 0
     assert not board.root.exists()
@@ -113,8 +122,8 @@ class Listener:
 @pytest.mark.parametrize(
     "faults",
     [
-        dict(list(AS_SERVICE.items())[:1]),
-        pytest.param(IN_TRIAL | AS_SERVICE, marks=pytest.mark.board),
+        dict(list(FAULTS.items())[:1]),
+        pytest.param(FAULTS, marks=pytest.mark.board),
     ],
     ids=["one fault", "all faults"],
 )
@@ -124,6 +133,7 @@ def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(
     """Beside a good release that drives a simulator all the while; each fault in its own way."""
     shop = board.workshop
     good = shop.make(0.1)
+    board.runs_a_process()
     config = tmp_path / "mock.toml"
     config.write_text(f'connect = "{shop.endpoint}"\nvehicle = "mock"\n')
     with Listener(shop.endpoint) as listener:
@@ -154,6 +164,7 @@ def test_ended_in_the_middle_of_a_switch_it_goes_back_and_a_link_that_breaks_doe
     board: Board,
 ):
     old, new = board.workshop.make(0.1), board.workshop.make(0.2)
+    board.runs_a_process()
     assert board.install(old.path, "process").returncode == 0
     line = board.command("install", new.path, "--service", "process", "--settle", "2")
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
@@ -165,4 +176,229 @@ def test_ended_in_the_middle_of_a_switch_it_goes_back_and_a_link_that_breaks_doe
     assert (run.returncode, len(lines(said))) == (1, 1), said
     assert f"went back to {old.manifest.version}: interrupted" in said
     shown = board.status()
-    assert (shown["current"], shown["service"]) == (old.manifest.version, "active restarts=0")
+    assert (shown["current"], shown["service"]) == (old.manifest.version, "active")
+
+
+def refused(done, *words: str) -> None:
+    said = done.stderr.strip().splitlines()
+    assert (done.returncode, len(said)) == (2, 1), done.stderr
+    assert all(word in said[0] for word in words), said
+
+
+def test_a_board_that_trusts_nobody_yet_must_be_told_whom(board: Board, workshop):
+    refused(board.run("install", workshop.make().path), "trusts no key yet", "--trust")
+    refused(board.run("install", workshop.make().path, "--trust", "missing.pub"), "missing.pub")
+    refused(board.run("install", workshop.make().path, "--trust", workshop.key), "not a PEM public")
+    assert not board.root.exists()
+
+
+def test_a_bundle_of_another_key_is_refused_now_and_later(board: Board, workshop, tmp_path):
+    private, public = write_key_pair(tmp_path / "other")
+    foreign = workshop.make(0.2, key=private)
+    refused(board.install(foreign.path), "signature is not of the key")
+    assert not board.root.exists()
+    assert board.install(workshop.make(0.1).path).returncode == 0
+    before = board.fingerprint()
+    refused(board.run("install", foreign.path), "signature is not of the key")
+    refused(board.run("install", foreign.path, "--trust", public), "trusts another key")
+    assert board.fingerprint() == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"python": "3.7"}, "run it with python3.7"),
+        ({"machine": "riscv64"}, f"this is {platform.machine()}"),
+        ({"glibc": "9.99"}, "needs glibc 9.99"),
+    ],
+)
+def test_a_bundle_for_another_computer_is_refused(board: Board, workshop, tmp_path, changes, word):
+    made = make_bundle(workshop.inputs(), HERE._replace(**changes), tmp_path)
+    refused(board.install(made.path), word)
+    assert not board.root.exists()
+
+
+def test_a_policy_that_may_not_drive_there_changes_nothing(board: Board, workshop, tmp_path):
+    """`check` of the release's own runtime says no: the release before stays."""
+    good = workshop.make(0.1)
+    assert board.install(good.path).returncode == 0
+    wheel = changed_wheel(
+        workshop.edge_wheel, tmp_path / "w", "edge_runtime/policy.py", "OPSET = 17", "OPSET = 18"
+    )
+    done = board.install(workshop.make(0.2, wheels=[wheel, workshop.host]).path)
+    assert done.returncode == 1
+    assert "edge_runtime check" in done.stderr
+    assert "opset" in done.stderr
+    assert board.status()["current"] == good.manifest.version
+    assert Layout(str(board.root)).versions() == [good.manifest.version]
+
+
+def test_a_damaged_release_is_said_and_made_again(board: Board, workshop):
+    made = workshop.make(0.1)
+    assert board.install(made.path).returncode == 0
+    victim = board.root / "current" / "site-packages" / "edge_runtime" / "safety.py"
+    victim.write_text("# nothing left\n")
+    shown = board.run("status")
+    assert shown.returncode == 1
+    assert "edge_runtime/safety.py" in shown.stdout
+    done = board.install(made.path)
+    assert done.returncode == 0
+    assert "damaged" in done.stdout
+    assert board.status()["whole"] == "yes"
+
+
+def test_it_installs_to_the_end_where_nobody_reads_what_it_says(board: Board, workshop):
+    """An ssh link that broke: its pipe has no reader."""
+    made = workshop.make(0.1)
+    line = board.command("install", made.path, "--trust", workshop.public_key)
+    with subprocess.Popen([*line, "--service", "none"], stdout=subprocess.PIPE) as run:
+        assert run.stdout is not None
+        run.stdout.close()
+    assert run.returncode == 0
+    assert board.status()["current"] == made.manifest.version
+
+
+def test_one_installer_at_a_time(board: Board, workshop):
+    made = workshop.make(0.1)
+    assert board.install(made.path).returncode == 0
+    before = board.fingerprint()
+    with open(board.root / ".lock", "r+") as other:
+        fcntl.lockf(other, fcntl.LOCK_EX)
+        refused(board.install(made.path), "another installer is at work")
+        refused(board.run("rollback"), "another installer is at work")
+    assert [row[0] for row in board.fingerprint()] == [row[0] for row in before]
+
+
+def test_there_must_be_something_to_go_back_to(board: Board, workshop):
+    refused(board.run("rollback", "--root", board.root), "no earlier release")
+    refused(board.run("status"), "nothing is installed")
+    assert board.install(workshop.make(0.1).path).returncode == 0
+    refused(board.run("rollback"), "no earlier release")
+
+
+def test_uninstall_takes_only_what_is_ours(board: Board, workshop):
+    refused(board.run("uninstall"), "nothing is installed")
+    assert board.install(workshop.make(0.1).path).returncode == 0
+    (board.root / "diary.txt").write_text("not ours")
+    done = board.run("uninstall")
+    assert done.returncode == 0
+    assert "stays" in done.stdout
+    assert [p.name for p in board.root.iterdir()] == ["diary.txt"]
+    (board.root / "diary.txt").unlink()
+    board.root.rmdir()
+
+
+def test_all_is_on_the_disk_before_a_release_has_its_name(workshop, tmp_path, monkeypatch):
+    """The order that a SIGKILL cannot show: written, synced, and only then renamed."""
+    order: list[tuple[str, bool]] = []
+    layout = Layout(str(tmp_path / "root"))
+    bundle = read_bundle(str(workshop.make(0.1).path), workshop.public_key.read_bytes())
+    folder = layout.release(bundle.manifest.version)
+
+    def synced() -> None:
+        made = layout.making(bundle.manifest.version)
+        order.append(("synced", (made / "contents.json").exists() and not folder.exists()))
+
+    with layout.locked():
+        monkeypatch.setattr(os, "sync", synced)
+        monkeypatch.setattr(
+            layout_module, "sync_folder", lambda path: order.append(("named", folder.exists()))
+        )
+        assert layout_module.make_release(bundle, layout, None) == folder
+    assert order == [("synced", True), ("named", True)]
+    assert layout_module.why_not_whole(folder) == ""
+
+
+@pytest.mark.skipif(systemd.is_there(), reason="systemd runs this computer")
+def test_a_systemd_that_does_not_run_is_said_before_anything_is_made(board: Board, workshop):
+    refused(board.install(workshop.make(0.1).path, "systemd"), "no systemd runs this computer")
+    assert not board.root.exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [], ["install"], ["fly"], ["status", "--service", "cron"], ["install", "missing.tar"],
+        ["supervise"],
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_line(board: Board, arguments):
+    command, *rest = arguments or [""]
+    line = board.command(command, *rest) if arguments else board.command("status")[:3]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert (done.returncode, len(done.stderr.strip().splitlines())) == (2, 1), done.stderr
+    assert not board.root.exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--health-limit", "soon"), ("--health-limit", "0"), ("--health-limit", "inf"),
+        ("--settle", "-1"), ("--settle", "nan"), ("--settle", "inf"),
+    ],
+)  # fmt: skip
+def test_what_is_no_number_of_seconds_is_refused(board: Board, option, value):
+    """Above all one that would wait for ever."""
+    line = board.command("rollback", option, value)
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2, done.stderr
+    assert f"argument {option}: {value!r} is not a number of seconds" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not board.root.exists()
+
+
+def test_the_secret_is_the_owners_alone(board: Board, workshop, tmp_path):
+    from deploy.__main__ import main
+
+    assert main(["certs", "--out", str(tmp_path / "certs")]) == 0
+    config = tmp_path / "c.toml"
+    config.write_text('connect = "tls/127.0.0.1:9"\n')
+    made = workshop.make(tls=tmp_path / "certs" / "edge-hunter01", config=config)
+    board.runs_a_process()
+    before = os.umask(0o077)  # the caller's must not lock the service's user out
+    try:
+        assert board.install(made.path, "process").returncode == 0
+    finally:
+        os.umask(before)
+    folder = board.root / "current"
+    modes = {
+        str(path.relative_to(folder)): path.stat().st_mode & 0o777
+        for path in [folder / "tls/key.pem", folder / "config.toml", folder / "bin/phil-edge"]
+    }
+    assert modes == {"tls/key.pem": 0o600, "config.toml": 0o644, "bin/phil-edge": 0o755}
+    assert (folder / "site-packages/edge_runtime").stat().st_mode & 0o777 == 0o755
+
+
+def test_nobody_else_can_keep_the_service_silent(tmp_path, monkeypatch):
+    """The hold is a lock: it is for the service's group to read, and asked for with a limit."""
+    monkeypatch.setattr(layout_module, "_HOLD_LIMIT_S", 0.05)
+    layout = Layout(str(tmp_path))
+    with layout.locked():
+        assert (tmp_path / ".lock").stat().st_mode & 0o777 == 0o600
+        with layout.holding():
+            assert layout.hold.stat().st_mode & 0o777 == 0o600
+        with layout.holding(os.getgid()):
+            assert layout.hold.stat().st_mode & 0o777 == 0o640
+        with open(layout.hold) as other:
+            fcntl.flock(other, fcntl.LOCK_SH)
+            with pytest.raises(UserError, match="another process holds"), layout.holding():
+                raise AssertionError("it has the lock")
+
+
+@pytest.mark.parametrize("root", ["/opt/two words", "/opt/100%"])
+def test_a_root_that_a_unit_file_cannot_name_is_refused(root, monkeypatch):
+    monkeypatch.setattr(systemd, "is_there", lambda: True)
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    with pytest.raises(UserError, match="in a unit only"):
+        choose("systemd", Path(root))
+
+
+def test_whoever_may_not_read_the_key_is_told_the_rest(board: Board, workshop, monkeypatch, capsys):
+    assert board.install(workshop.make(0.1).path).returncode == 0
+
+    def may_not(folder: Path) -> str:
+        raise PermissionError(13, "Permission denied", str(folder / "tls" / "key.pem"))
+
+    monkeypatch.setattr(installer, "why_not_whole", may_not)
+    assert installer.main(["status", "--root", str(board.root)]) == 0
+    assert "not known: this user may not read" in capsys.readouterr().out

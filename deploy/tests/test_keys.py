@@ -1,4 +1,6 @@
 import stat
+import subprocess
+import sys
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key, load_pem_public_key
@@ -31,3 +33,17 @@ def test_a_place_that_is_no_directory_is_refused(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert run_cli(main, ["keys", "--out", str(tmp_path / "file" / "keys")]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_two_files_take_few_modules(tmp_path):
+    """Nothing of bundles, certificates or the wire is loaded to write a pair."""
+    program = (
+        "import sys; from deploy.__main__ import main; main(sys.argv[1:]);"
+        " print(*(name for name in sys.modules if name.startswith(('deploy', 'edge_runtime'))))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "keys", "--out", str(tmp_path / "keys")],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    ours = done.stdout.splitlines()[-1].split()
+    assert len(ours) <= 10, ours

@@ -67,7 +67,16 @@ def test_a_push_installs_and_leaves_nothing_behind(far, board, workshop, capfd):
     assert board.status()["current"] == made.manifest.version
     assert list((far / "home").iterdir()) == []
     log = (far / "log").read_text().splitlines()
-    assert [line.split()[0] for line in log] == ["ssh", "ssh", "scp", "scp", "scp", "ssh", "ssh"]
+    assert [line.split()[0] for line in log] == [
+        "ssh",
+        "ssh",
+        "scp",
+        "scp",
+        "scp",
+        "scp",
+        "ssh",
+        "ssh",
+    ]
 
 
 @pytest.mark.parametrize("name", ["install.pyz", "trust.pub", "-q.tar", "two words;id.tar"])
@@ -75,6 +84,7 @@ def test_a_bundle_may_have_any_name(far, board, workshop, tmp_path, name):
     made = workshop.make(0.1)
     bundle = tmp_path / name
     bundle.write_bytes(made.path.read_bytes())
+    Path(f"{bundle}.sig").write_bytes(Path(f"{made.path}.sig").read_bytes())
     assert push(board, workshop, "board", bundle, "--service", "none") == 0
     assert board.status()["current"] == made.manifest.version
 
@@ -83,11 +93,11 @@ def test_a_dry_run_says_each_step_and_does_none(far, board, workshop, capsys):
     made = workshop.make(0.1)
     assert push(board, workshop, "board", made.path, "--dry-run") == 0
     said = capsys.readouterr().out.splitlines()
-    programs = ["ssh", "ssh", "scp", "scp", "scp", "ssh", "ssh"]
+    programs = ["ssh"] * 2 + ["scp"] * 4 + ["ssh"] * 2
     assert [line.split()[0] for line in said[::2]] == ["#"] * len(programs)
     assert [line.split()[0] for line in said[1::2]] == programs
     assert str(made.path) in said[9]
-    assert "install" in said[11]
+    assert "install" in said[13]
     assert not (far / "log").read_text()
     assert not board.root.exists()
 
@@ -125,7 +135,7 @@ def test_a_copy_that_fails_leaves_nothing_behind(far, board, workshop, monkeypat
 
 def test_a_board_of_another_kind_is_not_touched(far, board, workshop, capfd, tmp_path):
     from deploy.bundle import make_bundle
-    from deploy.campaigns.light import HERE
+    from deploy.tests.boards import HERE
 
     made = make_bundle(workshop.inputs(), HERE._replace(machine="riscv64"), tmp_path / "b")
     assert push(board, workshop, "board", made.path) == 2
@@ -146,6 +156,7 @@ def test_a_bundle_that_the_board_would_refuse_is_not_sent(far, board, workshop, 
     data = bytearray(made.path.read_bytes())
     data[-2000] ^= 1
     changed.write_bytes(data)
+    Path(f"{changed}.sig").write_bytes(Path(f"{made.path}.sig").read_bytes())
     assert push(board, workshop, "board", changed) == 2
     assert "is refused" in capsys.readouterr().err
     assert push(board, workshop, "board", Path("missing.tar")) == 2

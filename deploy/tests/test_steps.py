@@ -9,14 +9,14 @@ import sys
 import pytest
 
 from deploy.installer import steps
-from deploy.installer.errors import UnhealthyError, UserError
-from deploy.installer.health import Limits
 from deploy.installer.layout import Layout
+from deploy.installer.systemd import Limits, NoService
+from deploy.installer.verify import UnhealthyError, UserError
 
 OLD, NEW = "0.1.0-old", "0.1.0-new"
 
 
-class Service:
+class Service(NoService):
     """Runs whatever `current` names; its watch of the new release ends with an error."""
 
     name = "fake"
@@ -27,9 +27,6 @@ class Service:
         self.runs = ""
         self.heard: list[str] = []
         """What ran at a moment when commands could leave."""
-
-    def account(self) -> None:
-        """Nobody special."""
 
     def start(self, release) -> None:
         self.runs = release.name

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+from deploy.installer import systemd as systemctl
+from deploy.installer.systemd import MAIN_UNIT, TRIAL_UNIT, Limits, Systemd
+from deploy.installer.verify import UnhealthyError
 
 UNITS = Path(__file__).parents[1] / "systemd"
 NAMES = ("phil-edge.service", "phil-can.service")
@@ -94,3 +100,150 @@ def test_the_bus_has_the_hunters_rate_and_is_no_condition_of_the_runtime():
     assert "phil-can.service" in runtime["Wants"][0]
     assert not {"Requires", "BindsTo", "Requisite"} & set(runtime)
     assert unit["CapabilityBoundingSet"] == ["CAP_NET_ADMIN CAP_SYS_MODULE"]
+
+
+FAKE = """\
+#!{python}
+import sys
+with open({log!r}, "a") as log:
+    log.write(" ".join(sys.argv[1:]) + "\\n")
+if sys.argv[1] == "show":
+    print(open({state!r}).read())
+elif sys.argv[1] == "start" and "refuse" in open({state!r}).read():
+    sys.exit("Job for phil-edge.service failed.")
+"""
+FAKE_RUN = """\
+#!{python}
+import sys
+with open({log!r}, "a") as log:
+    log.write("systemd-run " + " ".join(sys.argv[1:]) + "\\n")
+(said,) = [word.split("=file:")[1] for word in sys.argv if "StandardError=" in word]
+with open(said, "w") as out:
+    out.write(open({log!r} + ".said").read())
+sys.exit("Job failed." if "refuse" in open({state!r}).read() else 0)
+"""
+ACTIVE = "ActiveState=active\nSubState=running\nNRestarts=0\nResult=success\nStatusText=standby"
+
+
+@pytest.fixture
+def systemd(tmp_path, monkeypatch):
+    """The service as units, with a folder of our own for them."""
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    names = {"python": sys.executable, "log": str(tmp_path / "log"), "state": str(tmp_path / "s")}
+    for name, text in (("systemctl", FAKE), ("systemd-run", FAKE_RUN)):
+        (programs / name).write_text(text.format(**names))
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
+    (tmp_path / "s").write_text(ACTIVE)
+    for folder in ("state", "etc"):
+        (tmp_path / folder).mkdir()
+    return Systemd(tmp_path, tmp_path / "etc")
+
+
+def release(folder, *units: str):
+    (folder / "units").mkdir(parents=True)
+    for unit in units:
+        text = f"[Service]\nExecStart=/opt/phil/current/{unit}\n"
+        (folder / "units" / unit).write_text(text + ("[Install]\n" if unit == MAIN_UNIT else ""))
+    return folder
+
+
+def told(tmp_path) -> list[str]:
+    log = tmp_path / "log"
+    lines = log.read_text().splitlines() if log.exists() else []
+    log.unlink(missing_ok=True)
+    return [line for line in lines if not line.startswith("show")]
+
+
+def test_units_are_installed_enabled_started_and_taken_away(systemd, tmp_path):
+    systemd.stop()
+    assert told(tmp_path) == []  # there is no service yet
+    systemd.start(release(tmp_path / "one", MAIN_UNIT, "phil-can.service"))
+    assert told(tmp_path) == [
+        "daemon-reload",
+        f"enable {MAIN_UNIT}",
+        f"reset-failed {MAIN_UNIT}",
+        f"start {MAIN_UNIT}",
+    ]
+    unit = (tmp_path / "etc" / MAIN_UNIT).read_text()
+    assert f"ExecStart={tmp_path}/current/{MAIN_UNIT}" in unit
+    systemd.watch(Limits(1.0, 0.1))
+    assert systemd.describe() == "active standby"
+    systemd.stop()
+    assert told(tmp_path) == [f"stop {MAIN_UNIT}"]
+    # The next release has no unit for the bus any more.
+    systemd.start(release(tmp_path / "two", MAIN_UNIT))
+    assert told(tmp_path)[0] == "disable --now phil-can.service"
+    assert [p.name for p in (tmp_path / "etc").iterdir()] == [MAIN_UNIT]
+    systemd.remove()
+    assert told(tmp_path) == [f"stop {MAIN_UNIT}", f"disable --now {MAIN_UNIT}", "daemon-reload"]
+    assert list((tmp_path / "etc").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("state", "match"),
+    [
+        (ACTIVE.replace("active", "failed", 1), "ended: success"),
+        (ACTIVE.replace("NRestarts=0", "NRestarts=1"), "ended"),
+        (ACTIVE.replace("=active", "=activating"), r"not healthy within 0\.2 s"),
+    ],
+)
+def test_a_service_that_is_not_well_is_said(systemd, tmp_path, state, match):
+    (tmp_path / "s").write_text(state)
+    with pytest.raises(UnhealthyError, match=match):
+        systemd.watch(Limits(0.2, 0.1))
+
+
+def test_a_start_that_systemd_refuses_is_said(systemd, tmp_path):
+    (tmp_path / "s").write_text("refuse")
+    with pytest.raises(UnhealthyError, match=r"systemctl start .* failed"):
+        systemd.start(release(tmp_path / "one", MAIN_UNIT))
+
+
+def test_a_bundle_without_the_service_is_said(systemd, tmp_path):
+    with pytest.raises(UnhealthyError, match=r"holds no phil-edge\.service"):
+        systemd.start(release(tmp_path / "one", "phil-can.service"))
+
+
+def test_systemd_is_not_taken_for_there_where_it_is_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(systemctl, "_BOOTED", tmp_path / "run")
+    assert not systemctl.is_there()
+    (tmp_path / "run").mkdir()
+    assert systemctl.is_there()
+
+
+def try_release(systemd, tmp_path, said: str, state: str = ACTIVE) -> list[str]:
+    """A trial of a runtime that says so; what systemd was told."""
+    (tmp_path / "log.said").write_text(said)
+    (tmp_path / "s").write_text(state)
+    systemd.try_release(tmp_path / "one", "abc", Limits(0.2, 0.1))
+    return told(tmp_path)
+
+
+def test_a_trial_runs_without_vehicle_and_network_and_is_taken_away(systemd, tmp_path):
+    before, after = [f"stop {TRIAL_UNIT}", f"reset-failed {TRIAL_UNIT}"], []
+    *after, run, left, gone = try_release(systemd, tmp_path, "loaded policy_id=abc\n")
+    assert (after, [left, gone]) == (before, before)
+    words = run.split()
+    assert words[0] == "systemd-run"
+    for name in ("PrivateNetwork=yes", "User=phil", "TimeoutStartSec=0.2", "NotifyAccess=main"):
+        assert f"--property={name}" in words
+    assert "--service-type=notify" in words
+    assert {w.split("=")[1] for w in words if "WatchdogSec" in w or "RuntimeMaxSec" in w}
+    assert run.endswith("--vehicle none --connect tcp/127.0.0.1:9 --log-level warning")
+
+
+@pytest.mark.parametrize(
+    ("said", "state", "match"),
+    [
+        ("policy_id=other\n", ACTIVE, "has loaded this policy"),
+        ("ready\nerror: no such file\n", "refuse\nResult=exit-code", "exit-code: error: no such"),
+        ("policy_id=abc\n", "ActiveState=failed\nResult=watchdog", "trial: watchdog"),
+        ("policy_id=abc\n", "ActiveState=inactive\nResult=success", "trial: success"),
+    ],
+)
+def test_a_trial_that_fails_says_why_and_is_taken_away(systemd, tmp_path, said, state, match):
+    with pytest.raises(UnhealthyError, match=match):
+        try_release(systemd, tmp_path, said, state)
+    assert told(tmp_path)[-2:] == [f"stop {TRIAL_UNIT}", f"reset-failed {TRIAL_UNIT}"]

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy import wheelhouse
-from deploy.campaigns.light import HERE
-from deploy.installer.errors import UserError as InstallerError
-from deploy.installer.wheels import unpack_wheel
-from deploy.targets import TARGETS, lock_path
-from deploy.wheelhouse import Pin, gather, read_lock
+from deploy import wheels
+from deploy.installer.layout import unpack_wheel
+from deploy.installer.verify import UserError as InstallerError
+from deploy.tests.boards import HERE
+from deploy.wheels import TARGETS, Pin, gather, lock_path, read_lock
 from edge_runtime.util import UserError
 
 
@@ -84,7 +83,7 @@ def test_a_lock_without_version_or_hash_is_refused(tmp_path, line):
 
 
 def test_a_full_folder_needs_no_network(tmp_path, monkeypatch):
-    monkeypatch.setattr(wheelhouse, "pip", lambda *_: pytest.fail("pip was asked"))
+    monkeypatch.setattr(wheels, "pip", lambda *_: pytest.fail("pip was asked"))
     (tmp_path / "a-1-py3-none-any.whl").write_bytes(b"")
     (tmp_path / "other-1-py3-none-any.whl").write_bytes(b"other")
     lock = tmp_path / "lock.txt"

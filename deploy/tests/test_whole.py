@@ -10,11 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy.bundle import Inputs, Made, make_bundle
+from deploy.bundle import NAME, Inputs, Made, build_installer, make_bundle
 from deploy.keys import write_key_pair
-from deploy.pyz import NAME, build_installer
-from deploy.targets import ROOT, TARGETS, lock_path
-from deploy.wheelhouse import DEFAULT_FOLDER, build_edge_wheel, gather
+from deploy.wheels import DEFAULT_FOLDER, ROOT, TARGETS, build_edge_wheel, gather, lock_path
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import Simulator, make_state
 from edge_runtime.tests.test_wheel import find_python38

@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 
 from bridge.messages import Scene
 from bridge.tests.harness import make_command
-from deploy.targets import TARGETS
+from deploy.wheels import TARGETS
 from edge_runtime.cli import run_cli
 from edge_runtime.tests.harness import make_state
 from edge_runtime.util import UserError

@@ -1,6 +1,8 @@
-"""The wheels of a target: those that its lock names by hash, and the edge runtime's own.
+"""The boards that bundles are made for, and the wheels of each.
 
-A folder keeps them between runs; a bundle made from a full folder needs no network.
+A lock names every wheel of a board by version and hash. A folder keeps the wheels between runs, so
+a bundle made from a full folder needs no network. After a change of versions in a lock,
+``python -m deploy.wheels TARGET`` writes the new hashes.
 """
 
 from __future__ import annotations
@@ -16,11 +18,25 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from deploy.installer.manifest import Target
-from deploy.targets import ROOT
+from deploy.installer.verify import Target
+from edge_runtime.cli import ArgumentParser, examples, run_cli
+from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
 
+ROOT = Path(__file__).parents[1]
+LOCKS = ROOT / "requirements"
 DEFAULT_FOLDER = "build/wheels"
+TARGETS = {
+    target.name: target
+    for target in (
+        # Jetson Xavier NX with JetPack 5: Ubuntu 20.04.
+        Target(name="jetpack5", python="3.8", machine="aarch64", glibc="2.31"),
+        # Debian bullseye.
+        Target(name="linux-aarch64", python="3.9", machine="aarch64", glibc="2.31"),
+        # The twin of jetpack5 on a workstation: the same versions of everything.
+        Target(name="linux-x86_64", python="3.8", machine="x86_64", glibc="2.31"),
+    )
+}
 _MANYLINUX = (5, 12, 17, 24, 26, 27, 28, 31)
 """The minor versions of glibc 2 that wheels are tagged with, up to the boards' own."""
 _PATCH = 2
@@ -37,6 +53,18 @@ class Pin(NamedTuple):
     name: str
     version: str
     sha256: str
+
+
+def find_target(name: str) -> Target:
+    """The row of a name. Raises UserError with the known ones."""
+    if name not in TARGETS:
+        raise UserError(f"target {name!r} is not known; choose from {', '.join(TARGETS)}")
+    return TARGETS[name]
+
+
+def lock_path(target: Target) -> Path:
+    """The file that names every wheel of a target by version and hash."""
+    return LOCKS / f"bundle-{target.name}.txt"
 
 
 def read_lock(path: Path) -> list[Pin]:
@@ -121,3 +149,31 @@ def _isolation() -> list[str]:
 def _by_hash(folder: Path) -> dict[str, Path]:
     wheels = sorted(folder.glob("*.whl")) if folder.is_dir() else []
     return {hashlib.sha256(path.read_bytes()).hexdigest(): path for path in wheels}
+
+
+def main(argv: list[str]) -> int:
+    """Download each `NAME==VERSION` of the lock and write the hash of what came beside it."""
+    parser = ArgumentParser(
+        prog="python -m deploy.wheels",
+        description=__doc__,
+        epilog=examples("python -m deploy.wheels jetpack5"),
+    )
+    parser.add_argument("target", metavar="|".join(TARGETS))
+    target = find_target(parser.parse_args(argv).target)
+    path = lock_path(target)
+    lines = []
+    for line in read_bytes(path, "lock").decode().splitlines():
+        if line.strip() and not line.startswith("#"):
+            pin = line.split()[0]
+            with tempfile.TemporaryDirectory() as place:
+                download(target, [pin], Path(place))
+                digest = hashlib.sha256(next(Path(place).glob("*.whl")).read_bytes()).hexdigest()
+            line = f"{pin} --hash=sha256:{digest}"
+        lines.append(line)
+    write_atomic(path, ("\n".join(lines) + "\n").encode())
+    print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run_cli(main))

@@ -1,1 +1,0 @@
-"""Long proofs of the installer: each a command with a JSON result."""

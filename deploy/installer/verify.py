@@ -1,0 +1,221 @@
+"""Which bundle is believed: its signature, what it holds, and that it is for this computer.
+
+A bundle is a tar, and beside it stands BUNDLE.tar.sig: what `ssh-keygen -Y sign` says of the whole
+file. So a changed byte anywhere is found, and nothing inside is looked at before that. The board's
+own `ssh-keygen -Y verify` decides; the key is the one that the board trusts.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import io
+import json
+import os
+import platform
+import re
+import stat
+import subprocess
+import sys
+import tarfile
+import tempfile
+from typing import Any, NamedTuple
+
+MANIFEST = "manifest.json"
+FORMAT = 1
+NAMESPACE = "phil-bundle"
+"""Of the signature: one over something else, with the same key, does not pass for a bundle's."""
+_SIGNER = "owner"
+_MAX_BUNDLE_BYTES = 1 << 30
+_MAX_SMALL_BYTES = 1 << 16
+_BEGIN, _END = "-----BEGIN PUBLIC KEY-----", "-----END PUBLIC KEY-----"
+_ED25519 = bytes.fromhex("302a300506032b6570032100")
+"""What stands before the 32 bytes of a key in a SubjectPublicKeyInfo of Ed25519 (RFC 8410)."""
+_SSH_ED25519 = b"\0\0\0\x0bssh-ed25519\0\0\0\x20"
+"""What stands before the same 32 bytes in a public key of OpenSSH (RFC 8709)."""
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+-]*(/[A-Za-z0-9_][A-Za-z0-9._+-]*)*")
+_VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,99}")
+
+
+class _OneLineError(Exception):
+    def __str__(self) -> str:
+        """The text on one line, whatever a file name or the system put into it."""
+        line = " ".join(super().__str__().split())
+        # What a terminal would act upon is written as its escape.
+        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
+class UserError(_OneLineError):
+    """Bad input. Its text is one line: what is wrong, and what would be right."""
+
+
+class UnhealthyError(_OneLineError):
+    """A release that may not run here. Its text says why, on one line."""
+
+
+class Target(NamedTuple):
+    """A kind of board: `python` like 3.8, `machine` as uname says, the least `glibc`."""
+
+    name: str
+    python: str
+    machine: str
+    glibc: str
+
+
+class Manifest(NamedTuple):
+    """What a bundle is. `version` names its bytes and no others."""
+
+    version: str
+    target: Target
+    vehicle_id: str
+    policy_id: str
+
+
+class Bundle(NamedTuple):
+    """A verified bundle: what it says of itself, and the bytes of each file by its path."""
+
+    manifest: Manifest
+    files: dict[str, bytes]
+
+
+def read_bundle(path: str, public_key: bytes) -> Bundle:
+    """Read a bundle that the owner of `public_key` (PEM) has signed.
+
+    It is read once, verified and used from memory, so nobody can change it in between.
+    Raises UserError, having written nothing.
+    """
+    allowed = _ssh_key(public_key)
+    data = read_file(path, "bundle", _MAX_BUNDLE_BYTES)
+    signature = read_file(f"{path}.sig", "signature", _MAX_SMALL_BYTES)
+    try:
+        _check_signature(data, signature, allowed)
+        files = _unpack(data)
+        return Bundle(parse_manifest(files.get(MANIFEST, b"")), files)
+    except UserError as error:
+        raise UserError(f"bundle {path} is refused: {error}") from None
+
+
+def read_public_key(path: str) -> bytes:
+    """The PEM of an Ed25519 public key. Raises UserError for anything else."""
+    pem = read_file(path, "public key", _MAX_SMALL_BYTES)
+    try:
+        _ssh_key(pem)
+    except UserError as error:
+        raise UserError(f"public key {path}: {error}") from None
+    return pem
+
+
+def same_key(one: bytes, other: bytes) -> bool:
+    """Whether two PEM files hold the same public key."""
+    return _ssh_key(one) == _ssh_key(other)
+
+
+def key_name(pem: bytes) -> str:
+    """A few digits by which a person tells public keys apart."""
+    return hashlib.sha256(_ssh_key(pem).encode()).hexdigest()[:16]
+
+
+def read_file(path: str, what: str, most: int) -> bytes:
+    """The bytes of a regular file of at most `most` bytes. UserError for all else."""
+    try:
+        # Not to wait for the other end of a pipe.
+        with open(path, "rb", opener=lambda p, flags: os.open(p, flags | os.O_NONBLOCK)) as stream:
+            found = os.fstat(stream.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                raise UserError(f"{what} {path} is not a file")
+            if found.st_size > most:
+                raise UserError(f"{what} {path} is larger than {most} bytes")
+            return stream.read()
+    except OSError as error:
+        raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
+
+
+def _ssh_key(pem: bytes) -> str:
+    """A public key in PEM as OpenSSH writes it in a file of allowed signers."""
+    lines = [line.strip() for line in pem.decode("ascii", "replace").split("\n") if line.strip()]
+    if len(lines) < 3 or lines[0] != _BEGIN or lines[-1] != _END:
+        raise UserError("the public key is not a PEM public key")
+    try:
+        der = base64.b64decode("".join(lines[1:-1]), validate=True)
+    except binascii.Error:
+        raise UserError("the public key is not a PEM public key") from None
+    if len(der) != len(_ED25519) + 32 or not der.startswith(_ED25519):
+        raise UserError("the public key is not an Ed25519 key")
+    return f"ssh-ed25519 {base64.b64encode(_SSH_ED25519 + der[-32:]).decode()}"
+
+
+def _check_signature(data: bytes, signature: bytes, allowed: str) -> None:
+    with tempfile.TemporaryDirectory(prefix="phil-verify-") as place:
+        keys, signed = os.path.join(place, "keys"), os.path.join(place, "sig")
+        for path, content in ((keys, f"{_SIGNER} {allowed}\n".encode()), (signed, signature)):
+            with open(path, "wb") as stream:
+                stream.write(content)
+        command = ["ssh-keygen", "-Y", "verify", "-f", keys, "-I", _SIGNER,
+                   "-n", NAMESPACE, "-s", signed]  # fmt: skip
+        try:
+            done = subprocess.run(command, input=data, capture_output=True, check=False)
+        except OSError as error:
+            raise UserError(f"ssh-keygen cannot be run: {error.strerror}") from None
+    if b"unknown option" in done.stderr:
+        raise UserError("this ssh-keygen verifies no signatures: OpenSSH 8.2 or newer is needed")
+    if done.returncode != 0:
+        raise UserError("its signature is not of the key that is trusted here, or it was changed")
+
+
+def _unpack(data: bytes) -> dict[str, bytes]:
+    """The files of a tar by path: regular ones with plain names, and nothing else."""
+    files: dict[str, bytes] = {}
+    try:
+        with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as tar:
+            for member in tar:
+                stream = tar.extractfile(member) if member.isreg() else None
+                if stream is None or not _NAME.fullmatch(member.name) or member.name in files:
+                    raise UserError(f"it holds what no bundle holds: {member.name!r}")
+                files[member.name] = stream.read()
+    except tarfile.TarError:
+        raise UserError("it is no bundle") from None
+    return files
+
+
+def to_json(manifest: Manifest) -> bytes:
+    """The one way to write it: sorted keys, no spaces, a newline at the end."""
+    value = {**manifest._asdict(), "format": FORMAT, "target": manifest.target._asdict()}
+    return json.dumps(value, sort_keys=True, separators=(",", ":")).encode() + b"\n"
+
+
+def parse_manifest(data: bytes) -> Manifest:
+    """Read `to_json`. Raises UserError for another format or a version that is no folder's name."""
+    try:
+        value: dict[str, Any] = json.loads(data)
+        if value["format"] != FORMAT:
+            raise UserError(f"its format is {value['format']}, this installer reads {FORMAT}")
+        names = ("version", "vehicle_id", "policy_id")
+        manifest = Manifest(target=Target(**value["target"]), **{n: value[n] for n in names})
+        if not _VERSION.fullmatch(manifest.version):
+            raise ValueError(manifest.version)
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise UserError("its manifest is not valid") from None
+    return manifest
+
+
+def check_fits(target: Target) -> None:
+    """Raise UserError unless Python, processor and C library are what the wheels need.
+
+    Wheels for another computer would fail late and strangely.
+    """
+    python = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    if python != target.python:
+        raise UserError(
+            f"the bundle is for Python {target.python} and this is {python}:"
+            f" run it with python{target.python}"
+        )
+    if platform.machine() != target.machine:
+        raise UserError(f"the bundle is for {target.machine}, this is {platform.machine()}")
+    name, _, version = (os.confstr("CS_GNU_LIBC_VERSION") or "another").partition(" ")
+    if name != "glibc" or _numbers(version) < _numbers(target.glibc):
+        raise UserError(f"the bundle needs glibc {target.glibc}, this is {name} {version}")
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(part) for part in version.split(".") if part.isdigit()]

@@ -1,0 +1,445 @@
+"""``python -m hil_tests board``: a bundle onto boards that are not there, and what that took.
+
+- `aarch64` is a whole computer, emulated by qemu: Debian 11 with its own kernel, systemd, OpenSSH,
+  Python 3.9 and glibc 2.31, and no network but our ssh to it. `deploy push` installs there; then a
+  simulator drives it, it is upgraded, rolled back, given changed and faulty bundles, hung, and
+  loses its power: qemu is killed, and with it whatever the board's kernel had not yet written.
+- `python38` is this computer with Python 3.8 and no systemd, as in a container: the versions of
+  the jetpack5 bundle, installed without a network, and run as `deploy/README.md` says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import shutil
+import subprocess
+import tempfile
+import time
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from deploy.__main__ import main as deploy
+from deploy.bundle import NAME, Inputs, build_installer, make_bundle
+from deploy.installer.systemd import MAIN_UNIT
+from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel
+from edge_runtime.cli import examples, positive, sigterm_as_interrupt
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.util import UserError
+from hil_tests.emulated_board import Computer, free_port, make_image, why_not_emulated
+from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand, wait_until
+
+BOARDS = ("aarch64", "python38")
+DEFAULT_CACHE = "build/board"
+VEHICLE, _PORT = "hunter01", 7447
+ENDPOINT = f"tls/127.0.0.1:{_PORT}"
+_EPISODE_LIMIT_S, _BACK_LIMIT_S = 300.0, 120.0
+_CHANGED_BYTES = 20
+_FACTS = ("Uid", "CapBnd", "CapEff", "NoNewPrivs", "Seccomp", "Cpus_allowed_list")
+_FORBIDDEN = ("/etc/passwd", "/opt/phil/current/policy.onnx", "/usr/bin/new", "/var/lib/new")
+_LIBRARIES = "/opt/libraries"
+_WHAT_IT_IS = "uname -rm; systemctl --version | head -1; python3 --version; ssh -V 2>&1"
+_FINGERPRINT = "find /opt/phil /etc/systemd/system -printf '%p %s %T@\\n' | sha256sum"
+FAULTS = {
+    "it never says that it is ready": "import os; os.environ.pop('NOTIFY_SOCKET', None)",
+    "it is ready and then silent": "import os; os.environ.pop('WATCHDOG_USEC', None)",
+    "it ends as a service only": "import os, sys; a = sys.argv;"
+    " 'run' in a and '--vehicle' not in a and os._exit(5)",
+}
+"""Releases that must go back by themselves: what Python runs at the start of each."""
+EXAMPLE = examples("python -m hil_tests board --boards python38 --out runs/board.json")
+
+
+class Parcels:
+    """Makes bundles: whole ones as a person would, and light ones whose libraries lie there."""
+
+    def __init__(self, folder: Path, wheels: Path, endpoint: str) -> None:
+        self._folder, self._wheels, self._endpoint = folder, wheels, endpoint
+        self.trust, self.certificates = folder / "keys/policy.pub", folder / "certs"
+        with _silent():
+            deploy(["keys", "--out", str(folder / "keys")])
+            deploy(["certs", "--out", str(self.certificates), "--vehicle-id", VEHICLE])
+        self._edge = build_edge_wheel(folder / "edge")
+        (folder / NAME).write_bytes(build_installer())
+
+    def whole(self, target: str) -> Path:
+        """A bundle with every wheel."""
+        with _silent():
+            deploy(
+                ["bundle", "--policy", str(POLICY), "--public-key", str(PUBLIC_KEY),
+                 "--target", target, "--config", str(self._config()), "--key", str(self._key()),
+                 "--tls", str(self.certificates / f"edge-{VEHICLE}"),
+                 "--wheels", str(self._wheels), "--out", str(self._folder / target)]
+            )  # fmt: skip
+        return next((self._folder / target).glob("*.tar"))
+
+    def light(self, line: str) -> Path:
+        """A bundle for the emulated board of which a path file takes the place of most wheels.
+
+        `line` is a further one of that file; Python runs it at its start.
+        """
+        host = self._folder / "host-1.0-py3-none-any.whl"
+        with zipfile.ZipFile(host, "w") as wheel:
+            wheel.writestr("host.pth", f"{_LIBRARIES}\n{line}\n")
+        tls, wheels = self.certificates / f"edge-{VEHICLE}", [self._edge, host]
+        inputs = Inputs(POLICY, PUBLIC_KEY, self._key(), self._config(), tls, wheels)
+        return make_bundle(inputs, TARGETS["linux-aarch64"], self._folder / "light").path
+
+    def _key(self) -> Path:
+        return self.trust.with_suffix(".key")
+
+    def _config(self) -> Path:
+        path = self._folder / "edge.toml"
+        path.write_text(f'connect = "{self._endpoint}"\nvehicle_id = "{VEHICLE}"\n')
+        return path
+
+
+class Installer(NamedTuple):
+    """The installer on an emulated board."""
+
+    board: Computer
+
+    def run(self, bundle: Path) -> subprocess.CompletedProcess[str]:
+        """Install a bundle that was copied there."""
+        return self.board.run(self.command(bundle))
+
+    def command(self, bundle: Path) -> str:
+        """What `run` types."""
+        return f"python3 -I {NAME} install {bundle.name}"
+
+    def upgrade(self, bundle: Path) -> None:
+        """Install one that must be taken. UserError with the installer's line."""
+        self._must(self.run(bundle))
+
+    def roll_back(self) -> None:
+        """Go back to the release before. UserError with the installer's line."""
+        self._must(self.board.run(f"python3 -I {NAME} rollback"))
+
+    @staticmethod
+    def _must(done: subprocess.CompletedProcess[str]) -> None:
+        if done.returncode != 0:
+            raise UserError(f"on the board: {done.stderr.strip()}")
+
+    def send(self, bundle: Path) -> None:
+        """A bundle and its signature to the board."""
+        self.board.copy(bundle, Path(f"{bundle}.sig"))
+
+    def status(self) -> dict[str, Any]:
+        """What the installed release says of itself. UserError where it is not whole."""
+        done = self.board.run(f"python3 /opt/phil/current/{NAME} status --json")
+        if done.returncode != 0:
+            raise UserError(f"the board is broken: {(done.stdout + done.stderr).strip()}")
+        return dict(json.loads(done.stdout))
+
+    def current(self) -> str:
+        """The version that is current, and whole."""
+        return str(self.status()["current"])
+
+
+def prove_aarch64(
+    cache: Path, wheels: Path, cuts: int, keep: Callable[[dict[str, Any]], None]
+) -> None:
+    """Install, drive, upgrade, spoil, hang and cut off an emulated board.
+
+    `keep` is given the report, for JSON, each time when it has grown.
+
+    Raises:
+        UserError: a step failed that must not.
+    """
+    if not (cache / "disk").exists():
+        make_image(cache)
+    with tempfile.TemporaryDirectory(prefix="phil-board-") as place:
+        folder = Path(place)
+        parcels = Parcels(folder, wheels, ENDPOINT)
+        with Computer(cache, folder) as board:
+            installer = Installer(board)
+            report: dict[str, Any] = {"boot_s": board.boot(), "is": board.run(_WHAT_IT_IS).stdout}
+            report |= _push(board, parcels)
+            report["status"] = installer.status()
+            report["episode"] = _drive_through_ssh(board, parcels)
+            report["service"] = _look_at_service(board)
+            report["hung_to_active_s"] = _hang(board)
+            keep(report)
+            lights = [parcels.light(f"# {number}") for number in range(3)]
+            board.run(f"cp -al /opt/phil/current/site-packages {_LIBRARIES}")
+            board.run(f"rm -r {_LIBRARIES}/edge_runtime")
+            board.copy(folder / NAME)
+            for light in lights:
+                installer.send(light)
+            report["rolled_back"] = _upgrade_and_back(installer, lights[0])
+            report["changed_bytes"] = _change_bytes(installer, lights[1])
+            report["faulty"] = {
+                why: _install_faulty(installer, parcels.light(line)) for why, line in FAULTS.items()
+            }
+            keep(report)
+            for cut in _cut(installer, lights, cuts):
+                keep(report | {"power_cuts": cut})
+            report["power_cuts"] = cut
+            board.run(f"python3 -I {NAME} uninstall")
+            left = board.run("ls -d /opt/phil /etc/systemd/system/phil-*.service").stdout.split()
+            keep(report | {"left_after_uninstall": left})
+
+
+def _push(board: Computer, parcels: Parcels) -> dict[str, Any]:
+    """`deploy push` of a whole bundle, over the system's ssh, to a healthy service."""
+    bundle = parcels.whole("linux-aarch64")
+    push = ["push", "board", str(bundle), "--trust", str(parcels.trust), "--no-sudo"]
+    begun_s = time.monotonic()
+    with board.known_to_ssh(), _silent():
+        if deploy(push) != 0:
+            raise UserError("deploy push does not install; its own line above says why")
+    took_s = round(time.monotonic() - begun_s, 1)
+    return {"bundle_mb": bundle.stat().st_size / 1e6, "pushed_and_installed_s": took_s}
+
+
+def _drive_through_ssh(board: Computer, parcels: Parcels) -> dict[str, Any]:
+    """One left turn by the board, which reaches the simulator here through our ssh only."""
+    port = free_port()
+    tunnel = board.ssh("-N", options=("-R", f"{_PORT}:127.0.0.1:{port}"))
+    with subprocess.Popen(tunnel, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as link:
+        try:
+            return _drive(parcels.certificates, port)
+        finally:
+            link.terminate()
+
+
+def _drive(certificates: Path, port: int) -> dict[str, Any]:
+    """One left turn in real time; parts of the simulator's report."""
+    out = certificates / "episode.json"
+    words = [
+        "bridge", "simulate", "--env", "left_turn", "--clock", "realtime", "--episodes", "1",
+        "--listen", f"tls/127.0.0.1:{port}", "--vehicle-id", VEHICLE, "--wait-edge-s", "120",
+        "--tls", str(certificates / f"simulator-{VEHICLE}"), "--out", str(out),
+    ]  # fmt: skip
+    with BackgroundCommand(*words, quiet=True) as simulator:
+        simulator.wait(_EPISODE_LIMIT_S)
+    report = json.loads(out.read_text())
+    kept = ("success_rate", "answered_states", "latency_ms", "safe_stops", "rejected", "policy_id")
+    return {name: report[name] for name in kept} | {"outcome": report["per_episode"][0]["outcome"]}
+
+
+def _look_at_service(board: Computer) -> dict[str, Any]:
+    """What the kernel and systemd say of the service's process, and what it could write."""
+    pid = board.show(MAIN_UNIT, "MainPID")
+    lines = board.run(f"cat /proc/{pid}/status").stdout.splitlines()
+    rows = dict(line.split(":", 1) for line in lines)
+    enter = f"nsenter --target {pid} --mount --root=/proc/{pid}/root --wd=/ touch"
+    said = board.run(f"systemd-analyze security --no-pager {MAIN_UNIT}").stdout
+    return {
+        **{name: " ".join(rows[name].split()) for name in _FACTS},
+        "written": [path for path in _FORBIDDEN if board.run(f"{enter} {path}").returncode == 0],
+        "can_unit": board.show("phil-can", "Result"),
+        "exposure": float(said.split("exposure level for")[1].split(":")[1].split()[0]),
+    }
+
+
+def _hang(board: Computer) -> float:
+    """Stop the process as a hang would; seconds until systemd has another one ready."""
+    pid, begun_s = board.show(MAIN_UNIT, "MainPID"), time.monotonic()
+    board.run(f"kill -STOP {pid}")
+    wait_until(
+        lambda: board.show(MAIN_UNIT, "MainPID") not in ("0", pid), "another process", _BACK_LIMIT_S
+    )
+    _wait_until_active(board)
+    return round(time.monotonic() - begun_s, 1)
+
+
+def _upgrade_and_back(installer: Installer, light: Path) -> bool:
+    """Whether an upgrade became current, and a roll-back the release before."""
+    before = installer.current()
+    installer.upgrade(light)
+    upgraded = installer.current()
+    installer.roll_back()
+    return upgraded != before and installer.current() == before
+
+
+def _change_bytes(installer: Installer, bundle: Path) -> dict[str, Any]:
+    """Change one byte of a bundle, many times: each is refused, with nothing written."""
+    choice, data = random.Random(1), bundle.read_bytes()
+    changed, refused = bundle.with_name("changed.tar"), 0
+    shutil.copyfile(f"{bundle}.sig", f"{changed}.sig")
+    before = installer.board.run(_FINGERPRINT).stdout
+    for place in choice.sample(range(len(data)), _CHANGED_BYTES):
+        changed.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        installer.send(changed)
+        done = installer.board.run(installer.command(changed))
+        untouched = installer.board.run(_FINGERPRINT).stdout == before
+        refused += done.returncode == 2 and "is refused" in done.stderr and untouched
+    return {"tried": _CHANGED_BYTES, "refused_and_nothing_written": refused}
+
+
+def _install_faulty(installer: Installer, bundle: Path) -> dict[str, Any]:
+    """Install a release that must go back by itself; what the installer says of it."""
+    before = installer.current()
+    installer.send(bundle)
+    done = installer.run(bundle)
+    return {
+        "status": done.returncode,
+        "said": done.stderr.strip(),
+        "went_back": installer.current() == before
+        and installer.board.show(MAIN_UNIT, "ActiveState") == "active",
+    }
+
+
+def _cut(installer: Installer, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]]:
+    """Cut the power at random moments of an upgrade; look, and let the same command complete it.
+
+    Yields what came of the cuts so far.
+    """
+    board, choice = installer.board, random.Random(1)
+    begun_s = time.monotonic()
+    installer.upgrade(lights[0])
+    whole_s = time.monotonic() - begun_s
+    said_last: Counter[str] = Counter()
+    current: Counter[str] = Counter()
+    broken: list[str] = []
+    boots_s: list[float] = []
+    for number in range(cuts):
+        before, bundle = installer.current(), lights[(number + 1) % len(lights)]
+        run = subprocess.Popen(
+            board.ssh(installer.command(bundle)), text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        time.sleep(choice.uniform(0.0, 1.1 * whole_s))
+        board.cut_power()
+        said = (run.communicate()[0].strip().splitlines() or ["nothing"])[-1].split()[0]
+        boots_s.append(board.boot())
+        said_last[said] += 1
+        try:
+            then = installer.current()
+            current["the old one" if then == before else "the new one"] += 1
+            _wait_until_active(board)
+            installer.upgrade(bundle)
+            if installer.current() == before:
+                raise UserError("the same command does not complete it")
+        except (UserError, TimeoutError) as error:
+            broken.append(f"cut {number}: {error}")
+        yield {
+            "cuts": number + 1, "broken": broken, "killed_after_it_said": dict(said_last),
+            "current_then": dict(current), "a_whole_upgrade_s": round(whole_s, 1),
+            "boots_s": boots_s,
+        }  # fmt: skip
+
+
+def _wait_until_active(board: Computer) -> None:
+    wait_until(lambda: board.show(MAIN_UNIT, "ActiveState") == "active", MAIN_UNIT, _BACK_LIMIT_S)
+
+
+def prove_python38(wheels: Path) -> dict[str, Any]:
+    """Install offline under Python 3.8, run the release as a container would, drive; a report."""
+    python, port = str(find_python38()), free_port()
+    with tempfile.TemporaryDirectory(prefix="phil-python38-") as place:
+        folder = Path(place)
+        parcels = Parcels(folder, wheels, f"tls/127.0.0.1:{port}")
+        bundle, opt = parcels.whole("linux-x86_64"), folder / "opt"
+
+        def run(*words: str) -> str:
+            done = subprocess.run(
+                ["unshare", "--net", python, "-I", folder / NAME, *words, "--root", opt],
+                capture_output=True, text=True, check=False, env={"PATH": os.defpath},
+            )  # fmt: skip
+            if done.returncode != 0:
+                raise UserError(f"install.pyz {words[0]}: {done.stderr.strip()}")
+            return done.stdout
+
+        begun_s = time.monotonic()
+        run("install", str(bundle), "--trust", str(parcels.trust), "--service", "none")
+        report = {
+            "bundle_mb": bundle.stat().st_size / 1e6,
+            "installed_s": round(time.monotonic() - begun_s, 2),
+            "status": json.loads(run("status", "--json")),
+        }
+        words = [str(opt / "current/bin/phil-edge"), "run", "--config", "config.toml"]
+        with subprocess.Popen(words, cwd=opt / "current", stderr=subprocess.DEVNULL) as runtime:
+            try:
+                report["episode"] = _drive(parcels.certificates, port)
+            finally:
+                runtime.terminate()
+        run("uninstall")
+        return {**report, "left_after_uninstall": opt.exists()}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--boards", nargs="+", choices=BOARDS, default=list(BOARDS),
+        help="an emulated aarch64 computer with systemd; Python 3.8 without systemd",
+    )  # fmt: skip
+    parser.add_argument(
+        "--cuts", metavar="N", type=positive, default=8, help="power cuts of the emulated one"
+    )
+    parser.add_argument(
+        "--cache", metavar="DIR", default=DEFAULT_CACHE, help="keeps the emulated one's disk"
+    )
+    parser.add_argument(
+        "--wheels", metavar="DIR", default=DEFAULT_FOLDER, help="keeps the bundles' wheels"
+    )
+    parser.add_argument("--out", metavar="R.json", help="write the reports to this file")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Prove each board, print its report, write the file.
+
+    Raises:
+        UserError: this machine cannot, or a step failed.
+    """
+    if arguments.out is not None:
+        check_writable(arguments.out)
+    for board in arguments.boards:
+        if reason := why_not(board):
+            raise UserError(f"no {board} here: {reason}")
+    report: dict[str, Any] = {"cores": os.cpu_count()}
+    with sigterm_as_interrupt():
+        for board in arguments.boards:
+
+            def keep(found: dict[str, Any], board: str = board) -> None:
+                report[board] = found
+                write_json_out(arguments.out, report)
+
+            prove(board, arguments.cache, arguments.wheels, arguments.cuts, keep)
+            print(f"{board}: {json.dumps(report[board], indent=1)}", flush=True)
+    return 0
+
+
+def prove(
+    board: str, cache: str, wheels: str, cuts: int, keep: Callable[[dict[str, Any]], None]
+) -> None:
+    """Prove one of BOARDS; `keep` is given its report each time when it has grown."""
+    if board == "aarch64":
+        prove_aarch64(Path(cache), Path(wheels), cuts, keep)
+    else:
+        keep(prove_python38(Path(wheels)))
+
+
+def why_not(board: str) -> str:
+    """What is missing for one of BOARDS here; empty if nothing is."""
+    if os.geteuid() != 0:
+        return "it needs root"
+    if board == "python38":
+        return "" if find_python38() else "no Python 3.8 on PATH or under ~/.pyenv"
+    return why_not_emulated()
+
+
+def find_python38() -> str | None:
+    """A Python 3.8 of this machine; None without one."""
+    candidates = [shutil.which("python3.8")]
+    candidates += [str(p) for p in sorted(Path.home().glob(".pyenv/versions/3.8*/bin/python"))]
+    for candidate in filter(None, candidates):
+        asked = subprocess.run(
+            [candidate, "--version"], capture_output=True, text=True, check=False
+        )
+        if asked.stdout.startswith("Python 3.8."):
+            return candidate
+    return None
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        yield
