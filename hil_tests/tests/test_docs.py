@@ -26,15 +26,34 @@ from trainer.picture import drive_moments
 
 ROOT = Path(__file__).parents[2]
 READMES = sorted(
-    path.relative_to(ROOT)
-    for path in [*ROOT.glob("*.md"), *ROOT.glob("*/README.md")]
-    if ".venv" not in path.parts
+    {
+        path.relative_to(ROOT)
+        for path in [*ROOT.glob("*.md"), *ROOT.glob("*/README.md"), *ROOT.glob("docs/*.md")]
+        if ".venv" not in path.parts
+    }
 )
 
 
 def test_every_folder_has_one():
     folders = ("edge_runtime", "bridge", "trainer", "hil_tests", "deploy")
     assert {Path(folder) / "README.md" for folder in folders} <= set(READMES)
+
+
+def test_the_front_page_is_one_page():
+    assert len((ROOT / "README.md").read_bytes()) <= 8192
+
+
+def anchors(text: str) -> set[str]:
+    """The names that GitHub gives a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", each.lower()).strip().replace(" ", "-") for each in headings}
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))])
+def test_a_link_into_a_page_meets_a_heading(page):
+    for link, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", (ROOT / page).read_text()):
+        target = (ROOT / page).parent / link if link else ROOT / page
+        assert anchor in anchors(target.read_text()), (link, anchor)
 
 
 @pytest.mark.parametrize("readme", READMES, ids=str)
@@ -55,7 +74,7 @@ def test_security_names_every_port_that_speaks_plain_text_beside_tls():
     assert "--vehicle ros2" in text
 
 
-@pytest.mark.parametrize("readme", ["README.md", "deploy/README.md"])
+@pytest.mark.parametrize("readme", ["docs/first_day.md", "deploy/README.md"])
 def test_of_two_bundles_the_newest_one_is_pushed(readme, tmp_path):
     """The command as it stands there, in a shell, with a program that tells its arguments."""
     (command,) = re.findall(
@@ -85,7 +104,7 @@ def test_the_table_of_targets_is_that_of_the_bundles():
     for target in TARGETS.values():
         assert f"| `{target.name}` | {target.python} | {target.machine}, {target.glibc} |" in text
     assert f"this bundle needs Python {TARGETS['jetpack5'].python} there" in (
-        (ROOT / "README.md").read_text()
+        (ROOT / "docs" / "first_day.md").read_text()
     )
 
 
