@@ -17,7 +17,7 @@ from trainer.experiments.plan import CONSTANT, FULL_PATH_M, HUMAN_MODEL, QUICK, 
 from trainer.experiments.run import Store
 from trainer.human.model import HumanModel, HumanModelConfig
 
-TINY = replace(QUICK, steps=dict.fromkeys(SCENARIOS, 300))
+TINY = replace(QUICK, steps=dict.fromkeys(SCENARIOS, 290))
 UNIT = Unit("left_turn", "per_td3", "normal", 1)
 """No human guides it."""
 SKILLS = {
