@@ -1,4 +1,4 @@
-"""TODO."""
+"""The Hunter's CAN frames and fault bits, as bytes and as numbers."""
 
 from __future__ import annotations
 

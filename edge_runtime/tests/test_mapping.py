@@ -1,4 +1,4 @@
-"""TODO."""
+"""From the policy's action to a vehicle's speed and wheel angle, within its limits."""
 
 from __future__ import annotations
 
