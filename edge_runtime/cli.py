@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import errno
 import math
 import os
@@ -13,8 +14,9 @@ import signal
 import sys
 import threading
 from importlib import import_module
-from typing import Any, Callable, Dict, Iterator, List, NoReturn, Optional, Tuple
+from typing import Any, Callable, Dict, Iterator, List, NamedTuple, NoReturn, Optional, Tuple
 
+from edge_runtime import __version__
 from edge_runtime.util import UserError, ending_signals, printable
 
 BAD_INPUT = 2
@@ -95,24 +97,41 @@ def add_public_key(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def dispatch(parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv: List[str]) -> int:
-    """Parse and run one of many commands; its exit status.
+class Command(NamedTuple):
+    """A command, in a module that has several."""
 
-    `commands` has for each name a module and one line on what it does. Such a module has EXAMPLE,
-    `add_arguments(parser)` and `run(arguments)`. Only that of the command that is asked for is
-    loaded: a mock of a chassis need not wait for torch.
+    EXAMPLE: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+
+
+def dispatch(parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv: List[str]) -> int:
+    """Parse and run one of many commands; its exit status. Without a command, print the help.
+
+    `commands` has for each name a place and one line on what it does. The place is a module with
+    EXAMPLE, `add_arguments(parser)` and `run(arguments)`, or `module:name` of a `Command` in it.
+    Only the command that is asked for is loaded: a mock of a chassis need not wait for torch.
     """
+    parser.add_argument("--version", action="version", version=__version__)
+    word = argv[0] if argv else "--help"
+    near = difflib.get_close_matches(word, commands, 1)
+    if near and near[0] != word:
+        parser.error(f"there is no command {word!r}; did you mean {near[0]}?")
     parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, (module, summary) in commands.items():
+    chosen: Any = None
+    for name, (place, summary) in commands.items():
         one = parsers.add_parser(
             name, help=summary, description=f"{summary[0].upper()}{summary[1:]}."
         )
-        if name in argv[:1]:
+        if name == word:
+            module, _, member = place.partition(":")
             chosen = import_module(module)
+            if member:
+                chosen = getattr(chosen, member)
             one.epilog = chosen.EXAMPLE
             chosen.add_arguments(one)
-    arguments = parser.parse_args(argv)
-    return int(import_module(commands[arguments.command][0]).run(arguments))
+    arguments = parser.parse_args(argv or ["--help"])
+    return int(chosen.run(arguments))
 
 
 def run_cli(main: Callable[[List[str]], int], argv: Optional[List[str]] = None) -> int:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 
-from edge_runtime import __version__
 from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -23,7 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 
 def main(argv: list[str]) -> int:
-    """Run one command; the exit status. Without one, print the help."""
+    """Run one command; the exit status."""
     parser = ArgumentParser(
         prog="python -m trainer",
         description="Trains driving policies with human guidance, evaluates and exports them.",
@@ -32,12 +30,7 @@ def main(argv: list[str]) -> int:
             "python -m trainer evaluate runs/phil_1 --runs 50",
         ),
     )
-    parser.add_argument("--version", action="version", version=__version__)
-    word = argv[0] if argv else "--help"
-    near = difflib.get_close_matches(word, COMMANDS, 1)
-    if near and near[0] != word:
-        parser.error(f"there is no command {word!r}; did you mean {near[0]}?")
-    return dispatch(parser, COMMANDS, argv or ["--help"])
+    return dispatch(parser, COMMANDS, argv)
 
 
 if __name__ == "__main__":

@@ -5,11 +5,14 @@ import importlib
 import importlib.util
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from deploy.installer import __main__ as installer
+from edge_runtime import __version__
 from edge_runtime.cli import ArgumentParser, examples
 
 ROOT = Path(__file__).parents[2]
@@ -116,6 +119,20 @@ def test_a_wrong_example_is_found_out(only_parse):
     with pytest.raises(SystemExit) as ended:
         parser.parse_args(example[1:])
     assert ended.value.code == 2
+
+
+def test_phil_runs_every_folder():
+    """As installed: the script lies beside the Python that runs this test."""
+    phil = Path(sys.executable).with_name("phil")
+    for words, status, said in (
+        (["trainer", "--version"], 0, __version__),
+        (["edge_runtime", "chekc"], 2, "chekc"),
+        (["bridg"], 2, "did you mean bridge?"),
+        ([], 0, "hil_tests"),
+    ):
+        ended = subprocess.run([phil, *words], capture_output=True, text=True)
+        assert ended.returncode == status
+        assert said in ended.stdout + ended.stderr
 
 
 def test_the_installer_shows_examples_that_it_takes():

@@ -1,0 +1,34 @@
+"""The console script ``phil``: ``phil FOLDER COMMAND`` is ``python -m FOLDER COMMAND``."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+
+from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
+
+FOLDERS = {
+    "trainer": "train a policy with a human's help, evaluate and export it",
+    "edge_runtime": "drive a policy on the board",
+    "bridge": "serve the simulator to a board; record, replay and look at the wire",
+    "hil_tests": "prove the loop without hardware",
+    "deploy": "sign, pack and install what the board needs",
+}
+
+
+def main() -> None:
+    """The entry point."""
+    sys.exit(run_cli(_run))
+
+
+def _run(argv: list[str]) -> int:
+    if argv and argv[0] in FOLDERS:
+        sys.argv[1:] = argv[1:]
+        runpy.run_module(argv[0], run_name="__main__", alter_sys=True)  # ends by itself
+    parser = ArgumentParser(
+        prog="phil",
+        description="Human-guided driving policies, from training to the board.",
+        epilog=examples("phil hil_tests demo", "phil trainer train --help"),
+    )
+    commands = {name: (f"{name}.__main__", summary) for name, summary in FOLDERS.items()}
+    return dispatch(parser, commands, argv)
