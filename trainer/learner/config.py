@@ -70,6 +70,9 @@ class LearnerConfig:
     """Of the critics' optimiser. As in the authors' code, see ``actor_learning_rate``."""
     learning_rate_decay: float = 0.996
     """Factor on both learning rates, once an episode (table A5)."""
+    learning_rate_final: float = 0.0
+    """Share of both learning rates that is left at the end of the run; they fall to it linearly.
+    The paper's is 1. With rates that stay high, the late policy swings about what it learned."""
     gamma: float = 0.95
     """Discount factor of one control period (table A5)."""
     return_steps: int = 8
@@ -163,6 +166,7 @@ RANGES = {
     "actor_learning_rate": FROM_ZERO,
     "critic_learning_rate": FROM_ZERO,
     "learning_rate_decay": SHARE,
+    "learning_rate_final": SHARE,
     "gamma": SHARE,
     "return_steps": FROM_ONE,
     "tau": SHARE,
@@ -192,6 +196,7 @@ PRINTED_LEARNER = LearnerConfig(
     exploration_correlation=0.0,
     actor_learning_rate=5e-4,
     critic_learning_rate=2e-4,
+    learning_rate_final=1.0,
     return_steps=1,
     tau=1e-3,
     split_loss=True,

@@ -72,6 +72,9 @@ class TD3Learner:
         self.critic_optimiser = torch.optim.Adam(
             self.critics.parameters(), config.critic_learning_rate, fused=True
         )
+        for optimiser in (self.actor_optimiser, self.critic_optimiser):
+            for group in optimiser.param_groups:
+                group["decayed_lr"] = group["lr"]
         self.noise = torch.Generator(self.device).manual_seed(seed)
         self.updates = 0
         self._charges_overruled = charges_overruled(config, algorithm)
@@ -124,11 +127,14 @@ class TD3Learner:
             priorities.double().cpu().numpy(),
         )
 
-    def decay_learning_rates(self) -> None:
-        """Once an episode (table A5)."""
+    def decay_learning_rates(self, progress: float) -> None:
+        """Once an episode (table A5); ``progress`` is the share of the run that is over."""
+        c = self.config
+        left = 1.0 - (1.0 - c.learning_rate_final) * min(progress, 1.0)
         for optimiser in (self.actor_optimiser, self.critic_optimiser):
             for group in optimiser.param_groups:
-                group["lr"] *= self.config.learning_rate_decay
+                group["decayed_lr"] *= c.learning_rate_decay
+                group["lr"] = group["decayed_lr"] * left
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers, noise and counters: all that a resumed run needs."""

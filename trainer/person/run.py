@@ -326,10 +326,10 @@ class UnhurriedLearning:
         """Nothing is waited for: 0 seconds."""
         return 0.0
 
-    def end_episode(self) -> EpisodeLearning:
+    def end_episode(self, progress: float) -> EpisodeLearning:
         """What was learned since the last call; learning rates decay. Waits for the update."""
         self.settle()
-        return self._inner.end_episode()
+        return self._inner.end_episode(progress)
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on. Waits for the update."""

@@ -37,11 +37,11 @@ def test_an_episode_reports_the_means_of_its_updates_and_then_forgets_them(learn
     for _ in range(2):
         learning.begin(0.0)
         learning.finish()
-    episode = learning.end_episode()
+    episode = learning.end_episode(0.0)
     found = (episode.critic_loss, episode.policy_loss, episode.cloning_loss, episode.value)
     assert found == (2.0, 4.0, 6.0, 8.0)
     assert 1.0 < episode.policy_priority <= 2.0
-    after = learning.end_episode()
+    after = learning.end_episode(0.0)
     assert np.isnan([after.critic_loss, after.policy_loss, after.cloning_loss, after.value]).all()
     assert after.learning_s == after.waiting_s == 0.0
 
@@ -60,7 +60,7 @@ def test_an_update_that_takes_longer_than_the_step_is_waited_for(learning):
     assert begun.wait(10.0)
     threading.Timer(0.02, let_go.set).start()
     waited_s = learning.finish()
-    episode = learning.end_episode()
+    episode = learning.end_episode(0.0)
     assert episode.waiting_s == waited_s > 0.0
     assert episode.learning_s > 0.0
 

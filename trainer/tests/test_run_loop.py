@@ -86,14 +86,14 @@ def test_beta_falls_to_zero_over_the_episodes(tmp_path, importance_sampling, bet
     assert run.betas == pytest.approx(betas)
 
 
-def test_learning_rates_decay_once_an_episode(tmp_path):
+def test_learning_rates_fall_once_an_episode(tmp_path):
     learner = replace(LEARNER, learning_rate_decay=0.9)
     run = scripted_run(tmp_path, replace(CONFIG, episodes=2, learner=learner), length=3)
     rates = []
     run.train(
         lambda metrics: rates.append(run.learning.learner.actor_optimiser.param_groups[0]["lr"])
     )
-    assert rates == pytest.approx([2e-4 * 0.9, 2e-4 * 0.81])
+    assert rates == pytest.approx([2e-4 * 0.9, 2e-4 * 0.81 / 2])
 
 
 def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):

@@ -148,16 +148,17 @@ def test_an_update_is_the_papers_losses_and_plain_adam(split):
         torch.testing.assert_close(moved, -rate * flat[clear].sign(), rtol=2e-2, atol=1e-6)
 
 
-def test_each_decay_scales_both_learning_rates():
-    learner = TD3Learner(replace(SMALL, learning_rate_decay=0.9), PHIL, seed=0)
-    for factor in (1.0, 0.9, 0.81):
+def test_both_learning_rates_fall_by_the_episode_and_over_the_run():
+    settings = replace(SMALL, learning_rate_decay=0.9, learning_rate_final=0.2)
+    learner = TD3Learner(settings, PHIL, seed=0)
+    for progress, factor in ((0.5, 1.0), (1.0, 0.9 * 0.6), (1.2, 0.81 * 0.2), (0.0, 0.729 * 0.2)):
         (actor,), (critics,) = (
             [group["lr"] for group in optimiser.param_groups]
             for optimiser in (learner.actor_optimiser, learner.critic_optimiser)
         )
         assert actor == pytest.approx(SMALL.actor_learning_rate * factor)
         assert critics == pytest.approx(SMALL.critic_learning_rate * factor)
-        learner.decay_learning_rates()
+        learner.decay_learning_rates(progress)
 
 
 def test_targets_follow_by_tau():
@@ -228,7 +229,7 @@ def test_same_seed_same_weights_and_a_restored_learner_goes_on_alike():
     restored.load_state_dict(first.state_dict())
     for learner in (first, second, restored):
         learner.update(make_batch(9))
-        learner.decay_learning_rates()
+        learner.decay_learning_rates(0.5)
         learner.update(make_batch(10))
     for name, flat in weights_of(first).items():
         assert torch.equal(flat, weights_of(second)[name])

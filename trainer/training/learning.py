@@ -61,8 +61,11 @@ class Learning(Store, Protocol):
         """
         ...
 
-    def end_episode(self) -> EpisodeLearning:
-        """What was learned since the last call; learning rates decay (table A5).
+    def end_episode(self, progress: float) -> EpisodeLearning:
+        """What was learned since the last call; learning rates fall.
+
+        Args:
+            progress: share of the run that is over, 0 to 1.
 
         Raises:
             FloatingPointError: it is not finite.
@@ -227,9 +230,9 @@ class LearningThread:
         self.replay.update_priorities(batch.indices, losses.priorities)
         return waited_s
 
-    def end_episode(self) -> EpisodeLearning:
-        """What was learned since the last call; learning rates decay (table A5)."""
-        self.learner.decay_learning_rates()
+    def end_episode(self, progress: float) -> EpisodeLearning:
+        """What was learned since the last call; learning rates fall."""
+        self.learner.decay_learning_rates(progress)
         mean_losses = np.mean(self._losses, axis=0) if self._losses else NO_LOSSES
         learned = EpisodeLearning(
             self._learning_s,

@@ -248,7 +248,7 @@ class TrainingRun:
             self.steps + tally.steps,
             self.learning.learner.updates,
             self._exploration_std(),
-            self.learning.end_episode(),
+            self.learning.end_episode(self.progress),
             info,
         )
 
