@@ -23,9 +23,9 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 import deploy.installer
 import edge_runtime
+from deploy.certs import DEFAULT_DIRECTORY
 from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
-from deploy.keys import DEFAULT_DIRECTORY
 from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, find_target, gather, lock_path
 from edge_runtime import tls as access
 from edge_runtime.cli import examples

@@ -1,8 +1,9 @@
-"""``python -m deploy certs``: an authority of one's own, and a certificate for each party.
+"""``python -m deploy keys, certs, router``: who may sign, and who may talk to whom.
 
-The common name of a certificate says which party it is; `edge_runtime.tls` says what each party
-may send and hear. Only the certificates of parties that listen may act as servers, so no viewer
-or operator can pose as a simulator. Each party gets a folder with the three files that it needs.
+An Ed25519 pair signs policies and bundles. An authority of one's own makes a TLS certificate for
+each party; its common name says which party it is, and `edge_runtime.tls` says what each party may
+send and hear. Only the certificates of parties that listen may act as servers, so no viewer or
+operator can pose as a simulator. A fleet's router gets the same rights in one file for zenohd.
 """
 
 from __future__ import annotations
@@ -14,28 +15,95 @@ import ipaddress
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+)
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from edge_runtime.cli import examples, whole_number
-from edge_runtime.files import write_atomic
+from edge_runtime.cli import Command, examples, whole_number
+from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
+from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
 from edge_runtime.tls import (
     CA_FILE,
     CERTIFICATE_FILE,
     KEY_FILE,
     ROLES,
+    ROUTER,
+    TlsFiles,
+    check_name,
     common_name,
+    load_tls,
     read_private_key,
+    rules_for_listener,
 )
 from edge_runtime.util import UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
+
+DEFAULT_DIRECTORY = str(DEFAULT_PUBLIC_KEY.parent)
+KEYS_EXAMPLE = examples("python -m deploy keys --out keys")
+
+
+def _add_keys_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        default=DEFAULT_DIRECTORY,
+        help="directory for policy.key and policy.pub",
+    )
+
+
+def _run_keys(arguments: argparse.Namespace) -> int:
+    """Make a pair and say where each half belongs."""
+    private, public = write_key_pair(Path(arguments.out))
+    print(f"private key (keep it on the workstation): {private}")
+    print(f"public key (goes onto the board):         {public}")
+    return 0
+
+
+def write_key_pair(directory: Path) -> tuple[Path, Path]:
+    """Write ``policy.key`` (PKCS8 PEM, readable by the owner alone) and ``policy.pub``.
+
+    Raises:
+        UserError: a key is there already (it may have signed policies that drive), or the
+            directory cannot be written.
+    """
+    private_path, public_path = directory / "policy.key", directory / DEFAULT_PUBLIC_KEY.name
+    for path in (private_path, public_path):
+        if path.exists():
+            raise UserError(f"{path} exists and is not overwritten; choose another --out")
+    make_directory(directory)
+    key = Ed25519PrivateKey.generate()
+    # The umask, not a later chmod: the private key is never readable by others, even briefly.
+    before = os.umask(0o077)
+    try:
+        private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+        write_atomic(private_path, private)
+    finally:
+        os.umask(before)
+    public = key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+    try:
+        write_atomic(public_path, public)
+    except UserError:
+        # Half a pair would make the next try refuse to overwrite it.
+        private_path.unlink()
+        raise
+    return private_path, public_path
+
+
+KEYS = Command(KEYS_EXAMPLE, _add_keys_arguments, _run_keys)
+
 
 CA_FOLDER = "ca"
 CA_KEY_FILE = "ca.key.pem"
@@ -50,7 +118,7 @@ MAX_NAME_CHARS = 64
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
 
-EXAMPLE = examples(
+CERTS_EXAMPLE = examples(
     "python -m deploy certs --vehicle-id hunter01 --host workstation.local --out certs",
 )
 
@@ -62,7 +130,7 @@ class Pair(NamedTuple):
     key: ec.EllipticCurvePrivateKey
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "--out", metavar="DIR", default=DEFAULT_OUT, help="directory of all folders"
@@ -91,7 +159,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _run_certs(arguments: argparse.Namespace) -> int:
     """Make what is missing of the authority and of the parties' folders.
 
     Raises UserError, with nothing written, where nothing is missing.
@@ -282,3 +350,122 @@ def _usage(signs_certificates: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
+
+
+CERTS = Command(CERTS_EXAMPLE, _add_certs_arguments, _run_certs)
+
+
+SESSIONS_PER_VEHICLE = 4
+"""Edge runtime, simulator, an operator's command, and the edge runtime's look at its start."""
+SPARE_SESSIONS = 1000
+"""Viewers; Zenoh's own default."""
+MAX_MESSAGE_BYTES = 256 * 1024
+"""Four times what an edge runtime reads. Larger ones end at the router; Zenoh itself says 1 GiB."""
+
+
+def router_config(
+    listens: Sequence[str], vehicle_ids: Sequence[str], tls: TlsFiles
+) -> dict[str, Any]:
+    """Zenoh's settings as one nested map.
+
+    Args:
+        listens: endpoints such as `tls/0.0.0.0:7447`.
+        vehicle_ids: whose parties have rights here; all others are denied everything.
+        tls: the files of the router's own certificate.
+
+    Raises:
+        UserError: another party's certificate, no vehicle, or a vehicle id that is not valid.
+    """
+    from edge_runtime.transport import session_rows  # Here: only a router needs Zenoh.
+
+    check_name(tls.name, ROUTER)
+    if not vehicle_ids:
+        raise UserError("no vehicle: name each with --vehicle-id, or all of them in --vehicles")
+    ids = list(dict.fromkeys(map(check_vehicle_id, vehicle_ids)))
+    rows = session_rows(list(listens), None, "router", tls, rules_for_listener(ids))
+    sessions = SPARE_SESSIONS + SESSIONS_PER_VEHICLE * len(ids)
+    return _nested(
+        {
+            **rows,
+            "transport/unicast/max_sessions": sessions,
+            # After a router's restart all of its vehicles come at once.
+            "transport/unicast/accept_pending": sessions,
+            "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+        }
+    )
+
+
+def _nested(rows: Mapping[str, Any]) -> dict[str, Any]:
+    """`{"a/b": 1}` as `{"a": {"b": 1}}`."""
+    top: dict[str, Any] = {}
+    for path, value in rows.items():
+        *folders, name = path.split("/")
+        place = top
+        for folder in folders:
+            place = place.setdefault(folder, {})
+        place[name] = value
+    return top
+
+
+ROUTER_FILE_EXAMPLE = examples(
+    "python -m deploy router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+    "    --vehicle-id hunter01 --vehicle-id hunter02 --out router.json5",
+    "python -m deploy router --listen tls/0.0.0.0:7447 --tls certs/router --vehicles fleet.txt \\\n"
+    "    --out router.json5",
+)
+
+
+def _add_router_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--listen",
+        metavar="tls/HOST:PORT",
+        action="append",
+        required=True,
+        help="where all others connect to, as tls/0.0.0.0:7447; may be repeated",
+    )
+    parser.add_argument(
+        "--tls",
+        metavar="DIR",
+        required=True,
+        help="the router's folder of `deploy certs`, as certs/router; zenohd opens its files",
+    )
+    parser.add_argument(
+        "--vehicle-id",
+        metavar="ID",
+        action="append",
+        default=[],
+        help="a vehicle whose parties have rights at this router; may be repeated",
+    )
+    parser.add_argument("--vehicles", metavar="FILE", help="a file with one vehicle id a line")
+    parser.add_argument("--out", metavar="FILE.json5", required=True, help="the settings' file")
+
+
+def _run_router(arguments: argparse.Namespace) -> int:
+    """Write the file. Raises UserError where anything in it would not hold."""
+    from edge_runtime.transport import check_endpoint, check_fits  # As above.
+
+    check_writable(arguments.out)
+    for endpoint in arguments.listen:
+        check_fits(check_endpoint(endpoint), with_tls=True)
+    ids = arguments.vehicle_id + (_read(arguments.vehicles) if arguments.vehicles else [])
+    settings = router_config(arguments.listen, ids, load_tls(arguments.tls))
+    write_json(arguments.out, settings)
+    size = Path(arguments.out).stat().st_size
+    names = len(settings["access_control"]["subjects"])
+    print(f"{arguments.out}: {len(set(ids))} vehicles, {names} names with rights, {size:,} bytes")
+    print(f"start it:  zenohd --config {arguments.out}")
+    print(f"or:        python -m bridge router --config {arguments.out}")
+    return 0
+
+
+def _read(path: str) -> list[str]:
+    """One id a line; empty lines and `#` to the line's end are nothing."""
+    try:
+        text = read_bytes(path, "file of vehicles").decode()
+    except UnicodeDecodeError:
+        raise UserError(f"file of vehicles {path} is no text") from None
+    return [word for line in text.splitlines() if (word := line.partition("#")[0].strip())]
+
+
+ROUTER_FILE = Command(ROUTER_FILE_EXAMPLE, _add_router_arguments, _run_router)

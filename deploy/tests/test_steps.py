@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from deploy.installer import steps
+from deploy.installer import __main__ as steps
 from deploy.installer.layout import Layout
 from deploy.installer.systemd import Limits, NoService
 from deploy.installer.verify import UnhealthyError, UserError

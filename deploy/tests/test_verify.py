@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from deploy import bundle as bundle_module
 from deploy.bundle import _pack, _sign
+from deploy.installer.__main__ import trusted_key
 from deploy.installer.layout import Layout
-from deploy.installer.steps import trusted_key
 from deploy.installer.verify import (
     MANIFEST,
     Manifest,
