@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 import deploy.installer
 import edge_runtime
-from deploy.certs import DEFAULT_DIRECTORY
+from deploy.certs import DEFAULT_KEY
 from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
 from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, find_target, gather, lock_path
@@ -37,7 +37,6 @@ from edge_runtime.util import UserError, read_bytes
 
 NAME = "install.pyz"
 DEFAULT_OUT = "build/bundles"
-DEFAULT_KEY = f"{DEFAULT_DIRECTORY}/policy.key"
 UNITS = Path(__file__).parent / "systemd"
 HOLD = "../../state/hold"
 """Seen from a release's folder: what the installer locks while it judges."""
