@@ -101,12 +101,7 @@ def write_key_pair(directory: Path) -> tuple[Path, Path]:
             raise UserError(f"{path} exists and is not overwritten; choose another --out")
     make_directory(directory)
     key = ed25519.Ed25519PrivateKey.generate()
-    # The umask, not a later chmod: the private key is never readable by others, even briefly.
-    before = os.umask(0o077)
-    try:
-        write_atomic(private_path, _pem(key))
-    finally:
-        os.umask(before)
+    write_private(private_path, _pem(key))
     public = key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
     try:
         write_atomic(public_path, public)
@@ -115,6 +110,15 @@ def write_key_pair(directory: Path) -> tuple[Path, Path]:
         private_path.unlink()
         raise
     return private_path, public_path
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that others cannot read, not even briefly: the umask, not a chmod."""
+    before = os.umask(0o077)
+    try:
+        write_atomic(path, data)
+    finally:
+        os.umask(before)
 
 
 KEYS = Command(examples("python -m deploy keys --out keys"), _add_keys_arguments, _run_keys)
@@ -226,9 +230,8 @@ def _write_folder(folder: Path, authority: Pair, files: dict[str, bytes]) -> Non
         draft.mkdir(mode=0o700)
         write_atomic(draft / CA_FILE, authority.certificate.public_bytes(Encoding.PEM))
         for name, data in files.items():
-            write_atomic(draft / name, data)
-            if name in (KEY_FILE, CA_KEY_FILE):
-                (draft / name).chmod(0o600)
+            write = write_private if name in (KEY_FILE, CA_KEY_FILE) else write_atomic
+            write(draft / name, data)
         draft.rename(folder)  # Fails where somebody has filled it meanwhile.
     except OSError as error:
         raise UserError(f"cannot create {folder}: {error.strerror}") from None
