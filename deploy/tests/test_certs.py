@@ -1,12 +1,22 @@
-"""The authority and its certificates as files; on the wire: hil_tests/tests/test_tls*.py."""
+"""Key pairs and certificates as files; on the wire: hil_tests/tests/test_tls*.py."""
 
+import contextlib
 import datetime
 import shutil
 import stat
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+    load_pem_public_key,
+)
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from deploy.__main__ import main
@@ -66,21 +76,14 @@ def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
     assert make(folder, "--vehicle-id", "two", "--host", "bench.local", "--host", "10.0.0.7") == 0
     after = contents(folder)
     assert {path: after[path] for path in before} == before
-    assert {p.parts[0] for p in set(after) - set(before)} == {
-        "edge-two",
-        "simulator-two",
-        "operator-two",
-    }
-    certificate = x509.load_pem_x509_certificate(
-        after[next(p for p in after if p.parts == ("simulator-two", "cert.pem"))]
-    )
+    new = {f"{role}-two" for role in ("edge", "simulator", "operator")}
+    assert {p.parts[0] for p in set(after) - set(before)} == new
+    pem = (folder / "simulator-two" / "cert.pem").read_bytes()
+    certificate = x509.load_pem_x509_certificate(pem)
     names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert set(names.get_values_for_type(x509.DNSName)) == {"localhost", "bench.local"}
-    assert {str(a) for a in names.get_values_for_type(x509.IPAddress)} == {
-        "127.0.0.1",
-        "::1",
-        "10.0.0.7",
-    }
+    addresses = {str(a) for a in names.get_values_for_type(x509.IPAddress)}
+    assert addresses == {"127.0.0.1", "::1", "10.0.0.7"}
 
 
 @pytest.mark.parametrize(
@@ -125,42 +128,32 @@ def test_an_authority_without_its_key_is_refused(made, tmp_path, capsys):
     assert "ca.key.pem" in capsys.readouterr().err
 
 
-def test_a_missing_file_is_named(party):
-    for name in ("ca.pem", "cert.pem", "key.pem"):
-        data = (party / name).read_bytes()
-        (party / name).unlink()
-        with pytest.raises(UserError, match=f"{name} does not exist"):
-            load_tls(party)
-        (party / name).write_bytes(data)
-        (party / name).chmod(0o600)
-    assert load_tls(party).name == "edge-hunter01"
+@pytest.mark.parametrize("name", ["ca.pem", "cert.pem", "key.pem"])
+def test_a_file_that_is_missing_or_no_pem_is_named(party, name):
+    (party / name).write_bytes(b"nonsense")
+    with pytest.raises(UserError, match=f"{name} is not a"):
+        load_tls(party)
+    (party / name).unlink()
+    with pytest.raises(UserError, match=f"{name} does not exist"):
+        load_tls(party)
     with pytest.raises(UserError, match="no directory"):
         load_tls(party / "nowhere")
 
 
-def test_what_is_no_pem_is_named(party):
-    for name in ("ca.pem", "cert.pem", "key.pem"):
-        data = (party / name).read_bytes()
-        (party / name).write_bytes(b"nonsense")
-        with pytest.raises(UserError, match=f"{name} is not a"):
-            load_tls(party)
-        (party / name).write_bytes(data)
-
-
-def test_files_of_different_parties_do_not_mix(party, made, tmp_path):
-    other = tmp_path / "other"
-    assert make(other) == 0
-    for source, match in (
-        (made / "viewer/key.pem", "does not fit"),
-        (other / "ca/ca.pem", "not issued by"),
-        (other / "edge-hunter01/cert.pem", "does not fit"),
-    ):
-        target = party / source.name
-        data = target.read_bytes()
-        target.write_bytes(source.read_bytes())
-        with pytest.raises(UserError, match=match):
-            load_tls(party)
-        target.write_bytes(data)
+@pytest.mark.parametrize(
+    ("source", "match"),
+    [
+        ("certs/viewer/key.pem", "does not fit"),
+        ("other/ca/ca.pem", "not issued by"),
+        ("other/edge-hunter01/cert.pem", "does not fit"),
+    ],
+)
+def test_files_of_different_parties_do_not_mix(party, made, source, match):
+    if not (made.parent / "other").exists():
+        assert make(made.parent / "other") == 0
+    shutil.copyfile(made.parent / source, party / Path(source).name)
+    with pytest.raises(UserError, match=match):
+        load_tls(party)
 
 
 @pytest.mark.parametrize(
@@ -168,11 +161,8 @@ def test_files_of_different_parties_do_not_mix(party, made, tmp_path):
 )
 def test_a_key_that_others_can_read_is_refused(party, mode, is_fine):
     (party / "key.pem").chmod(mode)
-    if is_fine:
+    with contextlib.nullcontext() if is_fine else pytest.raises(UserError, match="chmod 600"):
         load_tls(party)
-    else:
-        with pytest.raises(UserError, match="chmod 600"):
-            load_tls(party)
 
 
 @pytest.mark.parametrize(("shift_days", "match"), [(-30, "expired at"), (30, "is the clock set")])
@@ -195,3 +185,33 @@ def test_plain_endpoints_and_certificates_do_not_go_together(made):
         tls_for(made / "viewer", "tcp/127.0.0.1:7447")
     with pytest.raises(UserError, match="needs certificates"):
         tls_for(None, "tls/127.0.0.1:7447")
+
+
+def test_a_pair_fits_together_is_private_and_never_overwritten(tmp_path, capsys):
+    keys = ["keys", "--out", str(tmp_path / "keys")]
+    assert exit_status(main, keys) == 0
+    private_path, public_path = tmp_path / "keys/policy.key", tmp_path / "keys/policy.pub"
+    pem = private_path.read_bytes()
+    private, public = load_pem_private_key(pem, None), load_pem_public_key(public_path.read_bytes())
+    public.verify(private.sign(b"policy"), b"policy")  # type: ignore[call-arg, union-attr]
+    assert stat.S_IMODE(private_path.stat().st_mode) == 0o600
+    (tmp_path / "file").write_text("")
+    for refused in (keys, ["keys", "--out", str(tmp_path / "file" / "keys")]):
+        capsys.readouterr()
+        assert exit_status(main, refused) == 2
+        assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert private_path.read_bytes() == pem
+
+
+def test_two_files_take_few_modules(tmp_path):
+    """Nothing of bundles, boards or Zenoh is loaded to write a pair."""
+    program = (
+        "import sys; from deploy.__main__ import main; main(sys.argv[1:]);"
+        " print(*(n for n in sys.modules if n.startswith(('deploy', 'edge_runtime', 'zenoh'))))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "keys", "--out", str(tmp_path / "keys")],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    ours = done.stdout.splitlines()[-1].split()
+    assert len(ours) <= 10, ours

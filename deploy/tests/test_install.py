@@ -33,24 +33,23 @@ WITH_VEHICLE = """\
 
                     threading.Timer(0.3, os._exit, (5,)).start()
                 self.loop.run()"""
+RUNS = "                self.loop.run()"
 FAULTS = {
-    "it answers for a while, then ends": (RUN, "                self.loop.run()", WITH_VEHICLE),
+    "it answers for a while, then ends": (RUN, RUNS, WITH_VEHICLE),
     "it cannot open the vehicle": (MOCK, "self._state = MockState()", "1 / 0"),
-    "it never says that it is ready": (
-        RUN,
-        "            self._say_ready()",
-        "            pass",
-    ),
-    "it ends as soon as it is ready": (
-        RUN,
-        "                self.loop.run()",
-        "                os._exit(3)",
-    ),
+    "it never says that it is ready": (RUN, "self._say_ready()", "pass"),
+    "it ends as soon as it is ready": (RUN, RUNS, RUNS.replace("self.loop.run()", "os._exit(3)")),
 }
 
 
 def lines(text: str) -> list[str]:
     return text.strip().splitlines()
+
+
+def refused(done, *words: str) -> None:
+    said = lines(done.stderr)
+    assert (done.returncode, len(said)) == (2, 1), done.stderr
+    assert all(word in said[0] for word in words), said
 
 
 def test_install_upgrade_back_and_away(board: Board):
@@ -121,10 +120,7 @@ class Listener:
 
 @pytest.mark.parametrize(
     "faults",
-    [
-        dict(list(FAULTS.items())[:1]),
-        pytest.param(FAULTS, marks=pytest.mark.board),
-    ],
+    [dict(list(FAULTS.items())[:1]), pytest.param(FAULTS, marks=pytest.mark.board)],
     ids=["one fault", "all faults"],
 )
 def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(
@@ -177,12 +173,6 @@ def test_ended_in_the_middle_of_a_switch_it_goes_back_and_a_link_that_breaks_doe
     assert f"went back to {old.manifest.version}: interrupted" in said
     shown = board.status()
     assert (shown["current"], shown["service"]) == (old.manifest.version, "active")
-
-
-def refused(done, *words: str) -> None:
-    said = done.stderr.strip().splitlines()
-    assert (done.returncode, len(said)) == (2, 1), done.stderr
-    assert all(word in said[0] for word in words), said
 
 
 def test_a_board_that_trusts_nobody_yet_must_be_told_whom(board: Board, workshop):
@@ -316,34 +306,21 @@ def test_a_systemd_that_does_not_run_is_said_before_anything_is_made(board: Boar
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("words", "said"),
     [
-        [], ["install"], ["fly"], ["status", "--service", "cron"], ["install", "missing.tar"],
-        ["supervise"],
+        ("", ""), ("install", ""), ("fly", ""), ("status --service cron", ""),
+        ("install missing.tar", ""), ("supervise", ""),
+        *((f"rollback {option} {value}", f"argument {option}: {value!r} is not a number of seconds")
+          for option in ("--health-limit", "--settle")
+          for value in ("soon", "0", "-1", "nan", "inf")),
     ],
 )  # fmt: skip
-def test_a_mistake_is_one_line(board: Board, arguments):
-    command, *rest = arguments or [""]
-    line = board.command(command, *rest) if arguments else board.command("status")[:3]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    assert (done.returncode, len(done.stderr.strip().splitlines())) == (2, 1), done.stderr
-    assert not board.root.exists()
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("--health-limit", "soon"), ("--health-limit", "0"), ("--health-limit", "inf"),
-        ("--settle", "-1"), ("--settle", "nan"), ("--settle", "inf"),
-    ],
-)  # fmt: skip
-def test_what_is_no_number_of_seconds_is_refused(board: Board, option, value):
-    """Above all one that would wait for ever."""
-    line = board.command("rollback", option, value)
+def test_a_mistake_is_one_line(board: Board, words, said):
+    """Above all a number of seconds that would wait for ever."""
+    command, *rest = words.split() or ["status"]
+    line = board.command(command, *rest) if words else board.command(command)[:3]
     done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 2, done.stderr
-    assert f"argument {option}: {value!r} is not a number of seconds" in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    refused(done, said)
     assert not board.root.exists()
 
 

@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 from deploy.__main__ import main
+from deploy.bundle import make_bundle
+from deploy.certs import write_key_pair
+from deploy.tests.boards import HERE
 from edge_runtime.tests.harness import exit_status
 
 SSH = """\
@@ -37,6 +40,7 @@ for file in files:
         sys.exit("scp: write remote: No space left on device")
     shutil.copy2(file, {home!r} + "/" + folder)
 """
+PROGRAMS = ["ssh"] * 2 + ["scp"] * 4 + ["ssh"] * 2
 
 
 @pytest.fixture
@@ -67,16 +71,7 @@ def test_a_push_installs_and_leaves_nothing_behind(far, board, workshop, capfd):
     assert board.status()["current"] == made.manifest.version
     assert list((far / "home").iterdir()) == []
     log = (far / "log").read_text().splitlines()
-    assert [line.split()[0] for line in log] == [
-        "ssh",
-        "ssh",
-        "scp",
-        "scp",
-        "scp",
-        "scp",
-        "ssh",
-        "ssh",
-    ]
+    assert [line.split()[0] for line in log] == PROGRAMS
 
 
 @pytest.mark.parametrize("name", ["install.pyz", "trust.pub", "-q.tar", "two words;id.tar"])
@@ -93,9 +88,8 @@ def test_a_dry_run_says_each_step_and_does_none(far, board, workshop, capsys):
     made = workshop.make(0.1)
     assert push(board, workshop, "board", made.path, "--dry-run") == 0
     said = capsys.readouterr().out.splitlines()
-    programs = ["ssh"] * 2 + ["scp"] * 4 + ["ssh"] * 2
-    assert [line.split()[0] for line in said[::2]] == ["#"] * len(programs)
-    assert [line.split()[0] for line in said[1::2]] == programs
+    assert [line.split()[0] for line in said[::2]] == ["#"] * len(PROGRAMS)
+    assert [line.split()[0] for line in said[1::2]] == PROGRAMS
     assert str(made.path) in said[9]
     assert "install" in said[13]
     assert not (far / "log").read_text()
@@ -104,8 +98,6 @@ def test_a_dry_run_says_each_step_and_does_none(far, board, workshop, capsys):
 
 def test_an_installer_that_refuses_is_told_and_cleaned_up(far, board, workshop, tmp_path, capfd):
     """The board trusts somebody else's key already."""
-    from deploy.certs import write_key_pair
-
     _, other = write_key_pair(tmp_path / "other")
     made = workshop.make(0.1)
     board.root.mkdir()
@@ -117,8 +109,7 @@ def test_an_installer_that_refuses_is_told_and_cleaned_up(far, board, workshop, 
 
 
 def test_a_host_that_is_not_there_ends_it_at_once(far, board, workshop, capfd):
-    made = workshop.make(0.1)
-    assert push(board, workshop, "nowhere", made.path) == 2
+    assert push(board, workshop, "nowhere", workshop.make(0.1).path) == 2
     assert "ssh does not reach the board" in capfd.readouterr().err
     assert len((far / "log").read_text().splitlines()) == 1
 
@@ -134,9 +125,6 @@ def test_a_copy_that_fails_leaves_nothing_behind(far, board, workshop, monkeypat
 
 
 def test_a_board_of_another_kind_is_not_touched(far, board, workshop, capfd, tmp_path):
-    from deploy.bundle import make_bundle
-    from deploy.tests.boards import HERE
-
     made = make_bundle(workshop.inputs(), HERE._replace(machine="riscv64"), tmp_path / "b")
     assert push(board, workshop, "board", made.path) == 2
     assert "the bundle is for riscv64" in capfd.readouterr().err
