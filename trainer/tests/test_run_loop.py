@@ -104,12 +104,12 @@ def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):
         lambda scale, bound, drawn: np.full(len(drawn), scale, np.float32),
     )
     learner = replace(
-        LEARNER, exploration_initial=0.5, exploration_decay=0.5, exploration_final=0.1
+        LEARNER, exploration_initial=0.5, exploration_share=0.4, exploration_final=0.1
     )
     run = scripted_run(tmp_path, replace(CONFIG, episodes=5, learner=learner))
     reported: list[float] = []
     run.train(lambda metrics: reported.append(metrics.exploration_std))
-    stds = [0.5, 0.25, 0.125, 0.1, 0.1]
+    stds = [0.5, 0.3, 0.1, 0.1, 0.1]
     assert reported == pytest.approx(stds)
     assert run.env.actions == pytest.approx([POLICY + std for std in stds])
 

@@ -319,7 +319,8 @@ class TrainingRun:
 
     def _exploration_std(self) -> float:
         c = self.config.learner
-        return max(c.exploration_final, c.exploration_initial * c.exploration_decay**self.episode)
+        left = max(0.0, 1.0 - self.progress / c.exploration_share)
+        return c.exploration_final + (c.exploration_initial - c.exploration_final) * left
 
     def _penalises(self, intervention: Intervention | None) -> bool:
         """Whether an intervention begins that the policy is to be penalised for (eq. 17)."""
