@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
@@ -23,7 +24,6 @@ from trainer.learner.config import Algorithm, LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.training.delayed import Store
-from trainer.util import as_arrays, as_tensors
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
@@ -246,14 +246,17 @@ class LearningThread:
         """All that is needed to go on."""
         return {
             "learner": self.learner.state_dict(),
-            "replay": as_tensors(self.replay.state_dict()),
+            "replay": {
+                name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+                for name, value in self.replay.state_dict().items()
+            },
             "drawing": self._random.bit_generator.state,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""
         self.learner.load_state_dict(state["learner"])
-        self.replay.load_state_dict(as_arrays(state["replay"]))
+        self.replay.load_state_dict(state["replay"])
         self._random.bit_generator.state = state["drawing"]
 
     def close(self) -> None:
