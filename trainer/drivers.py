@@ -116,6 +116,10 @@ class ConstantDriver:
         """The action, float32 [1]."""
         return self.action
 
+    def act_together(self, observations: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The same for n observations: float32 [n, 1]."""
+        return np.tile(self.action, (len(observations), 1))
+
 
 class OnnxDriver:
     """An exported policy file at the wheel, run by the edge runtime's own loader."""

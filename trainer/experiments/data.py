@@ -24,7 +24,7 @@ from trainer.experiments.plan import (
     Unit,
     units_of,
 )
-from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
+from trainer.experiments.store import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
 
 Numbers = NDArray[np.float64]
 BySeed = dict[int, float]

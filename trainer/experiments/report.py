@@ -37,8 +37,8 @@ from trainer.experiments.plan import (
     TIME,
     units_of,
 )
-from trainer.experiments.run import Store
 from trainer.experiments.statistics import Estimate, mean_estimate, within
+from trainer.experiments.store import Store
 from trainer.experiments.timing import PAPER_S, TIME_FILE, Turns, ratio, seconds
 
 COMMAND = "python -m trainer experiment"

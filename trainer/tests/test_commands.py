@@ -14,8 +14,8 @@ from edge_runtime.tests.harness import exit_status
 from edge_runtime.tests.policies import public_pem
 from edge_runtime.util import UserError
 from trainer.__main__ import main
-from trainer.commands.train import settings, with_setting
 from trainer.options import add_time_limit, deadline_s, until
+from trainer.training.command import settings, with_setting
 from trainer.training.config import RunConfig
 from trainer.util import save_torch
 

@@ -31,7 +31,8 @@ from trainer.experiments.plan import (
     unit_id,
     units_of,
 )
-from trainer.experiments.run import BUSY, FAILED, FINISHED, STOPPED, Task, compute, run_units
+from trainer.experiments.run import Task, compute, run_units
+from trainer.experiments.store import BEGUN, BUSY, DONE, FAILED, FINISHED, RUNNING, STOPPED
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
@@ -73,7 +74,7 @@ def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
     assert compute(Task(UNIT, store, stop_at_s=1.0)) == STOPPED, "time was over before it began"
     ends = [compute(Task(UNIT, store, stop_at_s=Soon(1e18))) for _ in range(2)]
     assert ends == [STOPPED, STOPPED]
-    assert store.states([UNIT])[UNIT] == running.BEGUN
+    assert store.states([UNIT])[UNIT] == BEGUN
     assert compute(Task(UNIT, store)) == FINISHED
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
@@ -107,7 +108,7 @@ def test_two_processes_share_one_file_of_records(tmp_path):
     ends = run_units([Task(unit, store) for unit in units], 2)
     assert ends == {FINISHED: 3}
     assert list(store.records("left_turn")) == sorted(units)
-    assert set(store.states(units).values()) == {running.DONE}
+    assert set(store.states(units).values()) == {DONE}
 
 
 def test_a_unit_that_another_process_has_is_left_to_it(straight, tmp_path, monkeypatch):
@@ -116,7 +117,7 @@ def test_a_unit_that_another_process_has_is_left_to_it(straight, tmp_path, monke
     with store.lock(UNIT) as mine:
         assert mine
         assert compute(Task(UNIT, store)) == BUSY
-        assert store.states([UNIT])[UNIT] == running.RUNNING
+        assert store.states([UNIT])[UNIT] == RUNNING
 
 
 def test_a_unit_that_is_done_is_not_trained_again(straight, tmp_path, monkeypatch):

@@ -17,12 +17,12 @@ from bridge.report import COLLISION
 from edge_runtime.cli import INTERRUPTED
 from edge_runtime.util import UserError
 from trainer import seeds
-from trainer.commands.train import _quit as ask_to_quit
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import ReplayBuffer
 from trainer.plots import moving_average, write_learning_curve
 from trainer.training import validation
+from trainer.training.command import _quit as ask_to_quit
 from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
