@@ -29,7 +29,7 @@ from edge_runtime.util import UserError, counted
 from trainer.drivers import CONDITIONS, load_driver, make_environment
 from trainer.human.guide import Action, Driver
 from trainer.options import add_latency, add_scenario, add_seed, set_threads
-from trainer.training.delayed import RemoteDriver
+from trainer.training.delayed import VehicleEnd
 from trainer.util import ProgressBar
 
 EXAMPLE = examples(
@@ -187,11 +187,11 @@ def drive_episode(
     The other arguments are as for ``Drive``.
     """
     drive = Drive(env, seed, noise_std)
-    if latency != NO_NETWORK:
-        driver = RemoteDriver(driver, env, latency, seed)
     driver.reset()
+    network = None if latency == NO_NETWORK else VehicleEnd(env, latency, seed)
     while not drive.over:
-        drive.step(driver.act(drive.observation))
+        seen = drive.observation
+        drive.step(network.tick(seen, driver.act) if network else driver.act(seen))
     return drive.result()
 
 
