@@ -72,7 +72,7 @@ AddPicture = Callable[[NDArray[np.uint8]], int]
 """Stores a picture [45, 80]; gives its running number."""
 
 
-class Ledger:
+class RingIndex:
     """Running numbers of pictures and transitions, and the rings they are kept in.
 
     Args:
@@ -245,8 +245,8 @@ class ReplayBuffer:
     ) -> None:
         self.capacity, self.alpha = capacity, alpha
         self.steps, self.gamma, self.overruled_value = steps, gamma, overruled_value
-        self._ledger = Ledger(capacity)
-        self._pictures = np.empty((self._ledger.frame_slots, *FRAME_SHAPE), np.uint8)
+        self._ring = RingIndex(capacity)
+        self._pictures = np.empty((self._ring.frame_slots, *FRAME_SHAPE), np.uint8)
         self._actions = np.zeros((capacity, action_size), np.float32)
         self._rewards = np.zeros(capacity, np.float32)
         self._terminals = np.zeros(capacity, np.float32)
@@ -257,27 +257,27 @@ class ReplayBuffer:
         self._trees = [SumTree(capacity) for _ in range(2 if separate else 1)]
 
     def __len__(self) -> int:
-        return len(self._ledger)
+        return len(self._ring)
 
     @property
     def added(self) -> int:
         """Transitions stored since the run began."""
-        return self._ledger.added
+        return self._ring.added
 
     @property
     def human_count(self) -> int:
         """How many of the kept transitions are the human's."""
-        return int(self._human[self._ledger.alive].sum())
+        return int(self._human[self._ring.alive].sum())
 
     def mean_priorities(self) -> tuple[float, float]:
         """Mean priority of the policy's and of the human's transitions (nan where none)."""
-        alive = self._ledger.alive
+        alive = self._ring.alive
         human, priorities = self._human[alive], self._priorities[alive]
         return _mean(priorities[~human]), _mean(priorities[human])
 
     def start_episode(self, frames: NDArray[np.uint8]) -> None:
         """Take the first observation [2, 45, 80] of an episode."""
-        self._ledger.start_episode(frames, self._add_picture)
+        self._ring.start_episode(frames, self._add_picture)
 
     def add(
         self,
@@ -300,9 +300,9 @@ class ReplayBuffer:
             overruled: the policy's action in its place, if so.
             penalised: whether that action is penalised.
         """
-        self._ledger.check_started()
+        self._ring.check_started()
         priority = self._highest_priority()
-        slot = self._ledger.add_transition(self._add_picture(next_frames[1]))
+        slot = self._ring.add_transition(self._add_picture(next_frames[1]))
         self._actions[slot] = action
         self._rewards[slot] = reward
         self._terminals[slot] = terminal
@@ -339,23 +339,23 @@ class ReplayBuffer:
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on, without the unused part of the arrays."""
-        used, pictures = self._ledger.used, self._ledger.used_frames
+        used, pictures = self._ring.used, self._ring.used_frames
         return {
-            **self._ledger.state_dict(),
+            **self._ring.state_dict(),
             "pictures": self._pictures[:pictures],
             **{name: getattr(self, f"_{name}")[:used] for name in COLUMNS},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave; the next episode begins with ``start_episode``."""
-        self._ledger.load_state_dict(state)
-        used, pictures = self._ledger.used, self._ledger.used_frames
+        self._ring.load_state_dict(state)
+        used, pictures = self._ring.used, self._ring.used_frames
         self._pictures[:pictures] = state["pictures"]
         for name in COLUMNS:
             getattr(self, f"_{name}")[:used] = state[name]
         # What was here before must not be drawn any more.
         self._trees = [SumTree(self.capacity) for _ in self._trees]
-        alive = self._ledger.alive
+        alive = self._ring.alive
         if len(alive):
             self._set_weights(alive, self._priorities[alive] ** self.alpha)
 
@@ -377,7 +377,7 @@ class ReplayBuffer:
 
     def _places(self, indices: Indices, first: int) -> Indices:
         """Where the two pictures from ``first`` on of each transition lie, [n, 2]."""
-        return self._ledger.frame_ids[indices, first : first + 2] % self._ledger.frame_slots
+        return self._ring.frame_ids[indices, first : first + 2] % self._ring.frame_slots
 
     def _returns(self, indices: Indices) -> _Returns:
         """The n-step returns, without their bootstrap, that begin with these transitions.
@@ -393,7 +393,7 @@ class ReplayBuffer:
         going = np.ones(len(indices), np.bool_)
         for step in range(1, self.steps):
             following = (lasts + 1) % self.capacity
-            going &= (terminals == 0.0) & self._ledger.follows(lasts, following)
+            going &= (terminals == 0.0) & self._ring.follows(lasts, following)
             if not going.any():
                 break
             discount = np.float32(self.gamma**step)
@@ -426,12 +426,12 @@ class ReplayBuffer:
     def _highest_priority(self) -> float:
         if len(self) == 0:
             return 1.0
-        return float(self._priorities[: self._ledger.used].max())
+        return float(self._priorities[: self._ring.used].max())
 
     def _add_picture(self, picture: NDArray[np.uint8]) -> int:
         """Store a picture and return its running number; forget transitions that lose theirs."""
-        number, lost = self._ledger.add_picture()
-        self._pictures[number % self._ledger.frame_slots] = picture
+        number, lost = self._ring.add_picture()
+        self._pictures[number % self._ring.frame_slots] = picture
         for slot in lost:
             # Not 0 ** alpha, which is one where alpha is zero.
             self._priorities[slot] = 0.0

@@ -202,9 +202,9 @@ def test_with_alpha_zero_all_are_drawn_alike_and_the_forgotten_never():
     source = Source(buffer)
     for _ in range(60):
         source.episode(1)
-    buffer.update_priorities(buffer._ledger.alive[:3], np.array([0.5, 2.0, 9.0]))
+    buffer.update_priorities(buffer._ring.alive[:3], np.array([0.5, 2.0, 9.0]))
     batch = buffer.sample(1000, np.random.default_rng(0))
-    assert set(batch.indices) == set(buffer._ledger.alive)
+    assert set(batch.indices) == set(buffer._ring.alive)
     np.testing.assert_allclose(batch.probabilities, 1 / len(buffer))
 
 
@@ -245,7 +245,7 @@ def test_a_restored_buffer_draws_the_same():
 def test_a_hundred_thousand_transitions_fit_into_400_mb():
     buffer = ReplayBuffer(100_000)
     size = sum(value.nbytes for value in vars(buffer).values() if isinstance(value, np.ndarray))
-    size += buffer._ledger.frame_ids.nbytes
+    size += buffer._ring.frame_ids.nbytes
     assert size + buffer._trees[0]._nodes.nbytes < 400e6
 
 

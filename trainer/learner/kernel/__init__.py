@@ -60,10 +60,8 @@ def load(name: str) -> ctypes.CDLL | None:
 def _built(source: Path) -> ctypes.CDLL:
     """The library of this source, compiler and processor: from the cache, or built now."""
     compiler = _compiler()
-    # Every header beside it, included or not: none can be forgotten.
-    code = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")))]
-    settings = "\0".join([*compiler, *_FLAGS, _OPENMP, _processor()]).encode()
-    key = b"\0".join([settings, *code])
+    settings = "\0".join([*compiler, *_FLAGS, _OPENMP, _processor(), ""]).encode()
+    key = settings + source.read_bytes()
     library = _cache() / f"{source.stem}-{hashlib.sha256(key).hexdigest()[:16]}.so"
     if not library.exists():
         _build(compiler, source, library)
