@@ -244,8 +244,8 @@ def test_a_restored_buffer_draws_the_same():
 
 def test_a_hundred_thousand_transitions_fit_into_400_mb():
     buffer = ReplayBuffer(100_000)
-    size = sum(value.nbytes for value in vars(buffer).values() if isinstance(value, np.ndarray))
-    size += buffer._ring.frame_ids.nbytes
+    parts = [*vars(buffer).values(), *vars(buffer._ring).values()]
+    size = sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
     assert size + buffer._trees[0]._nodes.nbytes < 400e6
 
 
