@@ -61,48 +61,32 @@ def test_contenders_take_turns_and_none_is_always_first():
     assert len(ticks) == 4
 
 
-def test_ratios_are_of_medians_and_of_rounds():
-    ours, peers = [[1.0, 2.0, 3.0], [10.0, 10.0, 10.0]], [[4.0, 4.0, 4.0], [30.0, 30.0, 30.0]]
-    assert median(ours) == 6.5
-    assert compare(ours, peers) == {"of_medians": 17.0 / 6.5, "median_of_rounds": 2.5}
-
-
-def test_a_slow_round_cancels_out_of_the_rounds_ratio():
-    ours, peers = [[1.0], [9.0], [1.0]], [[3.0], [27.0], [3.0]]
-    assert compare(ours, peers)["median_of_rounds"] == 3.0
-
-
-def test_learner_figures():
-    found = figures({OURS: [[20.0], [30.0]], SB3: [[100.0], [90.0]]}, "ms_per_update")
-    assert found["ms_per_update"] == 25.0
-    assert found["peers"] == {
-        SB3: {"ms_per_update": 95.0, "ratio": {"of_medians": 3.8, "median_of_rounds": 4.0}}
+@pytest.mark.parametrize(
+    ("ours", "peers", "of_medians", "of_rounds"),
+    [
+        ([[1.0, 2.0, 3.0], [10.0] * 3], [[4.0] * 3, [30.0] * 3], 17.0 / 6.5, 2.5),
+        # What slows a whole round down cancels out of the rounds' ratio.
+        ([[1.0], [9.0], [1.0]], [[3.0], [27.0], [3.0]], 3.0, 3.0),
+    ],
+)
+def test_ratios_are_of_medians_and_of_rounds(ours, peers, of_medians, of_rounds):
+    ratio = {"of_medians": of_medians, "median_of_rounds": of_rounds}
+    assert compare(ours, peers) == ratio
+    assert figures({OURS: ours, SB3: peers}, "ms") == {
+        "ms": median(ours),
+        "peers": {SB3: {"ms": median(peers), "ratio": ratio}},
     }
-
-
-def test_environment_figures():
-    found = per_second({OURS: [[0.0005]], HIGHWAY: [[0.004]]}, "steps_per_s")
-    assert found["steps_per_s"] == 2000.0
-    assert found["peers"][HIGHWAY]["steps_per_s"] == 250.0
-    assert found["peers"][HIGHWAY]["ratio"]["of_medians"] == 8.0
+    assert per_second({OURS: ours}, "steps")["steps"] == 1.0 / median(ours)
 
 
 def test_training_figures_scale_to_10000_steps():
-    parts_s = {"environment": 0.1, "acting": 0.2, "storing": 0.3, "learning": 6.0, "waiting": 0.0}
+    parts_s = dict(zip(PARTS, (0.1, 0.2, 0.3, 6.0, 0.0), strict=True))
     named = {f"{name}_s": value for name, value in parts_s.items()}
-    episodes: list[Any] = [SimpleNamespace(steps=100, **named), SimpleNamespace(steps=300, **named)]
+    episodes: list[Any] = [SimpleNamespace(steps=steps, **named) for steps in (100, 300)]
     found = training_figures(episodes, 16.0)
+    wanted = zip(("total", *PARTS), (400.0, 5.0, 10.0, 15.0, 300.0, 0.0), strict=True)
     assert found["steps"] == 400
-    assert found["s_per_10k_steps"] == pytest.approx(
-        {
-            "total": 400.0,
-            "environment": 5.0,
-            "acting": 10.0,
-            "storing": 15.0,
-            "learning": 300.0,
-            "waiting": 0.0,
-        }
-    )
+    assert found["s_per_10k_steps"] == pytest.approx(dict(wanted))
 
 
 def test_an_update_draws_learns_and_sets_the_new_priorities():
