@@ -89,7 +89,10 @@ def test_the_same_seed_gives_the_same_weights(trained, tmp_path):
 
 def test_a_run_in_two_parts_ends_with_the_same_weights_and_metrics(trained, tmp_path):
     directory = tmp_path / "parts"
-    train(replace(TINY, episodes=2), directory)
+    directory.mkdir()
+    first = TrainingRun(TINY, directory)
+    first.train(lambda _: setattr(first, "quitting", True))
+    assert first.episode == 2
     resumed = train(TINY, directory, resume=True)
     assert torch.equal(actor_weights(trained), actor_weights(resumed))
     for ours, whole in zip(read_metrics(directory), read_metrics(trained.run_dir), strict=True):
