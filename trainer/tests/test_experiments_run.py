@@ -164,53 +164,45 @@ def test_damaged_records_are_refused_in_one_line(straight, tmp_path, damage):
 
 
 class TestIds:
-    def test_what_decides_changes_the_id(self, tmp_path, monkeypatch):
-        store = store_in(tmp_path)
-        human = write_human(store)
-        ids = [unit_id(GUIDED, TINY, store.humans)]
-
-        def add(unit=GUIDED, plan=TINY):
-            ids.append(unit_id(unit, plan, store.humans))
-
-        for other in (UNIT, GUIDED._replace(seed=2), GUIDED._replace(setting="biased")):
-            add(other)
-        for change in ({"steps": {"left_turn": 300}}, {"evaluation_runs": 3}, {"test_runs": 4}):
-            add(plan=replace(TINY, **change))
-        add(plan=replace(TINY, learner={"tau": 0.5}))
-        monkeypatch.setitem(
-            ALGORITHMS, "phil_td3", replace(ALGORITHMS["phil_td3"], advantage_weight=2.0)
-        )
-        add()
-        monkeypatch.undo()
-        monkeypatch.setattr(planned, "behaviour", lambda *_: "another scene")
-        add()
-        monkeypatch.undo()
-        human.unlink()
-        write_human(store, seed=2)
-        add()
-        assert len(set(ids)) == len(ids)
-
-    def test_what_does_not_decide_keeps_it(self, tmp_path):
+    def test_what_decides_changes_the_id_and_nothing_else_does(self, tmp_path, monkeypatch):
         store, elsewhere = store_in(tmp_path), store_in(tmp_path / "elsewhere")
-        for each in (store, elsewhere):
-            write_human(each)
+        human = write_human(store)
+        write_human(elsewhere)
         first = unit_id(GUIDED, TINY, store.humans)
         assert first == unit_id(GUIDED, replace(TINY, checkpoint_every=7), store.humans)
         assert first == unit_id(GUIDED, TINY, elsewhere.humans)
-        human = unit_id(UNIT, TINY, tmp_path / "nowhere")
-        assert human == unit_id(UNIT, TINY, store.humans), "nobody guides it"
+        unguided = unit_id(UNIT, TINY, store.humans)
+        assert unguided == unit_id(UNIT, TINY, tmp_path / "nowhere"), "nobody guides it"
+        plans: list[dict] = [
+            {"steps": {"left_turn": 300}},
+            {"evaluation_runs": 3},
+            {"test_runs": 4},
+            {"learner": {"tau": 0.5}},
+        ]
+        others = (GUIDED._replace(seed=2), GUIDED._replace(setting="biased"))
+        ids = [first, unguided, *(unit_id(other, TINY, store.humans) for other in others)]
+        ids += [unit_id(GUIDED, replace(TINY, **change), store.humans) for change in plans]
+        with monkeypatch.context() as patch:
+            row = replace(ALGORITHMS["phil_td3"], advantage_weight=2.0)
+            patch.setitem(ALGORITHMS, "phil_td3", row)
+            ids.append(unit_id(GUIDED, TINY, store.humans))
+        with monkeypatch.context() as patch:
+            patch.setattr(planned, "behaviour", lambda *_: "another scene")
+            ids.append(unit_id(GUIDED, TINY, store.humans))
+        human.unlink()
+        write_human(store, seed=2)
+        ids.append(unit_id(GUIDED, TINY, store.humans))
+        assert len(set(ids)) == len(ids)
 
     def test_tests_do_not_name_the_training(self, tmp_path):
         more = replace(TINY, test_runs=9)
         assert training_id(UNIT, TINY, tmp_path) == training_id(UNIT, more, tmp_path)
 
     def test_a_scene_that_does_another_thing_is_another_scene(self):
-        assert planned.behaviour("left_turn", "nominal") == planned.behaviour("left_turn", "noise")
-        assert planned.behaviour("left_turn", "nominal") != planned.behaviour(
-            "left_turn", "variant"
-        )
-        printed = planned.behaviour("left_turn", "nominal", printed_reward=True)
-        assert planned.behaviour("left_turn", "nominal") != printed
+        nominal = planned.behaviour("left_turn", "nominal")
+        assert planned.behaviour("left_turn", "noise") == nominal
+        assert planned.behaviour("left_turn", "variant") != nominal
+        assert planned.behaviour("left_turn", "nominal", printed_reward=True) != nominal
 
     @given(st.permutations(["a", "b", "c"]))
     def test_the_order_of_values_does_not_matter(self, names):

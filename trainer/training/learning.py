@@ -100,29 +100,6 @@ class EpisodeLearning:
 NO_LOSSES = (math.nan,) * 4
 
 
-class LearningDriver:
-    """The policy that is being learned at the wheel, asked where it is learned.
-
-    Args:
-        learning: where.
-        averaged: whether the target actor drives, the running average of the one that learns.
-    """
-
-    def __init__(self, learning: Learning, averaged: bool) -> None:
-        self.learning, self.averaged = learning, averaged
-
-    def reset(self) -> None:
-        """Networks have no memory."""
-
-    def act(self, observation: Observation) -> Action:
-        """The action, float32 [action size]; not while an update is under way."""
-        return self.act_together(observation[None])[0]
-
-    def act_together(self, observations: Observation) -> Action:
-        """The same for observations [n, 2, 45, 80]: float32 [n, action size]."""
-        return self.learning.act_together(observations, self.averaged)
-
-
 class LearningThread:
     """``Learning`` whose updates run in a thread of their own.
 
