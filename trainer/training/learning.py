@@ -35,20 +35,16 @@ class Learning(Store, Protocol):
     @property
     def added(self) -> int:
         """Transitions stored since the run began."""
-        ...
 
     @property
     def learner(self) -> TD3Learner:
         """The networks, as of the last finished update."""
-        ...
 
     def act(self, observation: Observation) -> Action:
         """The actor's action, float32 [action size]; not while updating."""
-        ...
 
     def act_together(self, observations: Observation, averaged: bool) -> Action:
         """The actor's actions, or the target actor's, [n, action size]; not while updating."""
-        ...
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
@@ -56,25 +52,17 @@ class Learning(Store, Protocol):
     def finish(self) -> float:
         """Wait until the update that was begun is done, if one was; the seconds waited.
 
-        Raises:
-            FloatingPointError: what it has learned is not finite; it may come out later, too.
+        FloatingPointError: what it has learned is not finite; it may come out later, too.
         """
-        ...
 
     def end_episode(self, progress: float) -> EpisodeLearning:
         """What was learned since the last call; learning rates fall.
 
-        Args:
-            progress: share of the run that is over, 0 to 1.
-
-        Raises:
-            FloatingPointError: it is not finite.
+        ``progress`` is the share of the run that is over. FloatingPointError: it is not finite.
         """
-        ...
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on."""
-        ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""
