@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 import shlex
 import signal
@@ -16,7 +17,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -285,26 +287,45 @@ def end_children() -> None:
                 os.kill(int(child), signal.SIGTERM)
 
 
-def in_threads(
+def in_parallel(
     work: Callable[[Item], Result],
     items: Sequence[Item],
     jobs: int,
     on_done: Callable[[Item, Result], None],
+    processes: bool = False,
 ) -> None:
     """Do the work of each item, ``jobs`` at a time; ``on_done`` is called here, as they end.
 
-    After a failure, and on ^C, what has not begun is not begun any more, and every process that
-    the others wait for is asked to end.
+    In threads, which suits work that waits for processes, or in processes. After a failure, and on
+    ^C, what has not begun is not begun any more, and every process under way is asked to end.
+
+    Raises:
+        UserError: a process of ours died.
     """
-    with ThreadPoolExecutor(min(jobs, len(items)) or 1) as pool:
+    jobs = min(jobs, len(items)) or 1
+    pool: Executor = ThreadPoolExecutor(jobs)
+    if processes:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(jobs, context, initializer=_follow_the_parent)
+    with pool:
         futures = {pool.submit(work, item): item for item in items}
         try:
             for future in as_completed(futures):
                 on_done(futures[future], future.result())
-        except BaseException:
+        except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
             end_children()
+            if isinstance(error, BrokenProcessPool):
+                raise UserError("a worker process died; use fewer --jobs") from error
             raise
+
+
+def _follow_the_parent() -> None:
+    """Leave ^C to the parent, and end where it is killed."""
+    from trainer.evaluate import die_with_parent
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=die_with_parent, daemon=True).start()
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
