@@ -92,7 +92,6 @@ def edge_stopped(rig: Rig, number: int) -> Try:
 def simulator_killed(rig: Rig, number: int) -> Try:
     """The edge runtime's safe stop; a new simulator has a new session."""
     at_any_phase(number)
-    assert rig.simulator is not None
     begin_s = time.monotonic()
     rig.simulator.kill()
     stop = stop_command(rig, begin_s)
@@ -107,7 +106,6 @@ def simulator_killed(rig: Rig, number: int) -> Try:
 @fault("TCP cut for 1 s and restored", _EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
 def link_cut(rig: Rig, number: int) -> Try:
     """Every connection broken and refused for a second: both ends stop, each by itself."""
-    assert rig.link is not None
     at_any_phase(number)
     begin_s, drive_s = time.monotonic(), last_drive_s(rig.timeline)
     rig.link.cut()
@@ -125,7 +123,6 @@ def link_cut(rig: Rig, number: int) -> Try:
 @fault("TCP held for 0.6 s, then all at once", _EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
 def link_stalled(rig: Rig, number: int) -> Try:
     """The link holds everything for a while, then brings it all at once."""
-    assert rig.link is not None
     at_any_phase(number)
     begin_s = time.monotonic()
     rig.link.stall()
@@ -144,13 +141,12 @@ def link_stalled(rig: Rig, number: int) -> Try:
 )  # fmt: skip
 def router_restarted(rig: Rig, number: int) -> Try:
     """The router between the ends is gone, and a new one comes on the same port."""
-    assert rig.router is not None
     at_any_phase(number)
     begin_s = time.monotonic()
     rig.router.kill()
     stopped_s, reason = logged_stop(rig, begin_s)
     rig.router = rig.start_router()
-    ended_s = wait_until(lambda: _listens_s(rig.router_endpoint), "the new router")
+    ended_s = wait_until(lambda: _listens_s(rig.edge_endpoint), "the new router")
     reaction_s = stopped_s - last_state_s(rig, before_s=begin_s)
     return Try(reaction_s, recovered_after_s(rig, ended_s), reason)
 
@@ -164,7 +160,6 @@ def clock_stepped_edge(rig: Rig, number: int) -> Try:
 @drives_on("simulator's wall clock 1 h ahead and back", "drives on")
 def clock_stepped_simulator(rig: Rig, number: int) -> Try:
     """The simulator's wall clock jumps an hour ahead, then back."""
-    assert rig.simulator is not None
     return _stepped(rig, rig.simulator, number)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 
 import msgspec
@@ -58,7 +58,6 @@ counted_at_its_end = partial(counted, flows=False, new_rig_each_try=True)
 )
 def bad_states(rig: Rig, number: int) -> Try:
     """Each kind of bad state between the good ones of the same simulator."""
-    assert rig.sender is not None
     at_any_phase(number)
     before, begin_s = edge_counts(rig), time.monotonic()
     wanted: Counter[str] = Counter()
@@ -94,7 +93,6 @@ def oversized(rig: Rig, number: int) -> Try:
 )  # fmt: skip
 def flood(rig: Rig, number: int) -> Try:
     """Valid states of one simulator at a hundred times the rate and more."""
-    assert rig.sender is not None
     rig.sender.running.clear()
     memory_mb, begin_s = rig.edge.resident_mb(), time.monotonic()
     sent = 0
@@ -226,7 +224,6 @@ def _bad_of(step: int) -> Iterable[tuple[str, bytes]]:
 
 def _send_reordered(rig: Rig, wanted: Counter[str]) -> None:
     """Two states that have overtaken one another, and one that says it comes from the future."""
-    assert rig.sender is not None
     rig.sender.step += 3
     step = rig.sender.step
     rig.sender.send(make_state(step - 1))
@@ -269,7 +266,33 @@ def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
     """``count`` payloads; the n-th is the same for the same seed. Some may be valid still."""
     generator = np.random.default_rng(seed)
     for _ in range(count):
-        yield _MUTATORS[int(generator.integers(len(_MUTATORS)))](valid, generator)
+        yield _mutant(valid, generator)
+
+
+def _mutant(valid: bytes, generator: np.random.Generator) -> bytes:
+    def below(limit: int) -> int:
+        return int(generator.integers(limit))
+
+    match below(7):
+        case 0:
+            return generator.bytes(below(_LONGEST_RANDOM))
+        case 1:
+            data = bytearray(valid)
+            for _ in range(1 + below(4)):
+                data[below(len(data))] ^= 1 << below(8)
+            return bytes(data)
+        case 2:
+            return valid[: below(len(valid))]
+        case 3:
+            return valid + generator.bytes(1 + below(_SPLICED))
+        case 4:  # a stretch of it replaced by a random one of another length
+            begin, end = sorted((below(len(valid)), below(len(valid))))
+            return valid[:begin] + generator.bytes(below(_SPLICED)) + valid[end:]
+    names = sorted(msgspec.msgpack.decode(valid))
+    name = names[below(len(names))]
+    if below(2):
+        return without(valid, name)
+    return with_fields(valid, **{name: _ABSURD[below(len(_ABSURD))]})
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:
@@ -284,49 +307,7 @@ def without(valid: bytes, name: str) -> bytes:
     return msgspec.msgpack.encode(fields)
 
 
-def _random(valid: bytes, generator: np.random.Generator) -> bytes:
-    return generator.bytes(int(generator.integers(0, _LONGEST_RANDOM)))
-
-
-def _flipped(valid: bytes, generator: np.random.Generator) -> bytes:
-    data = bytearray(valid)
-    for place in generator.integers(0, len(data), int(generator.integers(1, 5))):
-        data[place] ^= 1 << int(generator.integers(8))
-    return bytes(data)
-
-
-def _truncated(valid: bytes, generator: np.random.Generator) -> bytes:
-    return valid[: int(generator.integers(0, len(valid)))]
-
-
-def _extended(valid: bytes, generator: np.random.Generator) -> bytes:
-    return valid + generator.bytes(int(generator.integers(1, _SPLICED)))
-
-
-def _spliced(valid: bytes, generator: np.random.Generator) -> bytes:
-    """A stretch of it replaced by a random one of another length."""
-    begin, end = sorted(int(place) for place in generator.integers(0, len(valid), 2))
-    return valid[:begin] + generator.bytes(int(generator.integers(0, _SPLICED))) + valid[end:]
-
-
-def _wrong_field(valid: bytes, generator: np.random.Generator) -> bytes:
-    """One field of a wrong type or with an absurd value."""
-    fields = msgspec.msgpack.decode(valid)
-    name = sorted(fields)[int(generator.integers(len(fields)))]
-    value = _ABSURD[int(generator.integers(len(_ABSURD)))]
-    return msgspec.msgpack.encode({**fields, name: value})
-
-
-def _missing_field(valid: bytes, generator: np.random.Generator) -> bytes:
-    fields = msgspec.msgpack.decode(valid)
-    del fields[sorted(fields)[int(generator.integers(len(fields)))]]
-    return msgspec.msgpack.encode(fields)
-
-
 _ABSURD: tuple[object, ...] = (
     None, True, -1, 2**63, -(2**63), float("nan"), float("inf"), 1e308, "", "x" * 300,
     b"", b"\xff" * 70_000, [], [float("nan")], [2.0], [[[[]]]], {}, {"a": {"b": {}}}, "drive",
-)  # fmt: skip
-_MUTATORS: tuple[Callable[[bytes, np.random.Generator], bytes], ...] = (
-    _random, _flipped, _truncated, _extended, _spliced, _wrong_field, _missing_field,
 )  # fmt: skip

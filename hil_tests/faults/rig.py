@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -31,6 +31,7 @@ VEHICLE_ID = "faults"
 SESSION = "campaign"
 HEARD = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
 """What is kept of the CAN bus: all commands, the chassis's state, its speed."""
+_INSIDE = "hil_tests.faults.inside"
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
 _TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(\w+)")
 _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
@@ -43,7 +44,26 @@ _STATE_BYTES = 20
 
 
 class Rig:
-    """Start it with ``with``; it ends every process that it started."""
+    """Start it with ``with``; it ends every process that it started.
+
+    ``simulator`` or ``sender``, ``link``, ``router``, ``chassis`` and ``monitor`` are there where
+    the options ask for them.
+
+    Args:
+        policy: the edge runtime's options for its policy.
+        directory: an empty one, for switches and reports.
+        between: ``link`` or ``router``: what edge runtime and probe meet at.
+        vehicle: the edge runtime's ``--vehicle``.
+        sender: send states here, without a simulator.
+        model: of a mock Hunter, on a CAN bus.
+    """
+
+    simulator: Process
+    sender: Sender
+    link: Link
+    router: Process
+    chassis: ChassisProcess
+    monitor: CanMonitor
 
     def __init__(
         self,
@@ -59,48 +79,59 @@ class Rig:
         self.crashes: list[str] = []
         self._policy, self._vehicle = policy, vehicle
         self._processes: list[tuple[str, Process]] = []
+        self._closing = contextlib.ExitStack()
         (directory / BRAKES).touch()
         self._simulator_endpoint, self._hub = free_endpoint(), free_endpoint()
-        self.simulator = None if sender else self.start_simulator()
+        if not sender:
+            self.simulator = self.start_simulator()
         connect = None if sender else self._simulator_endpoint
         self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline)
-        self.sender = Sender(self.probe) if sender else None
-        self.link = Link(self._hub) if between == "link" else None
-        self.router_endpoint = free_endpoint() if between == "router" else ""
-        self.router = self.start_router() if self.router_endpoint else None
+        self._closing.callback(self.probe.close)
+        self.edge_endpoint = self._hub
+        """Where the edge runtime connects."""
+        if between == "link":
+            self.link = Link(self._hub)
+            self._closing.callback(self.link.close)
+            self.edge_endpoint = self.link.endpoint
+        if between == "router":
+            self.edge_endpoint = free_endpoint()
+            self.router = self.start_router()
         self._bus = free_bus() if model else ""
-        self.chassis = ChassisProcess(self._bus, "--model", model) if model else None
-        self.monitor = CanMonitor(self._bus, HEARD) if model else None
-        if self.chassis is not None:
+        if model:
+            self.chassis = ChassisProcess(self._bus, "--model", model)
             self._processes.append(("chassis", self.chassis.process))
+            self.monitor = CanMonitor(self._bus, HEARD)
+            self._closing.callback(self.monitor.close)
         self.edge = self.start_edge()
+        self._closing.callback(self._end_processes)
+        if sender:
+            self.sender = Sender(self.probe)
+            self._closing.callback(self.sender.stop)
 
     def start_edge(self) -> Process:
         """The edge runtime, not waited for."""
-        endpoint = self.link.endpoint if self.link else self.router_endpoint or self._hub
-        arguments = ["edge_runtime", "run", *self._policy, "--connect", endpoint]
-        arguments += ["--vehicle-id", VEHICLE_ID, "--vehicle", self._vehicle]
-        if self._bus:
-            arguments += ["--bus", self._bus]
-        return self._start("edge", "hil_tests.faults.inside", *arguments)
+        bus = ("--bus", self._bus) if self._bus else ()
+        return self._start(
+            "edge", _INSIDE, "edge_runtime", "run", *self._policy, "--connect", self.edge_endpoint,
+            "--vehicle-id", VEHICLE_ID, "--vehicle", self._vehicle, *bus,
+        )  # fmt: skip
 
     def start_simulator(self) -> Process:
         """`bridge simulate` in real time, not waited for."""
-        arguments = ["bridge", "simulate", "--env", ENVIRONMENT, "--clock", "realtime"]
-        arguments += ["--listen", self._simulator_endpoint, "--vehicle-id", VEHICLE_ID]
-        arguments += ["--out", str(self.directory / "report.json")]
-        return self._start("simulator", "hil_tests.faults.inside", *arguments)
+        return self._start(
+            "simulator", _INSIDE, "bridge", "simulate", "--env", ENVIRONMENT,
+            "--clock", "realtime", "--listen", self._simulator_endpoint,
+            "--vehicle-id", VEHICLE_ID, "--out", str(self.directory / "report.json"),
+        )  # fmt: skip
 
     def start_recorder(self, path: Path) -> Process:
         """`bridge record` of this drive, not waited for."""
-        arguments = ["bridge", "record", "--out", str(path), "--connect", self._hub]
-        return self._start("recorder", *arguments, "--vehicle-id", VEHICLE_ID)
+        record = ("bridge", "record", "--out", str(path), "--connect", self._hub)
+        return self._start("recorder", *record, "--vehicle-id", VEHICLE_ID)
 
     def start_router(self) -> Process:
         """The router process between edge and probe, not waited for."""
-        return self._start(
-            "router", "hil_tests.faults.inside", "router", self.router_endpoint, self._hub
-        )
+        return self._start("router", _INSIDE, "router", self.edge_endpoint, self._hub)
 
     def wait_until_driving(
         self, timeout_s: float = 30.0, ready: Callable[[], bool] = lambda: True
@@ -136,6 +167,10 @@ class Rig:
         temporary.write_text(word)
         temporary.replace(path)
 
+    def bright(self, on: bool) -> None:
+        """Turn the frames white, or back."""
+        self.switch(BRIGHT, "" if on else None)
+
     def rearm(self) -> None:
         """As an operator does, until the runtime takes it."""
         wait_until(self.try_rearm, "the vehicle to be re-armed")
@@ -146,37 +181,24 @@ class Rig:
             return bool(ask(self._hub, VEHICLE_ID, "rearm")["accepted"])
         return False
 
-    def bright(self, on: bool) -> None:
-        """Turn the frames white, or back."""
-        self.switch(BRIGHT, "" if on else None)
-
     def end_drive(self) -> None:
         """Let the simulator end its episode and write its report."""
-        assert self.simulator is not None
         self.switch(END, "")
         self.simulator.wait()
 
-    def close(self) -> None:
-        """End everything; crashes are noted first."""
-        if self.sender is not None:
-            self.sender.stop()
-        for name, process in self._processes:
-            if process.crashed():
-                self.crashes.append(f"{name}: {process.lines[-1:]}")
-        # The simulator first: it says its episode's end to an edge that still listens.
-        for _, process in reversed(self._processes):
-            process.end()
-        if self.link is not None:
-            self.link.close()
-        if self.monitor is not None:
-            self.monitor.close()
-        self.probe.close()
-
-    def __enter__(self) -> Rig:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self.close()
+        self._closing.close()
+
+    def _end_processes(self) -> None:
+        """Crashes are noted first."""
+        for name, process in self._processes:
+            if process.crashed():
+                self.crashes.append(f"{name}: {process.lines[-1:]}")
+        for _, process in reversed(self._processes):
+            process.end()
 
     def _is_driving(self) -> bool:
         now_s = time.monotonic()
@@ -193,8 +215,7 @@ class Rig:
         return process
 
     def _on_edge_line(self, seen_s: float, line: str) -> None:
-        found = _MODE.search(line)
-        if found:
+        if found := _MODE.search(line):
             mode, reason = found.group(1), found.group(2) or ""
             self.timeline.modes.append(ModeSeen(seen_s, mode, reason))
 
@@ -299,11 +320,10 @@ class ChassisProcess:
         return any(one.moves for one in before + inside)
 
     def _on_line(self, seen_s: float, line: str) -> None:
-        told, switched = _TOLD.match(line), _SWITCHED.match(line)
-        if told:
-            moves = told.group(4) == "moves"
-            self.truth.append(Truth(float(told.group(1)), told.group(2), told.group(3), moves))
-        if switched:
+        if told := _TOLD.match(line):
+            since_s, control, condition, motion = told.groups()
+            self.truth.append(Truth(float(since_s), control, condition, motion == "moves"))
+        if switched := _SWITCHED.match(line):
             applied_s, name, word = switched.groups()
             self.switched.append((float(applied_s), name, word))
 
@@ -338,7 +358,8 @@ class Link:
         """Break every connection and refuse new ones; what was under way is lost."""
         with self._lock:
             self._is_cut = True
-            self._break()
+            _shut(*self._open)
+            self._open.clear()
 
     def stall(self) -> None:
         """Keep the connections and hold what comes, as a radio link that repeats does."""
@@ -358,19 +379,15 @@ class Link:
         self._listener.close()
 
     def _accept(self) -> None:
-        while True:
-            try:
-                near, _ = self._listener.accept()
-            except OSError:
-                return
-            self._join(near)
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                self._join(self._listener.accept()[0])
 
     def _join(self, near: socket.socket) -> None:
         with self._lock:
-            if self._is_cut:
-                near.close()
-                return
             try:
+                if self._is_cut:
+                    raise ConnectionError
                 far = socket.create_connection(self._target, timeout=1.0)
             except OSError:
                 near.close()
@@ -379,8 +396,8 @@ class Link:
             for end in (near, far):
                 end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._open += [near, far]
-        threading.Thread(target=self._pump, args=(near, far, False), daemon=True).start()
-        threading.Thread(target=self._pump, args=(far, near, True), daemon=True).start()
+        for pair in ((near, far, False), (far, near, True)):
+            threading.Thread(target=self._pump, args=pair, daemon=True).start()
 
     def _pump(self, source: socket.socket, sink: socket.socket, to_caller: bool) -> None:
         with contextlib.suppress(OSError):
@@ -390,10 +407,6 @@ class Link:
                 if to_caller and len(data) > _STATE_BYTES:
                     self.last_state_s = time.monotonic()
         _shut(source, sink)
-
-    def _break(self) -> None:
-        _shut(*self._open)
-        self._open.clear()
 
 
 def address(endpoint: str) -> tuple[str, int]:
