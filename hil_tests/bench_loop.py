@@ -31,9 +31,11 @@ from hil_tests.bench_floor import STEP_BYTES
 from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 from hil_tests.report import table
+from hil_tests.sweep import simulate
 from trainer.util import processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
+SCENARIO = "left_turn"
 PICTURES = 64
 PERIOD_S = 0.004
 STARTS = 5
@@ -118,8 +120,6 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         memory = memory_mb(edge, ours, arguments.steps)
         ours.end_block()
         floor_memory = memory_mb(bare, floor, min(FLOOR_STEPS, arguments.steps))
-    with tempfile.TemporaryDirectory() as directory:
-        drive = lockstep(policy, "left_turn", arguments.episodes, Path(directory))
     return {
         "latency": latency,
         "process": {
@@ -130,7 +130,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         },
         "modes": dict(ours.modes),
         "state_bytes": len(ours.prepare()[1]),
-        "lockstep": drive,
+        "lockstep": lockstep(policy, arguments.episodes),
     }
 
 
@@ -357,41 +357,22 @@ def _cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def lockstep(policy: list[str], scenario: str, episodes: int, directory: Path) -> dict[str, Any]:
+def lockstep(policy: list[str], episodes: int) -> dict[str, Any]:
     """Drive ``episodes`` in lock-step; simulated seconds per wall second, without the start-up."""
     endpoint = free_endpoint()
-    seen: list[tuple[float, wire.State]] = []
-
-    def hear(sample: zenoh.Sample) -> None:
-        seen_s = time.perf_counter()
-        state = wire.decode_state(bytes(sample.payload))
-        if isinstance(state, wire.State) and (state.final or not seen):
-            seen.append((seen_s, state))
-
-    with ExitStack() as stack:
-        simulator = stack.enter_context(
-            Process(
-                "bridge", "simulate", "--env", scenario, "--clock", "lockstep",
-                "--listen", endpoint, "--vehicle-id", OURS, "--episodes", str(episodes),
-                "--out", str(directory / "lock.json"),
-            )
+    with tempfile.TemporaryDirectory() as folder, start_edge(policy, endpoint):
+        report = simulate(
+            endpoint, OURS, Path(folder) / "lock.json", _LOCKSTEP_LIMIT_S,
+            "--env", SCENARIO, "--clock", "lockstep", "--episodes", str(episodes),
         )  # fmt: skip
-        session = open_session(connect=endpoint, mode="peer")
-        stack.callback(session.close)
-        subscriber = session.declare_subscriber(wire.key(OURS, "state"), hear)
-        stack.callback(subscriber.undeclare)
-        stack.enter_context(start_edge(policy, endpoint))
-        status = simulator.wait(_LOCKSTEP_LIMIT_S)
-    if status:
-        raise RuntimeError(f"bridge simulate ended with status {status}: {simulator.lines[-3:]}")
-    simulated_s = sum(state.sim_time_s for _, state in seen if state.final)
-    wall_s = seen[-1][0] - seen[0][0]
+    simulated_s = sum(row["time_s"] for row in report["per_episode"])
+    times = report["times_real_time"]
     return {
-        "scenario": scenario,
+        "scenario": SCENARIO,
         "episodes": episodes,
         "simulated_s": simulated_s,
-        "wall_s": wall_s,
-        "times_real_time": simulated_s / wall_s,
+        "wall_s": simulated_s / times,
+        "times_real_time": times,
     }
 
 
