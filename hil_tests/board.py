@@ -16,7 +16,6 @@ import json
 import os
 import random
 import shutil
-import socket
 import subprocess
 import tempfile
 import time
@@ -32,6 +31,7 @@ from deploy.installer.systemd import MAIN_UNIT
 from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel
 from edge_runtime.cli import examples, positive, sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand, wait_until
 
@@ -230,7 +230,7 @@ class Board:
     def __init__(self, cache: Path, folder: Path) -> None:
         self._cache, self._folder = cache.absolute(), folder
         self._disk = folder / "disk.qcow2"
-        self._port = free_port()
+        self._port = _free_port()
         self._config = folder / "ssh_config"
         self._config.write_text(
             f"Host board\n HostName 127.0.0.1\n Port {self._port}\n User root\n"
@@ -408,7 +408,7 @@ def _push(board: Board, parcels: Parcels) -> dict[str, Any]:
 
 def _drive_through_ssh(board: Board, parcels: Parcels) -> dict[str, Any]:
     """One left turn by the board, which reaches the simulator here through our ssh only."""
-    port = free_port()
+    port = _free_port()
     tunnel = board.ssh("-N", options=("-R", f"{_PORT}:127.0.0.1:{port}"))
     with subprocess.Popen(tunnel, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as link:
         try:
@@ -535,7 +535,7 @@ def _cut(board: Board, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]
 
 def prove_python38(wheels: Path) -> dict[str, Any]:
     """Install offline under Python 3.8, run the release as a container would, drive; a report."""
-    python, port = str(find_python38()), free_port()
+    python, port = str(find_python38()), _free_port()
     with tempfile.TemporaryDirectory(prefix="phil-python38-") as place:
         folder = Path(place)
         parcels = Parcels(folder, wheels, f"tls/127.0.0.1:{port}")
@@ -567,10 +567,8 @@ def prove_python38(wheels: Path) -> dict[str, Any]:
         return {**report, "left_after_uninstall": opt.exists()}
 
 
-def free_port() -> int:
-    """A TCP port of loopback that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
+def _free_port() -> int:
+    return int(free_endpoint().rpartition(":")[2])
 
 
 @contextlib.contextmanager

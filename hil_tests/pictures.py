@@ -33,8 +33,8 @@ from hil_tests.processes import (
     POLICY,
     PUBLIC_KEY,
     BackgroundCommand,
-    Operator,
     headless_viewer,
+    operator,
     run_command,
 )
 from hil_tests.report import write_figures, write_png
@@ -210,7 +210,7 @@ def recorded_drive(work: Path) -> Path:
         stack.enter_context(BackgroundCommand(*edge, ready="ready"))
         record = ("bridge", "record", "--out", str(out), *common, "--wait-s", "30")
         recorder = stack.enter_context(BackgroundCommand(*record))
-        stack.enter_context(Operator(endpoint, VEHICLE_ID))
+        stack.enter_context(operator(endpoint, VEHICLE_ID))
         run_command(
             "bridge", "simulate", "--env", "left_turn", "--clock", "realtime",
             "--latency", LATENCY, "--episodes", EPISODES, "--seed", SEED,

@@ -11,7 +11,6 @@ import multiprocessing
 import os
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from edge_runtime.commands import ask
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
 
 Item = TypeVar("Item")
@@ -217,45 +217,31 @@ class BackgroundCommand(Process):
         return UserError(f"python -m {self.name}: {last}")
 
 
-class Operator:
-    """Watches a vehicle for the length of a ``with`` block, and re-arms it after a safe stop.
+@contextlib.contextmanager
+def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
+    """Watch a vehicle for the length of a ``with`` block, and re-arm it after a safe stop.
 
     A runtime with a vehicle never drives again by itself: this stands in for the person who is
     missing in an unattended drive, and says each time what it does.
     """
+    end = threading.Event()
 
-    def __init__(self, endpoint: str, vehicle_id: str) -> None:
-        self.endpoint, self.vehicle_id = endpoint, vehicle_id
-        self._end = threading.Event()
-        self._failure: Exception | None = None
-        self._thread = threading.Thread(target=self._watch, name="operator")
+    def watch() -> None:
+        while not end.wait(OPERATOR_LOOKS_EVERY_S):
+            # Simulator or runtime not up yet, or already gone: nothing to re-arm.
+            with contextlib.suppress(UserError):
+                status = ask(endpoint, vehicle_id, "status")
+                stopped = status["needs_rearm"] and status["mode"] == "safe_stop"
+                if stopped and ask(endpoint, vehicle_id, "rearm")["accepted"]:
+                    print(f"operator: re-armed {vehicle_id} after {status['reason']}", flush=True)
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-        if self._failure is not None:
-            raise self._failure
-
-    def _watch(self) -> None:
+    with ThreadPoolExecutor(1, "operator") as pool:
+        watching = pool.submit(watch)
         try:
-            while not self._end.wait(OPERATOR_LOOKS_EVERY_S):
-                # Simulator or runtime not up yet, or already gone: nothing to re-arm.
-                with contextlib.suppress(UserError):
-                    self._rearm_if_needed()
-        except Exception as error:
-            # Nobody would re-arm any more: who waits for this drive must hear of it.
-            self._failure = error
-
-    def _rearm_if_needed(self) -> None:
-        status = ask(self.endpoint, self.vehicle_id, "status")
-        if not status["needs_rearm"] or status["mode"] != "safe_stop":
-            return
-        if ask(self.endpoint, self.vehicle_id, "rearm")["accepted"]:
-            print(f"operator: re-armed {self.vehicle_id} after {status['reason']}", flush=True)
+            yield
+        finally:
+            end.set()
+        watching.result()  # Where it failed, nobody would have re-armed any more.
 
 
 def run_command(*arguments: str) -> None:
@@ -348,17 +334,15 @@ def headless_viewer() -> Iterator[Any]:
     Raises:
         UserError: it does not start here, or ends as soon as it is to draw.
     """
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    host, _, port = free_endpoint().removeprefix("tcp/").rpartition(":")
     command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
-    command += ["--bind", "127.0.0.1", "--port", str(port), "--window-size", VIEWER_SIZE]
+    command += ["--bind", host, "--port", port, "--window-size", VIEWER_SIZE]
     # A group of its own: the module starts the real viewer as a child, which must end with it.
     viewer = subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     )
     try:
-        yield _connect_viewer(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
+        yield _connect_viewer(viewer, f"rerun+http://{host}:{port}/proxy")
     except ConnectionError as error:
         raise UserError(f"rerun's viewer ends as it draws ({error}): {VIEWER_NEEDS}") from None
     finally:

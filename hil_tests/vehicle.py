@@ -22,7 +22,7 @@ from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests.faults.rig import free_bus
 from hil_tests.mock_hunter.body import make_parameters, read_changes
-from hil_tests.processes import BackgroundCommand, Operator, in_parallel, trusting
+from hil_tests.processes import BackgroundCommand, in_parallel, operator, trusting
 from hil_tests.report import (
     check_report,
     comparison_verdict,
@@ -201,7 +201,7 @@ def run_rig(task: Task, loop: str) -> dict[str, Any]:
             )
         )  # fmt: skip
         if loop == VEHICLE:
-            stack.enter_context(Operator(endpoint, VEHICLE_ID))
+            stack.enter_context(operator(endpoint, VEHICLE_ID))
         limit_s = LONGEST_EPISODE_S * (1 + task.runs)
         report: dict[str, Any] = simulate(
             endpoint, VEHICLE_ID, Path(folder) / "report.json", limit_s,
