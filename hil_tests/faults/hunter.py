@@ -24,7 +24,7 @@ from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
 from edge_runtime.wire import DRIVE
 from hil_tests.faults.observe import REACTION_LIMIT_S, CanMonitor, CommandSeen, Heard
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.row import Try, at_any_phase, fault, recovered_after_s, stop_command
+from hil_tests.faults.row import Try, at_any_phase, fault
 from hil_tests.mock_hunter.body import MODELS
 from hil_tests.mock_hunter.chassis import BITS, FAULTS
 
@@ -61,7 +61,7 @@ def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
     rig.wait_until_driving(ready=lambda: _drives(rig.monitor))
     at_any_phase(number)
     on_s = rig.chassis.switch(expect.name, True)
-    stop = stop_command(rig, on_s)
+    stop = rig.stop_command(on_s)
     stands_s = rig.chassis.stands_s(on_s, STANDS_WITHIN_S)
     taken = expect.name in _REFUSED and rig.try_rearm()
     wrong = ["was re-armed while the fault lasted"] if taken else []
@@ -79,7 +79,7 @@ def stuck(rig: Rig, number: int) -> Try:
     on_s = rig.chassis.switch("stuck", True)
     held_mps = speed_mps(rig.monitor.of(0x221)[-1])
     rig.bright(False)
-    stop = stop_command(rig, on_s)
+    stop = rig.stop_command(on_s)
     stands_s = rig.chassis.stands_s(stop.seen_s, STANDS_WITHIN_S)
     known_s = next(  # the stop at the latest: its set-point is 0
         one.seen_s
@@ -107,7 +107,7 @@ def _when_over(
     rig.rearm()
     rearmed_s = time.monotonic()
     rig.wait_until_driving(ready=lambda: rig.chassis.moves)
-    recovered_s = recovered_after_s(rig, rearmed_s)
+    recovered_s = rig.recovered_after_s(rearmed_s)
     drove_s = rearmed_s + recovered_s
     # Between a re-arm and the first drive feedback has nothing to say, or it was stopped again.
     said = {w for s, w in list(rig.timeline.named) if rearmed_s + _SAID_BEFORE_S < s < drove_s}

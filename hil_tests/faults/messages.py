@@ -26,14 +26,9 @@ from hil_tests.faults.rig import Rig, make_state
 from hil_tests.faults.row import (
     GAP,
     Try,
-    at_any_phase,
     drives_on,
     drove_on,
-    edge_counts,
     fault,
-    longest_gap,
-    recovered_after_s,
-    simulator_counts,
 )
 from hil_tests.processes import wait_until
 
@@ -58,8 +53,7 @@ counted_at_its_end = partial(counted, flows=False, new_rig_each_try=True)
 )
 def bad_states(rig: Rig, number: int) -> Try:
     """Each kind of bad state between the good ones of the same simulator."""
-    at_any_phase(number)
-    before, begin_s = edge_counts(rig), time.monotonic()
+    before, begin_s = rig.edge_counts(), time.monotonic()
     wanted: Counter[str] = Counter()
     for _ in range(BAD_STATE_ROUNDS):
         with rig.sender.lock:
@@ -69,20 +63,20 @@ def bad_states(rig: Rig, number: int) -> Try:
             _send_reordered(rig, wanted)
         time.sleep(CONTROL_PERIOD_S / 2)
     end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, edge_counts(rig) - before)
+    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
 
 
 @counted("states of 10 MB")
 def oversized(rig: Rig, number: int) -> Try:
     """Five times; the memory must not grow by them."""
     payload = bytes(OVERSIZED_BYTES)
-    before, begin_s = edge_counts(rig), time.monotonic()
+    before, begin_s = rig.edge_counts(), time.monotonic()
     memory_mb = rig.edge.resident_mb()
     for _ in range(5):
         rig.probe.put("state", payload)
         time.sleep(CONTROL_PERIOD_S)
     end_s = time.monotonic()
-    found = edge_counts(rig) - before
+    found = rig.edge_counts() - before
     figures = {"memory grown, MB": rig.edge.resident_mb() - memory_mb}
     return drove_on(rig, begin_s, end_s, Counter(oversized=5), found, figures=figures)
 
@@ -103,19 +97,18 @@ def flood(rig: Rig, number: int) -> Try:
         time.sleep(0.001)
     end_s = time.monotonic()
     rig.sender.running.set()
-    recovered_s = recovered_after_s(rig, end_s)
+    recovered_s = rig.recovered_after_s(end_s)
     figures = {
         "states/s": sent / (end_s - begin_s),
         "memory grown, MB": rig.edge.resident_mb() - memory_mb,
     }
-    return Try(longest_gap(rig, begin_s, end_s), recovered_s, figures=figures)
+    return Try(rig.longest_gap(begin_s, end_s), recovered_s, figures=figures)
 
 
 @counted("a second simulator with the same id")
 def second_simulator(rig: Rig, number: int) -> Try:
     """States of another session on the same key, as a second simulator sends them."""
-    at_any_phase(number)
-    before, begin_s = edge_counts(rig), time.monotonic()
+    before, begin_s = rig.edge_counts(), time.monotonic()
     wanted: Counter[str] = Counter()
     for step in range(round(SECOND_S / CONTROL_PERIOD_S)):
         # Where the first one is silent for 2 T it may be answered: it is no garbage.
@@ -124,7 +117,7 @@ def second_simulator(rig: Rig, number: int) -> Try:
         wanted["foreign_session"] += 1
         time.sleep(CONTROL_PERIOD_S)
     end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, edge_counts(rig) - before)
+    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
 
 
 @counted_at_its_end(
@@ -132,7 +125,6 @@ def second_simulator(rig: Rig, number: int) -> Try:
 )
 def second_edge(rig: Rig, number: int) -> Try:
     """A second edge runtime with the same id gives way; the first answer to a state counts."""
-    at_any_phase(number)
     second = rig.start_edge()
     begin_s = time.monotonic()
     status = second.wait()
@@ -143,7 +135,7 @@ def second_edge(rig: Rig, number: int) -> Try:
     wanted = Counter(stale=sum(count - 1 for count in answers.values()))
     ended = f"the second one ended with status {status}: {second.lines[-1:]}"
     wrong = [] if status == BAD_INPUT else [ended]
-    return drove_on(rig, begin_s, end_s, wanted, simulator_counts(rig), wrong=wrong)
+    return drove_on(rig, begin_s, end_s, wanted, rig.simulator_counts(), wrong=wrong)
 
 
 @counted(f"{COUNT:,} random and mutated states")
@@ -151,11 +143,11 @@ def garbage_states(rig: Rig, number: int) -> Try:
     """On the state's key; the edge runtime counts each by reason."""
     payloads = list(mutated(encode(make_state(1, session=_FOREIGN)), COUNT, number))
     wanted = Counter(_reason(wire.decode_state(payload)) for payload in payloads)
-    before = edge_counts(rig)
+    before = rig.edge_counts()
     begin_s = time.monotonic()
     _put_all(rig, "state", payloads)
     end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, edge_counts(rig) - before)
+    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
 
 
 @counted_at_its_end(f"{COUNT:,} random and mutated commands; future, old, wrong size")
@@ -176,7 +168,7 @@ def garbage_commands(rig: Rig, number: int) -> Try:
     end_s = time.monotonic()
     # Its own answers are in order, so that every rejection is one of these.
     rig.end_drive()
-    return drove_on(rig, begin_s, end_s, wanted, simulator_counts(rig))
+    return drove_on(rig, begin_s, end_s, wanted, rig.simulator_counts())
 
 
 @counted(f"{COUNT:,} random and mutated feedback messages", expected="drives on")
@@ -203,7 +195,7 @@ def garbage_health(rig: Rig, number: int) -> Try:
     _put_all(rig, "health", payloads)
     end_s = time.monotonic()
     rig.end_drive()
-    counts = simulator_counts(rig)
+    counts = rig.simulator_counts()
     unread = Counter({name: n for name, n in counts.items() if name.startswith("health_")})
     return drove_on(rig, begin_s, end_s, wanted, unread)
 

@@ -8,13 +8,15 @@ The simulator may also be the rig's own sender, where a row sends states of its 
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 
@@ -22,11 +24,20 @@ from edge_runtime.commands import ask
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import bus as multicast
-from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE, State, encode
+from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, FRAMES_SHAPE, SAFE_STOP, State, encode
 from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
-from hil_tests.faults.observe import BrakeSeen, CanMonitor, ModeSeen, Probe, Timeline, last_drive_s
+from hil_tests.faults.observe import (
+    BrakeSeen,
+    CanMonitor,
+    CommandSeen,
+    ModeSeen,
+    Probe,
+    Timeline,
+    longest_gap_s,
+)
 from hil_tests.processes import Process, wait_until
 
+E = TypeVar("E")
 VEHICLE_ID = "faults"
 SESSION = "campaign"
 HEARD = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
@@ -37,6 +48,8 @@ _TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(
 _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
 _REARM_EVERY_S = 2.0
+_HEALTH_S = 0.6
+"""Longer than a period of the health message."""
 _CHUNK_BYTES = 65536
 _STATE_BYTES = 20
 """More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
@@ -186,6 +199,74 @@ class Rig:
         self.switch(END, "")
         self.simulator.wait()
 
+    def last_drive_s(self) -> float:
+        """When the newest drive command came; -inf before the first."""
+        times = (c.seen_s for c in reversed(self.timeline.commands) if c.mode == DRIVE)
+        return next(times, float("-inf"))
+
+    def last_state_s(self, before_s: float) -> float:
+        """When the probe saw the newest state before ``before_s``."""
+        return max(s for s in list(self.timeline.states.values()) if s < before_s)
+
+    def last_answered_s(self, before_s: float) -> float:
+        """When the probe saw the newest state that a drive command had answered by then."""
+        states, commands = self.timeline.states, self.timeline.commands
+        answered = (c.place for c in commands if c.mode == DRIVE and c.seen_s < before_s)
+        return max(states[place] for place in answered if place in states)
+
+    def own_brake_s(self, since_s: float) -> float:
+        """When the simulated vehicle's brake went on after ``since_s``."""
+        return _await_first(
+            self.brakes, lambda b: b.pressed and b.seen_s > since_s, "the simulator's own brake"
+        ).seen_s
+
+    def stop_command(self, since_s: float) -> CommandSeen:
+        """The first safe_stop command after ``since_s``."""
+        return _await_first(
+            lambda: self.timeline.commands,
+            lambda c: c.seen_s > since_s and c.mode == SAFE_STOP,
+            "a safe_stop command",
+        )
+
+    def logged_stop(self, since_s: float) -> ModeSeen:
+        """When the edge runtime went into safe stop by its log, and why."""
+        return _await_first(
+            lambda: self.timeline.modes,
+            lambda m: m.seen_s > since_s and m.mode == SAFE_STOP,
+            "safe_stop in the log",
+        )
+
+    def recovered_after_s(self, ended_s: float) -> float:
+        """From the fault's end to the arrival of the first drive command after it."""
+        # By its sending: what a link held up was driven before.
+        command = _await_first(
+            lambda: self.timeline.commands,
+            lambda c: c.sent_s > ended_s and c.mode == DRIVE,
+            "a drive command",
+        )
+        return command.seen_s - ended_s
+
+    def must_stop_first(self, since_s: float) -> list[str]:
+        """Wrong where the first command after a silence is a drive."""
+        modes = (c.mode for c in self.timeline.commands if c.sent_s > since_s)
+        return ["drove on without a safe stop"] if next(modes, "") == DRIVE else []
+
+    def longest_gap(self, begin_s: float, end_s: float) -> float:
+        """The longest time without a command at the probe, s."""
+        return longest_gap_s((c.seen_s for c in list(self.timeline.commands)), begin_s, end_s)
+
+    def edge_counts(self) -> Counter[str]:
+        """The edge's rejections by reason, by a health message sent after all sent so far."""
+        time.sleep(_HEALTH_S)
+        seen = len(self.probe.health)
+        wait_until(lambda: len(self.probe.health) > seen, "a health message")
+        return Counter(self.probe.health[-1].rejected)
+
+    def simulator_counts(self) -> Counter[str]:
+        """The simulator's rejections by reason, from the report that it wrote at its end."""
+        report = json.loads((self.directory / "report.json").read_text())
+        return Counter(report["rejected_by_simulator"])
+
     def __enter__(self) -> Self:
         return self
 
@@ -205,7 +286,7 @@ class Rig:
         recent = [c for c in self.timeline.commands[-10:] if now_s - c.seen_s < _SETTLED_S]
         steady = len(recent) >= _SETTLED_COMMANDS and {c.mode for c in recent} == {"drive"}
         brakes = self.brakes()
-        fresh = now_s - last_drive_s(self.timeline) < _SETTLED_S
+        fresh = now_s - self.last_drive_s() < _SETTLED_S
         return steady and fresh and not (brakes and brakes[-1].pressed)
 
     def _start(self, name: str, *arguments: str) -> Process:
@@ -218,6 +299,12 @@ class Rig:
         if found := _MODE.search(line):
             mode, reason = found.group(1), found.group(2) or ""
             self.timeline.modes.append(ModeSeen(seen_s, mode, reason))
+
+
+def _await_first(events: Callable[[], list[E]], wanted: Callable[[E], bool], what: str) -> E:
+    """The first event of that kind, as soon as it is there; TimeoutError."""
+    found = wait_until(lambda: [event for event in events() if wanted(event)][:1], what)
+    return cast(E, found[0])
 
 
 class Sender:

@@ -20,7 +20,7 @@ from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE
 from hil_tests.faults import ends, hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.row import ROWS, Row, Try
+from hil_tests.faults.row import ROWS, Row, Try, at_any_phase
 from hil_tests.processes import POLICY, PUBLIC_KEY, in_parallel, trusting
 
 SLOW_S = 2.5 * CONTROL_PERIOD_S
@@ -162,6 +162,7 @@ def _try(row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
     """Whether the rig can be used again."""
     try:
         rig.wait_until_driving()
+        at_any_phase(number)
         begin_s = time.monotonic()
         done = row.run(rig, number)
     except TimeoutError as error:
