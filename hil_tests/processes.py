@@ -53,7 +53,6 @@ class Process:
         environment: variables beside ours.
         told: it reads its standard input, and `tell` writes there.
         on_line: called with the time and text of each line, in a thread.
-        prefix: words of a program that runs it, as in ``nsenter --net``.
     """
 
     def __init__(
@@ -62,13 +61,12 @@ class Process:
         environment: Mapping[str, str] | None = None,
         told: bool = False,
         on_line: Callable[[float, str], None] = lambda seen_s, line: None,
-        prefix: Sequence[str] = (),
     ) -> None:
         self.lines: list[tuple[float, str]] = []
         self._ended_by_us = False
         self._on_line = on_line
         self._process = subprocess.Popen(
-            [*prefix, sys.executable, "-m", *arguments],
+            [sys.executable, "-m", *arguments],
             stdin=subprocess.PIPE if told else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -164,24 +162,17 @@ class BackgroundCommand(Process):
     Args:
         arguments: the module and its arguments.
         ready: text of its output that says it has started; None: no wait.
-        prefix: words of a program that runs it.
         quiet: do not print the command.
 
     Raises:
         UserError: it ended, or said nothing for too long, before it was ready.
     """
 
-    def __init__(
-        self,
-        *arguments: str,
-        ready: str | None = None,
-        prefix: Sequence[str] = (),
-        quiet: bool = False,
-    ) -> None:
+    def __init__(self, *arguments: str, ready: str | None = None, quiet: bool = False) -> None:
         if not quiet:
             print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
         self.name = " ".join(arguments[:2])
-        super().__init__(*arguments, prefix=prefix)
+        super().__init__(*arguments)
         if ready is None:
             return
         try:
@@ -208,12 +199,9 @@ class BackgroundCommand(Process):
             raise self._failure()
         return status
 
-    def said(self) -> str:
-        """All of its output so far."""
-        return "\n".join(line for _, line in self.lines)
-
     def _failure(self) -> UserError:
-        last = (self.said().strip().splitlines() or ["it said nothing"])[-1]
+        said = [line for _, line in self.lines if line.strip()]
+        last = said[-1].strip() if said else "it said nothing"
         return UserError(f"python -m {self.name}: {last}")
 
 
