@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
 from hil_tests.faults.run import choose_rows, run_faults
@@ -59,21 +59,12 @@ EXAMPLE = examples(
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    add_sweep_arguments(parser, 100, "episodes of each latency row, the same seeds", 0.98)
-    parser.add_argument("--only", choices=PARTS, help="one part (default: both)")
+    add_sweep_arguments(parser, PARTS, 100, "episodes of each row, the same seeds", 0.98)
     parser.add_argument(
         "--rows",
         metavar="NAME,...",
         help=f"only these latency axes ({', '.join(axis.name for axis in NETWORK_AXES)}) and "
         "faults, by name or pattern (hunter_*)",
-    )
-    parser.add_argument(
-        "--jobs",
-        type=not_negative,
-        default=0,
-        metavar="N",
-        help="vehicles at once, each with an edge runtime and an endpoint of its own; "
-        "0: one a core; changes no result in virtual time",
     )
     parser.add_argument(
         "--against",

@@ -331,7 +331,9 @@ def _read_kept(path: Path) -> dict[str, Any]:
     return result
 
 
-def add_sweep_arguments(parser: ArgumentParser, runs: int, runs_help: str, target: float) -> None:
+def add_sweep_arguments(
+    parser: ArgumentParser, parts: Sequence[str], runs: int, runs_help: str, target: float
+) -> None:
     """The options that both campaigns have."""
     parser.add_argument(
         "--out",
@@ -339,17 +341,24 @@ def add_sweep_arguments(parser: ArgumentParser, runs: int, runs_help: str, targe
         metavar="R.json",
         help="the report; R.md, pictures and R_rows/ (what is done already) go beside it",
     )
-    parser.add_argument(
-        "--policy",
-        metavar="P.onnx",
-        help="policy file (default: results/policies/SCENARIO.onnx)",
-    )
+    default = "policy file (default: results/policies/SCENARIO.onnx)"
+    parser.add_argument("--policy", metavar="P.onnx", help=default)
     add_public_key(parser)
     add_scenario(parser)
     parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
-    parser.add_argument("--runs", type=_several, default=runs, help=runs_help)
-    parser.add_argument("--seed", type=not_negative, default=0, help="of the first episode")
-    parser.add_argument("--target", type=share, default=target, help="success that is asked for")
+    parser.add_argument("--only", choices=parts, help="one part (default: both)")
+    for name, kind, value, text in (
+        ("--runs", _several, runs, runs_help),
+        ("--seed", not_negative, 0, "of the first episode"),
+        ("--target", share, target, "success that is asked for"),
+        (
+            "--jobs",
+            not_negative,
+            0,
+            "drives or faults side by side, changes no result; 0: one a core",
+        ),
+    ):
+        parser.add_argument(name, type=kind, default=value, help=text)
 
 
 def _several(text: str) -> int:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.report import GOAL
-from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests.faults.rig import free_bus
@@ -75,22 +75,9 @@ EXAMPLE = examples(
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    add_sweep_arguments(parser, 50, "episodes of each loop and of each lag", 0.95)
-    parser.add_argument("--only", choices=PARTS, help="one part (default: both)")
-    parser.add_argument(
-        "--rigs",
-        type=positive,
-        default=4,
-        metavar="N",
-        help="simulators in real time side by side, each with a vehicle of its own",
-    )
-    parser.add_argument(
-        "--jobs",
-        type=not_negative,
-        default=0,
-        metavar="N",
-        help="processes of the sweep, which is in virtual time; 0: one a core",
-    )
+    add_sweep_arguments(parser, PARTS, 50, "episodes of each loop and of each lag", 0.95)
+    rigs = "simulators in real time side by side, each with a vehicle of its own"
+    parser.add_argument("--rigs", type=positive, default=4, metavar="N", help=rigs)
     parser.add_argument(
         "--set",
         action="append",
