@@ -355,7 +355,7 @@ def add_sweep_arguments(
             "--jobs",
             not_negative,
             0,
-            "drives or faults side by side, changes no result; 0: one a core",
+            "drives or faults side by side; 0: one a core",
         ),
     ):
         parser.add_argument(name, type=kind, default=value, help=text)
