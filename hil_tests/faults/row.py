@@ -110,15 +110,10 @@ def drove_on(
     counted: Counter[str] | None = None,
     **more: Any,
 ) -> Try:
-    """The try of a row in which nothing is to happen, but perhaps counting; ``more`` of its fields.
+    """The try of a row in which nothing was to happen between two moments, but perhaps counting.
 
-    Args:
-        rig: where it was tried.
-        begin_s: from here on it had to drive,
-        end_s: up to here.
-        wanted: how many messages had to be rejected, by reason.
-        counted: how many were.
-        more: further fields of the `Try`.
+    ``wanted`` messages had to be rejected, by reason, and ``counted`` ones were; ``more`` are
+    further fields of the `Try`.
     """
     wanted, counted = wanted or Counter(), counted or Counter()
     wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]

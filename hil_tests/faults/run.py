@@ -133,12 +133,7 @@ def choose_rows(names: Sequence[str] | None) -> list[Row]:
 def run_row(row: Row, trust: Sequence[str], work: Path, tries: int, on_try: OnTry) -> Outcome:
     """All tries of a row; a rig in which a try came to no end is replaced.
 
-    Args:
-        row: which.
-        trust: the edge runtime's options for its policy.
-        work: where its rigs may have their directories.
-        tries: how many count.
-        on_try: called after each.
+    ``trust`` are the options of its edge runtimes; rigs have their directories in ``work``.
     """
     outcome, number = Outcome(), 0
     while number < tries:
