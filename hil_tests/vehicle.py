@@ -228,15 +228,14 @@ def join_vehicles(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     The largest stands for ``max`` and ``p99``.
     """
-    samples = [part["samples"] for part in parts]
     ages = [part["feedback_age_ms"] for part in parts]
     return {
         "name": parts[0]["name"],
         "scale": parts[0]["scale"],
-        "samples": sum(samples),
-        "speed_error_mps": _pool(samples, [part["speed_error_mps"] for part in parts]),
+        "samples": sum(part["samples"] for part in parts),
+        "speed_error_mps": _pool([(part["samples"], part["speed_error_mps"]) for part in parts]),
         "action_error": {
-            name: _pool(samples, [part["action_error"][name] for part in parts])
+            name: _pool([(part["samples"], part["action_error"][name]) for part in parts])
             for name in parts[0]["action_error"]
         },
         "lag_ms": {
@@ -252,17 +251,13 @@ def join_vehicles(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _pool(samples: Sequence[int], errors: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    told = [
-        (n, error) for n, error in zip(samples, errors, strict=True) if error["rmse"] is not None
-    ]
+def _pool(errors: Sequence[tuple[int, Mapping[str, float]]]) -> dict[str, float | None]:
+    told = [(samples, error) for samples, error in errors if error["rmse"] is not None]
     if not told:
         return {"rmse": None, "max": None}
-    squares = sum(n * error["rmse"] ** 2 for n, error in told)
-    return {
-        "rmse": (squares / sum(n for n, _ in told)) ** 0.5,
-        "max": max(error["max"] for _, error in told),
-    }
+    squares = sum(samples * error["rmse"] ** 2 for samples, error in told)
+    rmse = (squares / sum(samples for samples, _ in told)) ** 0.5
+    return {"rmse": rmse, "max": max(error["max"] for _, error in told)}
 
 
 def _of_told(join: Callable[[list[float]], float], values: Sequence[float | None]) -> float | None:
