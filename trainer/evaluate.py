@@ -285,10 +285,12 @@ def drive_episodes_in_parallel(
     results: list[EpisodeResult] = []
     try:
         with interrupts_blocked():
-            found = pool.map(drive, seeds)
-        for result in found:
-            results.append(result)
-            on_episode(result)
+            # Not `pool.map`: it cancels what is left where a worker has died, and the pool's own
+            # thread breaks over that and leaves the other workers behind (Python 3.11).
+            futures = [pool.submit(drive, seed) for seed in seeds]
+        for future in futures:
+            results.append(future.result())
+            on_episode(results[-1])
     except BrokenProcessPool as error:
         raise UserError(
             f"a worker process died after {len(results)} of {len(seeds)} episodes; "
