@@ -8,7 +8,7 @@ rest is for ``bridge simulate``. Pure: numbers in, a dict or a line of text out 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -156,40 +156,34 @@ def make_report(
     safe_stop_events: Sequence[SafeStopEvent],
     latencies_ms: Sequence[float],
     command_ages_ms: Sequence[float],
-    counts: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    vehicle: Mapping[str, Any] | None = None,
+    facts: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Join the summary of the episodes with what happened on the wire.
 
-    ``settings`` holds scenario, condition, policy_ids, seed, clock, loop, standing, latency_spec
-    and wall_s; ``vehicle`` is the part of a vehicle in the loop;
-    ``counts`` holds deadline_misses, tick_overruns, missed_ticks, edge_changes,
-    wall_clock_stalls and ``rejections``. The report's policy_id is that of the policy that
-    answered last.
+    ``facts`` are rows of the report as they are: what was asked for, counts, ``policy_ids`` and
+    ``wall_s``. The report's policy_id is that of the policy that answered last.
     """
+    policy_id = next(reversed(facts["policy_ids"]), "")
+    summary = summarise(results, facts["scenario"], facts["condition"], policy_id, facts["seed"])
     return {
-        **summarise(
-            results,
-            scenario=settings["scenario"],
-            condition=settings["condition"],
-            policy_id=settings["policy_ids"][-1] if settings["policy_ids"] else "",
-            seed=settings["seed"],
-        ),
-        "policy_ids": list(settings["policy_ids"]),
+        **summary,
         "latency_ms": quantiles(latencies_ms),
         "answered_states": len(latencies_ms),
         "command_age_ms": quantiles(command_ages_ms),
-        **counts,
+        "vehicle": None,
+        **facts,
         "safe_stops": len(safe_stop_events),
-        **{name: settings[name] for name in ("clock", "loop", "standing")},
-        "latency_spec": settings["latency_spec"],
-        "wall_s": settings["wall_s"],
-        "vehicle": vehicle,
-        "times_real_time": sum(result.time_s for result in results) / settings["wall_s"],
+        "times_real_time": sum(result.time_s for result in results) / facts["wall_s"],
         "safe_stop_events": [asdict(event) for event in safe_stop_events],
-        "per_episode": [result.as_dict() for result in results],
+        "per_episode": [asdict(result) for result in results],
     }
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table in Markdown, without a newline at its end; a ``|`` in a cell becomes a ``/``."""
+    cells = [header, ["---"] * len(header), *rows]
+    lines = (" | ".join(str(cell).replace("|", "/") for cell in row) for row in cells)
+    return "\n".join(f"| {line} |" for line in lines)
 
 
 def summary_line(report: Mapping[str, Any]) -> str:

@@ -18,15 +18,14 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from bridge.commands import add_connect, add_span, add_tls, add_vehicle_id
+from bridge.commands import add_options
 from bridge.messages import Heard
-from bridge.ports import Feed, open_feed
+from bridge.ports import open_listener
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, number, sigterm_as_interrupt
 from edge_runtime.commands import ask
-from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.transport import check_endpoint
+from edge_runtime.files import write_json_out
+from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import CARS, ScenarioCar, Similarity
 from edge_runtime.vehicles.ros2 import node as ros
@@ -45,7 +44,6 @@ from edge_runtime.wire import (
     Feedback,
     Rejection,
     State,
-    check_vehicle_id,
 )
 
 MAX_RATE_HZ = 20.0
@@ -87,9 +85,8 @@ EXAMPLE = (
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    add_connect(parser)
-    add_tls(parser)
-    add_vehicle_id(parser, "the vehicle to show")
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    add_options(parser, "--vehicle-id", help="the vehicle to show")
     side = parser.add_mutually_exclusive_group()
     side.add_argument(
         "--ros2-listen",
@@ -111,64 +108,45 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=MAX_RATE_HZ,
         help="most messages a second on each topic; more are left out",
     )
-    add_span(parser)
-    parser.add_argument("--out", metavar="R.json", help="write the counts to this file at the end")
+    add_options(parser, "--out", help="write the counts to this file at the end")
 
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    check_vehicle_id(arguments.vehicle_id)
-    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+    connect, vehicle_id = arguments.connect, arguments.vehicle_id
+    tls = tls_for(arguments.tls, connect)
     for endpoint in (arguments.ros2_listen, arguments.ros2_connect):
         check_ros2_endpoint(endpoint)
-    namespace = arguments.namespace
-    if namespace is None:
-        namespace = namespace_of(arguments.vehicle_id)
+    namespace = arguments.namespace or namespace_of(vehicle_id)
     check_ros_name(namespace, "namespace")
-    if arguments.out is not None:
-        check_writable(arguments.out)
-    report = _run(arguments, namespace, tls)
-    write_json_out(arguments.out, report)
-    print(_summary(report))
-    return 0
-
-
-def _run(arguments: Any, namespace: str, tls: TlsFiles | None) -> dict[str, Any]:
-    status = functools.partial(ask, arguments.connect, arguments.vehicle_id, "status", tls)
+    session = open_ros2_session(arguments.ros2_listen, arguments.ros2_connect)
     with (
+        contextlib.closing(session),
         sigterm_as_interrupt(),
-        contextlib.closing(
-            open_ros2_session(arguments.ros2_listen, arguments.ros2_connect)
-        ) as session,
-        open_feed(arguments.connect, arguments.vehicle_id, arguments.wait_s, tls) as feed,
+        open_listener(connect, vehicle_id, arguments.wait_s, tls) as listener,
         open_node(session, namespace) as node,
     ):
+        status = functools.partial(ask, connect, vehicle_id, "status", tls)
         outlet = Outlet(node, Policies(status), arguments.max_rate_hz)
-        print(f"ready vehicle_id={arguments.vehicle_id} namespace={namespace}", flush=True)
+        print(f"ready vehicle_id={vehicle_id} namespace={namespace}", flush=True)
         # Being interrupted is the ordinary way to end.
         with contextlib.suppress(KeyboardInterrupt):
-            for heard in feed.until_gone(arguments.duration_s):
+            for heard in listener.until_gone(arguments.duration_s):
                 outlet.take(heard)
-        return _report(feed, node, outlet)
-
-
-def _report(feed: Feed, node: Ros2Node, outlet: Outlet) -> dict[str, Any]:
-    return {
-        "sent": node.sent,
-        "rejected": dict(outlet.rejected),
-        "skipped": outlet.skipped,
-        "dropped": feed.dropped,
-    }
-
-
-def _summary(report: dict[str, Any]) -> str:
-    parts = [f"{topic} {count}" for topic, count in report["sent"].items()]
-    text = f"sent: {', '.join(parts)}"
-    for what in ("rejected", "skipped"):
-        if report[what]:
-            counts = ", ".join(f"{name} {count}" for name, count in report[what].items())
-            text += f"; {what}: {counts}"
-    return text
+        counts = {
+            "sent": node.sent,
+            "rejected": dict(outlet.rejected),
+            "skipped": outlet.skipped,
+        }
+        report = {**counts, "dropped": listener.dropped}
+    write_json_out(arguments.out, report)
+    parts = (
+        f"{what}: " + ", ".join(f"{name} {count}" for name, count in found.items())
+        for what, found in counts.items()
+        if found or what == "sent"
+    )
+    print("; ".join(parts))
+    return 0
 
 
 class Outlet:

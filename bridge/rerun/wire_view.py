@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.commands import add_connect, add_span, add_tls, wait_to_be_told
+from bridge.commands import add_options, wait_to_be_told
 from bridge.messages import MESSAGES, Heard, Scene
-from bridge.ports import open_feed
+from bridge.ports import open_listener
 from bridge.recording import Recording, read_heard
 from bridge.rerun import APPLIED, POLICY
 from bridge.rerun.draw import (
@@ -43,7 +43,6 @@ from bridge.virtual_link import SILENCE_LIMIT_S
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import CONTROL_PERIOD_S, DEFAULT_VEHICLE_ID, Command, Feedback, Health, State
 
 APPLICATION = "phil_hil"
@@ -63,26 +62,19 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="show what bridge record has written, instead of listening",
     )
     add_sink(parser)
-    add_connect(parser)
-    add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        help=f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)",
-    )
-    add_span(parser)
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    told = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    add_options(parser, "--vehicle-id", default=None, help=told)
 
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    if arguments.vehicle_id is not None:
-        wire.check_vehicle_id(arguments.vehicle_id)
     sink = chosen_sink(arguments)
     if arguments.recording is not None:
         check_sink(sink)
         _show_recording(arguments, sink)
     else:
-        tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+        tls = tls_for(arguments.tls, arguments.connect)
         check_sink(sink)
         dropped = _watch(arguments, sink, tls)
         if dropped:
@@ -119,15 +111,15 @@ def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
     vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
     with (
         sigterm_as_interrupt(),
-        open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,
+        open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
         open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         contextlib.suppress(KeyboardInterrupt),
     ):
         log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
-        for heard in feed.until_gone(arguments.duration_s):
+        for heard in listener.until_gone(arguments.duration_s):
             _write(log, heard)
-    return feed.dropped
+    return listener.dropped
 
 
 def _write(log: WireLog, heard: Heard) -> None:

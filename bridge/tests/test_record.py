@@ -18,11 +18,10 @@ import zenoh
 from mcap.reader import NonSeekingReader, make_reader
 
 from bridge.messages import WIRE_TOPICS, Heard, Stamps, encode_scene
-from bridge.ports import QUEUE_MESSAGES, Feed
+from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.record import RecordingWriter, _listen
-from bridge.recorded import RecordedDrive
 from bridge.recording import Recording
-from bridge.replay import replay_in_process
+from bridge.replay import RecordedDrive, replay_in_process
 from bridge.tests.harness import (
     SLOW_TOY,
     BridgeProcess,
@@ -258,7 +257,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
 
 
 def test_a_feed_that_falls_behind_drops_and_counts():
-    feed, endpoint = Feed(), free_endpoint()
+    feed, endpoint = WireListener(), free_endpoint()
     session = open_session(listen=endpoint, mode="router")
     try:
         subscriber = session.declare_subscriber("phil/v/state", feed.hearer("state"))
@@ -271,7 +270,7 @@ def test_a_feed_that_falls_behind_drops_and_counts():
     assert feed.waiting == QUEUE_MESSAGES
 
 
-class WithoutSimulator(Feed):
+class WithoutSimulator(WireListener):
     """An edge runtime behind a router, whose simulator has gone: it goes on saying how it is."""
 
     def __init__(self) -> None:

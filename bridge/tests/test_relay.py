@@ -49,9 +49,9 @@ def test_every_topic_is_held_back_and_nothing_is_changed():
     state, command = encode(make_state(0)), encode(make_command(0))
     with Rig("up.delay=30ms,down.delay=60ms") as rig:
         began_s = time.monotonic()
-        rig.traffic.handler("command")(command)
-        rig.traffic.handler("health")(b"anything")
-        rig.traffic.handler("state")(state)
+        rig.traffic.take("command", command)
+        rig.traffic.take("health", b"anything")
+        rig.traffic.take("state", state)
         wait_until(lambda: len(rig.came) == 3, "all messages")
     assert [(name, payload) for name, payload, _ in rig.came] == [
         ("state", state), ("command", command), ("health", b"anything"),
@@ -62,8 +62,8 @@ def test_every_topic_is_held_back_and_nothing_is_changed():
 
 def test_the_final_state_passes_a_dead_link_and_what_was_before_it_is_forgotten():
     with Rig("up.delay=50ms") as rig:
-        rig.traffic.handler("state")(encode(make_state(0)))
-        rig.traffic.handler("state")(final := encode(make_state(1, final=True)))
+        rig.traffic.take("state", encode(make_state(0)))
+        rig.traffic.take("state", final := encode(make_state(1, final=True)))
         time.sleep(0.1)
     assert [payload for _, payload, _ in rig.came] == [final]
 
@@ -72,11 +72,11 @@ def test_outages_begin_to_count_with_the_first_state():
     with Rig("outage=10s@0.05s") as rig:
         for number in range(2):  # Before the first state time stands at 0.
             time.sleep(0.06)
-            rig.traffic.handler("health")(b"%d" % number)
-        rig.traffic.handler("state")(encode(make_state(0)))
+            rig.traffic.take("health", b"%d" % number)
+        rig.traffic.take("state", encode(make_state(0)))
         time.sleep(0.06)
-        rig.traffic.handler("state")(encode(make_state(1)))
-        rig.traffic.handler("health")(b"2")
+        rig.traffic.take("state", encode(make_state(1)))
+        rig.traffic.take("health", b"2")
         wait_until(lambda: len(rig.came) == 3, "what was sent before the outage")
     topics = rig.traffic.report()["topics"]
     assert (topics["state"]["delivered"], topics["state"]["lost"]) == (1, 1)

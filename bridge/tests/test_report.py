@@ -36,11 +36,9 @@ def report_of(outcomes, stops=(), rejected=None):
         [SafeStopEvent(0, 3, reason, 0.2) for reason in stops],
         latencies_ms=[1.0],
         command_ages_ms=[1.0],
-        counts={"deadline_misses": 38, "rejected": rejected or {}},
-        settings={
+        facts={
             "scenario": "toy", "condition": "nominal", "policy_ids": ["p"], "seed": 0,
-            "clock": "realtime", "loop": "policy", "standing": False, "latency_spec": "none",
-            "wall_s": 1.0,
+            "deadline_misses": 38, "rejected": rejected or {}, "wall_s": 1.0,
         },
     )  # fmt: skip
 

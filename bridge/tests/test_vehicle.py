@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 
+from bridge.clocks import VehicleClock
 from bridge.inbound import NO_FEEDBACK, CommandCheck, FeedbackCheck
 from bridge.network import parse_spec
 from bridge.ports import connect_client
@@ -24,7 +25,6 @@ from bridge.tests.harness import (
     start_simulate,
 )
 from bridge.tracking import LAG_STEP_S, TrackingLog
-from bridge.vehicle import VehicleClock
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
 from edge_runtime.util import UserError
@@ -253,7 +253,7 @@ def test_without_any_vehicle_it_says_what_to_do():
 
 
 def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
-    monkeypatch.setattr("bridge.vehicle.STANDSTILL_WAIT_S", 0.3)
+    monkeypatch.setattr("bridge.clocks.STANDSTILL_WAIT_S", 0.3)
     with rig_of() as rig:
         rig.clock.begin(0, seed=0)
         rig.report(-1, speed_mps=1.0, session="", episode=-1)
