@@ -35,7 +35,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, ti
 from mcap.writer import CompressionType, Writer
 
 from bridge.commands import add_options
-from bridge.messages import MESSAGES, TOKEN_TOPICS, Heard
+from bridge.messages import DECODERS, TOKEN_TOPICS, Heard
 from bridge.ports import ANY_VEHICLE, POLL_S, QUEUE_MESSAGES, WireListener, open_listener
 from bridge.recording import METADATA, WIRE_ENCODING, Recording
 from edge_runtime import __version__, wire
@@ -193,7 +193,7 @@ class RecordingWriter:
         self._file.close()
 
     def _view(self, heard: Heard) -> None:
-        message = MESSAGES[heard.topic].decode(heard.payload)
+        message = DECODERS[heard.topic](heard.payload)
         if message is None or isinstance(message, wire.Rejection):
             why = message.detail if message else "not a scene"
             self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {why}")

@@ -19,9 +19,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from bridge.commands import add_options
-from bridge.messages import Heard
+from bridge.messages import DECODERS, Heard, Pace
 from bridge.ports import open_listener
-from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, number, sigterm_as_interrupt
 from edge_runtime.commands import ask
 from edge_runtime.files import write_json_out
@@ -48,8 +47,6 @@ from edge_runtime.wire import (
 
 MAX_RATE_HZ = 20.0
 RETRY_S = 2.0
-BURST = 2.0
-"""So that jitter of a stream at just this rate costs no message."""
 LONGEST_GAP_S = 0.5
 """After a longer silence nobody knows how fast it was meanwhile: only so much is made up."""
 ERROR_PER_METRE = 0.1
@@ -158,7 +155,12 @@ class Outlet:
     def __init__(self, node: Ros2Node, policies: Policies, max_rate_hz: float) -> None:
         self.rejected: Counter[str] = Counter()
         self._policies = policies
-        self._bounds = {topic: RateBound(max_rate_hz) for topic in ("state", "command", "feedback")}
+        self._show: dict[str, Callable[[Any, bool], None]] = {
+            "state": self._show_state,
+            "command": self._show_command,
+            "feedback": self._show_feedback,
+        }
+        self._paces = {topic: Pace(1.0 / max_rate_hz) for topic in self._show}
         self._image = node.publisher(IMAGE, ros.Image)
         self._odometry = node.publisher(ODOMETRY, ros.Odometry)
         self._drive = node.publisher(DRIVE, ros.AckermannDriveStamped)
@@ -169,27 +171,26 @@ class Outlet:
     @property
     def skipped(self) -> dict[str, int]:
         """Return how many messages of each topic came faster than the bound."""
-        return {topic: bound.skipped for topic, bound in self._bounds.items() if bound.skipped}
+        return {topic: pace.skipped for topic, pace in self._paces.items() if pace.skipped}
 
     def take(self, heard: Heard) -> None:
         """Show one message; topics that ROS 2 has no standard message for are left out."""
-        row = _ROWS.get(heard.topic)
-        if row is None:
+        if heard.topic not in self._show:
             return
-        decode, show = row
-        message = decode(heard.payload)
+        message = DECODERS[heard.topic](heard.payload)
         if isinstance(message, Rejection):
             self.rejected[f"{heard.topic}_{message.reason.value}"] += 1
         else:
-            show(self, message, self._bounds[heard.topic].lets(heard.arrived_ns * 1e-9))
+            may_publish = self._paces[heard.topic].due(heard.arrived_ns * 1e-9)
+            self._show[heard.topic](message, may_publish)
 
-    def show_state(self, state: State, may_publish: bool) -> None:
+    def _show_state(self, state: State, may_publish: bool) -> None:
         """Publish the newest frame; the speed is kept, whatever the rate."""
         self._speed_mps = state.speed_mps
         if may_publish:
             self._image(image_of(state))
 
-    def show_command(self, command: Command, may_publish: bool) -> None:
+    def _show_command(self, command: Command, may_publish: bool) -> None:
         """Publish the command in both forms, once its policy is known."""
         if not may_publish:
             return
@@ -201,9 +202,11 @@ class Outlet:
         self._drive(drive)
         self._twist(twist_of(drive.drive, policy.car))
 
-    def show_feedback(self, feedback: Feedback, may_publish: bool) -> None:
+    def _show_feedback(self, feedback: Feedback, may_publish: bool) -> None:
         """Go on with the dead reckoning at every message, and publish it at the bounded rate."""
-        self._scale = _scale_of(feedback, self._scale)
+        # The vehicle's metres for one of the scenario, where it moves and reports both speeds.
+        if feedback.scenario_speed_mps and feedback.speed_mps:
+            self._scale = abs(feedback.speed_mps / feedback.scenario_speed_mps)
         policy = self._policies.newest
         curvature = policy and feedback_curvature(feedback, policy, self._scale)
         self._pose.advance(feedback.speed_mps, curvature or 0.0, feedback.sent_ns)
@@ -211,47 +214,11 @@ class Outlet:
             self._odometry(odometry_of(feedback, self._pose, curvature))
 
 
-def _scale_of(feedback: Feedback, last: float) -> float:
-    """Metres of the vehicle for one of the scenario, where it moves and reports both speeds."""
-    if not feedback.scenario_speed_mps or not feedback.speed_mps:
-        return last
-    return abs(feedback.speed_mps / feedback.scenario_speed_mps)
-
-
-_ROWS: dict[str, tuple[Callable[[bytes], Any], Callable[[Outlet, Any, bool], None]]] = {
-    "state": (wire.decode_state, Outlet.show_state),
-    "command": (wire.decode_command, Outlet.show_command),
-    "feedback": (wire.decode_feedback, Outlet.show_feedback),
-}
-
-
-class RateBound:
-    """Lets ``rate_hz`` messages a second through on average, and two at once at most."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self.skipped = 0
-        self._rate_hz = rate_hz
-        self._tokens = BURST
-        self._filled_s: float | None = None
-
-    def lets(self, now_s: float) -> bool:
-        """Return whether a message may pass now; one that may not is counted."""
-        elapsed_s = 0.0 if self._filled_s is None else max(0.0, now_s - self._filled_s)
-        self._filled_s = now_s
-        self._tokens = min(BURST, self._tokens + elapsed_s * self._rate_hz)
-        if self._tokens < 1.0:
-            self.skipped += 1
-            return False
-        self._tokens -= 1.0
-        return True
-
-
 class Policies:
     """Which policy gives the commands: asked of the edge runtime, for the wire has numbers only.
 
-    ``ask`` returns the edge's status, UserError if none answers.
-
-    ``newest`` is what the last call of ``find`` returned.
+    ``ask`` returns the edge's status, UserError if none answers. ``newest`` is what the last call
+    of ``find`` returned.
     """
 
     def __init__(self, ask: Ask, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -267,18 +234,14 @@ class Policies:
         """
         if policy_id not in self._known and self._clock_s() >= self._ask_again_s:
             self._ask_again_s = self._clock_s() + RETRY_S
-            self._learn()
+            with contextlib.suppress(UserError):  # the edge has just gone: asked again later
+                self._learn(self._ask())
         self.newest = self._known.get(policy_id)
         return self.newest
 
-    def _learn(self) -> None:
-        try:
-            status = self._ask()
-        except UserError:
-            return  # The edge has just gone; its next command asks again.
+    def _learn(self, status: dict[str, Any]) -> None:
         manifest = status["manifest"]
-        scenario = manifest["scenario"]
-        car = CARS.get(scenario)
+        scenario, car = manifest["scenario"], CARS.get(manifest["scenario"])
         if car is None:
             known = ", ".join(sorted(CARS))
             print(
@@ -322,7 +285,8 @@ def drive_of(command: Command, speed_mps: float, policy: Policy) -> ros.Ackerman
     control period, ``acceleration`` its magnitude; a policy without a pedal asks for no change.
     ``steering_angle`` is that of the wheel whose path has the asked curvature at this wheelbase.
     """
-    acceleration = _acceleration(policy.action(command.action, "pedal") or 0.0, policy.car)
+    pedal = policy.action(command.action, "pedal") or 0.0
+    acceleration = pedal * (policy.car.throttle_mps2 if pedal > 0.0 else policy.car.brake_mps2)
     target_mps = speed_mps + acceleration * CONTROL_PERIOD_S
     curvature = _curvature(policy, command.action, 1.0)
     return ros.AckermannDriveStamped(
@@ -371,10 +335,6 @@ def odometry_of(feedback: Feedback, pose: DeadReckoning, curvature: float | None
             _diagonal(0.0, 0.0, 0.0 if curvature is not None else UNKNOWN),
         ),
     )
-
-
-def _acceleration(pedal: float, car: ScenarioCar) -> float:
-    return pedal * (car.throttle_mps2 if pedal > 0.0 else car.brake_mps2)
 
 
 def _curvature(policy: Policy, values: Sequence[float], scale: float) -> float:

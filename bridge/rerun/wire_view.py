@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bridge.commands import add_options, wait_to_be_told
-from bridge.messages import MESSAGES, Heard, Scene
+from bridge.messages import DECODERS, Heard, Pace, Scene
 from bridge.ports import open_listener
 from bridge.recording import Recording, read_heard
 from bridge.rerun import APPLIED, POLICY
@@ -28,7 +28,6 @@ from bridge.rerun.draw import (
     PICTURE_INTERVAL_S,
     PURPLE,
     RED,
-    Pace,
     Plot,
     draw_cars,
     draw_ground,
@@ -123,10 +122,9 @@ def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
 
 
 def _write(log: WireLog, heard: Heard) -> None:
-    row = MESSAGES.get(heard.topic)
-    if row is None:
+    if heard.topic not in DECODERS:
         return  # A token: it shows as silence.
-    message = row.decode(heard.payload)
+    message = DECODERS[heard.topic](heard.payload)
     if message is None or isinstance(message, wire.Rejection):
         log.write_unreadable(heard.topic, message.detail if message else "not a scene")
     else:

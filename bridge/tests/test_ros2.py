@@ -21,7 +21,6 @@ from bridge.ros2 import (
     Outlet,
     Policies,
     Policy,
-    RateBound,
     drive_of,
     feedback_curvature,
     image_of,
@@ -143,22 +142,6 @@ def test_the_odometry_says_what_it_does_not_know():
     message = odometry_of(steered, pose, curvature)
     assert message.twist.twist.angular.z == pytest.approx(curvature)
     assert message.pose.covariance[35] == pytest.approx(0.05**2)
-
-
-@given(st.lists(st.floats(0, 0.2), min_size=1, max_size=300), st.floats(1, 100))
-def test_no_rate_is_passed(steps, rate_hz):
-    bound, now_s, passed = RateBound(rate_hz), 0.0, 0
-    for step in steps:
-        now_s += step
-        passed += bound.lets(now_s)
-    assert passed <= rate_hz * now_s + 2
-    assert bound.skipped == len(steps) - passed
-
-
-@given(st.lists(st.floats(-0.02, 0.02), min_size=50, max_size=200))
-def test_jitter_at_the_rate_itself_costs_nothing(jitters):
-    bound = RateBound(20.0)
-    assert all(bound.lets(step * 0.05 + jitter) for step, jitter in enumerate(jitters))
 
 
 class FakeNode:
