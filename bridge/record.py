@@ -26,7 +26,7 @@ import sys
 import time
 import typing
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -206,15 +206,8 @@ class RecordingWriter:
         if isinstance(message, wire.State):
             # The frames lie one after the other: in memory that is one picture, twice as high.
             count, height, width = wire.FRAMES_SHAPE
-            picture = RawImage(
-                timestamp=heard.arrived_ns,
-                width=width,
-                height=count * height,
-                encoding="mono8",
-                step=width,
-                data=message.frames,
-                frame_id=_vehicle_id(heard),
-            )
+            size, at = (width, count * height), heard.arrived_ns
+            picture = RawImage(at, *size, "mono8", width, message.frames, _vehicle_id(heard))
             self._copy(heard, "frames", picture)
 
     def _event(self, heard: Heard, level: Level, text: str) -> None:
@@ -288,12 +281,12 @@ class FlushedFile:
 
         Raises OSError (a full disk, for one); the file is then as it was after the last flush.
         """
-        view = memoryview(bytes(self._pending))
+        data = memoryview(bytes(self._pending))
         self._pending.clear()
         written = 0
         try:
-            while written < len(view):
-                written += os.write(self._descriptor, view[written:])
+            while written < len(data):
+                written += os.write(self._descriptor, data[written:])
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._descriptor, self.flushed_bytes)
@@ -472,7 +465,14 @@ def _run_repair(arguments: Any) -> int:
     source = Path(arguments.recording)
     if arguments.out is None:
         check_writable(source)
-    with _held(source):
+    try:
+        stream = open_regular(source)
+    except OSError as error:
+        raise UserError(f"recording {source} cannot be read: {error.strerror}") from None
+    with stream:
+        # What a growing recording still gets would go into the old file.
+        if not try_to_lock_file(stream.fileno()):
+            raise UserError(f"{source} is being written; repair it when its writer has ended")
         recording = Recording(source)
         data, messages = _rewrite(recording)
         found = counted(messages, "message")
@@ -493,19 +493,6 @@ def _run_repair(arguments: Any) -> int:
     left_out = recording.missing() and f"; left out: {recording.missing()}"
     print(f"wrote {arguments.out or source}: {found}{left_out}{kept}")
     return 0
-
-
-@contextlib.contextmanager
-def _held(source: Path) -> Iterator[None]:
-    """Refuse a recording that is still growing: what comes later would go into the old file."""
-    try:
-        stream = open_regular(source)
-    except OSError as error:
-        raise UserError(f"recording {source} cannot be read: {error.strerror}") from None
-    with stream:
-        if not try_to_lock_file(stream.fileno()):
-            raise UserError(f"{source} is being written; repair it when its writer has ended")
-        yield
 
 
 def _write(data: bytes, recording: Recording, out: str | None) -> str:

@@ -6,7 +6,7 @@ import contextlib
 import math
 import sys
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,15 +69,11 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
     sink = chosen_sink(arguments)
+    check_sink(sink)
     if arguments.recording is not None:
-        check_sink(sink)
         _show_recording(arguments, sink)
     else:
-        tls = tls_for(arguments.tls, arguments.connect)
-        check_sink(sink)
-        dropped = _watch(arguments, sink, tls)
-        if dropped:
-            print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
+        _watch(arguments, sink, tls_for(arguments.tls, arguments.connect))
     if sink.path:
         print(f"wrote {sink.path}")
     return 0
@@ -95,7 +91,7 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
     ):
         log = WireLog(recording)
         for each in chain([first] if first else [], heard):
-            _write(log, each)
+            log.write(each)
         if file.trouble():
             text = f"the recording {file.trouble()}; what is whole of it is shown"
             print(text, file=sys.stderr, flush=True)
@@ -105,8 +101,8 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
             wait_to_be_told()
 
 
-def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
-    """Draw until there is a reason to stop; return how many messages had to be dropped."""
+def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> None:
+    """Draw until there is a reason to stop."""
     vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
     with (
         sigterm_as_interrupt(),
@@ -117,18 +113,9 @@ def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
     ):
         log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
         for heard in listener.until_gone(arguments.duration_s):
-            _write(log, heard)
-    return listener.dropped
-
-
-def _write(log: WireLog, heard: Heard) -> None:
-    if heard.topic not in DECODERS:
-        return  # A token: it shows as silence.
-    message = DECODERS[heard.topic](heard.payload)
-    if message is None or isinstance(message, wire.Rejection):
-        log.write_unreadable(heard.topic, message.detail if message else "not a scene")
-    else:
-        getattr(log, f"write_{heard.topic}")(message, heard.arrived_ns)
+            log.write(heard)
+    if listener.dropped:
+        print(f"{listener.dropped} messages came faster than they could be drawn", file=sys.stderr)
 
 
 PLOTS = (
@@ -154,11 +141,7 @@ SERIES = {
 def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
     left = rrb.Vertical(road_view(scene, "Road from above"), frames_view(), row_shares=[3, 1.4])
-    return full_blueprint(left, _numbers(), [3, 2], "sim_time")
-
-
-def _numbers() -> rrb.Vertical:
-    return rrb.Vertical(
+    right = rrb.Vertical(
         rrb.StateTimelineView(
             origin="mode",
             name="Mode, and why it does not drive",
@@ -172,6 +155,7 @@ def _numbers() -> rrb.Vertical:
         ),
         row_shares=[2.2, 2, 2, 2, 1.6, 1.8],
     )
+    return full_blueprint(left, right, [3, 2], "sim_time")
 
 
 SILENT = "no command"
@@ -210,12 +194,29 @@ class WireLog:
         self._reasons: set[tuple[str, str]] = set()
         self._drawn_episode = -1
         self._health: Health | None = None
-        self._define_series()
+        style_lines(recording, SERIES)
+        for side, colour in SIDES.items():
+            self._style_rejections(side, ALL, colour)
+        lanes = rr.StateConfiguration(values=list(EGO), labels=list(EGO), colors=list(EGO.values()))
+        recording.log("mode/mode", lanes, static=True)
+        quiet = rr.StateConfiguration(values=[NOTHING_WRONG], labels=[" "], colors=[GREY])
+        recording.log("mode/reason", quiet, static=True)
+
+    def write(self, heard: Heard) -> None:
+        """Draw one message as it came; a token shows as silence."""
+        if heard.topic not in DECODERS:
+            return
+        message = DECODERS[heard.topic](heard.payload)
+        if message is None or isinstance(message, wire.Rejection):
+            why = message.detail if message else "not a scene"
+            self._event(f"unreadable {heard.topic}: {why}", rr.TextLogLevel.ERROR)
+        else:
+            getattr(self, f"write_{heard.topic}")(message, heard.arrived_ns)
 
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
         self._stand_at(self._timeline.place(state.episode, state.step))
-        self._remember(state)
+        _keep(self._sent_ns, (state.episode, state.step), state.sent_ns)
         if self._frames_pace.due(arrived_ns * 1e-9):
             before, now = state.frames_array()
             self._recording.log("frames/before", rr.Image(before, color_model="L"))
@@ -238,7 +239,7 @@ class WireLog:
         """Draw what is asked, the mode, and where the time went."""
         self._stand_at(self._timeline.place(command.episode, command.step))
         self._heard_command_ns = arrived_ns
-        self._action("action/asked", command.action)
+        self._recording.log("action/asked", rr.Scalars(list(command.action)))
         sent_ns = self._sent_ns.get((command.episode, command.step))
         if sent_ns is not None:
             self._scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
@@ -253,7 +254,7 @@ class WireLog:
 
     def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
         """Draw what the vehicle has reached."""
-        self._action("action/achieved", feedback.action)
+        self._recording.log("action/achieved", rr.Scalars(list(feedback.action)))
         self._scalar("speed/vehicle", feedback.speed_mps)
 
     def write_health(self, health: Health, _arrived_ns: int) -> None:
@@ -280,28 +281,12 @@ class WireLog:
         if self._cars_pace.due(arrived_ns * 1e-9):
             draw_cars(self._recording, scene, EGO[self._told or SILENT])
 
-    def write_unreadable(self, topic: str, why: str) -> None:
-        """Note a message that the viewer cannot read."""
-        self._event(f"unreadable {topic}: {why}", rr.TextLogLevel.ERROR)
-
-    def _define_series(self) -> None:
-        style_lines(self._recording, SERIES)
-        for side, colour in SIDES.items():
-            self._style_rejections(side, ALL, colour)
-        lanes = rr.StateConfiguration(values=list(EGO), labels=list(EGO), colors=list(EGO.values()))
-        self._recording.log("mode/mode", lanes, static=True)
-        quiet = rr.StateConfiguration(values=[NOTHING_WRONG], labels=[" "], colors=[GREY])
-        self._recording.log("mode/reason", quiet, static=True)
-
     def _stand_at(self, moment: Moment) -> None:
         recording = self._recording
         recording.reset_time()
         recording.set_time("sim_time", duration=moment.sim_time_s)
         recording.set_time("step", sequence=moment.total_step)
         recording.set_time(f"episode_{moment.episode}", duration=moment.episode_time_s)
-
-    def _remember(self, state: State) -> None:
-        _keep(self._sent_ns, (state.episode, state.step), state.sent_ns)
 
     def _round_trip(self, scene: Scene) -> None:
         """The newest round trip, and what is left of it for the way down."""
@@ -338,9 +323,6 @@ class WireLog:
         self._recording.log("mode/reason", rr.StateChange(state=reason or NOTHING_WRONG))
         self._event(f"{mode}: {reason}" if reason else mode, level)
         self._write_status()
-
-    def _action(self, path: str, action: Sequence[float]) -> None:
-        self._recording.log(path, rr.Scalars(list(action)))
 
     def _scalar(self, path: str, value: float) -> None:
         self._recording.log(path, rr.Scalars(value))
