@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from bridge.commands import add_options, progress_bar
-from bridge.messages import Heard
+from bridge.messages import DECODERS, Heard
 from bridge.ports import SimulatorPort, open_port
 from bridge.recording import Recording, choose_vehicle, heard_of
 from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
@@ -37,7 +37,6 @@ from edge_runtime.wire import (
     Health,
     State,
     decode_command,
-    decode_health,
     decode_state,
     encode,
 )
@@ -232,14 +231,16 @@ class RecordedDrive:
         if self._zero_ns is None:
             self._zero_ns = heard.arrived_ns
         heard_s = (heard.arrived_ns - self._zero_ns) * 1e-9
-        if heard.topic == "command":
-            command = decode_command(heard.payload)
-            if isinstance(command, Command) and command.reason != RUNTIME_ENDED:
-                self._take_command(command, heard_s)
-        elif heard.topic == "health":
-            health = decode_health(heard.payload)
-            if isinstance(health, Health):
-                self._take_health(health, heard_s)
+        if heard.topic not in ("command", "health"):
+            return
+        message = DECODERS[heard.topic](heard.payload)
+        if isinstance(message, Command) and message.reason != RUNTIME_ENDED:
+            self._take_command(message, heard_s)
+        elif isinstance(message, Health):
+            self.vehicle = message.vehicle
+            start_s = heard_s - message.uptime_s
+            if not self.runtime_starts_s or start_s > self.runtime_starts_s[-1] + RESTART_S:
+                self.runtime_starts_s.append(start_s)
 
     def _take_command(self, command: Command, heard_s: float) -> None:
         if command.policy_id not in self.policy_ids:
@@ -263,12 +264,6 @@ class RecordedDrive:
         if known is None or known[0] != runtime or abs(lead_s - known[1]) > CLOCK_STEP_S:
             self._lead_s = known = (runtime, lead_s)
         return stamp_s + known[1]
-
-    def _take_health(self, health: Health, heard_s: float) -> None:
-        self.vehicle = health.vehicle
-        start_s = heard_s - health.uptime_s
-        if not self.runtime_starts_s or start_s > self.runtime_starts_s[-1] + RESTART_S:
-            self.runtime_starts_s.append(start_s)
 
 
 def note(answers: list[Answer], decision: Command | Order) -> None:
@@ -450,11 +445,18 @@ def compare(
     for key, ours, theirs in zip(answered, each_ours, each_theirs, strict=True):
         same_shape, distance = _distance(ours, theirs)
         largest = max(largest, distance)
-        row = kinds.setdefault(_kind(ours[-1]), {"compared": 0, "different": 0})
+        kind = f"{ours[-1].mode}: {ours[-1].reason}".removesuffix(": ")
+        row = kinds.setdefault(kind, {"compared": 0, "different": 0})
         row["compared"] += 1
         if not same_shape or distance > tolerance:
             row["different"] += 1
-            differences.append(_describe(key, ours, theirs))
+            differences.append(
+                {
+                    **dict(zip(("session", "episode", "step"), key, strict=True)),
+                    "recorded": [answer._asdict() for answer in ours],
+                    "replayed": [answer._asdict() for answer in theirs],
+                }
+            )
     return {
         "states": len(states),
         "compared": len(answered),
@@ -491,18 +493,3 @@ def _distance(ours: Sequence[Answer], theirs: Sequence[Answer]) -> tuple[bool, f
         for a, b in zip(one.action, other.action, strict=False)
     ]
     return same, max(apart, default=0.0)
-
-
-def _kind(answer: Answer) -> str:
-    return f"{answer.mode}: {answer.reason}" if answer.reason else answer.mode
-
-
-def _describe(key: Key, ours: Sequence[Answer], theirs: Sequence[Answer]) -> dict[str, Any]:
-    session, episode, step = key
-    return {
-        "session": session,
-        "episode": episode,
-        "step": step,
-        "recorded": [answer._asdict() for answer in ours],
-        "replayed": [answer._asdict() for answer in theirs],
-    }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections import OrderedDict
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
@@ -18,25 +17,8 @@ from bridge.commands import add_options, wait_to_be_told
 from bridge.messages import DECODERS, Heard, Pace, Scene
 from bridge.ports import open_listener
 from bridge.recording import Recording, read_heard
-from bridge.rerun import APPLIED, POLICY
-from bridge.rerun.draw import (
-    ALL_OF_IT,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PICTURE_INTERVAL_S,
-    PURPLE,
-    RED,
-    Plot,
-    draw_cars,
-    draw_ground,
-    frames_view,
-    full_blueprint,
-    plot_view,
-    road_view,
-    style_lines,
-)
+from bridge.rerun import APPLIED, POLICY, draw
+from bridge.rerun.draw import Plot
 from bridge.rerun.sinks import SERVE, Sink, add_sink, check_sink, chosen_sink, flush, open_sink
 from bridge.virtual_link import SILENCE_LIMIT_S
 from edge_runtime import wire
@@ -111,7 +93,7 @@ def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> None:
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         contextlib.suppress(KeyboardInterrupt),
     ):
-        log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
+        log = WireLog(recording, draw.PICTURE_INTERVAL_S if sink.is_live else 0.0)
         for heard in listener.until_gone(arguments.duration_s):
             log.write(heard)
     if listener.dropped:
@@ -128,26 +110,28 @@ PLOTS = (
 SERIES = {
     "action/asked": POLICY,
     "action/achieved": APPLIED,
-    "speed/simulated": BLUE,
-    "speed/vehicle": ORANGE,
-    "latency/uplink": BLUE,
-    "latency/inference": GREEN,
-    "latency/downlink": PURPLE,
-    "latency/round_trip": ORANGE,
+    "speed/simulated": draw.BLUE,
+    "speed/vehicle": draw.ORANGE,
+    "latency/uplink": draw.BLUE,
+    "latency/inference": draw.GREEN,
+    "latency/downlink": draw.PURPLE,
+    "latency/round_trip": draw.ORANGE,
 }
 """Lines that are there from the start; those of rejections come with their reasons."""
 
 
 def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
-    left = rrb.Vertical(road_view(scene, "Road from above"), frames_view(), row_shares=[3, 1.4])
+    left = rrb.Vertical(
+        draw.road_view(scene, "Road from above"), draw.frames_view(), row_shares=[3, 1.4]
+    )
     right = rrb.Vertical(
         rrb.StateTimelineView(
             origin="mode",
             name="Mode, and why it does not drive",
-            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+            time_view=rrb.TimeAxis(view_range=draw.ALL_OF_IT),
         ),
-        *map(plot_view, PLOTS),
+        *map(draw.plot_view, PLOTS),
         rrb.TextLogView(
             origin="events",
             name="Events: modes, rejections, episodes",
@@ -155,18 +139,18 @@ def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
         ),
         row_shares=[2.2, 2, 2, 2, 1.6, 1.8],
     )
-    return full_blueprint(left, right, [3, 2], "sim_time")
+    return draw.full_blueprint(left, right, [3, 2], "sim_time")
 
 
 SILENT = "no command"
 NOTHING_WRONG = "-"
 REMEMBERED_STATES = 64
 """States whose sending time is kept, for the latency of their commands."""
-EGO = {"drive": POLICY, "safe_stop": RED, SILENT: (160, 30, 120)}
+EGO = {"drive": POLICY, "safe_stop": draw.RED, SILENT: (160, 30, 120)}
 """Colour of the ego car by what it is told."""
 ALL = "all"
 """The sum over the reasons, which has a line from the start."""
-SIDES = {"edge": ORANGE, "simulator": BLUE}
+SIDES = {"edge": draw.ORANGE, "simulator": draw.BLUE}
 """Who rejects, and the colour of all that it has rejected."""
 
 
@@ -185,8 +169,8 @@ class WireLog:
         self._timeline = Timeline()
         self._told, self._reason = "", ""
         self._heard_command_ns: int | None = None
-        self._sent_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
-        self._answered_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._sent_ns: dict[tuple[int, int], int] = {}
+        self._answered_ns: dict[tuple[int, int], int] = {}
         """From the sending of a state to that of its command, by the stamps of both."""
         self._split: tuple[int, int] | None = None
         """The state whose round trip was drawn in its parts last."""
@@ -194,12 +178,12 @@ class WireLog:
         self._reasons: set[tuple[str, str]] = set()
         self._drawn_episode = -1
         self._health: Health | None = None
-        style_lines(recording, SERIES)
+        draw.style_lines(recording, SERIES)
         for side, colour in SIDES.items():
             self._style_rejections(side, ALL, colour)
         lanes = rr.StateConfiguration(values=list(EGO), labels=list(EGO), colors=list(EGO.values()))
         recording.log("mode/mode", lanes, static=True)
-        quiet = rr.StateConfiguration(values=[NOTHING_WRONG], labels=[" "], colors=[GREY])
+        quiet = rr.StateConfiguration(values=[NOTHING_WRONG], labels=[" "], colors=[draw.GREY])
         recording.log("mode/reason", quiet, static=True)
 
     def write(self, heard: Heard) -> None:
@@ -275,11 +259,11 @@ class WireLog:
             self._recording.send_blueprint(make_blueprint(scene))
         if self._drawn_episode != scene.episode:
             self._drawn_episode = scene.episode
-            draw_ground(self._recording, scene)
+            draw.draw_ground(self._recording, scene)
         self._round_trip(scene)
         self._rejections("simulator", scene.rejected)
         if self._cars_pace.due(arrived_ns * 1e-9):
-            draw_cars(self._recording, scene, EGO[self._told or SILENT])
+            draw.draw_cars(self._recording, scene, EGO[self._told or SILENT])
 
     def _stand_at(self, moment: Moment) -> None:
         recording = self._recording
@@ -305,7 +289,7 @@ class WireLog:
         for reason, count in counts.items():
             if count and (side, reason) not in self._reasons:
                 self._reasons.add((side, reason))
-                self._style_rejections(side, reason, GREY)
+                self._style_rejections(side, reason, draw.GREY)
                 self._scalar(f"rejected/{side}/{reason}", 0)
             if count:
                 self._scalar(f"rejected/{side}/{reason}", count)
@@ -338,10 +322,11 @@ class WireLog:
         self._recording.log("status", rr.TextDocument(text, media_type="text/markdown"))
 
 
-def _keep(table: OrderedDict[tuple[int, int], int], key: tuple[int, int], value: int) -> None:
+def _keep(table: dict[tuple[int, int], int], key: tuple[int, int], value: int) -> None:
+    """Remember a value, and forget the oldest where there are too many."""
     table[key] = value
     if len(table) > REMEMBERED_STATES:
-        table.popitem(last=False)
+        del table[next(iter(table))]
 
 
 def _health_lines(health: Health) -> list[str]:

@@ -308,24 +308,3 @@ def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
             assert recorder.wait(PATIENCE_S) == 0, recorder.errors
     sessions = {state.session for _, state in states_in(recording)}
     assert len(sessions) == 2
-
-
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        (["record", "--out", "there.mcap"], "exists"),
-        (["record", "--out", "/dev/null/a.mcap"], "Not a directory"),
-        (["record", "--out", "a.mcap", "--vehicle-id", "a/b"], "vehicle id"),
-        (["record", "--out", "a.mcap", "--connect", "here"], "endpoint"),
-        (["record", "--out", "a.mcap", "--connect", free_endpoint(), "--wait-s", "0"], "nobody"),
-        (["repair", "none.mcap"], "No such file"),
-        (["repair", "there.mcap"], "no MCAP recording"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(options, part, capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "there.mcap").write_bytes(b"mine")
-    assert bridge_status(options) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
-    assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]

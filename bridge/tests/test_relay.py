@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 import time
 
-import pytest
-
 from bridge.network import parse_spec
 from bridge.relay import DOWN, RelayTraffic
 from bridge.tests.harness import (
     SHORT_TOY,
     BridgeProcess,
-    bridge_status,
     make_command,
     make_policy,
     read,
@@ -110,23 +107,3 @@ def test_two_unmodified_ends_drive_through_a_relay(tmp_path):
     assert counts["latency_spec"] == "delay=40ms,jitter=5ms,loss=10%,duplicate=10%"
     assert "delivered: state" in relay.output
     json.dumps(counts, allow_nan=False)
-
-
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        (["--listen", "tcp/127.0.0.1:7001"], "--connect"),
-        (["--listen", "here", "--connect", "tcp/127.0.0.1:7001"], "endpoint"),
-        (["--listen", "tcp/127.0.0.1:7001", "--connect", "tcp/127.0.0.1:7001"], "circle"),
-        (["--listen", "tls/127.0.0.1:7001", "--connect", "tcp/127.0.0.1:7002"], "plain text only"),
-        (["--listen", "tcp/127.0.0.1:7001", "--connect", "quic/127.0.0.1:7002"], "plain text only"),
-        (
-            ["--listen", "tcp/127.0.0.1:7001", "--connect", "udp/127.0.0.1:7001", "--latency", "5"],
-            "latency",
-        ),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(options, part, capsys):
-    assert bridge_status(["relay", *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line

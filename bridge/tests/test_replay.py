@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import pytest
 
@@ -297,32 +296,7 @@ def test_through_a_running_edge_runtime(hand, path, tmp_path):
     assert len(report["policy_id"]) == 64
 
 
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        (["--policy", "none.onnx"], "does not exist"),
-        (["--policy", "none.onnx", "--tls", "certs/viewer"], "--tls is for a link"),
-        (["--listen", free_endpoint(), "--config", "edge.toml"], "--config is for --policy"),
-        ([], "--policy"),
-        (["--policy", "a.onnx", "--connect", free_endpoint()], "not allowed"),
-        (["--listen", "here"], "endpoint"),
-        (["--listen", free_endpoint(), "--wait-edge-s", "0"], "python -m edge_runtime run"),
-        (["--policy", "a.onnx", "--tolerance", "-1"], "tolerance"),
-        (["--policy", "a.onnx", "--out", "/dev/null/r.json"], "Not a directory"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(options, part, hand, path, capsys):
-    hand.drive(0, 2)
+def test_a_recording_without_messages_is_one_line_and_status_2(hand, path, capsys):
     hand.close()
-    assert bridge_status(["replay", str(path), *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
-
-
-@pytest.mark.parametrize("name", ["missing.mcap", "junk.mcap", "empty.mcap"])
-def test_what_is_no_recording_is_one_line_and_status_2(name, hand, tmp_path, capsys):
-    (tmp_path / "junk.mcap").write_bytes(b"\x89MCAP1\r\n" + bytes(100))
-    hand.close()
-    shutil.move(tmp_path / "by_hand.mcap", tmp_path / "empty.mcap")
-    assert bridge_status(["replay", str(tmp_path / name), "--policy", "p.onnx"]) == 2
+    assert bridge_status(["replay", str(path), "--policy", "p.onnx"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

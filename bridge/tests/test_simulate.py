@@ -147,33 +147,6 @@ def test_nobody_comes_and_one_line_says_what_to_start(tmp_path):
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        (["--env", "phil/Nowhere-v0"], "Nowhere"),
-        (["--env", "no_such_module:X-v0"], "no_such_module"),
-        (["--env", "CartPole-v1"], "uint8"),
-        (["--env", "bridge.tests.broken_module:X-v0"], "RuntimeError: two"),
-        (["--env", TOY, "--condition", "variant"], "scene"),
-        (["--env", "congestion", "--condition", "foggy"], "foggy"),
-        (["--env", "::"], "module:id"),
-        (["--env", TOY, "--latency", "fast"], "latency"),
-        (["--env", TOY, "--episodes", "0"], "at least 1"),
-        (["--env", TOY, "--vehicle-id", "a/b"], "vehicle id"),
-        (["--env", TOY, "--listen", "here"], "endpoint"),
-        (["--env", TOY, "--connect", "here"], "endpoint"),
-        (["--env", TOY, "--connect", free_endpoint(), "--wait-edge-s", "0"], "nobody answers"),
-        (["--env", TOY, "--connect", free_endpoint(), "--listen", free_endpoint()], "not allowed"),
-        (["--env", TOY, "--out", "/dev/null/r.json"], "Not a directory"),
-        (["--env", TOY, "--clock", "sundial"], "sundial"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(options, part, capsys):
-    assert bridge_status(["simulate", *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
-
-
 def test_a_number_that_is_not_finite_is_one_line_and_status_2(tmp_path):
     policy, endpoint, out = make_policy(tmp_path), free_endpoint(), tmp_path / "never.json"
     env = "bridge.tests.toy:BridgeToyNan-v0"

@@ -16,7 +16,6 @@ from bridge.network import parse_spec
 from bridge.ports import connect_client
 from bridge.tests.harness import (
     SHORT_TOY,
-    bridge_status,
     make_command,
     make_feedback,
     make_policy,
@@ -266,11 +265,6 @@ def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
         wait_until(lambda: rig.check.heard == make_feedback(1, speed_mps=0.5, sent_ns=6), "it")
         rig.clock.wait_for_standstill()
     assert rig.clock.moving_starts == 1
-
-
-def test_lock_step_cannot_have_a_vehicle(capsys):
-    assert bridge_status(["simulate", "--env", SHORT_TOY, "--loop", "vehicle"]) == 2
-    assert "--loop vehicle needs --clock realtime" in capsys.readouterr().err
 
 
 class Stranger:

@@ -90,26 +90,6 @@ def test_a_killed_simulator_ends_the_view(tmp_path):
     verify(recording)
 
 
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        (["--save", "never.rrd", "--wait-s", "0"], "nobody answers"),
-        ([], "no display"),
-        (["--save", "/dev/null/a.rrd"], "Not a directory"),
-        (["--vehicle-id", "a/b"], "vehicle id"),
-        (["--save", "a.rrd", "--serve"], "not allowed with"),
-        (["--save", "a.mcap"], "called F.rrd"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(options, part, capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert bridge_status(["view", "--connect", free_endpoint(), *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
-
-
 def test_a_simulator_of_another_vehicle_is_one_line_and_no_file(tmp_path, capsys):
     endpoint, recording = free_endpoint(), tmp_path / "other.rrd"
     with open_port(endpoint, "other"):
@@ -158,21 +138,6 @@ def test_a_damaged_recording_is_shown_without_what_is_broken(tmp_path, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert "is damaged (1 damaged place of" in line
     assert "road/ego/body" in verify(out)
-
-
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        (["none.mcap"], "cannot be read"),
-        ([str(LEFT_TURN), "--vehicle-id", "other"], "holds no vehicle other"),
-        ([__file__], "no MCAP recording"),
-    ],
-)
-def test_a_recording_that_cannot_be_shown_is_one_line_and_no_file(options, part, capsys, tmp_path):
-    assert bridge_status(["view", *options, "--save", str(tmp_path / "a.rrd")]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
-    assert list(tmp_path.iterdir()) == []
 
 
 def keep_numbers(monkeypatch, log):
