@@ -143,7 +143,9 @@ class LockStepClock(Clock):
     def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
         payload = encode(_stamp(arrival.message))
-        self._take_unasked()
+        # What came between two ticks is read all the same, so that faults are counted.
+        while not self._inbox.empty():
+            self._check.read(self._inbox.get()[0])
         published_s = time.monotonic()
         self._publish(payload)
         if arrival.overtaken:
@@ -152,11 +154,6 @@ class LockStepClock(Clock):
         if answer is not None:
             command, received_s = answer
             self._link.answer(arrival, command, computing_s=received_s - published_s)
-
-    def _take_unasked(self) -> None:
-        """Empty the inbox of what came between two ticks, so that only faults are counted."""
-        while not self._inbox.empty():
-            self._check.read(self._inbox.get()[0])
 
     def _await_answer(self, step: int, published_s: float) -> tuple[Command, float] | None:
         """Wait in wall time for the answer to exactly this state, and say when it came."""
@@ -194,11 +191,8 @@ class LockStepClock(Clock):
         """Wall time without an answer (s), if the last state really published got none."""
         if not self._edge_silent:
             return None
-        return (
-            SILENCE_LIMIT_S
-            if self._answered_at_s is None
-            else (time.monotonic() - self._answered_at_s)
-        )
+        answered_at_s = self._answered_at_s
+        return SILENCE_LIMIT_S if answered_at_s is None else time.monotonic() - answered_at_s
 
 
 class RealTimeClock(Clock):
@@ -352,7 +346,9 @@ class VehicleClock(RealTimeClock):
 
     def wait_for_standstill(self) -> None:
         """Wait until the vehicle stands; where it does not, count that and go on."""
-        self.moving_starts += not self._wait_until(_stands, STANDSTILL_WAIT_S)
+        self.moving_starts += not self._wait_until(
+            lambda feedback: abs(feedback.speed_mps) < STANDSTILL_MPS, STANDSTILL_WAIT_S
+        )
 
     def rejected(self) -> Counter[str]:
         """Return the feedback that was not believed, as ``feedback_REASON``."""
@@ -412,10 +408,6 @@ class VehicleClock(RealTimeClock):
                 return True
             time.sleep(POLL_S)
         return False
-
-
-def _stands(feedback: Feedback) -> bool:
-    return abs(feedback.speed_mps) < STANDSTILL_MPS
 
 
 REALTIME = "realtime"

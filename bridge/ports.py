@@ -263,23 +263,17 @@ def open_listener(
             token, watch = f"phil/{vehicle_id}/{topic}", listener.watch(topic)
             declared.append(session.liveliness().declare_subscriber(token, watch, history=True))
         try:
-            _wait_for_simulator(listener, give_up_s, vehicle_id, connect)
+            # A listener to a vehicle that is not there would never see it go, nor end.
+            if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
+                hint = "start one: python -m bridge simulate"
+                if vehicle_id != ANY_VEHICLE:
+                    hint = "name it with --vehicle-id"
+                which = "" if vehicle_id == ANY_VEHICLE else f" with vehicle id {vehicle_id}"
+                raise UserError(f"no simulator{which} at {connect}; {hint}")
             yield listener
         finally:
             for subscriber in declared:
                 subscriber.undeclare()
-
-
-def _wait_for_simulator(
-    listener: WireListener, give_up_s: float, vehicle_id: str, endpoint: str
-) -> None:
-    """Without it, a listener to a vehicle that is not there would never see it go, nor end."""
-    if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
-        if vehicle_id == ANY_VEHICLE:
-            raise UserError(f"no simulator at {endpoint}; start one: python -m bridge simulate")
-        raise UserError(
-            f"no simulator with vehicle id {vehicle_id} at {endpoint}; name it with --vehicle-id"
-        )
 
 
 def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:

@@ -55,26 +55,27 @@ def summarise(
     """
     if not results:
         raise ValueError("no episode to summarise")
+    outcomes = Counter(result.outcome for result in results)
+    spreads = {
+        "surviving_distance_m": "distance_m",
+        "episode_reward": "reward",
+        "episode_time_s": "time_s",
+        "lateral_acceleration_mps2": "lateral_acceleration_mps2",
+        "longitudinal_acceleration_mps2": "longitudinal_acceleration_mps2",
+    }
     return {
         "scenario": scenario,
         "condition": condition,
         "episodes": len(results),
-        "success_rate": _rate(results, GOAL),
-        "collision_rate": _rate(results, COLLISION),
-        "surviving_distance_m": _spread([r.distance_m for r in results]),
-        "episode_reward": _spread([r.reward for r in results]),
-        "episode_time_s": _spread([r.time_s for r in results]),
-        "lateral_acceleration_mps2": _spread([r.lateral_acceleration_mps2 for r in results]),
-        "longitudinal_acceleration_mps2": _spread(
-            [r.longitudinal_acceleration_mps2 for r in results]
-        ),
+        "success_rate": outcomes[GOAL] / len(results),
+        "collision_rate": outcomes[COLLISION] / len(results),
+        **{
+            key: _spread([getattr(result, name) for result in results])
+            for key, name in spreads.items()
+        },
         "policy_id": policy_id,
         "seed": seed,
     }
-
-
-def _rate(results: Sequence[EpisodeResult], outcome: str) -> float:
-    return sum(result.outcome == outcome for result in results) / len(results)
 
 
 def _spread(values: Sequence[float]) -> dict[str, float]:

@@ -134,9 +134,6 @@ COMMAND_BYTES = 217
 """What the messages take on the wire, for links of limited rate: the same for every message, so
 that a longer session name or another digit does not change a drive."""
 
-_SESSION = ""
-"""An episode has one simulator."""
-
 Message = TypeVar("Message")
 
 
@@ -228,10 +225,10 @@ class VirtualLink(Generic[Message]):
 
     def _note_fresh(self, now_s: float) -> None:
         """What the edge runtime's safety machine makes of a fresh state's moment."""
-        gap = classify_arrival(self._safety, _SESSION, now_s - ROUNDING_S, needs_rearm=False)
+        gap = classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
         if gap is not None:
             self._safety = advance(self._safety, gap)
-        self._safety = note_arrival(self._safety, _SESSION, now_s)
+        self._safety = note_arrival(self._safety, "", now_s)
         fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
         self._safety = advance(self._safety, fresh)
 
