@@ -25,8 +25,7 @@ import msgspec
 
 from bridge.inbound import CommandCheck, FeedbackCheck, FeedbackHold, VehicleDecision
 from bridge.network import EventHeap, LatencyModel, LatencySpec, make_link
-from bridge.report import STANDSTILL_MPS, quantiles
-from bridge.tracking import TrackingLog
+from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
     COMMAND_WINDOW_S,
     SILENCE_LIMIT_S,

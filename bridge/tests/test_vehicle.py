@@ -14,6 +14,7 @@ from bridge.clocks import VehicleClock
 from bridge.inbound import NO_FEEDBACK, CommandCheck, FeedbackCheck
 from bridge.network import parse_spec
 from bridge.ports import connect_client
+from bridge.report import LAG_STEP_S, TrackingLog
 from bridge.tests.harness import (
     SHORT_TOY,
     make_command,
@@ -23,7 +24,6 @@ from bridge.tests.harness import (
     start_edge,
     start_simulate,
 )
-from bridge.tracking import LAG_STEP_S, TrackingLog
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
 from edge_runtime.util import UserError
