@@ -6,8 +6,6 @@ import collections
 import contextlib
 import resource
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,6 +27,7 @@ from bridge.tests.harness import (
     make_command,
     make_policy,
     read,
+    rerun,
     start_edge,
     start_simulate,
 )
@@ -133,12 +132,6 @@ def states_in(path: Path) -> list[tuple[int, State]]:
             assert isinstance(state, State)
             found.append((stored.message.log_time, state))
     return found
-
-
-def rerun(*arguments: str) -> str:
-    """Run rerun's own reader; what it prints."""
-    command = [sys.executable, "-m", "rerun", *arguments]
-    return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
 
 
 @pytest.fixture(scope="module")

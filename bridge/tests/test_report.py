@@ -13,6 +13,7 @@ from bridge.report import (
     SafeStopEvent,
     episode_line,
     make_report,
+    markdown_table,
     summarise,
     summary_line,
 )
@@ -86,6 +87,11 @@ def test_summarise_by_hand():
     json.dumps(report, allow_nan=False)
     with pytest.raises(ValueError, match="no episode"):
         summarise([], "left_turn", "nominal", "id", 7)
+
+
+def test_a_table_in_markdown():
+    table = markdown_table(["row", "p50"], [["a|b", 1], ["c", None]])
+    assert table == "| row | p50 |\n| --- | --- |\n| a/b | 1 |\n| c | None |"
 
 
 def test_without_a_terminal_each_episode_is_told_as_it_ends(tmp_path):

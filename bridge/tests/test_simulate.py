@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import subprocess
-import sys
-import textwrap
 import time
 
 import numpy as np
@@ -236,16 +233,6 @@ def test_two_vehicles_on_one_router_each_drive_as_if_alone(tmp_path):
             np.testing.assert_allclose(row["actions"], actions, atol=1e-5)
 
 
-PROJECT = """
-[build-system]
-requires = ["setuptools"]
-build-backend = "setuptools.build_meta"
-[project]
-name = "somebodys-envs"
-version = "1.0"
-[project.entry-points."gymnasium.envs"]
-somebody = "somebodys_envs:register"
-"""
 MODULE = """
 import gymnasium
 import numpy as np
@@ -273,16 +260,17 @@ def register():
 """
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """A folder into which pip has installed the package, from source and without a network."""
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
-    (source / "pyproject.toml").write_text(textwrap.dedent(PROJECT))
-    (source / "somebodys_envs.py").write_text(MODULE)
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]
-    command = [*pip, "--no-build-isolation", "--target", str(target), str(source)]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    return target
+@pytest.fixture
+def site(tmp_path):
+    """A folder as pip leaves it: the module, and the entry point in the package's metadata."""
+    (tmp_path / "somebodys_envs.py").write_text(MODULE)
+    about = tmp_path / "somebodys_envs-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: somebodys-envs\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(
+        "[gymnasium.envs]\nsomebody = somebodys_envs:register\n"
+    )
+    return tmp_path
 
 
 def test_an_installed_environment_is_served_by_its_id(site, tmp_path):
