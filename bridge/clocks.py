@@ -5,9 +5,9 @@ really published in their virtual order of arrival, and each real answer is awai
 its virtual way back. Computing takes no virtual time, so the same seed gives the same run on a fast
 and a slow machine.
 
-Real time has absolute ticks on the monotonic clock and waits for nobody. Tick n begins at n T after
-the episode's start; its state goes out through the delay line, and the vehicle acts at the latest
-25 ms after the tick on the newest command that has arrived. With a vehicle in the loop
+Real time has absolute ticks on the monotonic clock and waits for no answer. Tick n begins at n T
+after the episode's start; its state goes out through the delay line, and the vehicle acts at the
+latest 25 ms after the tick on the newest command that has arrived. With a vehicle in the loop
 (`VehicleClock`), its newest feedback at tick n + 1 says what came of state n.
 """
 
@@ -90,7 +90,7 @@ class Clock:
         """Send the final state at once, and forget whatever is still under way.
 
         It says that the simulation has ended, which no radio link carries: no delay or loss is
-        injected, and nobody waits for an answer.
+        injected, and no answer is awaited.
         """
         raise NotImplementedError
 
@@ -135,7 +135,7 @@ class LockStepClock(Clock):
         return None if step < 0 else (step, self.latencies_ms[-1])
 
     def finish(self, state: State) -> None:
-        """Publish the final state at once; nobody waits for an answer to it."""
+        """Publish the final state at once; no answer to it is awaited."""
         self._check.end(state.step, self._link.hold.newest_step)
         self._publish(encode(_stamp(state)))
 

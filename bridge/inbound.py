@@ -113,8 +113,8 @@ NOT_COMMANDED = ""
 class FeedbackCheck:
     """Reads feedback for one simulator session and keeps the counts of the whole run.
 
-    Another simulator's session is nobody's fault before the vehicle has heard of this one, and is
-    not believed either. Its stamps say which feedback is the newest; after 2 T without any, order
+    Another simulator's session is no fault before the vehicle has heard of this one, but is not
+    believed either. Its stamps say which feedback is the newest; after 2 T without any, order
     begins anew: another board, with another clock, may have taken over.
     """
 
@@ -180,7 +180,7 @@ SELF_BRAKING = "self_braking"
 
 @dataclass(frozen=True)
 class VehicleDecision(Decision):
-    """What the vehicle did in one tick; without feedback, nobody knows."""
+    """What the vehicle did in one tick; without feedback, that is unknown."""
 
     feedback: Feedback | None = None
     feedback_age_s: float | None = None

@@ -161,7 +161,7 @@ class DirectionSpec:
     reorder_by_ms: float = _setting(150.0, "reorder_by", MS, "300ms")
     """How long they are held back; the default lets one state of the control loop pass."""
     order: str = _setting("free", "order", Choice(ORDERS), "|".join(ORDERS))
-    """``kept``: nobody overtakes, so a late message holds up all behind it, as TCP does."""
+    """``kept``: no message overtakes, so a late message holds up all behind it, as TCP does."""
     duplicate_percent: float = _setting(0.0, "duplicate", PERCENT, "1%")
     """Share of the messages that arrive twice; the copy's time under way is drawn anew."""
     rate_kbps: float = _setting(0.0, "rate", RATE, "1Mbit/s")
@@ -270,12 +270,12 @@ def _parse_part(part: str, text: str) -> list[tuple[str, Any]]:
     for name, word in pairs:
         if name not in SETTINGS:
             raise UserError(f"latency {text!r}: {part!r} is not understood; write {GRAMMAR}")
-        told = SETTINGS[name].metadata
-        value = told["kind"].read(word)
+        setting = SETTINGS[name].metadata
+        value = setting["kind"].read(word)
         if value is None:
             raise UserError(
                 f"latency {text!r}: {part!r} is not understood; write it like"
-                f" {name}={told['example']}{told['kind'].limit}"
+                f" {name}={setting['example']}{setting['kind'].limit}"
             )
         found.append((name, value))
     return found
@@ -403,7 +403,7 @@ class LatencyModel:
         return max(0.0, under_way_ms) * 1e-3
 
     def _in_order(self, times: list[float]) -> tuple[float, ...]:
-        """Nobody overtakes: what would arrive before an earlier message arrives with it."""
+        """No message overtakes: what would arrive before an earlier message arrives with it."""
         kept = tuple(max(arrival_s, self._newest_arrival_s) for arrival_s in times)
         self._newest_arrival_s = kept[-1]
         return kept

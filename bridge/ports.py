@@ -203,7 +203,7 @@ class WireListener:
 
         def hear(sample: zenoh.Sample) -> None:
             if "*" in str(sample.key_expr):
-                return  # put to many vehicles at once: it is nobody's own
+                return  # put to many vehicles at once: no vehicle's own
             size = len(sample.payload)
             # A flood of huge messages must not fill the memory.
             payload = sample.payload.to_bytes() if size <= MAX_PAYLOAD_BYTES else b""

@@ -77,8 +77,8 @@ def _add_record_arguments(parser: Any) -> None:
         help="the recording; it must not exist yet",
     )
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
-    told = "record this vehicle only (otherwise all)"
-    add_options(parser, "--vehicle-id", default=None, help=told)
+    help_text = "record this vehicle only (otherwise all)"
+    add_options(parser, "--vehicle-id", default=None, help=help_text)
     parser.add_argument(
         "--linger-s",
         metavar="SECONDS",

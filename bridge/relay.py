@@ -1,10 +1,10 @@
 """What stands between simulators and edge runtimes: ``python -m bridge relay`` and ``router``.
 
-The router connects all who connect to it. The relay is a slow and lossy network between two
-unmodified ends: to the edge runtime, at ``--listen``, it is the simulator's router, and to the
-simulator at ``--connect`` a peer. States (up), commands, feedback and health (down) pass through
-the model, in real time. Status and re-arm queries and the liveliness tokens pass at once: they
-observe the loop, and are no part of it.
+The router connects simulators, edge runtimes and viewers. The relay is a slow and lossy network
+between two unmodified ends: to the edge runtime, at ``--listen``, it is the simulator's router, and
+to the simulator at ``--connect`` a peer. States (up), commands, feedback and health (down) pass
+through the model, in real time. Status and re-arm queries and the liveliness tokens pass at once:
+they observe the loop, and are no part of it.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ COUNTS = ("received", "bytes", "lost", "duplicated", "delivered")
 
 def _add_relay_arguments(parser: Any) -> None:
     add_options(parser, "--listen", required=True, help="where the edge runtime connects to")
-    told = "where the simulator listens; it may come later"
-    add_options(parser, "--connect", required=True, default=None, help=told)
+    help_text = "where the simulator listens; it may come later"
+    add_options(parser, "--connect", required=True, default=None, help=help_text)
     add_options(parser, "--latency", "--seed")
     add_options(parser, "--vehicle-id", help="the vehicle to relay")
-    told = "write the counts to this file at the end (SIGTERM or ^C)"
-    add_options(parser, "--out", help=told)
+    help_text = "write the counts to this file at the end (SIGTERM or ^C)"
+    add_options(parser, "--out", help=help_text)
 
 
 def _run_relay(arguments: Any) -> int:
@@ -152,13 +152,13 @@ class Relay:
         """Undeclare all, then stop the delay lines. The sessions are the caller's."""
         for declared in reversed(self._declared):
             declared.undeclare()
-        # Nobody changes these any more: their listeners went first.
+        # Their listeners went first, so these no longer change.
         for token in self._mirrored.values():
             token.undeclare()
         self.traffic.close()
 
     def _publisher(self, session: zenoh.Session, topic: str, express: bool) -> Any:
-        # As the ends themselves publish: nobody is held up by a slow listener.
+        # As the ends themselves publish: a slow listener holds nothing up.
         return session.declare_publisher(
             key(self._vehicle_id, topic),
             congestion_control=zenoh.CongestionControl.DROP,
@@ -176,7 +176,7 @@ class Relay:
         asked = key(self._vehicle_id, topic)
 
         def came(query: zenoh.Query) -> None:
-            # As the edge runtime itself: a look at everything (`phil/**`) re-arms nobody.
+            # As the edge runtime itself: a query for everything (`phil/**`) re-arms no vehicle.
             if topic == REARM and str(query.key_expr) != asked:
                 return
             with self._lock:
@@ -280,14 +280,14 @@ class RelayTraffic:
 
 
 def _add_router_arguments(parser: Any) -> None:
-    told = f"where all others connect to; may be repeated (default: {DEFAULT_ENDPOINT})"
-    add_options(parser, "--listen", action="append", help=told)
+    help_text = f"where all others connect to; may be repeated (default: {DEFAULT_ENDPOINT})"
+    add_options(parser, "--listen", action="append", help=help_text)
     add_options(parser, "--tls")
-    told = (
+    help_text = (
         "a vehicle whose parties have rights here, with --tls; may be repeated"
         f" (default: {DEFAULT_VEHICLE_ID})"
     )
-    add_options(parser, "--vehicle-id", action="append", default=None, help=told)
+    add_options(parser, "--vehicle-id", action="append", default=None, help=help_text)
     parser.add_argument(
         "--config",
         metavar="FILE.json5",
@@ -298,9 +298,9 @@ def _add_router_arguments(parser: Any) -> None:
 def _run_router(arguments: Any) -> int:
     """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
     listens = list(dict.fromkeys(arguments.listen or [DEFAULT_ENDPOINT]))
-    tls, rules, told = None, None, f"config={arguments.config}"
+    tls, rules, ready = None, None, f"config={arguments.config}"
     if arguments.config is None:
-        told = f"listen={','.join(listens)}"
+        ready = f"listen={','.join(listens)}"
         tls = access.tls_for(arguments.tls, *listens)
     elif arguments.listen or arguments.tls or arguments.vehicle_id:
         raise UserError("--config goes with no other option: the file says it all")
@@ -313,7 +313,7 @@ def _run_router(arguments: Any) -> int:
         else:
             session = _open(arguments.config)
         with contextlib.closing(session):
-            print(f"ready {told}", flush=True)
+            print(f"ready {ready}", flush=True)
             wait_to_be_told()
     return 0
 

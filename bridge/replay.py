@@ -71,10 +71,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     through.add_argument(
         "--policy", metavar="POLICY.onnx", help="replay in process, with the recording's times"
     )
-    told = "replay in real time to an edge runtime that connects here"
-    add_options(through, "--listen", help=told)
-    told = "replay in real time to an edge runtime behind this router"
-    add_options(through, "--connect", default=None, help=told)
+    help_text = "replay in real time to an edge runtime that connects here"
+    add_options(through, "--listen", help=help_text)
+    help_text = "replay in real time to an edge runtime behind this router"
+    add_options(through, "--connect", default=None, help=help_text)
     add_options(parser, "--tls", "--wait-edge-s", "--out")
     add_public_key(parser)
     parser.add_argument(
@@ -88,8 +88,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="with --policy: the settings of the edge runtime that was recorded, where a vehicle's"
         " model or scale was not the default",
     )
-    told = "which vehicle, where the recording holds several"
-    add_options(parser, "--vehicle-id", default=None, help=told)
+    help_text = "which vehicle, where the recording holds several"
+    add_options(parser, "--vehicle-id", default=None, help=help_text)
     parser.add_argument(
         "--tolerance",
         metavar="X",

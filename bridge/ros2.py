@@ -48,7 +48,7 @@ from edge_runtime.wire import (
 MAX_RATE_HZ = 20.0
 RETRY_S = 2.0
 LONGEST_GAP_S = 0.5
-"""After a longer silence nobody knows how fast it was meanwhile: only so much is made up."""
+"""After a longer silence its speed meanwhile is unknown: only so much is made up."""
 ERROR_PER_METRE = 0.1
 """Guessed, not measured: a standard deviation of 10 % of the way, and 0.1 rad a metre."""
 UNKNOWN = 1e6
@@ -228,7 +228,7 @@ class Policies:
         self.newest: Policy | None = None
 
     def find(self, policy_id: str) -> Policy | None:
-        """Return the policy of that id; None while nobody says, and for an unknown scenario.
+        """Return the policy of that id; None until the edge says, and for an unknown scenario.
 
         Waits for the edge's answer once for each new policy, and seldom where none comes.
         """

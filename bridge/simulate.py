@@ -79,8 +79,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     where = parser.add_mutually_exclusive_group()
     add_options(where, "--listen", default=DEFAULT_ENDPOINT)
-    told = "share a router with other vehicles instead of listening"
-    add_options(where, "--connect", default=None, help=told)
+    help_text = "share a router with other vehicles instead of listening"
+    add_options(where, "--connect", default=None, help=help_text)
     add_options(parser, "--tls", "--latency", "--wait-edge-s", "--out")
     add_options(parser, "--vehicle-id", help="the vehicle to simulate")
     add_options(parser, "--seed", help="episode i is reset with seed + i")

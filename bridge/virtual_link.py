@@ -8,8 +8,7 @@ listen to.
 `VirtualLink` is shared by lock-step and by training under latency. Tick n stands at virtual time
 n T. Its state arrives at the edge runtime after the uplink's delay; the answer takes no time, and
 arrives at the vehicle after the downlink's; the tick is decided at n T + 25 ms from what has
-arrived by then. Who answers is the caller's business: a real edge runtime that is waited for, or a
-function.
+arrived by then. The caller gives the answers: those of a real edge runtime, or of a function.
 
 The edge runtime's rule for silence counts time, and here time is virtual: a real one, which sees
 states come faster than in life, would miss the gaps. So its safety machine runs along, and what it

@@ -202,7 +202,7 @@ class Viewer:
 
     def __init__(self, options: Sequence[str], ports: Sequence[int]) -> None:
         command = [sys.executable, "-m", "rerun_cli", "--bind", LOOPBACK, *options]
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 (closed by the last who writes)
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 (open for as long as the viewer writes)
         # A group of its own: ^C is not for it, and it ends with the child that the module starts.
         self._process = subprocess.Popen(
             command,
@@ -253,7 +253,7 @@ class Viewer:
 
 
 def free_port() -> int:
-    """One on which nobody listens."""
+    """A port that is not in use."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])

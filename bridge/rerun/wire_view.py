@@ -44,8 +44,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_sink(parser)
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
-    told = f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
-    add_options(parser, "--vehicle-id", default=None, help=told)
+    help_text = (
+        f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
+    )
+    add_options(parser, "--vehicle-id", default=None, help=help_text)
 
 
 def run(arguments: Any) -> int:
@@ -151,7 +153,7 @@ EGO = {"drive": POLICY, "safe_stop": draw.RED, SILENT: (160, 30, 120)}
 ALL = "all"
 """The sum over the reasons, which has a line from the start."""
 SIDES = {"edge": draw.ORANGE, "simulator": draw.BLUE}
-"""Who rejects, and the colour of all that it has rejected."""
+"""The side that rejects, and the colour of all that it has rejected."""
 
 
 class WireLog:
@@ -214,7 +216,7 @@ class WireLog:
             # A viewer that comes late has not yet had the time to hear one.
             self._heard_command_ns = arrived_ns
         silent = arrived_ns - self._heard_command_ns > SILENCE_LIMIT_S * 1e9
-        # Between two episodes nobody owes a command.
+        # Between two episodes no command is due.
         if silent and state.step > 0 and not state.final:
             self._scalar("action/asked", math.nan)  # A gap in the line: nothing is asked.
             self._tell(SILENT, "the simulator brakes by itself", rr.TextLogLevel.WARN)
