@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from bridge.episode import vehicle_action
 from bridge.inbound import VehicleDecision
-from bridge.tracking import TrackingLog
+from bridge.report import TrackingLog
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter.core import HunterCore
