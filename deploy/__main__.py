@@ -7,11 +7,11 @@ import sys
 from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS = {
-    "keys": ("deploy.keys", "make a key pair that signs policies and bundles"),
-    "certs": ("deploy.certs", "make an authority and certificates for TLS"),
+    "keys": ("deploy.certs:KEYS", "make a key pair that signs policies and bundles"),
+    "certs": ("deploy.certs:CERTS", "make an authority and certificates for TLS"),
     "bundle": ("deploy.bundle", "make one signed archive for one board and vehicle"),
     "push": ("deploy.push", "bring a bundle to a board and install it"),
-    "router": ("deploy.router", "write a fleet's router settings, for zenohd"),
+    "router": ("deploy.certs:ROUTER_FILE", "write a fleet's router settings, for zenohd"),
 }
 
 

@@ -6,7 +6,7 @@ The same inputs give the same bytes: the archive holds no time, place or user na
 from __future__ import annotations
 
 import argparse
-import contextlib
+import functools
 import hashlib
 import io
 import os
@@ -23,21 +23,29 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 import deploy.installer
 import edge_runtime
+from deploy.certs import DEFAULT_KEY, write_private
 from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
-from deploy.keys import DEFAULT_DIRECTORY
 from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, find_target, gather, lock_path
-from edge_runtime import tls as access
 from edge_runtime.cli import examples
 from edge_runtime.config import NONE, Config, load_config
+from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.policy import Policy, load_policy
 from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
-from edge_runtime.tls import CA_FILE, CERTIFICATE_FILE, KEY_FILE, load_tls, read_signing_key
+from edge_runtime.tls import (
+    CA_FILE,
+    CERTIFICATE_FILE,
+    EDGE,
+    KEY_FILE,
+    check_name,
+    common_name,
+    load_tls,
+    read_signing_key,
+)
 from edge_runtime.util import UserError, read_bytes
 
 NAME = "install.pyz"
 DEFAULT_OUT = "build/bundles"
-DEFAULT_KEY = f"{DEFAULT_DIRECTORY}/policy.key"
 UNITS = Path(__file__).parent / "systemd"
 HOLD = "../../state/hold"
 """Seen from a release's folder: what the installer locks while it judges."""
@@ -60,18 +68,16 @@ EXAMPLE = examples(
 
 
 class Inputs(NamedTuple):
-    """What a bundle is made of."""
+    """What a bundle is made of: a policy with its signature beside it and the signer's public key,
+    the private key that signs the bundle, settings of `run` (None for its defaults), the vehicle's
+    folder of `deploy certs`, and all wheels.
+    """
 
     policy: Path
-    """With its signature beside it."""
     public_key: Path
-    """Of whoever signed the policy."""
     key: Path
-    """The private key that signs the bundle."""
     config: Path | None
-    """Settings of `run`; None for its defaults."""
     tls: Path | None
-    """The folder of `deploy certs` for this vehicle."""
     wheels: list[Path]
 
 
@@ -85,74 +91,51 @@ class Made(NamedTuple):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--policy", metavar="POLICY.onnx", required=True, help="signed policy file")
     parser.add_argument(
         "--target", metavar="|".join(TARGETS), required=True, help="the board's kind"
     )
-    parser.add_argument("--out", metavar="DIR", default=DEFAULT_OUT, help="where the archive goes")
-    parser.add_argument(
-        "--config",
-        metavar="FILE.toml",
-        help="settings of `edge_runtime run`: connect, vehicle, ...",
-    )
-    parser.add_argument(
-        "--tls",
-        metavar="DIR",
-        help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01",
-    )
-    parser.add_argument(
+    add = functools.partial(parser.add_argument, metavar="FILE")
+    add("--policy", required=True, help="signed policy file")
+    add("--config", help="settings of `edge_runtime run`: connect, vehicle, ... (TOML)")
+    add(
         "--public-key",
-        metavar="FILE",
         default=str(DEFAULT_PUBLIC_KEY),
         help="of whoever signed the policy",
     )
-    parser.add_argument(
-        "--key", metavar="FILE", default=DEFAULT_KEY, help="private key that signs the bundle"
-    )
-    parser.add_argument(
-        "--wheels", metavar="DIR", default=DEFAULT_FOLDER, help="wheels are kept here"
-    )
+    add("--key", default=DEFAULT_KEY, help="private key that signs the bundle")
+    add = functools.partial(parser.add_argument, metavar="DIR")
+    add("--tls", help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01")
+    add("--wheels", default=DEFAULT_FOLDER, help="wheels are kept here")
+    add("--out", default=DEFAULT_OUT, help="where the archive goes")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Make a bundle and print its size and contents."""
-    target = find_target(arguments.target)
+    target, out = find_target(arguments.target), Path(arguments.out)
+    inputs = Inputs(
+        policy=Path(arguments.policy),
+        public_key=Path(arguments.public_key),
+        key=Path(arguments.key),
+        config=Path(arguments.config) if arguments.config else None,
+        tls=Path(arguments.tls) if arguments.tls else None,
+        wheels=[],
+    )
+    check_inputs(inputs)  # Before minutes of downloads, and so is the next line.
+    check_writable(out / "bundle.tar")
+    wheels = gather(target, lock_path(target), Path(arguments.wheels) / target.name)
     with tempfile.TemporaryDirectory() as place:
-        inputs = Inputs(
-            policy=Path(arguments.policy),
-            public_key=Path(arguments.public_key),
-            key=Path(arguments.key),
-            config=Path(arguments.config) if arguments.config else None,
-            tls=Path(arguments.tls) if arguments.tls else None,
-            wheels=[],
-        )
-        check_inputs(inputs)  # Before minutes of downloads.
-        _check_out(Path(arguments.out))
-        wheels = gather(target, lock_path(target), Path(arguments.wheels) / target.name)
-        inputs = inputs._replace(wheels=[*wheels, build_edge_wheel(Path(place))])
-        made = make_bundle(inputs, target, Path(arguments.out))
-    print("\n".join(_lines(made)))
+        wheels.append(build_edge_wheel(Path(place)))
+        made = make_bundle(inputs._replace(wheels=wheels), target, out)
+    for name, size in made.sizes.items():
+        print(f"{size:>12,}  {name}")
+    print(f"{sum(s for n, s in made.sizes.items() if n.startswith(WHEELS)):>12,}  of it wheels")
+    size, manifest = made.path.stat().st_size, made.manifest
+    print(f"{size:>12,}  {made.path}  ({size / 1e6:.1f} MB), signed by {made.path.name}.sig")
+    print(
+        f"version {manifest.version}, for {manifest.vehicle_id}, Python {target.python}"
+        f" on {target.machine} with glibc {target.glibc} or newer"
+    )
     return 0
-
-
-def _check_out(out: Path) -> None:
-    """Raise UserError where the folder cannot be made, without making it."""
-    whole = out.absolute()
-    there = next(place for place in (whole, *whole.parents) if place.exists())
-    if not there.is_dir():
-        raise UserError(f"--out {out}: {there} is a file, not a directory")
-
-
-def _lines(made: Made) -> list[str]:
-    manifest, size = made.manifest, made.path.stat().st_size
-    wheels = sum(size for path, size in made.sizes.items() if path.startswith(WHEELS))
-    return [
-        *(f"{size:>12,}  {path}" for path, size in made.sizes.items()),
-        f"{wheels:>12,}  of it wheels",
-        f"{size:>12,}  {made.path}  ({size / 1e6:.1f} MB), signed by {made.path.name}.sig",
-        f"version {manifest.version}, for {manifest.vehicle_id}, Python {manifest.target.python}"
-        f" on {manifest.target.machine} with glibc {manifest.target.glibc} or newer",
-    ]
 
 
 def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
@@ -169,17 +152,22 @@ def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
         f"{POLICY}.sig": read_bytes(f"{inputs.policy}.sig", "signature"),
         PUBLIC_KEY: read_bytes(inputs.public_key, "public key"),
         CONFIG: text.encode(),
-        **{f"units/{path.name}": path.read_bytes() for path in sorted(UNITS.glob("*.*"))},
-        **{f"{WHEELS}{_short(path)}": path.read_bytes() for path in inputs.wheels},
     }
-    if inputs.tls is not None:
-        contents |= _tls(inputs.tls, config.vehicle_id)
+    for path in sorted(UNITS.glob("*.*")):
+        contents[f"units/{path.name}"] = path.read_bytes()
+    for path in inputs.wheels:
+        # NAME-VERSION: the tags were pip's concern, and make some names too long for a tar.
+        name = "-".join(path.name.split("-")[:2])
+        contents[f"{WHEELS}{name}.whl"] = path.read_bytes()
+    if inputs.tls is not None:  # The party's three files, and none that may stand beside them.
+        for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE):
+            contents[f"{TLS}{name}"] = read_bytes(inputs.tls / name, "TLS file")
     manifest = _manifest(contents, target, config.vehicle_id, policy.policy_id)
     path = out / f"phil-{target.name}-{config.vehicle_id}-{manifest.version}.tar"
     packed = _pack({MANIFEST: to_json(manifest), **contents})
     signature = _sign(packed, key)
-    _write(Path(f"{path}.sig"), signature, 0o644)
-    _write(path, packed, 0o600)  # it holds a private key, so nobody else may read it
+    write_atomic(f"{path}.sig", signature)
+    write_private(path, packed)  # it holds a private key
     return Made(path, manifest, {name: len(data) for name, data in sorted(contents.items())})
 
 
@@ -198,7 +186,7 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
     policy = load_policy(inputs.policy, inputs.public_key)
     config, text = _config(inputs)
     if inputs.tls is not None:
-        _tls(inputs.tls, config.vehicle_id)
+        check_name(load_tls(inputs.tls).name, common_name(EDGE, config.vehicle_id))
     return key, policy, config, text
 
 
@@ -251,7 +239,8 @@ def _sign(data: bytes, key: Ed25519PrivateKey) -> bytes:
 
 def _config(inputs: Inputs) -> tuple[Config, str]:
     """The settings, checked as `run` checks them, and the file that the board gets."""
-    plain = load_config(inputs.config, {"policy": str(inputs.policy), **_tls_flag(inputs)})
+    flags = {"policy": str(inputs.policy), **({"tls": str(inputs.tls)} if inputs.tls else {})}
+    config = load_config(inputs.config, flags)
     given = read_bytes(inputs.config, "config file").decode() if inputs.config else ""
     keys = tomllib.loads(given).keys()
     for name in _OF_THE_BUNDLE:
@@ -259,7 +248,7 @@ def _config(inputs: Inputs) -> tuple[Config, str]:
             raise UserError(
                 f"config file {inputs.config}: {name} is the bundle's to say; leave it out"
             )
-    if "armed_at_start" in keys and plain.armed_at_start and plain.vehicle != NONE:
+    if "armed_at_start" in keys and config.armed_at_start and config.vehicle != NONE:
         raise UserError(
             f"config file {inputs.config}: armed_at_start would let a machine move the vehicle"
             " when it starts; leave it out"
@@ -275,49 +264,11 @@ def _config(inputs: Inputs) -> tuple[Config, str]:
         given.strip(),
     ]
     text = "\n".join(lines).rstrip() + "\n"
-    _check_text(text)
-    return plain, text
-
-
-def _short(wheel: Path) -> str:
-    """NAME-VERSION.whl: the tags were pip's concern, and make some names too long for a tar."""
-    return "-".join(wheel.name.split("-")[:2]) + ".whl"
-
-
-def _tls_flag(inputs: Inputs) -> dict[str, str]:
-    return {"tls": str(inputs.tls)} if inputs.tls else {}
-
-
-def _check_text(text: str) -> None:
     with tempfile.NamedTemporaryFile("w", suffix=".toml") as file:
         file.write(text)
         file.flush()
         load_config(file.name, {})
-
-
-def _tls(folder: Path, vehicle_id: str) -> dict[str, bytes]:
-    """The three files of the edge runtime's party, and none that may stand beside them."""
-    files = load_tls(folder)
-    access.check_name(files.name, access.common_name(access.EDGE, vehicle_id))
-    return {
-        f"{TLS}{name}": read_bytes(folder / name, "TLS file")
-        for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE)
-    }
-
-
-def _write(path: Path, data: bytes, mode: int) -> None:
-    """Write a file beside it and move it there."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as stream:
-            stream.write(data)
-        draft.replace(path)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from None
-    finally:  # ^C, too: half a bundle holds a private key as well
-        with contextlib.suppress(OSError):
-            draft.unlink()
+    return config, text
 
 
 def build_installer() -> bytes:

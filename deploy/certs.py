@@ -1,8 +1,9 @@
-"""``python -m deploy certs``: an authority of one's own, and a certificate for each party.
+"""``python -m deploy keys, certs, router``: who may sign, and who may talk to whom.
 
-The common name of a certificate says which party it is; `edge_runtime.tls` says what each party
-may send and hear. Only the certificates of parties that listen may act as servers, so no viewer
-or operator can pose as a simulator. Each party gets a folder with the three files that it needs.
+An Ed25519 pair signs policies and bundles. An authority of one's own makes a TLS certificate for
+each party; its common name says which party it is, and `edge_runtime.tls` says what each party may
+send and hear. Only the certificates of parties that listen may act as servers, so no viewer or
+operator can pose as a simulator. A fleet's router gets the same rights in one file for zenohd.
 """
 
 from __future__ import annotations
@@ -14,45 +15,113 @@ import ipaddress
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+)
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from edge_runtime.cli import examples, whole_number
-from edge_runtime.files import write_atomic
+from edge_runtime.cli import Command, examples, whole_number
+from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
+from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
 from edge_runtime.tls import (
     CA_FILE,
     CERTIFICATE_FILE,
     KEY_FILE,
     ROLES,
+    ROUTER,
+    TlsFiles,
+    check_name,
     common_name,
+    load_tls,
     read_private_key,
+    rules_for_listener,
 )
 from edge_runtime.util import UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
-CA_FOLDER = "ca"
+DEFAULT_KEY = str(DEFAULT_PUBLIC_KEY.with_suffix(".key"))
 CA_KEY_FILE = "ca.key.pem"
 CA_DAYS = 3650
-DEFAULT_OUT = "certs"
-DEFAULT_DAYS = 365
 CLOCK_SLACK = datetime.timedelta(days=1)
 """A certificate is valid from a day ago: boards' clocks are behind until they are set."""
 LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
 MAX_NAME_CHARS = 64
-"""Of a certificate's common name (RFC 5280)."""
+"""The longest common name of a certificate (RFC 5280)."""
+SESSIONS_PER_VEHICLE = 4
+"""Edge runtime, simulator, an operator's command, and the edge runtime's look at its start."""
+SPARE_SESSIONS = 1000
+"""Viewers; Zenoh's own default."""
+MAX_MESSAGE_BYTES = 256 * 1024
+"""Four times what an edge runtime reads. Larger ones end at the router; Zenoh itself says 1 GiB."""
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 _HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(\.{_LABEL})*")
+_NO_USE = dict.fromkeys(
+    ("digital_signature", "content_commitment", "key_encipherment", "data_encipherment",
+     "key_agreement", "key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
+    False,
+)  # fmt: skip
 
-EXAMPLE = examples(
-    "python -m deploy certs --vehicle-id hunter01 --host workstation.local --out certs",
-)
+
+def _add_keys_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        default=str(DEFAULT_PUBLIC_KEY.parent),
+        help="directory for policy.key and policy.pub",
+    )
+
+
+def _run_keys(arguments: argparse.Namespace) -> int:
+    private, public = write_key_pair(Path(arguments.out))
+    print(f"private key (keep it on the workstation): {private}")
+    print(f"public key (goes onto the board):         {public}")
+    return 0
+
+
+def write_key_pair(directory: Path) -> tuple[Path, Path]:
+    """Write `policy.key` (PKCS8 PEM, readable by the owner alone) and `policy.pub`.
+
+    Raises UserError where a key is there already (it may have signed policies that drive), or the
+    directory cannot be written.
+    """
+    public_path = directory / DEFAULT_PUBLIC_KEY.name
+    private_path = public_path.with_suffix(".key")
+    for path in (private_path, public_path):
+        if path.exists():
+            raise UserError(f"{path} exists and is not overwritten; choose another --out")
+    make_directory(directory)
+    key = ed25519.Ed25519PrivateKey.generate()
+    write_private(private_path, _pem(key))
+    public = key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+    try:
+        write_atomic(public_path, public)
+    except UserError:
+        # Half a pair would make the next try refuse to overwrite it.
+        private_path.unlink()
+        raise
+    return private_path, public_path
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that others cannot read, not even briefly: the umask, not a chmod."""
+    before = os.umask(0o077)
+    try:
+        write_atomic(path, data)
+    finally:
+        os.umask(before)
+
+
+KEYS = Command(examples("python -m deploy keys --out keys"), _add_keys_arguments, _run_keys)
 
 
 class Pair(NamedTuple):
@@ -62,11 +131,8 @@ class Pair(NamedTuple):
     key: ec.EllipticCurvePrivateKey
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "--out", metavar="DIR", default=DEFAULT_OUT, help="directory of all folders"
-    )
+def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="DIR", default="certs", help="directory of all folders")
     parser.add_argument(
         "--vehicle-id",
         metavar="ID",
@@ -86,23 +152,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--days",
         metavar="N",
         type=whole_number(1, CA_DAYS),
-        default=DEFAULT_DAYS,
+        default=365,
         help="how long they are valid, days",
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _run_certs(arguments: argparse.Namespace) -> int:
     """Make what is missing of the authority and of the parties' folders.
 
     Raises UserError, with nothing written, where nothing is missing.
     """
     out, days = Path(arguments.out), arguments.days
-    hosts = [*LOOPBACK_HOSTS, *map(_check_host, arguments.host)]
-    roles = _missing(out, _check_parties(arguments.vehicle_id or [DEFAULT_VEHICLE_ID]))
+    hosts = list(dict.fromkeys(map(_host, [*LOOPBACK_HOSTS, *arguments.host])))
+    roles = _missing(out, arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
     now = datetime.datetime.now(datetime.UTC)
-    ca_folder = out / CA_FOLDER
+    ca_folder = out / "ca"
     is_new = not ca_folder.exists()
-    authority = make_authority(now) if is_new else read_authority(ca_folder)
+    authority = _make_authority(now) if is_new else read_authority(ca_folder)
     left = authority.certificate.not_valid_after_utc - now
     if left < datetime.timedelta(days=days):
         raise UserError(f"--days {days} is longer than the authority's own {left.days} days")
@@ -110,7 +176,8 @@ def run(arguments: argparse.Namespace) -> int:
         _write_folder(ca_folder, authority, {CA_KEY_FILE: _pem(authority.key)})
     for name, role in roles.items():
         issued = issue(authority, name, role, hosts, now, days)
-        files = {CERTIFICATE_FILE: _pem(issued.certificate), KEY_FILE: _pem(issued.key)}
+        certificate = issued.certificate.public_bytes(Encoding.PEM)
+        files = {CERTIFICATE_FILE: certificate, KEY_FILE: _pem(issued.key)}
         _write_folder(out / name, authority, files)
     print(f"authority (keep {ca_folder / CA_KEY_FILE} off every board): {ca_folder}")
     for name in roles:
@@ -119,28 +186,20 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _check_parties(vehicle_ids: list[str]) -> dict[str, str]:
-    """The role of each party of these vehicles, by name; UserError for ids that name none."""
-    roles = party_roles(map(check_vehicle_id, vehicle_ids))
+def _missing(out: Path, vehicle_ids: Sequence[str]) -> dict[str, str]:
+    """The role of each party without a folder, by its name: those of all vehicles first.
+
+    Raises UserError where all have one, and for an id that no certificate can name.
+    """
+    roles = {role: role for role, rights in ROLES.items() if rights.all_vehicles}
+    own = [role for role, rights in ROLES.items() if not rights.all_vehicles]
+    roles |= {common_name(role, vehicle): role for vehicle in vehicle_ids for role in own}
     for name in roles:
         if len(name) > MAX_NAME_CHARS:
             raise UserError(
                 f"no certificate can name {name}: its {len(name)} characters are over"
                 f" {MAX_NAME_CHARS}; choose a shorter --vehicle-id"
             )
-    return roles
-
-
-def _check_host(text: str) -> str:
-    with contextlib.suppress(ValueError):
-        return str(ipaddress.ip_address(text))
-    if _HOST_NAME.fullmatch(text) is None:
-        raise UserError(f"host {text!r} is not valid: write a name or an address, without port")
-    return text
-
-
-def _missing(out: Path, roles: dict[str, str]) -> dict[str, str]:
-    """Those that have no folder yet; UserError where all have one."""
     missing = {name: role for name, role in roles.items() if not (out / name).exists()}
     if not missing:
         raise UserError(
@@ -152,6 +211,14 @@ def _missing(out: Path, roles: dict[str, str]) -> dict[str, str]:
     return missing
 
 
+def _host(text: str) -> x509.GeneralName:
+    with contextlib.suppress(ValueError):
+        return x509.IPAddress(ipaddress.ip_address(text))
+    if _HOST_NAME.fullmatch(text) is None:
+        raise UserError(f"host {text!r} is not valid: write a name or an address, without port")
+    return x509.DNSName(text)
+
+
 def _write_folder(folder: Path, authority: Pair, files: dict[str, bytes]) -> None:
     """Fill a draft beside it and move it there, so that the folder is whole or absent.
 
@@ -161,10 +228,10 @@ def _write_folder(folder: Path, authority: Pair, files: dict[str, bytes]) -> Non
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         draft.mkdir(mode=0o700)
-        for name, data in {CA_FILE: _pem(authority.certificate), **files}.items():
-            write_atomic(draft / name, data)
-            if name in (KEY_FILE, CA_KEY_FILE):
-                (draft / name).chmod(0o600)
+        write_atomic(draft / CA_FILE, authority.certificate.public_bytes(Encoding.PEM))
+        for name, data in files.items():
+            write = write_private if name in (KEY_FILE, CA_KEY_FILE) else write_atomic
+            write(draft / name, data)
         draft.rename(folder)  # Fails where somebody has filled it meanwhile.
     except OSError as error:
         raise UserError(f"cannot create {folder}: {error.strerror}") from None
@@ -172,26 +239,12 @@ def _write_folder(folder: Path, authority: Pair, files: dict[str, bytes]) -> Non
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _pem(each: x509.Certificate | ec.EllipticCurvePrivateKey) -> bytes:
-    if isinstance(each, x509.Certificate):
-        return each.public_bytes(Encoding.PEM)
-    return each.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-
-
-def make_authority(now: datetime.datetime, days: int = CA_DAYS) -> Pair:
-    """A new authority that may issue certificates of parties and no further authorities."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = _name("PHIL-TD3 hardware-in-the-loop authority")
-    builder = (
-        _builder(name, name, key, now, days)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs_certificates=True), critical=True)
-    )
-    return Pair(builder.sign(key, hashes.SHA256()), key)
+def _pem(key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 
 def read_authority(folder: Path) -> Pair:
-    """The authority that `make_authority` made before. UserError where its files do not fit."""
+    """The authority that was made before. UserError where its files do not fit."""
     pem = read_bytes(folder / CA_FILE, "authority")
     try:
         certificate = x509.load_pem_x509_certificate(pem)
@@ -205,80 +258,163 @@ def read_authority(folder: Path) -> Pair:
     return Pair(certificate, key)
 
 
-def party_roles(vehicle_ids: Iterable[str]) -> dict[str, str]:
-    """Return the role of each party by its common name: those of all vehicles first."""
-    shared = {role: role for role, rights in ROLES.items() if rights.all_vehicles}
-    own = [role for role, rights in ROLES.items() if not rights.all_vehicles]
-    return shared | {common_name(role, i): role for i in vehicle_ids for role in own}
+def _make_authority(now: datetime.datetime) -> Pair:
+    """A new authority that may issue certificates of parties and no further authorities."""
+    return _certify(
+        "PHIL-TD3 hardware-in-the-loop authority", None, now, CA_DAYS,
+        (x509.BasicConstraints(ca=True, path_length=0), True),
+        (x509.KeyUsage(**_NO_USE | {"key_cert_sign": True, "crl_sign": True}), True),
+    )  # fmt: skip
 
 
 def issue(
     authority: Pair,
     party: str,
     role: str,
-    hosts: Iterable[str],
+    hosts: Sequence[x509.GeneralName],
     now: datetime.datetime,
     days: int,
 ) -> Pair:
-    """A certificate for a party; ``hosts`` are the names under which a listener is reached."""
-    key = ec.generate_private_key(ec.SECP256R1())
+    """A certificate for a party; `hosts` are the names under which a listener is reached."""
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    builder = _builder(_name(party), authority.certificate.subject, key, now, days)
+    names: list[tuple[x509.ExtensionType, bool]] = []
     if ROLES[role].listens:
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
-        names = x509.SubjectAlternativeName([_host(host) for host in dict.fromkeys(hosts)])
-        builder = builder.add_extension(names, critical=False)
-    builder = (
-        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs_certificates=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
-            critical=False,
-        )
-    )
-    return Pair(builder.sign(authority.key, hashes.SHA256()), key)
+        names.append((x509.SubjectAlternativeName(hosts), False))
+    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
+    return _certify(
+        party, authority, now, days,
+        (x509.BasicConstraints(ca=False, path_length=None), True),
+        (x509.KeyUsage(**_NO_USE | {"digital_signature": True}), True),
+        (x509.ExtendedKeyUsage(purposes), False),
+        (issuer, False),
+        *names,
+    )  # fmt: skip
 
 
-def _builder(
-    subject: x509.Name,
-    issuer: x509.Name,
-    key: ec.EllipticCurvePrivateKey,
+def _certify(
+    common: str,
+    authority: Pair | None,
     now: datetime.datetime,
     days: int,
-) -> x509.CertificateBuilder:
-    return (
+    *extensions: tuple[x509.ExtensionType, bool],
+) -> Pair:
+    """A new key and its certificate, signed by the authority or, without one, by itself.
+
+    `extensions` come with whether a reader that does not know them must refuse the certificate.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+    builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(issuer)
+        .issuer_name(authority.certificate.subject if authority else subject)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - CLOCK_SLACK)
         .not_valid_after(now + datetime.timedelta(days=days))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
+    for extension, is_critical in extensions:
+        builder = builder.add_extension(extension, is_critical)
+    return Pair(builder.sign(authority.key if authority else key, hashes.SHA256()), key)
 
 
-def _name(common: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+CERTS = Command(
+    examples("python -m deploy certs --vehicle-id hunter01 --host workstation.local --out certs"),
+    _add_certs_arguments,
+    _run_certs,
+)
 
 
-def _host(host: str) -> x509.GeneralName:
-    try:
-        return x509.IPAddress(ipaddress.ip_address(host))
-    except ValueError:
-        return x509.DNSName(host)
-
-
-def _usage(signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=not signs_certificates,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
+def _add_router_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--listen",
+        metavar="tls/HOST:PORT",
+        action="append",
+        required=True,
+        help="where all others connect to, as tls/0.0.0.0:7447; may be repeated",
     )
+    parser.add_argument(
+        "--tls",
+        metavar="DIR",
+        required=True,
+        help="the router's folder of `deploy certs`, as certs/router; zenohd opens its files",
+    )
+    parser.add_argument(
+        "--vehicle-id",
+        metavar="ID",
+        action="append",
+        default=[],
+        help="a vehicle whose parties have rights at this router; may be repeated",
+    )
+    parser.add_argument("--vehicles", metavar="FILE", help="a file with one vehicle id a line")
+    parser.add_argument("--out", metavar="FILE.json5", required=True, help="the settings' file")
+
+
+def _run_router(arguments: argparse.Namespace) -> int:
+    """Write the file. Raises UserError where anything in it would not hold."""
+    check_writable(arguments.out)
+    ids = arguments.vehicle_id + (_read_ids(arguments.vehicles) if arguments.vehicles else [])
+    settings = _router_settings(arguments.listen, ids, load_tls(arguments.tls))
+    write_json(arguments.out, settings)
+    size = Path(arguments.out).stat().st_size
+    names = len(settings["access_control"]["subjects"])
+    print(f"{arguments.out}: {len(set(ids))} vehicles, {names} names with rights, {size:,} bytes")
+    print(f"start it:  zenohd --config {arguments.out}")
+    print(f"or:        python -m bridge router --config {arguments.out}")
+    return 0
+
+
+def _router_settings(
+    listens: Sequence[str], vehicle_ids: Sequence[str], tls: TlsFiles
+) -> dict[str, Any]:
+    """Zenoh's settings as one nested map: those of `bridge router --tls`, and a fleet's limits.
+
+    Raises UserError for plain endpoints, another party's certificate, no vehicle, or a vehicle id
+    that is not valid.
+    """
+    # Here: keys and certificates need no Zenoh.
+    from edge_runtime.transport import check_endpoint, check_fits, session_rows
+
+    for endpoint in listens:
+        check_fits(check_endpoint(endpoint), with_tls=True)
+    check_name(tls.name, ROUTER)
+    if not vehicle_ids:
+        raise UserError("no vehicle: name each with --vehicle-id, or all of them in --vehicles")
+    ids = list(dict.fromkeys(map(check_vehicle_id, vehicle_ids)))
+    rows = session_rows(list(listens), None, "router", tls, rules_for_listener(ids))
+    sessions = SPARE_SESSIONS + SESSIONS_PER_VEHICLE * len(ids)
+    rows["transport/unicast/max_sessions"] = sessions
+    # After a router's restart all of its vehicles come at once.
+    rows["transport/unicast/accept_pending"] = sessions
+    rows["transport/link/rx/max_message_size"] = MAX_MESSAGE_BYTES
+    nested: dict[str, Any] = {}
+    for path, value in rows.items():
+        *folders, name = path.split("/")
+        place = nested
+        for folder in folders:
+            place = place.setdefault(folder, {})
+        place[name] = value
+    return nested
+
+
+def _read_ids(path: str) -> list[str]:
+    """One id a line; empty lines and `#` to the line's end are nothing."""
+    try:
+        text = read_bytes(path, "file of vehicles").decode()
+    except UnicodeDecodeError:
+        raise UserError(f"file of vehicles {path} is no text") from None
+    return [word for line in text.splitlines() if (word := line.partition("#")[0].strip())]
+
+
+ROUTER_FILE = Command(
+    examples(
+        "python -m deploy router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+        "    --vehicle-id hunter01 --vehicle-id hunter02 --out router.json5",
+        "python -m deploy router --listen tls/0.0.0.0:7447 --tls certs/router"
+        " --vehicles fleet.txt \\\n    --out router.json5",
+    ),
+    _add_router_arguments,
+    _run_router,
+)

@@ -21,7 +21,7 @@ from deploy.installer.systemd import WAYS
 from deploy.installer.verify import Manifest
 from edge_runtime.cli import examples
 from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
-from edge_runtime.util import UserError, read_bytes
+from edge_runtime.util import UserError
 
 _UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 """A password asked for in the middle would hang a script, and so would a board without power."""
@@ -66,77 +66,59 @@ def run(arguments: argparse.Namespace) -> int:
     """Copy, install, and clean up; the installer's exit status."""
     if not _HOST.fullmatch(arguments.host):
         raise UserError(f"host {arguments.host!r} is not valid: write name or user@name")
-    manifest = _verify(arguments)
+    try:  # What the board would refuse is not sent.
+        key = verify.read_public_key(arguments.trust)
+        manifest = verify.read_bundle(arguments.bundle, key).manifest
+    except verify.UserError as error:
+        raise UserError(str(error)) from None
     with tempfile.TemporaryDirectory() as place:
         files = {name: Path(place) / name for name in (NAME, _TRUST)}
         files[NAME].write_bytes(build_installer())
-        files[_TRUST].write_bytes(read_bytes(arguments.trust, "public key"))
+        files[_TRUST].write_bytes(key)
         # Absolute: scp would take "a:b" for a file of the host a.
         files[_BUNDLE] = Path(arguments.bundle).absolute()
         files[f"{_BUNDLE}.sig"] = Path(f"{files[_BUNDLE]}.sig")
-        before, install, after = steps(arguments, manifest, files)
+        probe, *copying, install, tidy = steps = _steps(arguments, manifest, files)
         if arguments.dry_run:
-            for step in (*before, install, after):
+            for step in steps:
                 print(f"# {step.why}\n{shlex.join(step.command)}")
             return 0
-        return _run(before, install, after)
+        _expect(probe)
+        try:
+            for step in copying:
+                _expect(step)
+            return _call(install)
+        finally:
+            # Whatever came of it: half a bundle may hold the vehicle's private key, too.
+            _call(tidy)
 
 
-def steps(
-    arguments: argparse.Namespace, manifest: Manifest, files: dict[str, Path]
-) -> tuple[list[Step], Step, Step]:
-    """What comes before the installation, the installation, and what is done in any case.
-
-    `files` are those to copy, by their names over there.
-    """
-    host, target = arguments.host, manifest.target
-    folder = f"phil-push-{manifest.version}"
+def _steps(arguments: argparse.Namespace, manifest: Manifest, files: dict[str, Path]) -> list[Step]:
+    """The probe, the copies of `files` by their names over there, the installation, the tidying."""
+    target, folder = manifest.target, f"phil-push-{manifest.version}"
     python = f"python{target.python}"
     probe = (
         f"{python} -c 'import platform, sys;"
         f' sys.exit(platform.machine() != "{target.machine}" and'
         f' "this board is " + platform.machine() + ", the bundle is for {target.machine}")\''
     )
-    sudo = [] if arguments.no_sudo else ["sudo", "-n"]
     install = [
-        *sudo, python, f"{folder}/{NAME}", "install", f"{folder}/{_BUNDLE}",
+        *([] if arguments.no_sudo else ["sudo", "-n"]),
+        python, f"{folder}/{NAME}", "install", f"{folder}/{_BUNDLE}",
         "--trust", f"{folder}/{_TRUST}", "--root", arguments.root,
         *(["--service", arguments.service] if arguments.service else []),
     ]  # fmt: skip
-    before = [
-        Step(f"has it Python {target.python} on {target.machine}?", [*SSH, host, probe]),
-        Step("a folder of its own there", [*SSH, host, f"umask 077 && mkdir -p {folder}"]),
+    ssh = [*SSH, arguments.host]
+    return [
+        Step(f"has it Python {target.python} on {target.machine}?", [*ssh, probe]),
+        Step("a folder of its own there", [*ssh, f"umask 077 && mkdir -p {folder}"]),
         *(
-            Step(f"{name} into it", [*SCP, str(path), f"{host}:{folder}/{name}"])
+            Step(f"{name} into it", [*SCP, str(path), f"{arguments.host}:{folder}/{name}"])
             for name, path in files.items()
         ),
+        Step("install", [*ssh, shlex.join(install)]),
+        Step("leave nothing behind", [*ssh, f"rm -rf {folder}"]),
     ]
-    return (
-        before,
-        Step("install", [*SSH, host, shlex.join(install)]),
-        Step("leave nothing behind", [*SSH, host, f"rm -rf {folder}"]),
-    )
-
-
-def _verify(arguments: argparse.Namespace) -> Manifest:
-    """The bundle's manifest: what the board would refuse is not sent."""
-    try:
-        key = verify.read_public_key(arguments.trust)
-        return verify.read_bundle(arguments.bundle, key).manifest
-    except verify.UserError as error:
-        raise UserError(str(error)) from None
-
-
-def _run(before: list[Step], install: Step, after: Step) -> int:
-    probe, *copying = before
-    _expect(probe)
-    try:
-        for step in copying:
-            _expect(step)
-        return _call(install)
-    finally:
-        # Whatever came of it: half a bundle may hold the vehicle's private key, too.
-        _call(after)
 
 
 def _expect(step: Step) -> None:

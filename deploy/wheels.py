@@ -7,6 +7,7 @@ a bundle made from a full folder needs no network. After a change of versions in
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import os
@@ -20,7 +21,7 @@ from typing import NamedTuple
 
 from deploy.installer.verify import Target
 from edge_runtime.cli import ArgumentParser, examples, run_cli
-from edge_runtime.files import write_atomic
+from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
 
 ROOT = Path(__file__).parents[1]
@@ -94,20 +95,14 @@ def gather(target: Target, lock: Path, folder: Path) -> list[Path]:
 
 def download(target: Target, wanted: list[str], folder: Path) -> None:
     """`pip download` of wheels for another computer. Raises UserError with pip's own line."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot keep wheels in {folder}: {error.strerror}") from None
-    platforms = [
-        f"--platform=manylinux_2_{minor}_{target.machine}"
-        for minor in _MANYLINUX
-        if minor <= int(target.glibc.split(".")[1])
-    ]
-    aliases = [f"--platform=manylinux{year}_{target.machine}" for year in (1, 2010, 2014)]
-    python = f"--python-version={target.python}.{_PATCH}"
+    make_directory(folder)
+    newest = int(target.glibc.split(".")[1])
+    tags = [*(f"_2_{minor}" for minor in _MANYLINUX if minor <= newest), "1", "2010", "2014"]
     pip(
-        "download", "--only-binary=:all:", "--no-deps", python,
-        *platforms, *aliases, "--dest", str(folder), *wanted,
+        "download", "--only-binary=:all:", "--no-deps",
+        f"--python-version={target.python}.{_PATCH}",
+        *(f"--platform=manylinux{tag}_{target.machine}" for tag in tags),
+        "--dest", str(folder), *wanted,
     )  # fmt: skip
 
 
@@ -121,10 +116,14 @@ def build_edge_wheel(folder: Path) -> Path:
         for path in source.rglob("*"):
             path.chmod(0o755 if path.is_dir() else 0o644)  # the umask of whoever cloned it
         made = Path(place) / "made"
-        pip("wheel", "--no-deps", *_isolation(), "--wheel-dir", str(made), str(source))
-        wheel = next(made.glob("*.whl"))
-        folder.mkdir(parents=True, exist_ok=True)
-        return Path(shutil.move(str(wheel), str(folder / wheel.name)))
+        # With the setuptools that is here, if it is new enough: no index is asked then.
+        options = []
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError, ValueError):
+            if int(importlib.metadata.version("setuptools").split(".")[0]) >= _SETUPTOOLS:
+                options = ["--no-build-isolation"]
+        pip("wheel", "--no-deps", *options, "--wheel-dir", str(made), str(source))
+        make_directory(folder)
+        return Path(shutil.move(next(made.glob("*.whl")), folder))
 
 
 def pip(*arguments: str) -> None:
@@ -137,17 +136,8 @@ def pip(*arguments: str) -> None:
         raise UserError(f"pip {arguments[0]}: {(lines or ['failed'])[-1]}")
 
 
-def _isolation() -> list[str]:
-    """Build with the setuptools that is here, if it is new enough: no index is asked then."""
-    try:
-        major = int(importlib.metadata.version("setuptools").split(".")[0])
-    except (importlib.metadata.PackageNotFoundError, ValueError):
-        return []
-    return ["--no-build-isolation"] if major >= _SETUPTOOLS else []
-
-
 def _by_hash(folder: Path) -> dict[str, Path]:
-    wheels = sorted(folder.glob("*.whl")) if folder.is_dir() else []
+    wheels = sorted(folder.glob("*.whl"))
     return {hashlib.sha256(path.read_bytes()).hexdigest(): path for path in wheels}
 
 

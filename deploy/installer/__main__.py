@@ -1,28 +1,61 @@
-"""`python3 install.pyz install | status | rollback | uninstall` (deploy/README.md)."""
+"""`python3 install.pyz install | status | rollback | uninstall` (deploy/README.md).
+
+`Installer` is the order of things, so that no step can break a board. A release becomes `current`
+only when its files are whole, its policy may drive and it has passed its trial; `current` changes
+by one rename. Cut off at any moment, the board has the old release or the new one, and the same
+command again completes the work.
+"""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import os
+import shutil
 import signal
+import subprocess
 import sys
-from typing import Any, Callable, NoReturn
+from typing import Any, NoReturn
 
-from deploy.installer.layout import DEFAULT_ROOT, Layout, why_not_whole
-from deploy.installer.steps import Way, install, rollback, uninstall
-from deploy.installer.systemd import WAYS, Limits, NoService, choose
-from deploy.installer.verify import MANIFEST, UnhealthyError, UserError, key_name, parse_manifest
+from deploy.installer.layout import (
+    DEFAULT_ROOT,
+    LAUNCHER,
+    POLICY,
+    PUBLIC_KEY,
+    Layout,
+    make_release,
+    why_not_whole,
+    write_whole,
+)
+from deploy.installer.systemd import WAYS, Limits, NoService, choose, remember
+from deploy.installer.verify import (
+    MANIFEST,
+    Bundle,
+    Manifest,
+    UnhealthyError,
+    UserError,
+    check_fits,
+    key_name,
+    parse_manifest,
+    read_bundle,
+    read_public_key,
+    ssh_key,
+)
 
-LIMITS = Limits()
-EXAMPLES = {
-    "install": "install phil-jetpack5-*.tar --trust bundle.pub",
-    "status": "status --json",
-    "rollback": "rollback --health-limit 20",
-    "uninstall": "uninstall",
+COMMANDS = {
+    "install": (
+        "verify a bundle, install it beside what runs, and switch when it is healthy",
+        "install phil-jetpack5-*.tar --trust bundle.pub",
+    ),
+    "status": ("what is installed here, and whether it is whole", "status --json"),
+    "rollback": ("go back to the release before", "rollback --health-limit 20"),
+    "uninstall": ("stop the service and remove everything", "uninstall"),
 }
+LIMITS = Limits()
 UNHEALTHY, BAD_INPUT, INTERRUPTED = 1, 2, 130
+_CHECK_LIMIT_S = 120.0
 
 
 class _Parser(argparse.ArgumentParser):
@@ -46,12 +79,9 @@ def main(argv: list[str]) -> int:
             return _dispatch(_parser().parse_args(argv))
         finally:
             sys.stdout.flush()  # at the exit nobody could say what is wrong
-    except UserError as error:
+    except (UserError, UnhealthyError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except UnhealthyError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return UNHEALTHY
+        return BAD_INPUT if isinstance(error, UserError) else UNHEALTHY
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # it may be stdout that takes no more
         print(f"error: {error.filename or 'the disk'}: {error.strerror}", file=sys.stderr)
@@ -62,21 +92,16 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    example = "example: sudo python3 install.pyz "
     parser = _Parser(
         prog="install.pyz",
         description="Installs, upgrades and undoes a release of the edge runtime on this board.",
-        epilog=_example("install"),
+        epilog=example + COMMANDS["install"][1],
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     commands.required = True
-    texts = (
-        ("install", "verify a bundle, install it beside what runs, and switch when it is healthy"),
-        ("status", "what is installed here, and whether it is whole"),
-        ("rollback", "go back to the release before"),
-        ("uninstall", "stop the service and remove everything"),
-    )
-    for name, text in texts:
-        command = commands.add_parser(name, help=text, description=text, epilog=_example(name))
+    for name, (text, words) in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text, epilog=example + words)
         command.add_argument(
             "--root", metavar="DIR", default=DEFAULT_ROOT, help=f"default: {DEFAULT_ROOT}"
         )
@@ -87,12 +112,12 @@ def _parser() -> argparse.ArgumentParser:
             help="who runs it (default: systemd where it runs this computer, else none)",
         )
         if name in ("install", "rollback"):
-            for option, kind, default, text in (
-                ("--health-limit", _seconds(True), LIMITS.within_s, "healthy by then, or back"),
-                ("--settle", _seconds(False), LIMITS.settle_s, "and for so long after that"),
+            for option, default, text in (
+                ("--health-limit", LIMITS.within_s, "healthy by then, or back"),
+                ("--settle", LIMITS.settle_s, "and for so long after that"),
             ):
                 text = f"{text}, s (default: {default:g})"
-                command.add_argument(option, metavar="S", type=kind, default=default, help=text)
+                command.add_argument(option, metavar="S", type=_seconds, default=default, help=text)
         if name == "install":
             command.add_argument("bundle", metavar="BUNDLE.tar")
             command.add_argument(
@@ -103,63 +128,37 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _seconds(above_0: bool) -> Callable[[str], float]:
-    """A type: a finite number of seconds, above 0 or at least 0."""
-
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value) or value < 0 or (above_0 and not value):
-            limit = "above 0" if above_0 else "at least 0"
-            raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, {limit}")
-        return value
-
-    return read
-
-
-def _example(name: str) -> str:
-    return f"example: sudo python3 install.pyz {EXAMPLES[name]}"
+def _seconds(text: str) -> float:
+    """A finite number of seconds above 0: systemd would take a watchdog of 0 s for none."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds, above 0")
+    return value
 
 
 def _dispatch(arguments: argparse.Namespace) -> int:
-    layout = Layout(arguments.root)
-    if arguments.command == "status":
-        service = choose(arguments.service, layout.root, only_look=True)
+    layout, command = Layout(arguments.root), arguments.command
+    service = choose(arguments.service, layout.root, only_look=command == "status")
+    if command == "status":
         return _status(layout, service, arguments.json)
-    service = choose(arguments.service, layout.root)
-    if arguments.command == "uninstall":
-        uninstall(layout, Way(service, LIMITS))
+    if command == "uninstall":
+        Installer(layout, service).uninstall()
         print(f"removed from {layout.root}")
         return 0
     # A link that breaks must not end it between two releases; whoever ends it makes it go back.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    _interrupt_on(signal.SIGTERM, signal.SIGINT)
-    limits = Limits(arguments.health_limit, arguments.settle)
-    way = Way(service, limits)
-    if arguments.command == "install":
-        version = install(arguments.bundle, arguments.trust, layout, way)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.default_int_handler)
+    installer = Installer(layout, service, Limits(arguments.health_limit, arguments.settle))
+    if command == "install":
+        version = installer.install(arguments.bundle, arguments.trust)
     else:
-        version = rollback(layout, way)
+        version = installer.rollback()
     print(f"current: {version}")
     return 0
-
-
-def _interrupt_on(*numbers: int) -> None:
-    """Let these signals be a KeyboardInterrupt here, and the end of the processes that compile.
-
-    Those have nothing to go back to, nor to say, from the moment of their fork on.
-    """
-    installer = os.getpid()
-
-    def handle(number: int, _frame: object) -> None:
-        if os.getpid() != installer:
-            os._exit(128 + number)
-        raise KeyboardInterrupt
-
-    for number in numbers:
-        signal.signal(number, handle)
 
 
 def _status(layout: Layout, service: NoService, as_json: bool) -> int:
@@ -167,7 +166,7 @@ def _status(layout: Layout, service: NoService, as_json: bool) -> int:
     current = layout.linked("current")
     if current is None:
         raise UserError(f"nothing is installed in {layout.root}")
-    manifest = parse_manifest((layout.release(current) / MANIFEST).read_bytes())
+    manifest = _manifest(layout, current)
     fault, whole = "", "yes"
     try:
         fault = why_not_whole(layout.release(current))
@@ -184,6 +183,202 @@ def _status(layout: Layout, service: NoService, as_json: bool) -> int:
     }
     print(json.dumps(rows) if as_json else "\n".join(f"{k:<11} {v}" for k, v in rows.items()))
     return UNHEALTHY if fault else 0
+
+
+def _manifest(layout: Layout, version: str) -> Manifest:
+    return parse_manifest((layout.release(version) / MANIFEST).read_bytes())
+
+
+class Installer:
+    """The steps on one board: where releases lie, how the service runs, and what is healthy."""
+
+    def __init__(self, layout: Layout, service: NoService, limits: Limits = LIMITS) -> None:
+        self._layout = layout
+        self._service = service
+        self._limits = limits
+
+    def install(self, bundle_path: str, trust: str | None) -> str:
+        """Install or upgrade; return the version. Nothing is written before the bundle is verified.
+
+        `trust` is the path of a public key. Raises UserError where the bundle may not be installed
+        here, UnhealthyError where it was and went back.
+        """
+        layout = self._layout
+        key = trusted_key(layout, trust)
+        bundle = read_bundle(bundle_path, key)
+        version = bundle.manifest.version
+        _say(f"verified {version} for {bundle.manifest.vehicle_id}")
+        check_fits(bundle.manifest.target)
+        with layout.locked():
+            layout.tidy()
+            if not layout.trusted.exists():
+                write_whole(layout.trusted, key)
+            remember(self._service.name, layout.root)
+            self._unpack(bundle)
+            self.activate(version, is_new=True)
+        return version
+
+    def rollback(self) -> str:
+        """Go back to the release before; return its version."""
+        layout = self._layout
+        with layout.locked():
+            layout.tidy()
+            version = layout.linked("previous")
+            if version is None or version == layout.linked("current"):
+                raise UserError(f"{layout.root} holds no earlier release to go back to")
+            fault = why_not_whole(layout.release(version))
+            if fault:
+                raise UserError(f"release {version} is damaged: {fault}")
+            self.activate(version, is_new=False)
+        return version
+
+    def uninstall(self) -> None:
+        """Stop the service and remove all that was installed, the trusted key last."""
+        layout = self._layout
+        if not layout.releases.is_dir() and not layout.trusted.exists():
+            raise UserError(f"nothing is installed in {layout.root}")
+        with layout.locked():
+            self._service.remove()
+            for name in ("current", "previous"):
+                layout.unlink(name)
+            layout.tidy()
+            for path in (layout.releases, layout.state):
+                shutil.rmtree(str(path), ignore_errors=True)
+            layout.trusted.unlink(missing_ok=True)
+            (layout.root / ".lock").unlink()
+        try:
+            layout.root.rmdir()
+        except OSError:
+            _say(f"{layout.root} stays: it holds what is not ours")
+
+    def activate(self, version: str, is_new: bool) -> None:
+        """Prove a release, let the service run it, and go back where it is not healthy."""
+        layout, before = self._layout, self._layout.linked("current")
+        try:
+            self._prove(version)
+        except UnhealthyError as error:
+            if is_new and version not in (before, layout.linked("previous")):
+                layout.remove_release(version)
+            stays = f"{before} goes on" if before else "nothing is installed"
+            raise UnhealthyError(f"release {version} may not run here, {stays}: {error}") from None
+        self._switch(version, before)
+        for other in layout.versions():
+            if other not in (layout.linked("current"), layout.linked("previous")):
+                layout.remove_release(other)
+
+    def _unpack(self, bundle: Bundle) -> None:
+        layout, version = self._layout, bundle.manifest.version
+        if layout.release(version).is_dir():
+            fault = why_not_whole(layout.release(version))
+            if not fault:
+                _say(f"{version} lies here already, whole")
+                return
+            _say(f"{version} lies here damaged ({fault}): made again")
+            if layout.linked("current") == version:
+                self._service.stop()
+            layout.remove_release(version)
+        _say(f"unpacked {make_release(bundle, layout, self._service.group())}")
+
+    def _prove(self, version: str) -> None:
+        """`edge_runtime check` by the release's own runtime, then its trial; or UnhealthyError."""
+        folder = self._layout.release(version)
+        command = [str(folder / LAUNCHER), "check", POLICY, "--public-key", PUBLIC_KEY]
+        try:
+            done = subprocess.run(
+                command, cwd=str(folder), timeout=_CHECK_LIMIT_S, check=False,
+                capture_output=True, text=True,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise UnhealthyError(f"edge_runtime check took over {_CHECK_LIMIT_S:.0f} s") from None
+        if done.returncode != 0:
+            lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+            raise UnhealthyError(f"edge_runtime check: {lines[-1]}")
+        _say("edge_runtime check: the policy may drive")
+        if self._service.name != "none":
+            policy_id = _manifest(self._layout, version).policy_id
+            self._service.try_release(folder, policy_id, self._limits)
+            _say("trial: healthy, in a network of its own")
+
+    def _switch(self, version: str, before: str | None) -> None:
+        layout, earlier = self._layout, self._layout.linked("previous")
+        try:
+            self._service.stop()
+            if before is not None and before != version:
+                layout.link("previous", before)
+            layout.link("current", version)
+            self._start(version)
+        # The old service is stopped: whatever goes wrong, somebody must start it again.
+        except (UnhealthyError, UserError, OSError, KeyboardInterrupt) as error:
+            why = str(error) or "interrupted"
+            _say(f"{version} is not healthy: {why}")
+            # Cut off between the rename and here, `current` is this very release already.
+            good = before if before != version else earlier
+            self._go_back(version, good, earlier)
+            raise UnhealthyError(
+                f"release {version} was not healthy as a service,"
+                f" {f'went back to {good}' if good else 'nothing is installed'}: {why}"
+            ) from None
+
+    def _start(self, version: str) -> None:
+        """Let the service run; the vehicle hears nothing of it until it is healthy."""
+        service = self._service
+        if service.name == "none":
+            return  # Whoever runs it could not be watched, nor perhaps be allowed to read the hold.
+        with self._layout.holding(service.group()):
+            try:
+                service.start(self._layout.release(version))
+                service.watch(self._limits)
+            except BaseException:  # while the hold lasts, so that nothing unproven is ever heard
+                service.stop()
+                raise
+
+    def _go_back(self, version: str, good: str | None, earlier: str | None) -> None:
+        layout = self._layout
+        if good is None:
+            self._service.remove()
+            layout.unlink("current")
+            layout.remove_release(version)
+            return
+        self._service.stop()
+        layout.link("current", good)
+        if earlier is not None and earlier != good:
+            layout.link("previous", earlier)
+        else:
+            layout.unlink("previous")
+        if version != earlier:  # One that has served before stays, to be gone back to again.
+            layout.remove_release(version)
+        try:
+            self._start(good)
+        except UnhealthyError as error:
+            raise UnhealthyError(
+                f"{version} was not healthy, nor is {good} again: {error}"
+            ) from None
+
+
+def trusted_key(layout: Layout, trust: str | None) -> bytes:
+    """The key that bundles must be signed with, in PEM: the board's own, or the first one named."""
+    given = read_public_key(trust) if trust is not None else None
+    if not layout.trusted.exists():
+        if given is None:
+            raise UserError("this board trusts no key yet: name your public key with --trust")
+        return given
+    kept = read_public_key(str(layout.trusted))
+    if given is not None and ssh_key(given) != ssh_key(kept):
+        raise UserError(
+            f"this board trusts another key than {trust}; whoever owns the board may replace"
+            f" {layout.trusted}"
+        )
+    return kept
+
+
+def _say(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except OSError:
+        # A reader that is gone, as an ssh link that broke, must not keep us from going back. What
+        # is left of the line would fail again at the next flush.
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

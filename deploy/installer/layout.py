@@ -19,21 +19,17 @@ from __future__ import annotations
 
 import compileall
 import contextlib
-import ctypes
 import fcntl
-import functools
 import hashlib
 import io
 import json
-import multiprocessing
 import os
+import re
 import shlex
 import shutil
-import signal
 import sys
 import time
 import zipfile
-from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
 from pathlib import Path, PurePosixPath
 from typing import Iterator, TextIO
 
@@ -44,12 +40,10 @@ SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"
 WHEELS, TLS = "wheels/", "tls/"
 POLICY, PUBLIC_KEY, CONFIG = "policy.onnx", "policy.pub", "config.toml"
 _MAKING = ".making-"
-_LINKS = ("current", "previous")
 _HOLD_LIMIT_S = 2.0
 """A runtime that asks whether it may send has the lock for microseconds."""
-_NOT_COMPILED = "tests"
+_NOT_COMPILED = re.compile(f"/{SITE}/(.*/)?tests/")
 """numpy's own tests are a quarter of all files, and nobody imports them here."""
-_SET_PARENT_DEATH_SIGNAL = 1  # sys/prctl.h
 _LAUNCH = """\
 import os
 import runpy
@@ -98,16 +92,14 @@ class Layout:
     def link(self, name: str, version: str) -> None:
         """Let `current` or `previous` name a release, in one step."""
         draft = self.root / f".{name}"
-        with contextlib.suppress(FileNotFoundError):
-            draft.unlink()
+        draft.unlink(missing_ok=True)
         os.symlink(os.path.join("releases", version), str(draft))
         os.replace(str(draft), str(self.root / name))
         sync_folder(self.root)
 
     def unlink(self, name: str) -> None:
         """Let `current` or `previous` name nothing."""
-        with contextlib.suppress(FileNotFoundError):
-            (self.root / name).unlink()
+        (self.root / name).unlink(missing_ok=True)
         sync_folder(self.root)
 
     def remove_release(self, version: str) -> None:
@@ -120,9 +112,8 @@ class Layout:
 
     def tidy(self) -> None:
         """Remove what a run that was cut off has left."""
-        for name in _LINKS:
-            with contextlib.suppress(FileNotFoundError):
-                (self.root / f".{name}").unlink()
+        for name in ("current", "previous"):
+            (self.root / f".{name}").unlink(missing_ok=True)
         if self.releases.is_dir():
             for path in self.releases.glob(f"{_MAKING}*"):
                 remove_tree(path)
@@ -135,8 +126,16 @@ class Layout:
         read the file could lock it, too: only the service's group `gid` may. UserError where
         somebody does.
         """
+        end_s = time.monotonic() + _HOLD_LIMIT_S
         with self._open_lock(self.hold, gid) as stream:
-            _lock_within(stream, _HOLD_LIMIT_S)
+            while True:
+                try:
+                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() > end_s:
+                        raise UserError(f"another process holds {self.hold} locked") from None
+                    time.sleep(0.02)
             yield
 
     @contextlib.contextmanager
@@ -144,7 +143,7 @@ class Layout:
         """Make the root and be the only installer in it. The lock goes with the process.
 
         It is `lockf`'s, which no child inherits: `flock`'s lives as long as any process that was
-        forked with it, so a killed installer's compilers would keep it.
+        forked with it, so what a killed installer has started would keep it.
         """
         try:
             self.root.mkdir(parents=True, exist_ok=True)
@@ -170,23 +169,11 @@ class Layout:
         return stream
 
 
-def _lock_within(stream: TextIO, limit_s: float) -> None:
-    end_s = time.monotonic() + limit_s
-    while True:
-        try:
-            return fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() > end_s:
-                raise UserError(f"another process holds {stream.name} locked") from None
-            time.sleep(0.02)
-
-
-def write_whole(path: Path, data: bytes, mode: int = 0o644) -> None:
+def write_whole(path: Path, data: bytes) -> None:
     """Write a file so that a power cut leaves the old one or the new one."""
     draft = path.with_name(f".{path.name}.new")
-    with contextlib.suppress(FileNotFoundError):
-        draft.unlink()
-    with open(os.open(str(draft), os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as stream:
+    draft.unlink(missing_ok=True)
+    with open(os.open(str(draft), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as stream:
         stream.write(data)
         stream.flush()
         os.fsync(stream.fileno())
@@ -224,11 +211,10 @@ def make_release(bundle: Bundle, layout: Layout, group: int | None) -> Path:
         os.sync()
         draft.rename(folder)
         sync_folder(layout.releases)
-    except OSError as error:
+    except (OSError, UserError) as error:
         remove_tree(draft)
-        raise UserError(f"cannot write {folder}: {error.strerror}") from None
-    except UserError:
-        remove_tree(draft)
+        if isinstance(error, OSError):
+            raise UserError(f"cannot write {folder}: {error.strerror}") from None
         raise
     return folder
 
@@ -298,38 +284,11 @@ def _fill(bundle: Bundle, draft: Path, folder: Path, group: int | None) -> None:
         else:
             _write(draft / path, data)
     _write(draft / "launch.py", _LAUNCH.encode())
-    _write(draft / LAUNCHER, _launcher(folder).encode(), 0o755)
-    _compile(draft / SITE)
-
-
-def _compile(site: Path) -> None:
-    """Now, because the service may not write here, and compiling at each start takes seconds."""
-    sources = [str(p) for p in site.rglob("*.py") if _NOT_COMPILED not in p.relative_to(site).parts]
-    # Forked, so that they are this thread's own children and end with it.
-    pool = ProcessPoolExecutor(
-        mp_context=multiprocessing.get_context("fork"),
-        initializer=_end_with_parent,
-        initargs=(os.getpid(),),
-    )
-    try:
-        with pool:
-            list(pool.map(functools.partial(compileall.compile_file, quiet=2), sources))
-    except BrokenProcessPool:
-        raise UserError(
-            "a process that compiled the release was killed; is there too little memory?"
-        ) from None
-
-
-def _end_with_parent(parent: int) -> None:
-    """Let the kernel kill this process when its parent, of that process id, has ended."""
-    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, int(signal.SIGKILL), 0, 0, 0)
-    if os.getppid() != parent:  # It had ended before it was asked for.
-        os._exit(1)
-
-
-def _launcher(folder: Path) -> str:
-    parts = [sys.executable, "-I", "-S", "-B", str(folder / "launch.py")]
-    return "#!/bin/sh\nexec " + " ".join(map(shlex.quote, parts)) + ' "$@"\n'
+    start = [sys.executable, "-I", "-S", "-B", str(folder / "launch.py")]
+    text = f'#!/bin/sh\nexec {" ".join(map(shlex.quote, start))} "$@"\n'
+    _write(draft / LAUNCHER, text.encode(), 0o755)
+    # Now, because the service may not write here, and compiling at each start takes seconds.
+    compileall.compile_dir(str(draft / SITE), quiet=2, rx=_NOT_COMPILED)
 
 
 def _write(path: Path, data: bytes, mode: int = 0o644, group: int | None = None) -> None:

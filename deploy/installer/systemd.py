@@ -8,7 +8,6 @@ its own. Whatever is wrong with it, the vehicle gets no command from it.
 from __future__ import annotations
 
 import contextlib
-import grp
 import os
 import pwd
 import re
@@ -26,7 +25,6 @@ USER = "phil"
 WAYS = ("systemd", "none")
 UNIT_FOLDER = Path("/etc/systemd/system")
 _BOOTED = Path("/run/systemd/system")
-_LIST = "phil-units"
 _WAY = "way"
 _FITS_A_UNIT = re.compile(r"[A-Za-z0-9._+@/-]+")
 """Spaces would cut a unit's line in two, and a % would be a specifier (systemd.unit(5))."""
@@ -78,34 +76,53 @@ class Systemd(NoService):
     name = "systemd"
 
     def __init__(self, root: Path, unit_folder: Path = UNIT_FOLDER) -> None:
-        self._root = root
+        self._root = str(root)
         self._unit_folder = unit_folder
-        self._list = root / "state" / _LIST
+        self._list = root / "state" / "phil-units"
 
     def group(self) -> int | None:
-        """Of the service's user, who is made where missing: no rights, no home, no shell."""
+        """The group of the service's user, made where missing: no rights, no home, no shell."""
         try:
-            user = pwd.getpwnam(USER)
+            return pwd.getpwnam(USER).pw_gid
         except KeyError:
             _run("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
-            user = pwd.getpwnam(USER)
-        return grp.getgrgid(user.pw_gid).gr_gid
+            return pwd.getpwnam(USER).pw_gid
 
     def try_release(self, folder: Path, policy_id: str, limits: Limits) -> None:
         """As `NoService`: ready within the limit, it goes on to say that it works, as this policy.
 
         `systemd-run` waits for READY=1, and systemd kills what does not say WATCHDOG=1.
         """
+        protocol = "tls" if (folder / TLS).is_dir() else "tcp"
         with tempfile.TemporaryDirectory(prefix="phil-trial-") as place:
             log = Path(place) / "log"
+            properties = {
+                "NotifyAccess": "main",
+                "PrivateNetwork": "yes",
+                "User": USER,
+                "UMask": "0077",
+                "WorkingDirectory": folder,
+                "StandardOutput": f"file:{log}",
+                "StandardError": f"file:{log}",
+                "TimeoutStartSec": limits.within_s,
+                "WatchdogSec": limits.settle_s / 3,
+                # It ends by itself, should the installer be killed.
+                "RuntimeMaxSec": 2 * (limits.within_s + limits.settle_s),
+                "TimeoutStopSec": _TRIAL_STOP_S,
+            }
             self._end_trial()  # of an installer that was killed
             try:
-                _run(*_trial(folder, log, limits))
-                settle(lambda: self._is_active(TRIAL_UNIT), limits, "it")
+                _run(
+                    "systemd-run", "--quiet", f"--unit={TRIAL_UNIT}", "--service-type=notify",
+                    *(f"--property={name}={value}" for name, value in properties.items()),
+                    folder / LAUNCHER, "run", "--config", CONFIG, "--vehicle", "none",
+                    "--connect", f"{protocol}/{_NOWHERE}", "--log-level", "warning",
+                )  # fmt: skip
+                settle(lambda: _is_active(TRIAL_UNIT), limits, "it")
             except UnhealthyError as error:
                 lines = log.read_text("utf-8", "replace").splitlines() if log.exists() else []
-                why = lines[-1] if lines else error
-                raise UnhealthyError(f"trial: {self._result(TRIAL_UNIT)}: {why}") from None
+                result, why = _show(TRIAL_UNIT).get("Result"), lines[-1] if lines else error
+                raise UnhealthyError(f"trial: {result}: {why}") from None
             finally:
                 self._end_trial()
             if f"policy_id={policy_id}" not in log.read_text("utf-8", "replace"):
@@ -118,47 +135,36 @@ class Systemd(NoService):
 
     def start(self, release: Path) -> None:
         """As `NoService`: install the release's units first."""
-        units = sorted((release / "units").glob("*.*"))
-        if not any(unit.name == MAIN_UNIT for unit in units):
+        paths = sorted((release / "units").glob("*.*"))
+        units = {path.name: path.read_text().replace(DEFAULT_ROOT, self._root) for path in paths}
+        if MAIN_UNIT not in units:
             raise UnhealthyError(f"the bundle holds no {MAIN_UNIT}")
-        self._forget({unit.name for unit in units})
-        write_whole(self._list, "".join(f"{unit.name}\n" for unit in units).encode())
-        for unit in units:
-            text = unit.read_text().replace(DEFAULT_ROOT, str(self._root))
-            write_whole(self._unit_folder / unit.name, text.encode())
+        self._forget(set(units))
+        write_whole(self._list, "".join(f"{name}\n" for name in units).encode())
+        for name, text in units.items():
+            write_whole(self._unit_folder / name, text.encode())
         _run("systemctl", "daemon-reload")
-        for unit in units:
-            if "[Install]" in unit.read_text():
-                _run("systemctl", "enable", unit.name)
+        for name, text in units.items():
+            if "[Install]" in text:
+                _run("systemctl", "enable", name)
         _run("systemctl", "reset-failed", MAIN_UNIT, check=False)
         _run("systemctl", "start", MAIN_UNIT)
 
     def watch(self, limits: Limits) -> None:
         """As `NoService`."""
-        settle(lambda: self._is_active(MAIN_UNIT), limits, MAIN_UNIT)
+        settle(lambda: _is_active(MAIN_UNIT), limits, MAIN_UNIT)
 
     def describe(self) -> str:
         """As `NoService`, with the service's own status."""
         shown = _show(MAIN_UNIT)
-        words = [shown.get("ActiveState", "unknown"), shown.get("StatusText", "")]
-        return " ".join(filter(None, words))
+        return f"{shown.get('ActiveState', 'unknown')} {shown.get('StatusText', '')}".strip()
 
     def remove(self) -> None:
         """As `NoService`: the units go, the user stays."""
         self.stop()
         self._forget(set())
-        with contextlib.suppress(FileNotFoundError):
-            self._list.unlink()
+        self._list.unlink(missing_ok=True)
         _run("systemctl", "daemon-reload")
-
-    def _is_active(self, unit: str) -> bool:
-        shown = _show(unit)
-        if shown.get("ActiveState") == "failed" or shown.get("NRestarts", "0") != "0":
-            raise UnhealthyError(f"{unit} ended: {self._result(unit)} (journalctl --unit {unit})")
-        return shown.get("ActiveState") == "active"
-
-    def _result(self, unit: str) -> str:
-        return _show(unit).get("Result", "?")
 
     def _end_trial(self) -> None:
         for verb in ("stop", "reset-failed"):
@@ -169,8 +175,7 @@ class Systemd(NoService):
         names = self._list.read_text().split() if self._list.exists() else []
         for name in sorted(set(names) - kept):
             _run("systemctl", "disable", "--now", name, check=False)
-            with contextlib.suppress(FileNotFoundError):
-                (self._unit_folder / name).unlink()
+            (self._unit_folder / name).unlink(missing_ok=True)
 
 
 def settle(looks_well: Callable[[], bool], limits: Limits, what: str) -> None:
@@ -206,7 +211,10 @@ def choose(way: str | None, root: Path, only_look: bool = False) -> NoService:
         # Before it makes a user and unpacks for a start that cannot come.
         raise UserError("--service systemd: no systemd runs this computer; use --service none")
     if way is None:
-        way = _remembered(root) or ("systemd" if is_there() else "none")
+        way = "systemd" if is_there() else "none"
+        with contextlib.suppress(OSError):
+            kept = (root / "state" / _WAY).read_text()
+            way = kept if kept in WAYS else way
     if way == "none":
         return NoService()
     if os.geteuid() != 0 and not only_look:
@@ -221,36 +229,12 @@ def remember(way: str, root: Path) -> None:
     write_whole(root / "state" / _WAY, way.encode())
 
 
-def _remembered(root: Path) -> str | None:
-    try:
-        way = (root / "state" / _WAY).read_text()
-    except OSError:
-        return None
-    return way if way in WAYS else None
-
-
-def _trial(folder: Path, log: Path, limits: Limits) -> list:
-    """The words that start a release's trial. It ends by itself, should the installer be killed."""
-    protocol = "tls" if (folder / TLS).is_dir() else "tcp"
-    properties = {
-        "NotifyAccess": "main",
-        "PrivateNetwork": "yes",
-        "User": USER,
-        "UMask": "0077",
-        "WorkingDirectory": folder,
-        "StandardOutput": f"file:{log}",
-        "StandardError": f"file:{log}",
-        "TimeoutStartSec": limits.within_s,
-        "WatchdogSec": limits.settle_s / 3,
-        "RuntimeMaxSec": 2 * (limits.within_s + limits.settle_s),
-        "TimeoutStopSec": _TRIAL_STOP_S,
-    }
-    return [
-        "systemd-run", "--quiet", f"--unit={TRIAL_UNIT}", "--service-type=notify",
-        *(f"--property={name}={value}" for name, value in properties.items()),
-        folder / LAUNCHER, "run", "--config", CONFIG, "--vehicle", "none",
-        "--connect", f"{protocol}/{_NOWHERE}", "--log-level", "warning",
-    ]  # fmt: skip
+def _is_active(unit: str) -> bool:
+    """Whether it runs. UnhealthyError where it ended, or was started again."""
+    shown = _show(unit)
+    if shown.get("ActiveState") == "failed" or shown.get("NRestarts", "0") != "0":
+        raise UnhealthyError(f"{unit} ended: {shown.get('Result')} (journalctl --unit {unit})")
+    return shown.get("ActiveState") == "active"
 
 
 def _show(unit: str) -> dict[str, str]:

@@ -85,7 +85,7 @@ def read_bundle(path: str, public_key: bytes) -> Bundle:
     It is read once, verified and used from memory, so nobody can change it in between.
     Raises UserError, having written nothing.
     """
-    allowed = _ssh_key(public_key)
+    allowed = ssh_key(public_key)
     data = read_file(path, "bundle", _MAX_BUNDLE_BYTES)
     signature = read_file(f"{path}.sig", "signature", _MAX_SMALL_BYTES)
     try:
@@ -100,20 +100,15 @@ def read_public_key(path: str) -> bytes:
     """The PEM of an Ed25519 public key. Raises UserError for anything else."""
     pem = read_file(path, "public key", _MAX_SMALL_BYTES)
     try:
-        _ssh_key(pem)
+        ssh_key(pem)
     except UserError as error:
         raise UserError(f"public key {path}: {error}") from None
     return pem
 
 
-def same_key(one: bytes, other: bytes) -> bool:
-    """Whether two PEM files hold the same public key."""
-    return _ssh_key(one) == _ssh_key(other)
-
-
 def key_name(pem: bytes) -> str:
     """A few digits by which a person tells public keys apart."""
-    return hashlib.sha256(_ssh_key(pem).encode()).hexdigest()[:16]
+    return hashlib.sha256(ssh_key(pem).encode()).hexdigest()[:16]
 
 
 def read_file(path: str, what: str, most: int) -> bytes:
@@ -131,7 +126,7 @@ def read_file(path: str, what: str, most: int) -> bytes:
         raise UserError(f"{what} {path} cannot be read: {error.strerror}") from None
 
 
-def _ssh_key(pem: bytes) -> str:
+def ssh_key(pem: bytes) -> str:
     """A public key in PEM as OpenSSH writes it in a file of allowed signers."""
     lines = [line.strip() for line in pem.decode("ascii", "replace").split("\n") if line.strip()]
     if len(lines) < 3 or lines[0] != _BEGIN or lines[-1] != _END:

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy
 
 from deploy.bundle import NAME, Inputs, Made, build_installer, make_bundle
+from deploy.certs import write_key_pair
 from deploy.installer.verify import Target
-from deploy.keys import write_key_pair
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.policies import public_pem, write_policy
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import stat
 import tarfile
-from pathlib import Path
 
 import pytest
 
@@ -166,10 +165,10 @@ def test_a_name_that_no_archive_takes_is_said(workshop, tmp_path):
 
 
 def test_a_bundle_that_is_interrupted_leaves_no_key_behind(workshop, tmp_path, monkeypatch):
-    def interrupted(path, target) -> None:
+    def interrupted(*_) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Path, "replace", interrupted)
+    monkeypatch.setattr(os, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         make_bundle(workshop.inputs(), HERE, tmp_path / "out")
     assert list((tmp_path / "out").iterdir()) == []

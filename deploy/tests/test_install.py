@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 
 from deploy.bundle import make_bundle
+from deploy.certs import write_key_pair
 from deploy.installer import __main__ as installer
 from deploy.installer import layout as layout_module
 from deploy.installer import systemd
 from deploy.installer.layout import Layout
 from deploy.installer.systemd import choose
 from deploy.installer.verify import UserError, read_bundle
-from deploy.keys import write_key_pair
 from deploy.tests.boards import HERE, Board, changed_wheel
 from edge_runtime.tests.harness import Simulator, make_state, wait_until
 

@@ -104,7 +104,7 @@ def test_a_dry_run_says_each_step_and_does_none(far, board, workshop, capsys):
 
 def test_an_installer_that_refuses_is_told_and_cleaned_up(far, board, workshop, tmp_path, capfd):
     """The board trusts somebody else's key already."""
-    from deploy.keys import write_key_pair
+    from deploy.certs import write_key_pair
 
     _, other = write_key_pair(tmp_path / "other")
     made = workshop.make(0.1)

@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from deploy.installer import steps
+from deploy.installer.__main__ import Installer
 from deploy.installer.layout import Layout
-from deploy.installer.systemd import Limits, NoService
+from deploy.installer.systemd import NoService
 from deploy.installer.verify import UnhealthyError, UserError
 
 OLD, NEW = "0.1.0-old", "0.1.0-new"
@@ -57,7 +57,7 @@ def layout(tmp_path, monkeypatch):
         layout.release(version).mkdir(parents=True)
     layout.state.mkdir()
     layout.link("current", OLD)
-    monkeypatch.setattr(steps, "_prove", lambda folder, way: None)
+    monkeypatch.setattr(Installer, "_prove", lambda self, version: None)
     return layout
 
 
@@ -80,7 +80,7 @@ def test_whatever_cuts_the_watch_off_the_old_release_runs_again(layout, monkeypa
         monkeypatch.setattr(closed, "write", _broken, raising=False)
         monkeypatch.setattr(sys, "stdout", closed)
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
-        steps.activate(NEW, layout, steps.Way(service, Limits()), is_new=True)
+        Installer(layout, service).activate(NEW, is_new=True)
     assert (layout.linked("current"), service.runs) == (OLD, OLD)
     assert layout.versions() == [OLD]
     assert service.heard == []
@@ -94,7 +94,7 @@ def test_a_roll_back_that_is_interrupted_can_be_tried_again(layout):
     layout.link("previous", NEW)
     service = Service(layout, KeyboardInterrupt())
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
-        steps.activate(NEW, layout, steps.Way(service, Limits()), is_new=False)
+        Installer(layout, service).activate(NEW, is_new=False)
     assert (layout.linked("current"), layout.linked("previous"), service.runs) == (OLD, NEW, OLD)
 
 
@@ -109,5 +109,5 @@ def test_a_stop_that_is_interrupted_starts_the_old_release_again(layout):
 
     service.stop = stop  # type: ignore[method-assign]
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}: interrupted"):
-        steps.activate(NEW, layout, steps.Way(service, Limits()), is_new=True)
+        Installer(layout, service).activate(NEW, is_new=True)
     assert (layout.linked("current"), layout.linked("previous"), service.runs) == (OLD, None, OLD)

@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from deploy import bundle as bundle_module
 from deploy.bundle import _pack, _sign
+from deploy.installer.__main__ import trusted_key
 from deploy.installer.layout import Layout
-from deploy.installer.steps import trusted_key
 from deploy.installer.verify import (
     MANIFEST,
     Manifest,
@@ -25,7 +25,7 @@ from deploy.installer.verify import (
     parse_manifest,
     read_bundle,
     read_public_key,
-    same_key,
+    ssh_key,
     to_json,
 )
 from deploy.tests.boards import HERE
@@ -200,8 +200,8 @@ def test_an_ssh_keygen_that_cannot_verify_is_said(bundle, tmp_path, monkeypatch,
 def test_a_key_is_the_same_however_its_lines_end(tmp_path):
     path = tmp_path / "key.pub"
     path.write_bytes(PUBLIC.replace(b"\n", b"\r\n"))
-    assert same_key(read_public_key(str(path)), PUBLIC)
-    assert not same_key(PUBLIC, pem_of(Ed25519PrivateKey.generate()))
+    assert ssh_key(read_public_key(str(path))) == ssh_key(PUBLIC)
+    assert ssh_key(PUBLIC) != ssh_key(pem_of(Ed25519PrivateKey.generate()))
 
 
 def test_what_is_no_public_key_is_said(tmp_path):

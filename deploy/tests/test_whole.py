@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from deploy.bundle import Inputs, Made, make_bundle
-from deploy.keys import write_key_pair
+from deploy.certs import write_key_pair
 from deploy.wheels import DEFAULT_FOLDER, ROOT, TARGETS, build_edge_wheel, gather, lock_path
 from edge_runtime.util import UserError
 

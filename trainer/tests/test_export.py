@@ -5,7 +5,7 @@ import onnx
 import pytest
 import torch
 
-from deploy.keys import write_key_pair
+from deploy.certs import write_key_pair
 from edge_runtime.policy import load_policy
 from edge_runtime.policy_file import read_onnx
 from edge_runtime.tls import read_signing_key
