@@ -12,16 +12,22 @@ COMMANDS = {
         "serve an environment to an edge runtime over Zenoh, and report",
     ),
     "router": (
-        "bridge.router",
+        "bridge.relay:ROUTER",
         "connect several simulators, edge runtimes and viewers with one another",
     ),
-    "relay": ("bridge.relay", "put an injected network between a simulator and an edge runtime"),
-    "record": ("bridge.record", "write everything on the wire to an MCAP recording"),
+    "relay": (
+        "bridge.relay:RELAY",
+        "put an injected network between a simulator and an edge runtime",
+    ),
+    "record": ("bridge.record:RECORD", "write everything on the wire to an MCAP recording"),
     "replay": (
         "bridge.replay",
         "run recorded states through a policy or runtime, and compare its commands",
     ),
-    "repair": ("bridge.repair", "save what is whole of a recording that was cut off or damaged"),
+    "repair": (
+        "bridge.record:REPAIR",
+        "save what is whole of a recording that was cut off or damaged",
+    ),
     "ros2": ("bridge.ros2", "show the wire to ROS 2, through a zenoh-bridge-ros2dds"),
     "view": ("bridge.rerun.wire_view", "show the wire in rerun, live or in a file"),
 }

@@ -1,13 +1,14 @@
-"""The two clocks: each carries one tick's state out and brings the vehicle's decision back.
+"""The clocks: each carries one tick's state out and brings the vehicle's decision back.
 
 Lock-step waits for each answer, and latency passes in virtual time (`virtual_link.py`): states are
 really published in their virtual order of arrival, and each real answer is awaited before it goes
 its virtual way back. Computing takes no virtual time, so the same seed gives the same run on a fast
 and a slow machine.
 
-Real time has absolute ticks on the monotonic clock and waits for nobody. Tick n begins at n T after
-the episode's start; its state goes out through the delay line, and the vehicle acts at the latest
-25 ms after the tick on the newest command that has arrived.
+Real time has absolute ticks on the monotonic clock and waits for no answer. Tick n begins at n T
+after the episode's start; its state goes out through the delay line, and the vehicle acts at the
+latest 25 ms after the tick on the newest command that has arrived. With a vehicle in the loop
+(`VehicleClock`), its newest feedback at tick n + 1 says what came of state n.
 """
 
 from __future__ import annotations
@@ -15,14 +16,16 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol
+from typing import Any
 
 import msgspec
 
-from bridge.inbound import CommandCheck
+from bridge.inbound import CommandCheck, FeedbackCheck, FeedbackHold, VehicleDecision
 from bridge.network import EventHeap, LatencyModel, LatencySpec, make_link
+from bridge.report import STANDSTILL_MPS, TrackingLog, quantiles
 from bridge.virtual_link import (
     COMMAND_WINDOW_S,
     SILENCE_LIMIT_S,
@@ -32,7 +35,16 @@ from bridge.virtual_link import (
     VirtualLink,
 )
 from edge_runtime.safety import Event
-from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Reason, State, encode
+from edge_runtime.util import UserError
+from edge_runtime.wire import (
+    CONTROL_PERIOD_S,
+    SAFE_STOP,
+    Command,
+    Feedback,
+    Reason,
+    State,
+    encode,
+)
 
 Publish = Callable[[bytes], None]
 """Sends an encoded state over the wire; must not block."""
@@ -40,54 +52,58 @@ WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 """Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
 
 
-class Clock(Protocol):
+class Clock:
     """Drives the exchange of one episode at a time; ``begin``, ``exchange`` ..., ``finish``."""
 
-    latencies_ms: list[float]
-    """From state sent to command received, injected delays included; one per answered state."""
-    tick_overruns: int
-    """Ticks that began so late that the simulation slipped behind the wall clock."""
-    missed_ticks: int
-    """Whole ticks of the wall clock that went by without a state because of it."""
-    wall_clock_stalls: int
-    """States of lock-step that the edge runtime did not answer in wall time, or only with a safe
-    stop because of it: it was gone, or got no processor. Always 0 in real time."""
+    def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
+        self.latencies_ms: list[float] = []
+        """From state sent to command received, injected delays included; one per answered state."""
+        self.tick_overruns = 0
+        """Ticks that began so late that the simulation slipped behind the wall clock."""
+        self.missed_ticks = 0
+        """Whole ticks of the wall clock that went by without a state because of it."""
+        self.wall_clock_stalls = 0
+        """States of lock-step that the edge runtime did not answer in wall time, or only with a
+        safe stop because of it: it was gone, or got no processor. Always 0 in real time."""
+        self._publish = publish
+        self._check = check
+        self._spec = spec
+        self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode; ``seed`` decides the delays and losses of the link."""
+        raise NotImplementedError
 
     def receive(self, payload: bytes) -> None:
         """Take one command from the wire, on Zenoh's thread."""
+        raise NotImplementedError
 
     def exchange(self, state: State) -> Decision:
         """Send the state of one tick and decide what the vehicle does in it."""
+        raise NotImplementedError
 
     def newest_answer(self) -> tuple[int, float] | None:
         """The newest state of this episode that was answered, and its latency in ms."""
+        raise NotImplementedError
 
     def finish(self, state: State) -> None:
-        """Send the final state. It says that the simulation has ended, which no radio link
-        carries, so no delay or loss is injected; whatever is still under way is forgotten.
+        """Send the final state at once, and forget whatever is still under way.
+
+        It says that the simulation has ended, which no radio link carries: no delay or loss is
+        injected, and no answer is awaited.
         """
+        raise NotImplementedError
 
     def close(self) -> None:
         """Stop any thread."""
 
 
-class LockStepClock:
-    """The clock of ``--clock lockstep``.
-
-    One thread runs all this; Zenoh's thread only fills the inbox.
-    """
+class LockStepClock(Clock):
+    """The clock of ``--clock lockstep``. One thread runs it; Zenoh's only fills the inbox."""
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
-        self.latencies_ms: list[float] = []
-        self.tick_overruns = self.missed_ticks = self.wall_clock_stalls = 0
-        self._publish = publish
-        self._check = check
-        self._spec = spec
         self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()
-        self.begin(episode=0, seed=0)
+        super().__init__(publish, check, spec)
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode at virtual time 0."""
@@ -119,17 +135,16 @@ class LockStepClock:
         return None if step < 0 else (step, self.latencies_ms[-1])
 
     def finish(self, state: State) -> None:
-        """Publish the final state at once; nobody waits for an answer to it."""
+        """Publish the final state at once; no answer to it is awaited."""
         self._check.end(state.step, self._link.hold.newest_step)
-        self._publish(encode(msgspec.structs.replace(state, sent_ns=time.time_ns())))
-
-    def close(self) -> None:
-        """Nothing runs in the background."""
+        self._publish(encode(_stamp(state)))
 
     def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
-        payload = encode(msgspec.structs.replace(arrival.message, sent_ns=time.time_ns()))
-        self._take_unasked()
+        payload = encode(_stamp(arrival.message))
+        # What came between two ticks is read all the same, so that faults are counted.
+        while not self._inbox.empty():
+            self._check.read(self._inbox.get()[0])
         published_s = time.monotonic()
         self._publish(payload)
         if arrival.overtaken:
@@ -138,11 +153,6 @@ class LockStepClock:
         if answer is not None:
             command, received_s = answer
             self._link.answer(arrival, command, computing_s=received_s - published_s)
-
-    def _take_unasked(self) -> None:
-        """Empty the inbox of what came between two ticks, so that only faults are counted."""
-        while not self._inbox.empty():
-            self._check.read(self._inbox.get()[0])
 
     def _await_answer(self, step: int, published_s: float) -> tuple[Command, float] | None:
         """Wait in wall time for the answer to exactly this state, and say when it came."""
@@ -180,14 +190,11 @@ class LockStepClock:
         """Wall time without an answer (s), if the last state really published got none."""
         if not self._edge_silent:
             return None
-        return (
-            SILENCE_LIMIT_S
-            if self._answered_at_s is None
-            else (time.monotonic() - self._answered_at_s)
-        )
+        answered_at_s = self._answered_at_s
+        return SILENCE_LIMIT_S if answered_at_s is None else time.monotonic() - answered_at_s
 
 
-class RealTimeClock:
+class RealTimeClock(Clock):
     """The clock of ``--clock realtime``.
 
     The caller's thread runs the ticks, Zenoh's hands in commands, the delay line's delivers both
@@ -195,14 +202,9 @@ class RealTimeClock:
     """
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
-        self.latencies_ms: list[float] = []
-        self.tick_overruns = self.missed_ticks = self.wall_clock_stalls = 0
-        self._publish = publish
-        self._check = check
-        self._spec = spec
         self._line = DelayLine()
         self._arrived = threading.Condition()
-        self.begin(episode=0, seed=0)
+        super().__init__(publish, check, spec)
 
     def begin(self, episode: int, seed: int) -> None:
         """Start an episode now."""
@@ -219,7 +221,14 @@ class RealTimeClock:
 
     def exchange(self, state: State) -> Decision:
         """Wait for the tick, send its state, and decide when its command window closes."""
-        return self._decide(state.step, self._send_state(state) + COMMAND_WINDOW_S)
+        window_end_s = self._send_state(state) + COMMAND_WINDOW_S
+        with self._arrived:
+            # An answered state ends the wait: nothing newer can arrive.
+            self._arrived.wait_for(
+                lambda: self._hold.newest_step >= state.step,
+                timeout=max(0.0, window_end_s - time.monotonic()),
+            )
+            return self._hold.decide(time.monotonic())
 
     def newest_answer(self) -> tuple[int, float] | None:
         """The newest state of this episode that was answered, and its latency in ms."""
@@ -269,15 +278,6 @@ class RealTimeClock:
         time.sleep(max(0.0, -late_s))
         return tick_s
 
-    def _decide(self, step: int, window_end_s: float) -> Decision:
-        """Return early if this state is already answered: nothing newer can arrive."""
-        with self._arrived:
-            self._arrived.wait_for(
-                lambda: self._hold.newest_step >= step,
-                timeout=max(0.0, window_end_s - time.monotonic()),
-            )
-            return self._hold.decide(time.monotonic())
-
     def _arrive_at_vehicle(self, payload: bytes) -> None:
         now_s = time.monotonic()
         with self._arrived:
@@ -302,11 +302,115 @@ def _stamp(state: State) -> State:
     return msgspec.structs.replace(state, sent_ns=time.time_ns())
 
 
+POLL_S = 0.02
+STANDSTILL_WAIT_S = 5.0
+"""Longer than any robot takes to stop, shorter than the edge runtime's pause without a re-arm."""
+
+
+class VehicleClock(RealTimeClock):
+    """The clock of ``--loop vehicle``. ``tracking`` keeps what was asked, and what became of it."""
+
+    def __init__(
+        self, publish: Publish, check: CommandCheck, spec: LatencySpec, feedback: FeedbackCheck
+    ) -> None:
+        self.tracking = TrackingLog()
+        self.feedback_ages_ms: list[float] = []
+        """At each tick's end, of the feedback that moved the car."""
+        self.moving_starts = 0
+        self.feedback_check = feedback
+        self._feedback = FeedbackHold(time.monotonic())
+        super().__init__(publish, check, spec)
+
+    def begin(self, episode: int, seed: int) -> None:
+        """Start an episode now; the vehicle stands, or is counted as moving."""
+        super().begin(episode, seed)
+        with self._arrived:
+            # Its own stream, so that commands meet the same luck as without it; so has the relay.
+            self._feedback_link = make_link(self._spec, seed + 1).down
+            self.tracking.begin()
+
+    def receive_feedback(self, payload: bytes) -> None:
+        """Send one feedback down the line to the simulation, on Zenoh's thread."""
+        received_s = time.monotonic()
+        arrive = partial(self._feedback_arrives, received_s=received_s)
+        self._send(self._feedback_link, payload, arrive)
+
+    def wait_for_vehicle(self, limit_s: float, vehicle_id: str) -> None:
+        """Wait until the vehicle reports; UserError after ``limit_s``."""
+        if not self._wait_until(lambda _: True, limit_s):
+            raise UserError(
+                f"no feedback from a vehicle of {vehicle_id} after {limit_s:g} s; give its edge "
+                "runtime one: python -m edge_runtime run --vehicle NAME"
+            )
+
+    def wait_for_standstill(self) -> None:
+        """Wait until the vehicle stands; where it does not, count that and go on."""
+        self.moving_starts += not self._wait_until(
+            lambda feedback: abs(feedback.speed_mps) < STANDSTILL_MPS, STANDSTILL_WAIT_S
+        )
+
+    def rejected(self) -> Counter[str]:
+        """Return the feedback that was not believed, as ``feedback_REASON``."""
+        counts = dict(self.feedback_check.rejected)  # the delay line's thread goes on counting
+        return Counter({f"feedback_{name}": count for name, count in counts.items()})
+
+    def report(self, action_names: Sequence[str]) -> dict[str, Any]:
+        """Return the report's part ``vehicle``."""
+        return {
+            **self.tracking.report(action_names),
+            "feedback_age_ms": quantiles(self.feedback_ages_ms),
+            "moving_starts": self.moving_starts,
+        }
+
+    def exchange(self, state: State) -> VehicleDecision:
+        """Wait for the tick, send its state, and at the next tick say what the vehicle has done."""
+        end_s = self._send_state(state) + CONTROL_PERIOD_S
+        time.sleep(max(0.0, end_s - time.monotonic()))
+        with self._arrived:
+            now_s = time.monotonic()
+            decision = self._feedback.decide(self._hold.decide(now_s), state.episode, now_s)
+        if decision.feedback_age_s is not None:
+            self.feedback_ages_ms.append(decision.feedback_age_s * 1e3)
+        return decision
+
+    def finish(self, state: State) -> None:
+        """Publish the final state at once; the vehicle is to stop."""
+        with self._arrived:
+            self.feedback_check.sent(state.episode, state.step)
+            self.tracking.end()
+        super().finish(state)
+
+    def _send_state(self, state: State) -> float:
+        with self._arrived:
+            self.feedback_check.sent(state.episode, state.step)
+        return super()._send_state(state)
+
+    def _admitted(self, command: Command) -> None:
+        self.tracking.command(command)
+
+    def _feedback_arrives(self, payload: bytes, received_s: float) -> None:
+        now_s = time.monotonic()
+        with self._arrived:
+            feedback = self.feedback_check.read(payload, now_s)
+            if feedback is None:
+                return
+            self._feedback.admit(feedback, received_s, now_s)
+            self.tracking.feedback(feedback)
+
+    def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:
+        """Whether it holds for what the vehicle says, of whichever drive, before ``limit_s``."""
+        give_up_s = time.monotonic() + limit_s
+        while time.monotonic() < give_up_s:
+            with self._arrived:
+                heard, heard_s = self.feedback_check.heard, self.feedback_check.heard_s
+            if heard is not None and time.monotonic() - heard_s <= SILENCE_LIMIT_S and holds(heard):
+                return True
+            time.sleep(POLL_S)
+        return False
+
+
 REALTIME = "realtime"
-CLOCKS: dict[str, Callable[[Publish, CommandCheck, LatencySpec], Clock]] = {
-    "lockstep": LockStepClock,
-    REALTIME: RealTimeClock,
-}
+CLOCKS: dict[str, type[Clock]] = {"lockstep": LockStepClock, REALTIME: RealTimeClock}
 Action = Callable[[], None]
 
 

@@ -22,8 +22,6 @@ from edge_runtime.wire import FRAMES_SHAPE
 
 SCENARIOS = {"left_turn": "phil/LeftTurn-v0", "congestion": "phil/Congestion-v0"}
 """Scenario word on the command line and in the report -> gymnasium id."""
-_REGISTERED_BY = {"phil": "trainer.scenarios"}
-"""Namespace of a gymnasium id -> the module that registers it."""
 NOMINAL = "nominal"
 CONDITIONS = {
     NOMINAL: "the scene that is trained in",
@@ -46,7 +44,9 @@ def make_environment(name: str, condition: str = NOMINAL) -> gymnasium.Env[Any, 
     Raises UserError for an unknown name, a module that does not import, or an environment whose
     observation or action space the wire cannot carry.
     """
-    environment_id = _qualified_id(name)
+    environment_id = SCENARIOS.get(name, name)
+    if environment_id.startswith("phil/"):
+        environment_id = f"trainer.scenarios:{environment_id}"  # the module that registers it
     if not _NAME.fullmatch(environment_id):
         raise UserError(f"{name!r} names no environment; {HINT}")
     try:
@@ -64,7 +64,7 @@ def make_environment(name: str, condition: str = NOMINAL) -> gymnasium.Env[Any, 
 def scenario_of(name: str) -> str:
     """Return the scenario word for any form of an environment's name; the name if it has none."""
     words = {environment_id: word for word, environment_id in SCENARIOS.items()}
-    return words.get(_bare_id(name), name)
+    return words.get(name.rpartition(":")[2], name)
 
 
 def task_of(
@@ -87,17 +87,6 @@ def task_of(
     assert isinstance(space, Box)
     names += ["an action"] * (len(space.low) - len(names))
     return task_text(scenario, list(zip(names, space.low, space.high, strict=False)))
-
-
-def _bare_id(name: str) -> str:
-    return name.rpartition(":")[2]
-
-
-def _qualified_id(name: str) -> str:
-    """Return the gymnasium id, with the module that registers it where that is known."""
-    environment_id = SCENARIOS.get(name, name)
-    module = _REGISTERED_BY.get(environment_id.partition("/")[0])
-    return environment_id if module is None else f"{module}:{environment_id}"
 
 
 def load_plugin(environment_id: str) -> None:

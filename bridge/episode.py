@@ -21,7 +21,7 @@ from bridge.report import EpisodeResult, SafeStopLog
 from bridge.virtual_link import Decision
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
-from edge_runtime.wire import CONTROL_PERIOD_S, Feedback, State
+from edge_runtime.wire import CONTROL_PERIOD_S, State
 
 Environment = gymnasium.Env[Any, Any]
 Apply = Callable[[Environment, Decision], np.ndarray]
@@ -57,19 +57,13 @@ def vehicle_action(action_names: Sequence[str]) -> Apply:
         if decision.feedback is None:
             return brake_action(environment)
         action = np.clip(np.asarray(decision.feedback.action, dtype=np.float32), -1.0, 1.0)
-        pedal = _pedal_for(environment, decision.feedback)
-        if pedal is not None and PEDAL in action_names:
-            action[list(action_names).index(PEDAL)] = pedal
+        speed_mps = decision.feedback.scenario_speed_mps
+        pedal_for_speed = getattr(environment.unwrapped, "pedal_for_speed", None)
+        if speed_mps is not None and callable(pedal_for_speed) and PEDAL in action_names:
+            action[list(action_names).index(PEDAL)] = float(pedal_for_speed(speed_mps))
         return action
 
     return apply
-
-
-def _pedal_for(environment: Environment, feedback: Feedback) -> float | None:
-    known = getattr(environment.unwrapped, "pedal_for_speed", None)
-    if feedback.scenario_speed_mps is None or not callable(known):
-        return None
-    return float(known(feedback.scenario_speed_mps))
 
 
 PublishScene = Callable[[Any, Stamps], None]
@@ -133,10 +127,12 @@ class EpisodeRunner:
     def _drive(self, episode: int, seed: int) -> EpisodeResult:
         observation, info = self._environment.reset(seed=seed, options=self._options)
         self._clock.begin(episode, seed)
-        steps: list[_Step] = []
+        result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, 0.0, 0.0, 0)
+        lateral_mps2: list[float] = []
+        longitudinal_mps2: list[float] = []
         ended = False
         while not ended:
-            state = self._state(episode, len(steps), observation, info)
+            state = self._state(episode, result.steps, observation, info)
             self._show(state)
             self._under_way = state
             decision = self._clock.exchange(state)
@@ -147,14 +143,24 @@ class EpisodeRunner:
                 )
             action = self._apply(self._environment, decision)
             observation, reward, terminated, truncated, info = self._environment.step(action)
-            steps.append(_Step(action, float(reward), info))
+            result.steps += 1
+            result.actions.append([float(value) for value in action])
+            result.reward += _finite("reward", reward)
+            # An environment need not report accelerations; then they count as zero.
+            lateral_mps2.append(abs(_number(info, "lateral_acceleration_mps2")))
+            longitudinal_mps2.append(abs(_number(info, "longitudinal_acceleration_mps2")))
             self._note(state, decision, _speed_mps(info))
             ended = bool(terminated or truncated)
-        final = self._state(episode, len(steps), observation, info, final=True)
+        final = self._state(episode, result.steps, observation, info, final=True)
         self._show(final)
         self._clock.finish(final)
         self._under_way = None
-        return _result(seed, steps, info)
+        result.outcome = str(info.get("outcome") or "ended")
+        result.distance_m = _number(info, "distance_m")
+        result.time_s = round(result.steps * CONTROL_PERIOD_S, 6)
+        result.lateral_acceleration_mps2 = float(np.mean(lateral_mps2))
+        result.longitudinal_acceleration_mps2 = float(np.mean(longitudinal_mps2))
+        return result
 
     def _state(
         self,
@@ -191,15 +197,6 @@ class EpisodeRunner:
         self._on_tick(state.episode, state.step, decision)
 
 
-class _Step:
-    def __init__(self, action: np.ndarray, reward: float, info: dict[str, Any]) -> None:
-        self.action = [float(value) for value in action]
-        self.reward = _finite("reward", reward)
-        # An environment need not report accelerations; then they count as zero.
-        self.lateral_mps2 = abs(_number(info, "lateral_acceleration_mps2"))
-        self.longitudinal_mps2 = abs(_number(info, "longitudinal_acceleration_mps2"))
-
-
 def _speed_mps(info: dict[str, Any]) -> float:
     try:
         return _finite("speed_mps", info["speed_mps"])
@@ -219,17 +216,3 @@ def _finite(name: str, value: Any) -> float:
     if not math.isfinite(number):
         raise UserError(f"the environment's {name} is {number}, not a finite number")
     return number
-
-
-def _result(seed: int, steps: list[_Step], info: dict[str, Any]) -> EpisodeResult:
-    return EpisodeResult(
-        seed=seed,
-        outcome=str(info.get("outcome") or "ended"),
-        distance_m=_number(info, "distance_m"),
-        reward=float(sum(step.reward for step in steps)),
-        time_s=round(len(steps) * CONTROL_PERIOD_S, 6),
-        lateral_acceleration_mps2=float(np.mean([step.lateral_mps2 for step in steps])),
-        longitudinal_acceleration_mps2=float(np.mean([step.longitudinal_mps2 for step in steps])),
-        steps=len(steps),
-        actions=[step.action for step in steps],
-    )

@@ -6,10 +6,10 @@ it is checked as commands are, and `FeedbackHold` says how long the newest one c
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 
@@ -73,8 +73,7 @@ class CommandCheck:
         if isinstance(command, Rejection):
             self.reject(command.reason.value)
             return None
-        fault = self._fault(command)
-        if fault:
+        if fault := self._fault(command):
             self.reject(fault)
             return None
         if self._overtaken(command):
@@ -114,8 +113,8 @@ NOT_COMMANDED = ""
 class FeedbackCheck:
     """Reads feedback for one simulator session and keeps the counts of the whole run.
 
-    Another simulator's session is nobody's fault before the vehicle has heard of this one, and is
-    not believed either. Its stamps say which feedback is the newest; after 2 T without any, order
+    Another simulator's session is no fault before the vehicle has heard of this one, but is not
+    believed either. Its stamps say which feedback is the newest; after 2 T without any, order
     begins anew: another board, with another clock, may have taken over.
     """
 
@@ -181,7 +180,7 @@ SELF_BRAKING = "self_braking"
 
 @dataclass(frozen=True)
 class VehicleDecision(Decision):
-    """What the vehicle did in one tick; without feedback, nobody knows."""
+    """What the vehicle did in one tick; without feedback, that is unknown."""
 
     feedback: Feedback | None = None
     feedback_age_s: float | None = None
@@ -211,18 +210,16 @@ class FeedbackHold:
         a stop its reason, and decide nothing.
         """
         feedback = self.newest(now_s)
-        known = _fields(heard)
-        if feedback is None:
-            return VehicleDecision(**{**known, "brake_reason": NO_FEEDBACK, "command_age_s": None})
-        known["brake_reason"] = _brake_reason(feedback, heard, episode)
-        if known["brake_reason"]:
-            known["command_age_s"] = None
-        age_s = now_s - self._received_s
-        return VehicleDecision(**known, feedback=feedback, feedback_age_s=age_s)
-
-
-def _fields(decision: Decision) -> dict[str, Any]:
-    return {name: getattr(decision, name) for name in Decision.__dataclass_fields__}
+        reason = NO_FEEDBACK if feedback is None else _brake_reason(feedback, heard, episode)
+        return VehicleDecision(
+            command=heard.command,
+            fresh=heard.fresh,
+            brake_reason=reason,
+            undriven_s=heard.undriven_s,
+            command_age_s=None if reason else heard.command_age_s,
+            feedback=feedback,
+            feedback_age_s=None if feedback is None else now_s - self._received_s,
+        )
 
 
 def _brake_reason(feedback: Feedback, heard: Decision, episode: int) -> str:
@@ -242,78 +239,52 @@ class EdgeCounts:
     """Adds up how the edge's counts grow; the first health seen is where they stood before.
 
     Two threads report here: health messages on Zenoh's, answers to the status query on the
-    caller's.
+    caller's. What is read is only ever replaced, so readers need no lock.
     """
 
     def __init__(self) -> None:
+        self.rejected: Counter[str] = Counter()
+        """States that the edge rejected, by reason, without zeros."""
+        self.unreadable: Counter[str] = Counter()
+        """Health messages that could not be read, as ``health_REASON``."""
+        self.changes = 0
+        """How often another edge runtime took over, or the same was started again."""
+        self.newest: Health | None = None
         self._lock = threading.Lock()
-        self._rejected: Counter[str] = Counter()
-        self._unreadable: Counter[str] = Counter()
-        self._changes = 0
-        self._last: Health | None = None
-
-    @property
-    def rejected(self) -> dict[str, int]:
-        """Return the states rejected by reason, without zeros."""
-        with self._lock:
-            return dict(self._rejected)
-
-    @property
-    def unreadable(self) -> dict[str, int]:
-        """Return the health messages that could not be read, by reason."""
-        with self._lock:
-            return dict(self._unreadable)
-
-    @property
-    def changes(self) -> int:
-        """Return how often another edge runtime took over, or the same was started again."""
-        with self._lock:
-            return self._changes
-
-    @property
-    def policy_id(self) -> str:
-        """Return the policy of the newest health; empty before the first."""
-        with self._lock:
-            return "" if self._last is None else self._last.policy_id
 
     @property
     def waits_for_rearm(self) -> bool:
         """Return whether, by the newest health, only an operator can let the vehicle drive."""
-        with self._lock:
-            return self._last is not None and self._last.needs_rearm
+        return self.newest is not None and self.newest.needs_rearm
 
     def observe_message(self, payload: bytes) -> None:
-        """Take a health message; one that cannot be read is counted, as ``health_REASON``."""
+        """Take a health message; one that cannot be read is counted."""
         health = decode_health(payload)
         if isinstance(health, Health):
             self.observe(health)
-            return
-        with self._lock:
-            self._unreadable[f"health_{health.reason.value}"] += 1
+        else:
+            with self._lock:
+                self.unreadable = self.unreadable + Counter([f"health_{health.reason.value}"])
 
     def observe_status(self, payload: bytes) -> None:
         """Take the JSON answer to the status query, which holds the fields of a health message."""
-        try:
+        with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
             self.observe(msgspec.json.decode(payload, type=Health))
-        except (msgspec.MsgspecError, ValueError, RecursionError):
-            return
 
     def observe(self, health: Health) -> None:
         """Add what is new since the last health."""
         with self._lock:
-            last = self._last
-            if last is None:
-                self._last = health
-                return
-            # Where a message and an answer have overtaken one another both clocks say so; a wall
-            # clock that was set back, or a restart, turns back only one of the two.
-            if health.sent_ns <= last.sent_ns and health.uptime_s <= last.uptime_s:
-                return
-            self._last = health
-            # A restarted edge runtime has a younger clock; it and another one count for themselves.
-            another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id
-            self._changes += another
-            before = {} if another else last.rejected
+            last, before = self.newest, health.rejected
+            if last is not None:
+                # Where a message and an answer have overtaken one another both clocks say so; a
+                # wall clock that was set back, or a restart, turns back only one of the two.
+                if health.sent_ns <= last.sent_ns and health.uptime_s <= last.uptime_s:
+                    return
+                # A restarted edge runtime has a younger clock; it counts from zero, as another.
+                another = health.uptime_s < last.uptime_s or health.policy_id != last.policy_id
+                self.changes += another
+                before = {} if another else last.rejected
             grown = Counter(health.rejected)
             grown.subtract(before)
-            self._rejected += grown
+            self.rejected = self.rejected + grown
+            self.newest = health

@@ -122,17 +122,38 @@ def decode_scene(payload: bytes) -> Scene | None:
         return None
 
 
-class Row(NamedTuple):
-    """A topic's message. ``decode`` gives something else than a ``kind`` for what is not valid."""
-
-    kind: type
-    decode: Callable[[bytes], Any]
-
-
-MESSAGES = {
-    "state": Row(wire.State, wire.decode_state),
-    "command": Row(wire.Command, wire.decode_command),
-    "feedback": Row(wire.Feedback, wire.decode_feedback),
-    "health": Row(wire.Health, wire.decode_health),
-    "scene": Row(Scene, decode_scene),
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    "state": wire.decode_state,
+    "command": wire.decode_command,
+    "feedback": wire.decode_feedback,
+    "health": wire.decode_health,
+    "scene": decode_scene,
 }
+"""Topic -> decoder; for what is not valid it returns a ``Rejection``, for a scene None."""
+
+
+BURST = 2.0
+"""Two at once, so that the jitter of a stream at just the pace costs no message."""
+
+
+class Pace:
+    """Lets one message an interval through on average, and two at once at most; of 0 s, all."""
+
+    def __init__(self, interval_s: float) -> None:
+        self.skipped = 0
+        self._interval_s = interval_s
+        self._tokens = BURST
+        self._filled_s: float | None = None
+
+    def due(self, now_s: float) -> bool:
+        """Whether a message may pass now; one that may not is counted."""
+        if not self._interval_s:
+            return True
+        elapsed_s = 0.0 if self._filled_s is None else max(0.0, now_s - self._filled_s)
+        self._filled_s = now_s
+        self._tokens = min(BURST, self._tokens + elapsed_s / self._interval_s)
+        if self._tokens < 1.0:
+            self.skipped += 1
+            return False
+        self._tokens -= 1.0
+        return True

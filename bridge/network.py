@@ -14,8 +14,8 @@ from __future__ import annotations
 import heapq
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -26,6 +26,55 @@ DIRECTIONS = ("up", "down")
 """State to edge runtime, and command to simulator."""
 TAILS = ("normal", "lognormal", "pareto")
 ORDERS = ("free", "kept")
+MAX_TIME_S = 1e6
+
+
+class Measure(NamedTuple):
+    """How a number with a unit is read and written. What does not fit is read as None."""
+
+    units: Mapping[str, float]
+    """Unit to its factor; values are written in the first, whose factor is 1."""
+    least: float = 0.0
+    most: float = math.inf
+
+    def read(self, text: str) -> float | None:
+        """The value in the first unit."""
+        match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)([A-Za-z/%]*)", text)
+        if match is None or match[2] not in self.units:
+            return None
+        value = float(match[1]) * self.units[match[2]]
+        return value if self.least <= value <= self.most else None
+
+    def write(self, value: float) -> str:
+        """The shortest text that reads back as the same value."""
+        return repr(float(value)).removesuffix(".0") + next(iter(self.units))
+
+    @property
+    def limit(self) -> str:
+        """What a message about a wrong value says besides the example."""
+        return f", at most {self.write(self.most)}"
+
+
+class Choice(NamedTuple):
+    """How one of a few words is read and written."""
+
+    words: tuple[str, ...]
+    limit: str = ""
+
+    def read(self, text: str) -> str | None:
+        """The word itself; None for any other."""
+        return text if text in self.words else None
+
+    def write(self, value: str) -> str:
+        """The word itself."""
+        return value
+
+
+MS = Measure({"ms": 1.0, "us": 1e-3, "s": 1e3}, most=60_000.0)
+SECONDS = Measure({"s": 1.0, "ms": 1e-3, "us": 1e-6}, most=MAX_TIME_S)
+PERCENT = Measure({"%": 1.0}, most=100.0)
+COUNT = Measure({"": 1.0}, least=1.0, most=1e6)
+RATE = Measure({"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}, 1e-3, 1e9)
 
 
 @dataclass(frozen=True)
@@ -49,69 +98,119 @@ class Outage:
         return (since_s % self.period_s if self.period_s else since_s) < self.length_s
 
 
+class Outages(NamedTuple):
+    """How windows are read and written: LENGTH@START, LENGTH/PERIOD or LENGTH/PERIOD@START."""
+
+    limit: str = ""
+
+    def read(self, text: str) -> tuple[Outage, ...] | None:
+        """The windows, which a plus separates; None where one is not understood."""
+        # A plus also stands inside an exponent, where it is followed by a bare number.
+        windows = [self._window(part) for part in re.split(r"(?<!e)\+", text)]
+        return None if None in windows else tuple(window for window in windows if window)
+
+    def _window(self, text: str) -> Outage | None:
+        match = re.fullmatch(r"([^/@]+)(?:/([^/@]+))?(?:@([^/@]+))?", text)
+        if match is None or not (match[2] or match[3]):
+            return None
+        times_s = [SECONDS.read(part) for part in match.groups() if part]
+        length_s, other_s, start_s = times_s[0], times_s[1], times_s[-1]
+        if length_s is None or other_s is None or start_s is None:
+            return None
+        if match[2] and length_s >= other_s:
+            raise UserError(f"outage {text!r} never ends: the length comes first, then the period")
+        return Outage(length_s, start_s, other_s if match[2] else None)
+
+    def write(self, outages: tuple[Outage, ...]) -> str:
+        """The windows; a start that is the period is left out."""
+        return "+".join(
+            SECONDS.write(one.length_s)
+            + ("" if one.period_s is None else "/" + SECONDS.write(one.period_s))
+            + ("" if one.start_s == one.period_s else "@" + SECONDS.write(one.start_s))
+            for one in outages
+        )
+
+
+def _setting(default: Any, name: str, kind: Measure | Choice | Outages, example: str) -> Any:
+    return field(default=default, metadata={"name": name, "kind": kind, "example": example})
+
+
 @dataclass(frozen=True)
 class DirectionSpec:
-    """One direction of the link. Raises UserError for a burst that cannot be.
+    """One direction of the link: the table of settings. UserError for a burst that cannot be.
 
     Messages are treated one by one, as datagrams are, unless ``order`` is kept.
     """
 
-    delay_ms: float = 0.0
+    delay_ms: float = _setting(0.0, "delay", MS, "50ms")
     """Mean time under way."""
-    jitter_ms: float = 0.0
+    jitter_ms: float = _setting(0.0, "jitter", MS, "10ms")
     """Standard deviation of the time under way; what falls below zero becomes zero."""
-    loss_percent: float = 0.0
+    loss_percent: float = _setting(0.0, "loss", PERCENT, "1%")
     """Share of the messages that never arrive, in percent, over all states of the burst model."""
-    tail: str = "normal"
+    tail: str = _setting("normal", "tail", Choice(TAILS), "|".join(TAILS))
     """Distribution of the time under way (`SHAPES`); mean and standard deviation stay."""
-    burst_messages: float = 0.0
-    """Mean length of a bad stretch in messages (`BurstLoss`); 0: losses are
-    independent."""
-    burst_loss_percent: float = 100.0
+    burst_messages: float = _setting(0.0, "burst", COUNT, "5")
+    """Mean length of a bad stretch in messages (`BurstLoss`); 0: losses are independent."""
+    burst_loss_percent: float = _setting(100.0, "burst_loss", PERCENT, "80%")
     """Loss inside a bad stretch."""
-    clear_loss_percent: float = 0.0
+    clear_loss_percent: float = _setting(0.0, "clear_loss", PERCENT, "0.1%")
     """Loss outside bad stretches."""
-    reorder_percent: float = 0.0
+    reorder_percent: float = _setting(0.0, "reorder", PERCENT, "1%")
     """Share of the messages that are held back, so that later ones can overtake them."""
-    reorder_by_ms: float = 150.0
+    reorder_by_ms: float = _setting(150.0, "reorder_by", MS, "300ms")
     """How long they are held back; the default lets one state of the control loop pass."""
-    order: str = "free"
-    """``kept``: nobody overtakes, so a late message holds up all behind it, as TCP does."""
-    duplicate_percent: float = 0.0
+    order: str = _setting("free", "order", Choice(ORDERS), "|".join(ORDERS))
+    """``kept``: no message overtakes, so a late message holds up all behind it, as TCP does."""
+    duplicate_percent: float = _setting(0.0, "duplicate", PERCENT, "1%")
     """Share of the messages that arrive twice; the copy's time under way is drawn anew."""
-    rate_kbps: float = 0.0
+    rate_kbps: float = _setting(0.0, "rate", RATE, "1Mbit/s")
     """Bandwidth in 1000 bit/s; 0: no limit."""
-    queue_ms: float = 200.0
+    queue_ms: float = _setting(200.0, "queue", MS, "100ms")
     """Longest wait for the line; a message that would wait longer is dropped."""
-    outages: tuple[Outage, ...] = ()
+    outages: tuple[Outage, ...] = _setting((), "outage", Outages(), "0.5s@2s+0.2s/10s")
     """Windows in which whatever leaves the sender is lost."""
 
     def __post_init__(self) -> None:
-        if self.burst_messages:
-            _check_burst(self)
+        if not self.burst_messages:
+            return
+        clear, loss, burst = self.clear_loss_percent, self.loss_percent, self.burst_loss_percent
+        if not (clear <= loss and clear < burst):
+            raise UserError(
+                f"loss {loss:g}% in bursts of {burst:g}% is impossible with {clear:g}% outside of"
+                " them: clear_loss is at most loss, and below burst_loss"
+            )
+        # Good stretches last one message at least, so bad ones cannot fill more than this.
+        most = self.burst_messages / (self.burst_messages + 1.0)
+        if self.bad_share > most:
+            raise UserError(
+                f"loss {loss:g}% is too much for bursts of {self.burst_messages:g} messages: at"
+                f" most {clear + most * (burst - clear):.4g}%, or longer bursts"
+            )
 
-
-def bad_share(spec: DirectionSpec) -> float:
-    """The share of the messages that meet the bad state, so that the overall loss is the asked."""
-    return (spec.loss_percent - spec.clear_loss_percent) / (
-        spec.burst_loss_percent - spec.clear_loss_percent
-    )
-
-
-def _check_burst(spec: DirectionSpec) -> None:
-    clear, loss, burst = spec.clear_loss_percent, spec.loss_percent, spec.burst_loss_percent
-    if not (clear <= loss and clear < burst):
-        raise UserError(
-            f"loss {loss:g}% in bursts of {burst:g}% is impossible with {clear:g}% outside of"
-            " them: clear_loss is at most loss, and below burst_loss"
+    @property
+    def bad_share(self) -> float:
+        """The share of messages in the bad state, so that the overall loss is the asked one."""
+        return (self.loss_percent - self.clear_loss_percent) / (
+            self.burst_loss_percent - self.clear_loss_percent
         )
-    # Good stretches last one message at least, so bad ones cannot fill more than this.
-    most = spec.burst_messages / (spec.burst_messages + 1.0)
-    if bad_share(spec) > most:
-        raise UserError(
-            f"loss {loss:g}% is too much for bursts of {spec.burst_messages:g} messages: at most"
-            f" {clear + most * (burst - clear):.4g}%, or longer bursts"
-        )
+
+    def written(self, prefix: str = "") -> list[str]:
+        """The settings that are not the default, as a person writes them."""
+        return [
+            f"{prefix}{row.metadata['name']}={row.metadata['kind'].write(value)}"
+            for row in fields(self)
+            if (value := getattr(self, row.name)) != row.default
+        ]
+
+
+SETTINGS = {row.metadata["name"]: row for row in fields(DirectionSpec)}
+"""Name in a specification -> field, whose metadata hold how it is read, and an example."""
+GRAMMAR = (
+    "none, 50ms+-10ms, or settings "
+    + ",".join(f"{name}={row.metadata['example']}" for name, row in SETTINGS.items())
+    + ", each also with up. or down. before it"
+)
 
 
 @dataclass(frozen=True)
@@ -123,153 +222,9 @@ class LatencySpec:
 
     def __str__(self) -> str:
         """Canonical form: defaults are left out, prefixes only where needed."""
-        return format_spec(self)
-
-
-MAX_DELAY_MS = 60_000.0
-MAX_TIME_S = 1e6
-
-_SECONDS_PER_UNIT = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
-_MS_PER_UNIT = {"us": 1e-3, "ms": 1.0, "s": 1e3}
-_KBPS_PER_UNIT = {"bit/s": 1e-3, "kbit/s": 1.0, "Mbit/s": 1e3, "Gbit/s": 1e6}
-_NUMBER = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
-_TIME = rf"{_NUMBER}(?:us|ms|s)"
-_SHORT = re.compile(rf"({_TIME})(?:(?:\+-|±)({_TIME}))?")
-_OUTAGE = re.compile(rf"({_TIME})(?:/({_TIME}))?(?:@({_TIME}))?")
-
-
-class Setting(NamedTuple):
-    """One row of SETTINGS. ``read`` returns None for a value that it does not understand."""
-
-    name: str
-    field: str
-    read: Callable[[str], Any]
-    write: Callable[[Any], str]
-    example: str
-
-
-def _number(value: float) -> str:
-    """The shortest text that reads back as the same number."""
-    text = repr(float(value))
-    return text[:-2] if text.endswith(".0") else text
-
-
-def _measure(text: str, units: dict[str, float]) -> float | None:
-    match = re.fullmatch(rf"({_NUMBER})([A-Za-z/%]*)", text)
-    if match is None or match[2] not in units:
-        return None
-    return float(match[1]) * units[match[2]]
-
-
-def _read_ms(text: str) -> float | None:
-    value_ms = _measure(text, _MS_PER_UNIT)
-    if value_ms is not None and value_ms > MAX_DELAY_MS:
-        raise UserError(f"latency of {text} is more than {MAX_DELAY_MS / 1e3:g}s")
-    return value_ms
-
-
-def _measured(units: dict[str, float], fits: Callable[[float], bool]) -> Callable[[str], Any]:
-    """Return a reader of numbers with a unit that fit; it returns None for any other text."""
-
-    def read(text: str) -> float | None:
-        value = _measure(text, units)
-        return value if value is not None and fits(value) else None
-
-    return read
-
-
-_PERCENT = _measured({"%": 1.0}, lambda percent: percent <= 100.0)
-_COUNT = _measured({"": 1.0}, lambda count: 1.0 <= count <= 1e6)
-_RATE = _measured(_KBPS_PER_UNIT, lambda rate_kbps: 0.0 < rate_kbps <= 1e9)
-
-
-def _choice(choices: tuple[str, ...]) -> Callable[[str], str | None]:
-    return lambda text: text if text in choices else None
-
-
-def _read_outages(text: str) -> tuple[Outage, ...] | None:
-    # A plus also stands inside an exponent, where it is followed by a bare number.
-    windows = [_read_outage(part) for part in re.split(r"(?<!e)\+", text)]
-    return None if None in windows else tuple(window for window in windows if window is not None)
-
-
-def _read_outage(text: str) -> Outage | None:
-    match = _OUTAGE.fullmatch(text)
-    if match is None or not (match[2] or match[3]):
-        return None
-    length_s, period_s, start_s = (
-        None if part is None else _measure(part, _SECONDS_PER_UNIT) for part in match.groups()
-    )
-    assert length_s is not None
-    if start_s is None:
-        start_s = period_s
-    assert start_s is not None
-    if max(length_s, start_s, period_s or 0.0) > MAX_TIME_S:
-        return None
-    if period_s is not None and length_s >= period_s:
-        raise UserError(f"outage {text!r} never ends: the length comes first, then the period")
-    return Outage(length_s, start_s, period_s)
-
-
-def _write_outages(outages: tuple[Outage, ...]) -> str:
-    return "+".join(_write_outage(outage) for outage in outages)
-
-
-def _write_outage(outage: Outage) -> str:
-    text = f"{_number(outage.length_s)}s"
-    if outage.period_s is not None:
-        text += f"/{_number(outage.period_s)}s"
-    return text if outage.start_s == outage.period_s else f"{text}@{_number(outage.start_s)}s"
-
-
-def _ms(name: str, field: str, example: str) -> Setting:
-    return Setting(name, field, _read_ms, lambda value: f"{_number(value)}ms", example)
-
-
-def _percent(name: str, field: str, example: str) -> Setting:
-    return Setting(name, field, _PERCENT, lambda value: f"{_number(value)}%", example)
-
-
-SETTINGS: tuple[Setting, ...] = (
-    _ms("delay", "delay_ms", "50ms"),
-    _ms("jitter", "jitter_ms", "10ms"),
-    _percent("loss", "loss_percent", "1%"),
-    Setting("tail", "tail", _choice(TAILS), str, "|".join(TAILS)),
-    Setting("burst", "burst_messages", _COUNT, _number, "5"),
-    _percent("burst_loss", "burst_loss_percent", "80%"),
-    _percent("clear_loss", "clear_loss_percent", "0.1%"),
-    _percent("reorder", "reorder_percent", "1%"),
-    _ms("reorder_by", "reorder_by_ms", "300ms"),
-    Setting("order", "order", _choice(ORDERS), str, "|".join(ORDERS)),
-    _percent("duplicate", "duplicate_percent", "1%"),
-    Setting("rate", "rate_kbps", _RATE, lambda v: f"{_number(v)}kbit/s", "1Mbit/s"),
-    _ms("queue", "queue_ms", "100ms"),
-    Setting("outage", "outages", _read_outages, _write_outages, "0.5s@2s+0.2s/10s"),
-)
-_BY_NAME = {row.name: row for row in SETTINGS}
-_DEFAULTS = {field.name: field.default for field in fields(DirectionSpec)}
-
-GRAMMAR = (
-    "none, 50ms+-10ms, or settings "
-    + ",".join(f"{row.name}={row.example}" for row in SETTINGS)
-    + ", each also with up. or down. before it"
-)
-
-
-def format_spec(spec: LatencySpec) -> str:
-    """Canonical form: defaults are left out, prefixes only where needed."""
-    if spec.up == spec.down:
-        return ",".join(_written(spec.up)) or "none"
-    return ",".join(_written(spec.up, "up.") + _written(spec.down, "down.")) or "none"
-
-
-def _written(direction: DirectionSpec, prefix: str = "") -> list[str]:
-    values = ((row, getattr(direction, row.field)) for row in SETTINGS)
-    return [
-        f"{prefix}{row.name}={row.write(value)}"
-        for row, value in values
-        if value != _DEFAULTS[row.field]
-    ]
+        both = self.up.written() if self.up == self.down else None
+        parts = self.up.written("up.") + self.down.written("down.") if both is None else both
+        return ",".join(parts) or "none"
 
 
 def parse_spec(text: str) -> LatencySpec:
@@ -287,44 +242,43 @@ def parse_spec(text: str) -> LatencySpec:
     """
     if text.strip() in ("", "none"):
         return LatencySpec()
-    both: dict[str, Any] = {}
-    single: dict[str, dict[str, Any]] = {name: {} for name in DIRECTIONS}
-    for raw_part in text.split(","):
-        part = raw_part.strip()
+    given: dict[str, dict[str, Any]] = {"": {}, "up": {}, "down": {}}
+    for part in map(str.strip, text.split(",")):
         prefix, dot, rest = part.partition(".")
-        prefixed = bool(dot) and prefix in DIRECTIONS
-        target = single[prefix] if prefixed else both
-        for row, value in _parse_part(rest if prefixed else part, text):
-            if row.field in target:
-                raise UserError(f"latency {text!r} sets {row.name} twice")
-            target[row.field] = value
+        if not dot or prefix not in DIRECTIONS:
+            prefix, rest = "", part
+        for name, value in _parse_part(rest, text):
+            if name in given[prefix]:
+                raise UserError(f"latency {text!r} sets {name} twice")
+            given[prefix][name] = value
     try:
-        up, down = (DirectionSpec(**{**both, **single[name]}) for name in DIRECTIONS)
+        ways = ({**given[""], **given[way]} for way in DIRECTIONS)
+        return LatencySpec(
+            *(DirectionSpec(**{SETTINGS[name].name: way[name] for name in way}) for way in ways)
+        )
     except UserError as error:
         raise UserError(f"latency {text!r}: {error}") from None
-    return LatencySpec(up, down)
 
 
-def _parse_part(part: str, text: str) -> list[tuple[Setting, Any]]:
-    short = _SHORT.fullmatch(part)
-    if short:
-        names = ("delay", "jitter")
-        given = [
-            (_BY_NAME[name], value)
-            for name, value in zip(names, short.groups(), strict=True)
-            if value
-        ]
-        return [(row, row.read(value)) for row, value in given]
-    name, _, written = part.partition("=")
-    row = _BY_NAME.get(name)
-    if row is None:
-        raise UserError(f"latency {text!r}: {part!r} is not understood; write {GRAMMAR}")
-    value = row.read(written)
-    if value is None:
-        raise UserError(
-            f"latency {text!r}: {part!r} is not understood; write it like {name}={row.example}"
-        )
-    return [(row, value)]
+def _parse_part(part: str, text: str) -> list[tuple[str, Any]]:
+    """Names and values of one part: one setting, or delay and jitter in their short form."""
+    name, is_named, word = part.partition("=")
+    pairs = [(name, word)]
+    if not is_named and part[:1].isdigit() and part.count("+-") + part.count("±") < 2:
+        pairs = list(zip(("delay", "jitter"), re.split(r"\+-|±", part), strict=False))
+    found = []
+    for name, word in pairs:
+        if name not in SETTINGS:
+            raise UserError(f"latency {text!r}: {part!r} is not understood; write {GRAMMAR}")
+        setting = SETTINGS[name].metadata
+        value = setting["kind"].read(word)
+        if value is None:
+            raise UserError(
+                f"latency {text!r}: {part!r} is not understood; write it like"
+                f" {name}={setting['example']}{setting['kind'].limit}"
+            )
+        found.append((name, value))
+    return found
 
 
 LOGNORMAL_SIGMA = 1.0
@@ -337,10 +291,6 @@ _PARETO_MEAN = PARETO_ALPHA / (PARETO_ALPHA - 1)
 _PARETO_STD = _PARETO_MEAN / math.sqrt(PARETO_ALPHA * (PARETO_ALPHA - 2))
 
 
-def _normal(draw: float) -> float:
-    return draw
-
-
 def _lognormal(draw: float) -> float:
     return (math.exp(LOGNORMAL_SIGMA * draw) - _LOGNORMAL_MEAN) / _LOGNORMAL_STD
 
@@ -351,7 +301,7 @@ def _pareto(draw: float) -> float:
 
 
 SHAPES: dict[str, Callable[[float], float]] = {
-    "normal": _normal,
+    "normal": lambda draw: draw,
     "lognormal": _lognormal,
     "pareto": _pareto,
 }
@@ -364,17 +314,6 @@ of one standard normal draw: the same seed delays the same messages, and only ho
 A long-tailed link has a floor (propagation) little below its mean and rare, very late messages:
 at least ``delay - 0.76 jitter`` with ``lognormal`` and ``delay - 0.58 jitter`` with ``pareto``.
 """
-
-
-class IndependentLoss:
-    """Every message has the same chance."""
-
-    def __init__(self, spec: DirectionSpec) -> None:
-        self._percent = spec.loss_percent
-
-    def percent(self) -> float:
-        """Chance of the next message to be lost, in percent."""
-        return self._percent
 
 
 class BurstLoss:
@@ -394,7 +333,7 @@ class BurstLoss:
     """
 
     def __init__(self, spec: DirectionSpec, rng: np.random.Generator) -> None:
-        share = bad_share(spec)
+        share = spec.bad_share
         self._loss_percent = {True: spec.burst_loss_percent, False: spec.clear_loss_percent}
         self._to_good = 1.0 / spec.burst_messages
         self._to_bad = self._to_good * share / (1.0 - share)
@@ -410,25 +349,6 @@ class BurstLoss:
         return percent
 
 
-class Line:
-    """A line of limited bandwidth with a queue that is bounded by the wait that it stands for."""
-
-    def __init__(self, spec: DirectionSpec) -> None:
-        self._rate_bytes_per_s = spec.rate_kbps * 1e3 / 8
-        self._longest_wait_s = spec.queue_ms * 1e-3
-        self._free_s = float("-inf")
-
-    def send(self, now_s: float, size_bytes: int) -> float | None:
-        """When the message's last byte has left; None if the queue is full. No rate: at once."""
-        if not self._rate_bytes_per_s:
-            return now_s
-        begin_s = max(now_s, self._free_s)
-        if begin_s - now_s > self._longest_wait_s:
-            return None
-        self._free_s = begin_s + size_bytes / self._rate_bytes_per_s
-        return self._free_s
-
-
 class LatencyModel:
     """One direction of the link. Not thread-safe; time must not run backwards.
 
@@ -442,47 +362,54 @@ class LatencyModel:
         self._rng = np.random.default_rng(seed)
         self._reorder_rng = np.random.default_rng(reorder)
         self._duplicate_rng = np.random.default_rng(duplicate)
-        self._loss = (
-            BurstLoss(spec, np.random.default_rng(bursts))
-            if spec.burst_messages
-            else IndependentLoss(spec)
+        self._bursts = (
+            BurstLoss(spec, np.random.default_rng(bursts)) if spec.burst_messages else None
         )
         self._shape = SHAPES[spec.tail]
-        self._line = Line(spec)
-        self._newest_arrival_s = float("-inf")
+        self._line_free_s = self._newest_arrival_s = float("-inf")
 
     def arrivals(self, now_s: float, size_bytes: int) -> tuple[float, ...]:
         """When a message handed over at ``now_s`` arrives (s, same clock), earliest first.
 
         Empty if it is lost, two times if it is duplicated. ``size_bytes`` matters with a rate.
         """
-        lost = self._rng.random() * 100.0 < self._loss.percent()
+        loss_percent = self._bursts.percent() if self._bursts else self.spec.loss_percent
+        lost = self._rng.random() * 100.0 < loss_percent
         draws = [self._rng.standard_normal()]
         held_back = self._reorder_rng.random() * 100.0 < self.spec.reorder_percent
         duplicated = self._duplicate_rng.random() * 100.0 < self.spec.duplicate_percent
         second_draw = self._duplicate_rng.standard_normal()
         if duplicated:
             draws.append(second_draw)
-        left_s = self._line.send(now_s, size_bytes)
+        left_s = self._leave_s(now_s, size_bytes)
         if left_s is None or lost or any(outage.covers(left_s) for outage in self.spec.outages):
             return ()
         extra_s = self.spec.reorder_by_ms * 1e-3 if held_back else 0.0
         times = sorted(left_s + self._under_way_s(draw) + extra_s for draw in draws)
         return self._in_order(times) if self.spec.order == "kept" else tuple(times)
 
+    def _leave_s(self, now_s: float, size_bytes: int) -> float | None:
+        """When the message's last byte has left; None if the queue is full. No rate: at once."""
+        if not self.spec.rate_kbps:
+            return now_s
+        begin_s = max(now_s, self._line_free_s)
+        if begin_s - now_s > self.spec.queue_ms * 1e-3:
+            return None
+        self._line_free_s = begin_s + size_bytes / (self.spec.rate_kbps * 1e3 / 8)
+        return self._line_free_s
+
     def _under_way_s(self, draw: float) -> float:
         under_way_ms = self.spec.delay_ms + self.spec.jitter_ms * self._shape(draw)
         return max(0.0, under_way_ms) * 1e-3
 
     def _in_order(self, times: list[float]) -> tuple[float, ...]:
-        """Nobody overtakes: what would arrive before an earlier message arrives with it."""
+        """No message overtakes: what would arrive before an earlier message arrives with it."""
         kept = tuple(max(arrival_s, self._newest_arrival_s) for arrival_s in times)
         self._newest_arrival_s = kept[-1]
         return kept
 
 
-@dataclass(frozen=True)
-class Link:
+class Link(NamedTuple):
     """The two directions of one episode."""
 
     up: LatencyModel

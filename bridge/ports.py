@@ -1,7 +1,7 @@
-"""Both ends of the bridge on Zenoh: the simulator's port, and the feed of a listener.
+"""Both ends of the bridge on Zenoh: the simulator's port, and what a listener hears.
 
-The port publishes states and hands on what comes back. The feed hears every topic through a bounded
-queue, for viewer, recorder and ROS 2: Zenoh's threads only put into it, so a listener that falls
+The port publishes states and hands on what comes back. A listener (viewer, recorder, ROS 2) hears
+every topic through a bounded queue. Zenoh's threads only put into it, so a listener that falls
 behind loses messages and never holds up the vehicle.
 """
 
@@ -41,12 +41,6 @@ QUERY_S = 1.0
 PayloadHandler = Callable[[bytes], None]
 
 
-class _Status(msgspec.Struct):
-    """What is needed of the answer to the status query."""
-
-    manifest: Manifest
-
-
 def simulator_key(vehicle_id: str) -> str:
     """Return the liveliness key by which viewers see that the simulator is there (extension)."""
     return f"phil/{vehicle_id}/simulator"
@@ -57,34 +51,30 @@ class SimulatorPort:
 
     def __init__(self, zenoh_session: zenoh.Session, vehicle_id: str) -> None:
         self.session = secrets.token_hex(8)
-        self._zenoh = zenoh_session
         self.vehicle_id = vehicle_id
+        self.edge_counts = EdgeCounts()
+        self._zenoh = zenoh_session
         # DROP: a slow listener must never hold up the simulation.
         drop = zenoh.CongestionControl.DROP
-        self._states = zenoh_session.declare_publisher(
-            key(vehicle_id, "state"), congestion_control=drop
-        )
-        self._scenes = zenoh_session.declare_publisher(
-            scene_key(vehicle_id), congestion_control=drop
-        )
-        self._token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
-        self._commands: Any = None
-        self._feedback: Any = None
-        self.edge_counts = EdgeCounts()
-        self._health = self._subscribe("health", self.edge_counts.observe_message)
+        states, scenes = key(vehicle_id, "state"), scene_key(vehicle_id)
+        self._states = zenoh_session.declare_publisher(states, congestion_control=drop)
+        self._scenes = zenoh_session.declare_publisher(scenes, congestion_control=drop)
+        token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
+        self._declared: list[Any] = [self._states, self._scenes, token]
+        self._subscribe("health", self.edge_counts.observe_message)
 
     def on_command(self, handler: PayloadHandler) -> None:
         """Call ``handler(payload)`` for every command, on Zenoh's thread: it must be quick."""
-        self._commands = self._subscribe("command", handler)
+        self._subscribe("command", handler)
 
     def on_feedback(self, handler: PayloadHandler) -> None:
         """Call ``handler(payload)`` for every feedback of the vehicle, as ``on_command`` does."""
-        self._feedback = self._subscribe("feedback", handler)
+        self._subscribe("feedback", handler)
 
-    def _subscribe(self, topic: str, handler: PayloadHandler) -> Any:
+    def _subscribe(self, topic: str, handler: PayloadHandler) -> None:
         own = key(self.vehicle_id, topic)
         hear = only_own(own, lambda sample: handler(sample.payload.to_bytes()))
-        return self._zenoh.declare_subscriber(own, hear)
+        self._declared.append(self._zenoh.declare_subscriber(own, hear))
 
     def publish_state(self, payload: bytes) -> None:
         """Send an encoded state to the edge runtime (and to viewers)."""
@@ -112,41 +102,33 @@ class SimulatorPort:
 
     def note_edge_counts(self) -> None:
         """Ask the edge runtime for its counts now: before and after the drive."""
-        for reply in self._status_replies():
-            if reply.ok is not None:
-                self.edge_counts.observe_status(reply.ok.payload.to_bytes())
-
-    def edge_policy_id(self) -> str:
-        """Return the policy that the edge runtime says it drives; empty if it says nothing."""
-        self.note_edge_counts()
-        return self.edge_counts.policy_id
+        for status in self._statuses():
+            self.edge_counts.observe_status(status)
 
     def edge_manifest(self) -> Manifest | None:
         """Return the manifest of the edge runtime's policy; None if it says nothing."""
-        for reply in self._status_replies():
-            if reply.ok is not None:
-                with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError):
-                    status = msgspec.json.decode(reply.ok.payload.to_bytes(), type=_Status)
-                    return status.manifest
+        for status in self._statuses():
+            with contextlib.suppress(msgspec.MsgspecError, ValueError, RecursionError, KeyError):
+                fields = msgspec.json.decode(status, type=dict[str, msgspec.Raw])
+                return msgspec.json.decode(fields["manifest"], type=Manifest)
         return None
 
     def _edge_is_there(self) -> bool:
         """Its token is seen, or it answers: the board's Zenoh can lose the token for a while."""
         alive = key(self.vehicle_id, "alive")
         tokens = self._zenoh.liveliness().get(alive, timeout=QUERY_S)
-        return any(reply.ok for reply in tokens) or any(
-            reply.ok for reply in self._status_replies()
-        )
+        return any(reply.ok for reply in tokens) or any(True for _ in self._statuses())
 
-    def _status_replies(self) -> Any:
-        return self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S)
+    def _statuses(self) -> Iterator[bytes]:
+        """The edge runtime's answers to the status query."""
+        for reply in self._zenoh.get(key(self.vehicle_id, "status"), timeout=QUERY_S):
+            if reply.ok is not None:
+                yield reply.ok.payload.to_bytes()
 
     def close(self) -> None:
         """Undeclare everything: a callback left open hangs the process at its end."""
-        callbacks = (self._commands, self._feedback, self._health)
-        for declared in (*callbacks, self._token, self._scenes, self._states):
-            if declared is not None:
-                declared.undeclare()
+        for declared in reversed(self._declared):
+            declared.undeclare()
 
 
 @contextlib.contextmanager
@@ -173,17 +155,14 @@ def open_port(
         zenoh_session = connect_client(connect, wait_s, tls)
     else:
         zenoh_session = open_session(listen=listen, mode="router", tls=tls, access=rules)
-    try:
-        port = SimulatorPort(zenoh_session, vehicle_id)
-        try:
-            yield port
-        finally:
-            port.close()
-    finally:
-        zenoh_session.close()
+    with (
+        contextlib.closing(zenoh_session),
+        contextlib.closing(SimulatorPort(zenoh_session, vehicle_id)) as port,
+    ):
+        yield port
 
 
-class Feed:
+class WireListener:
     """The messages in order of arrival, and whether their simulators are there."""
 
     def __init__(self) -> None:
@@ -201,10 +180,9 @@ class Feed:
 
     def next(self, timeout_s: float) -> Heard | None:
         """Return the next message, None if there is none within ``timeout_s``."""
-        try:
+        with contextlib.suppress(queue.Empty):
             return self._queue.get(timeout=timeout_s)
-        except queue.Empty:
-            return None
+        return None
 
     def until_gone(self, duration_s: float | None) -> Iterator[Heard]:
         """Yield messages until no simulator is left and the queue is empty, or the time is over."""
@@ -225,7 +203,7 @@ class Feed:
 
         def hear(sample: zenoh.Sample) -> None:
             if "*" in str(sample.key_expr):
-                return  # put to many vehicles at once: it is nobody's own
+                return  # put to many vehicles at once: no vehicle's own
             size = len(sample.payload)
             # A flood of huge messages must not fill the memory.
             payload = sample.payload.to_bytes() if size <= MAX_PAYLOAD_BYTES else b""
@@ -262,9 +240,9 @@ class Feed:
 
 
 @contextlib.contextmanager
-def open_feed(
+def open_listener(
     connect: str, vehicle_id: str, wait_s: float = 0.0, tls: TlsFiles | None = None
-) -> Iterator[Feed]:
+) -> Iterator[WireListener]:
     """Listen to one vehicle, or to ANY_VEHICLE.
 
     UserError if no simulator for it is at ``connect`` within ``wait_s``, and for a certificate that
@@ -275,35 +253,27 @@ def open_feed(
     if vehicle_id != ANY_VEHICLE:
         check_vehicle_id(vehicle_id)
     give_up_s = time.monotonic() + wait_s
-    session = connect_client(connect, wait_s, tls)
-    try:
-        feed = Feed()
+    with contextlib.closing(connect_client(connect, wait_s, tls)) as session:
+        listener = WireListener()
         declared = [
-            session.declare_subscriber(f"phil/{vehicle_id}/{topic}", feed.hearer(topic))
+            session.declare_subscriber(f"phil/{vehicle_id}/{topic}", listener.hearer(topic))
             for topic in WIRE_TOPICS
         ]
-        liveliness = session.liveliness()
         for topic in TOKEN_TOPICS:
-            token = f"phil/{vehicle_id}/{topic}"
-            declared.append(liveliness.declare_subscriber(token, feed.watch(topic), history=True))
+            token, watch = f"phil/{vehicle_id}/{topic}", listener.watch(topic)
+            declared.append(session.liveliness().declare_subscriber(token, watch, history=True))
         try:
-            _wait_for_simulator(feed, give_up_s, vehicle_id, connect)
-            yield feed
+            # A listener to a vehicle that is not there would never see it go, nor end.
+            if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
+                hint = "start one: python -m bridge simulate"
+                if vehicle_id != ANY_VEHICLE:
+                    hint = "name it with --vehicle-id"
+                which = "" if vehicle_id == ANY_VEHICLE else f" with vehicle id {vehicle_id}"
+                raise UserError(f"no simulator{which} at {connect}; {hint}")
+            yield listener
         finally:
             for subscriber in declared:
                 subscriber.undeclare()
-    finally:
-        session.close()
-
-
-def _wait_for_simulator(feed: Feed, give_up_s: float, vehicle_id: str, endpoint: str) -> None:
-    """Without it, a listener to a vehicle that is not there would never see it go, nor end."""
-    if not feed.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
-        if vehicle_id == ANY_VEHICLE:
-            raise UserError(f"no simulator at {endpoint}; start one: python -m bridge simulate")
-        raise UserError(
-            f"no simulator with vehicle id {vehicle_id} at {endpoint}; name it with --vehicle-id"
-        )
 
 
 def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) -> zenoh.Session:

@@ -1,6 +1,7 @@
-"""``python -m bridge record``: a listener of its own that writes the wire to an MCAP file.
+"""``python -m bridge record`` and ``repair``: MCAP files of the wire, and how they are mended.
 
-It keeps the exact payloads for replay, and copies that viewers can draw:
+The recorder is a listener of its own. It keeps the exact payloads for replay, and copies that
+viewers can draw:
 
 | topic | encoding |
 |---|---|
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import io
 import os
 import sys
 import time
@@ -32,17 +34,22 @@ import msgspec
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import CompressionType, Writer
 
-from bridge.commands import add_connect, add_span, add_tls
-from bridge.messages import MESSAGES, TOKEN_TOPICS, Heard
-from bridge.ports import ANY_VEHICLE, POLL_S, QUEUE_MESSAGES, Feed, open_feed
-from bridge.recording import METADATA, WIRE_ENCODING
+from bridge.commands import add_options
+from bridge.messages import DECODERS, TOKEN_TOPICS, Heard
+from bridge.ports import ANY_VEHICLE, POLL_S, QUEUE_MESSAGES, WireListener, open_listener
+from bridge.recording import METADATA, WIRE_ENCODING, Recording
 from edge_runtime import __version__, wire
-from edge_runtime.cli import ArgumentParser, examples, seconds, sigterm_as_interrupt
-from edge_runtime.files import check_writable, lock_file, make_directory
+from edge_runtime.cli import Command, examples, seconds, sigterm_as_interrupt
+from edge_runtime.files import (
+    behind_link,
+    check_writable,
+    lock_file,
+    make_directory,
+    try_to_lock_file,
+    write_atomic,
+)
 from edge_runtime.tls import tls_for
-from edge_runtime.transport import check_endpoint
-from edge_runtime.util import UserError, counted
-from edge_runtime.wire import check_vehicle_id
+from edge_runtime.util import UserError, counted, open_regular
 
 FLUSH_S = 0.5
 """A kill loses at most this much, and what waits in the queue."""
@@ -52,23 +59,26 @@ CHUNK_BYTES = 1 << 20
 MAX_PENDING_BYTES = 4 << 20
 NEVER_OVER = "choose another name: no recording is lost"
 
-EXAMPLE = examples(
-    "python -m bridge record --out drive.mcap",
-    "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
-)
+
+def _new(path: str) -> str:
+    """The path itself; UserError where a recording could not be begun there later."""
+    check_writable(path)
+    if Path(path).exists():
+        raise UserError(f"{path} exists; {NEVER_OVER}")
+    return path
 
 
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
+def _add_record_arguments(parser: Any) -> None:
     parser.add_argument(
-        "--out", metavar="F.mcap", required=True, help="the recording; it must not exist yet"
+        "--out",
+        metavar="F.mcap",
+        type=_new,
+        required=True,
+        help="the recording; it must not exist yet",
     )
-    add_connect(parser)
-    add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id", metavar="ID", help="record this vehicle only (otherwise all)"
-    )
-    add_span(parser)
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    help_text = "record this vehicle only (otherwise all)"
+    add_options(parser, "--vehicle-id", default=None, help=help_text)
     parser.add_argument(
         "--linger-s",
         metavar="SECONDS",
@@ -78,24 +88,21 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
 
 
-def run(arguments: Any) -> int:
+def _run_record(arguments: Any) -> int:
     """Run the command until the simulators go, the time is over, or somebody interrupts."""
-    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
-    vehicle_id = arguments.vehicle_id
-    vehicle_id = ANY_VEHICLE if vehicle_id is None else check_vehicle_id(vehicle_id)
-    path = Path(arguments.out)
-    check_new(path)
+    tls = tls_for(arguments.tls, arguments.connect)
+    path, vehicle_id = Path(arguments.out), arguments.vehicle_id or ANY_VEHICLE
     with (
         sigterm_as_interrupt(),
-        open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,
+        open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
+        contextlib.closing(RecordingWriter(path)) as writer,
     ):
-        writer = RecordingWriter(path)
         try:
             print(f"recording {path}", flush=True)
             # Being interrupted is the ordinary way to end a recording.
             with contextlib.suppress(KeyboardInterrupt):
-                _listen(feed, writer, arguments)
-            writer.finish(feed.dropped)
+                _listen(listener, writer, arguments)
+            writer.finish(listener.dropped)
         except OSError as error:
             print(
                 f"error: recording {path} stopped: {error.strerror}; it holds what was written"
@@ -103,32 +110,40 @@ def run(arguments: Any) -> int:
                 file=sys.stderr,
             )
             return NOT_WRITTEN
-        finally:
-            writer.close()
-    if feed.dropped:
-        dropped = counted(feed.dropped, "message")
+    if listener.dropped:
+        dropped = counted(listener.dropped, "message")
         print(f"{dropped} came faster than they could be written", file=sys.stderr)
     print(f"wrote {path}: {counted(writer.messages, 'message')}")
     return 0
 
 
-def _listen(feed: Feed, writer: RecordingWriter, arguments: Any) -> None:
+RECORD = Command(
+    examples(
+        "python -m bridge record --out drive.mcap",
+        "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
+    ),
+    _add_record_arguments,
+    _run_record,
+)
+
+
+def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> None:
     now_s = time.monotonic()
     end_s = None if arguments.duration_s is None else now_s + arguments.duration_s
     flush_s, seen_s = now_s + FLUSH_S, now_s
     while end_s is None or now_s < end_s:
-        heard = feed.next(POLL_S)
+        heard = listener.next(POLL_S)
         if heard is not None:
             # Under a flood the copies for viewers are the first to go.
-            writer.write(heard, with_view=feed.waiting < QUEUE_MESSAGES // 2)
+            writer.write(heard, with_view=listener.waiting < QUEUE_MESSAGES // 2)
         now_s = time.monotonic()
         if now_s >= flush_s:
             writer.flush()
             flush_s = now_s + FLUSH_S
-        if not feed.simulator_gone.is_set():
+        if not listener.simulator_gone.is_set():
             seen_s = now_s
         # An edge runtime behind a router goes on sending health: that is no drive to wait for.
-        elif now_s - seen_s >= arguments.linger_s and not feed.waiting:
+        elif now_s - seen_s >= arguments.linger_s and not listener.waiting:
             return
 
 
@@ -178,7 +193,7 @@ class RecordingWriter:
         self._file.close()
 
     def _view(self, heard: Heard) -> None:
-        message = MESSAGES[heard.topic].decode(heard.payload)
+        message = DECODERS[heard.topic](heard.payload)
         if message is None or isinstance(message, wire.Rejection):
             why = message.detail if message else "not a scene"
             self._event(heard, Level.WARNING, f"unreadable {heard.topic}: {why}")
@@ -191,15 +206,8 @@ class RecordingWriter:
         if isinstance(message, wire.State):
             # The frames lie one after the other: in memory that is one picture, twice as high.
             count, height, width = wire.FRAMES_SHAPE
-            picture = RawImage(
-                timestamp=heard.arrived_ns,
-                width=width,
-                height=count * height,
-                encoding="mono8",
-                step=width,
-                data=message.frames,
-                frame_id=_vehicle_id(heard),
-            )
+            size, at = (width, count * height), heard.arrived_ns
+            picture = RawImage(at, *size, "mono8", width, message.frames, _vehicle_id(heard))
             self._copy(heard, "frames", picture)
 
     def _event(self, heard: Heard, level: Level, text: str) -> None:
@@ -233,13 +241,6 @@ def start_mcap(stream: Any) -> Writer:
     writer = Writer(stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="", library=f"phil-hil {__version__}")
     return writer
-
-
-def check_new(path: Path) -> None:
-    """Raise UserError now if a recording could not be begun there later."""
-    check_writable(path)
-    if path.exists():
-        raise UserError(f"{path} exists; {NEVER_OVER}")
 
 
 class FlushedFile:
@@ -280,12 +281,12 @@ class FlushedFile:
 
         Raises OSError (a full disk, for one); the file is then as it was after the last flush.
         """
-        view = memoryview(bytes(self._pending))
+        data = memoryview(bytes(self._pending))
         self._pending.clear()
         written = 0
         try:
-            while written < len(view):
-                written += os.write(self._descriptor, view[written:])
+            while written < len(data):
+                written += os.write(self._descriptor, data[written:])
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._descriptor, self.flushed_bytes)
@@ -438,3 +439,122 @@ def _without_none(hint: Any) -> Any:
     inner = [part for part in typing.get_args(hint) if part is not type(None)]
     is_optional = type(None) in typing.get_args(hint) and len(inner) == 1
     return inner[0] if is_optional else hint
+
+
+KEPT = ".damaged"
+"""Ends the name under which a damaged recording is kept beside the repaired one."""
+
+
+def _add_repair_arguments(parser: Any) -> None:
+    parser.add_argument(
+        "recording",
+        metavar="F.mcap",
+        help="the recording; where more than a torn end is left out of it, the file as it was is"
+        f" kept as F.mcap{KEPT}",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="G.mcap",
+        type=_new,
+        help="write here instead of over the recording itself; it must not exist yet",
+    )
+
+
+def _run_repair(arguments: Any) -> int:
+    """Rewrite what can be read; the file is replaced only once the new one is whole."""
+    source = Path(arguments.recording)
+    if arguments.out is None:
+        check_writable(source)
+    try:
+        stream = open_regular(source)
+    except OSError as error:
+        raise UserError(f"recording {source} cannot be read: {error.strerror}") from None
+    with stream:
+        # What a growing recording still gets would go into the old file.
+        if not try_to_lock_file(stream.fileno()):
+            raise UserError(f"{source} is being written; repair it when its writer has ended")
+        recording = Recording(source)
+        data, messages = _rewrite(recording)
+        found = counted(messages, "message")
+        if not messages:
+            raise UserError(f"{source} holds no whole message; there is nothing to repair")
+        if recording.trouble() or arguments.out is not None:
+            kept = _write(data, recording, arguments.out)
+        elif recording.has_checksums:
+            print(f"{source} is whole: {found}; nothing done")
+            return 0
+        else:
+            print(
+                f"{source} can be read to its end: {found}; nothing done. It has no checksum over"
+                " all of it, so a change in its index would not show; --out G.mcap writes it with"
+                " one"
+            )
+            return 0
+    left_out = recording.missing() and f"; left out: {recording.missing()}"
+    print(f"wrote {arguments.out or source}: {found}{left_out}{kept}")
+    return 0
+
+
+def _write(data: bytes, recording: Recording, out: str | None) -> str:
+    """Write the new file, over the recording or to ``out``; say where the old one is kept."""
+    if out is not None or not recording.is_damaged:
+        write_atomic(out or recording.path, data)
+        return ""
+    file = behind_link(recording.path)
+    kept = file.with_name(file.name + KEPT)
+    try:
+        os.link(file, kept)
+    except FileExistsError:
+        # A repair that was killed leaves its link.
+        if not (kept.exists() and kept.samefile(file)):
+            raise UserError(
+                f"{kept} exists; move it away, or name another file with --out"
+            ) from None
+    except OSError as error:
+        raise UserError(
+            f"cannot keep {file} as {kept}: {error.strerror}; name another file with --out"
+        ) from None
+    try:
+        write_atomic(file, data)
+    except UserError:  # Nothing was replaced. (After an interrupt nobody knows: it stays.)
+        kept.unlink()
+        raise
+    return f"; the file as it was: {kept}"
+
+
+def _rewrite(recording: Recording) -> tuple[bytes, int]:
+    """Copy every message into a new recording, held in memory."""
+    stream = io.BytesIO()
+    writer = start_mcap(stream)
+    schemas: dict[int, int] = {0: 0}
+    channels: dict[int, int] = {}
+    messages = 0
+    for channel, schema, message in recording.messages():
+        if schema is not None and schema.id not in schemas:
+            schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        if channel.id not in channels:
+            channels[channel.id] = writer.register_channel(
+                channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0)
+            )
+        writer.add_message(
+            channels[channel.id],
+            message.log_time,
+            message.data,
+            message.publish_time,
+            message.sequence,
+        )
+        messages += 1
+    if recording.metadata:
+        writer.add_metadata(METADATA, recording.metadata)
+    writer.finish()
+    return stream.getvalue(), messages
+
+
+REPAIR = Command(
+    examples(
+        "python -m bridge repair drive.mcap",
+        "python -m bridge repair drive.mcap --out whole.mcap",
+    ),
+    _add_repair_arguments,
+    _run_repair,
+)

@@ -142,17 +142,33 @@ class Recording(Condition):
     def _read(self, records: Records) -> Iterator[Stored]:
         if not records.is_mcap():
             raise UserError(f"{self.path} is no MCAP recording")
-        names = _Names(records)
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+
+        def learn(record: McapRecord) -> None:
+            # Of two the first, which is from a chunk with a checksum.
+            if isinstance(record, Schema):
+                schemas.setdefault(record.id, record)
+            elif isinstance(record, Channel):
+                channels.setdefault(record.id, record)
+
+        has_looked = False
         for record in records.walk():
-            names.learn(record)
+            learn(record)
             if isinstance(record, Metadata):
                 self.metadata |= record.metadata
             elif isinstance(record, Message):
-                stored = names.name(record)
-                if stored is None:
+                channel = channels.get(record.channel_id)
+                if not has_looked and (channel is None or channel.schema_id not in (0, *schemas)):
+                    # The chunk that named it is broken; the index at the end repeats all names.
+                    has_looked = True
+                    for other in records.again().walk():
+                        learn(other)
+                    channel = channels.get(record.channel_id)
+                if channel is None:
                     records.nameless_messages += 1
                 else:
-                    yield stored
+                    yield Stored(channel, schemas.get(channel.schema_id), record)
         vars(self).update(asdict(records))
 
 
@@ -313,37 +329,15 @@ def _written(record: McapRecord) -> bytes:
     return builder.end() + (MCAP0_MAGIC if isinstance(record, Footer) else b"")
 
 
-class _Names:
-    """What the channels are called, as far as the file has been read."""
-
-    def __init__(self, records: Records) -> None:
-        self._records = records
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._has_looked = False
-
-    def learn(self, record: McapRecord) -> None:
-        """Take a schema or channel; of two the first, which is from a chunk with a checksum."""
-        if isinstance(record, Schema):
-            self._schemas.setdefault(record.id, record)
-        elif isinstance(record, Channel):
-            self._channels.setdefault(record.id, record)
-
-    def name(self, message: Message) -> Stored | None:
-        """Find out what the message is; None where the file does not say."""
-        if not self._knows(message.channel_id) and not self._has_looked:
-            # The chunk that said so is broken; the index at the end repeats all names.
-            self._has_looked = True
-            for record in self._records.again().walk():
-                self.learn(record)
-        channel = self._channels.get(message.channel_id)
-        if channel is None:
-            return None
-        return Stored(channel, self._schemas.get(channel.schema_id), message)
-
-    def _knows(self, channel_id: int) -> bool:
-        channel = self._channels.get(channel_id)
-        return channel is not None and channel.schema_id in (0, *self._schemas)
+def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
+    """The vehicle of that id, or the only one; UserError where it is not in the recording."""
+    there = {vehicle for vehicle, _ in map(_wire_topic, recording.messages()) if vehicle}
+    names = ", ".join(sorted(there)) or "none"
+    if vehicle_id is not None and vehicle_id not in there:
+        raise UserError(f"{recording.path} holds no vehicle {vehicle_id} (vehicles in it: {names})")
+    if vehicle_id is None and len(there) != 1:
+        raise UserError(f"{recording.path} holds vehicles {names}; name one with --vehicle-id")
+    return vehicle_id or there.pop()
 
 
 def read_heard(recording: Recording, vehicle_id: str | None) -> Iterator[Heard]:
@@ -359,24 +353,12 @@ def read_heard(recording: Recording, vehicle_id: str | None) -> Iterator[Heard]:
     return heard_of(recording, choose_vehicle(recording, vehicle_id))
 
 
-def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
-    """The vehicle of that id, or the only one; UserError where it is not in the recording."""
-    there = {vehicle for vehicle, _ in map(_wire_topic, recording.messages()) if vehicle}
-    names = ", ".join(sorted(there)) or "none"
-    if vehicle_id is not None and vehicle_id not in there:
-        raise UserError(f"{recording.path} holds no vehicle {vehicle_id} (vehicles in it: {names})")
-    if vehicle_id is None and len(there) != 1:
-        raise UserError(f"{recording.path} holds vehicles {names}; name one with --vehicle-id")
-    return vehicle_id or there.pop()
-
-
 def heard_of(recording: Recording, vehicle_id: str) -> Iterator[Heard]:
     """As `read_heard`, of a vehicle that is known to be there."""
     for stored in recording.messages():
         vehicle, topic = _wire_topic(stored)
         if vehicle == vehicle_id:
-            message = stored.message
-            key = stored.channel.topic
+            message, key = stored.message, stored.channel.topic
             yield Heard(key, topic, message.data, message.log_time, len(message.data))
 
 

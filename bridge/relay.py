@@ -1,9 +1,10 @@
-"""``python -m bridge relay``: a slow and lossy network between a simulator and an edge runtime.
+"""What stands between simulators and edge runtimes: ``python -m bridge relay`` and ``router``.
 
-Both ends are unmodified: the edge runtime connects to ``--listen``, where the relay is the
-simulator's router; to the simulator at ``--connect`` it is a peer. Through the model pass states
-(up), commands, feedback and health (down), in real time. Status and re-arm queries and the
-liveliness tokens pass at once: they observe the loop, and are no part of it.
+The router connects simulators, edge runtimes and viewers. The relay is a slow and lossy network
+between two unmodified ends: to the edge runtime, at ``--listen``, it is the simulator's router, and
+to the simulator at ``--connect`` a peer. States (up), commands, feedback and health (down) pass
+through the model, in real time. Status and re-arm queries and the liveliness tokens pass at once:
+they observe the loop, and are no part of it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -19,126 +20,90 @@ from typing import Any
 import zenoh
 
 from bridge.clocks import DelayLine, Publish
-from bridge.commands import add_vehicle_id, wait_to_be_told
-from bridge.network import GRAMMAR, LatencyModel, LatencySpec, make_link, parse_spec
+from bridge.commands import add_options, wait_to_be_told
+from bridge.network import LatencySpec, make_link
 from bridge.ports import simulator_key
 from bridge.report import quantiles
-from edge_runtime.cli import ArgumentParser, examples, not_negative, sigterm_as_interrupt
-from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.transport import check_endpoint, is_tls, only_own, open_session
-from edge_runtime.util import UserError
-from edge_runtime.wire import State, check_vehicle_id, decode_state, key
+from edge_runtime import tls as access
+from edge_runtime.cli import Command, examples, sigterm_as_interrupt
+from edge_runtime.files import write_json_out
+from edge_runtime.transport import DEFAULT_ENDPOINT, is_tls, only_own, open_session
+from edge_runtime.util import UserError, read_bytes
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, State, decode_state, key
 
-UP = ("state",)
 DOWN = ("command", "feedback", "health")
-"""The topics that pass the model, by direction; queries and liveliness pass at once."""
+"""The topics that pass the model towards the simulator; the other way goes the state."""
 REARM = "rearm"
 QUERIES = ("status", REARM)
 QUERY_S = 2.0
 """As long as the operator's commands wait for an answer."""
 LAG_WINDOW = 100_000
-EXAMPLE = examples(
-    "python -m bridge relay --listen tcp/127.0.0.1:7448 --connect tcp/127.0.0.1:7447 \\\n"
-    "    --latency 50ms+-10ms,loss=1% --out relay.json",
-)
+COUNTS = ("received", "bytes", "lost", "duplicated", "delivered")
 
 
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "--listen",
-        metavar="PROTOCOL/HOST:PORT",
-        required=True,
-        help="where the edge runtime connects to",
-    )
-    parser.add_argument(
-        "--connect",
-        metavar="PROTOCOL/HOST:PORT",
-        required=True,
-        help="where the simulator listens; it may come later",
-    )
-    network = "injected network: " + GRAMMAR.replace("%", "%%")
-    parser.add_argument("--latency", metavar="SPEC", default="none", help=network)
-    parser.add_argument(
-        "--seed", metavar="N", type=not_negative, default=0, help="of delays and losses"
-    )
-    add_vehicle_id(parser, "the vehicle to relay")
-    parser.add_argument(
-        "--out", metavar="R.json", help="write the counts to this file at the end (SIGTERM or ^C)"
-    )
+def _add_relay_arguments(parser: Any) -> None:
+    add_options(parser, "--listen", required=True, help="where the edge runtime connects to")
+    help_text = "where the simulator listens; it may come later"
+    add_options(parser, "--connect", required=True, default=None, help=help_text)
+    add_options(parser, "--latency", "--seed")
+    add_options(parser, "--vehicle-id", help="the vehicle to relay")
+    help_text = "write the counts to this file at the end (SIGTERM or ^C)"
+    add_options(parser, "--out", help=help_text)
 
 
-def run(arguments: Any) -> int:
-    """Run the command until it is told to end; UserError for anything the caller can put right."""
-    spec = _check(arguments)
+def _run_relay(arguments: Any) -> int:
+    for endpoint in (arguments.listen, arguments.connect):
+        if is_tls(endpoint):  # it would need two certificates: a simulator's and an edge's
+            raise UserError(
+                f"endpoint {endpoint} is not for the relay: it speaks plain text only, for the"
+                " bench; use tcp/ or udp/"
+            )
+    if arguments.listen == arguments.connect:
+        raise UserError(f"--listen and --connect are both {arguments.listen}: that is a circle")
+    known = {name: getattr(arguments, name) for name in ("vehicle_id", "listen", "connect")}
+    known["latency_spec"] = str(arguments.latency)
     began_s = time.monotonic()
-    with sigterm_as_interrupt():
-        try:
-            with open_relay(
-                arguments.listen, arguments.connect, arguments.vehicle_id, spec, arguments.seed
-            ) as running:
-                _carry(arguments, spec, running)
-        except KeyboardInterrupt:
-            return 0  # Told to end before it had begun.
-    report = _report(arguments, spec, running, time.monotonic() - began_s)
+    relay: Relay | None = None
+    with (
+        contextlib.suppress(KeyboardInterrupt),  # the ordinary end
+        sigterm_as_interrupt(),
+        open_relay(
+            arguments.listen,
+            arguments.connect,
+            arguments.vehicle_id,
+            arguments.latency,
+            arguments.seed,
+        ) as running,
+    ):
+        relay = running
+        shown = " ".join(f"{name}={value}" for name, value in known.items())
+        print(f"ready {shown}".replace("latency_spec", "latency"), flush=True)
+        wait_to_be_told()
+    if relay is None:
+        return 0  # told to end before it had begun
+    report = {
+        **known,
+        "seed": arguments.seed,
+        "duration_s": round(time.monotonic() - began_s, 3),
+        **relay.traffic.report(),
+        "queries": relay.queries,
+    }
     write_json_out(arguments.out, report)
-    print(_summary(report))
+    topics = report["topics"].items()
+    parts = ", ".join(f"{name} {row['delivered']} of {row['received']}" for name, row in topics)
+    late_ms = report["timer_lag_ms"]["p99"]
+    print(f"delivered: {parts}; timers late by p99 {late_ms:.2f} ms")
     return 0
 
 
-def _carry(arguments: Any, spec: LatencySpec, running: Relay) -> None:
-    """Zenoh's threads do the work; being interrupted is the ordinary end."""
-    try:
-        print(
-            f"ready vehicle_id={arguments.vehicle_id} listen={arguments.listen}"
-            f" connect={arguments.connect} latency={spec}",
-            flush=True,
-        )
-        wait_to_be_told()
-    except KeyboardInterrupt:
-        return
-
-
-def _check(arguments: Any) -> LatencySpec:
-    for endpoint in (arguments.listen, arguments.connect):
-        _check_plain(check_endpoint(endpoint))
-    if arguments.listen == arguments.connect:
-        raise UserError(f"--listen and --connect are both {arguments.listen}: that is a circle")
-    check_vehicle_id(arguments.vehicle_id)
-    if arguments.out is not None:
-        check_writable(arguments.out)
-    return parse_spec(arguments.latency)
-
-
-def _check_plain(endpoint: str) -> None:
-    """With TLS it would need two certificates: a simulator to one end, an edge to the other."""
-    if is_tls(endpoint):
-        raise UserError(
-            f"endpoint {endpoint} is not for the relay: it speaks plain text only, for the bench;"
-            " use tcp/ or udp/"
-        )
-
-
-def _report(arguments: Any, spec: LatencySpec, running: Relay, duration_s: float) -> dict[str, Any]:
-    return {
-        "vehicle_id": arguments.vehicle_id,
-        "listen": arguments.listen,
-        "connect": arguments.connect,
-        "latency_spec": str(spec),
-        "seed": arguments.seed,
-        "duration_s": round(duration_s, 3),
-        **running.traffic.report(),
-        "queries": running.queries,
-    }
-
-
-def _summary(report: dict[str, Any]) -> str:
-    parts = [
-        f"{name} {row['delivered']} of {row['received']}" for name, row in report["topics"].items()
-    ]
-    return (
-        f"delivered: {', '.join(parts)}; timers late by p99 {report['timer_lag_ms']['p99']:.2f} ms"
-    )
+RELAY = Command(
+    examples(
+        "python -m bridge relay --listen tcp/127.0.0.1:7448 --connect tcp/127.0.0.1:7447 \\\n"
+        "    --latency 50ms+-10ms,loss=1% --out relay.json",
+    ),
+    _add_relay_arguments,
+    _run_relay,
+)
 
 
 @contextlib.contextmanager
@@ -175,23 +140,25 @@ class Relay:
         publishers = {"state": self._publisher(to_edge, "state", express=False)}
         for topic in DOWN:
             publishers[topic] = self._publisher(to_simulator, topic, express=True)
-        self._declared: list[Any] = list(publishers.values())
-        self.traffic = RelayTraffic(
-            spec, seed, {topic: publisher.put for topic, publisher in publishers.items()}
-        )
-        self._listen()
+        self.traffic = RelayTraffic(spec, seed, {name: one.put for name, one in publishers.items()})
+        self._declared = list(publishers.values())
+        self._declared += [self._hear(to_simulator, "state")]
+        self._declared += [self._hear(to_edge, topic) for topic in DOWN]
+        self._declared += [self._answer(topic) for topic in QUERIES]
+        self._mirror(to_edge, to_simulator, key(vehicle_id, "alive"))
+        self._mirror(to_simulator, to_edge, simulator_key(vehicle_id))
 
     def close(self) -> None:
         """Undeclare all, then stop the delay lines. The sessions are the caller's."""
         for declared in reversed(self._declared):
             declared.undeclare()
-        # Nobody changes these any more: their listeners went first.
+        # Their listeners went first, so these no longer change.
         for token in self._mirrored.values():
             token.undeclare()
         self.traffic.close()
 
     def _publisher(self, session: zenoh.Session, topic: str, express: bool) -> Any:
-        # As the ends themselves publish: nobody is held up by a slow listener.
+        # As the ends themselves publish: a slow listener holds nothing up.
         return session.declare_publisher(
             key(self._vehicle_id, topic),
             congestion_control=zenoh.CongestionControl.DROP,
@@ -199,19 +166,9 @@ class Relay:
             express=express,
         )
 
-    def _listen(self) -> None:
-        self._declared.append(self._hear(self._simulator, "state"))
-        for topic in DOWN:
-            self._declared.append(self._hear(self._edge, topic))
-        for topic in QUERIES:
-            self._declared.append(self._answer(topic))
-        self._mirror(self._edge, self._simulator, key(self._vehicle_id, "alive"))
-        self._mirror(self._simulator, self._edge, simulator_key(self._vehicle_id))
-
     def _hear(self, session: zenoh.Session, topic: str) -> Any:
-        take = self.traffic.handler(topic)
         own = key(self._vehicle_id, topic)
-        hear = only_own(own, lambda sample: take(sample.payload.to_bytes()))
+        hear = only_own(own, lambda sample: self.traffic.take(topic, sample.payload.to_bytes()))
         return session.declare_subscriber(own, hear)
 
     def _answer(self, topic: str) -> Any:
@@ -219,7 +176,7 @@ class Relay:
         asked = key(self._vehicle_id, topic)
 
         def came(query: zenoh.Query) -> None:
-            # As the edge runtime itself: a look at everything (`phil/**`) re-arms nobody.
+            # As the edge runtime itself: a query for everything (`phil/**`) re-arms no vehicle.
             if topic == REARM and str(query.key_expr) != asked:
                 return
             with self._lock:
@@ -259,85 +216,123 @@ class RelayTraffic:
 
     def __init__(self, spec: LatencySpec, seed: int, deliver: dict[str, Publish]) -> None:
         link = make_link(spec, seed)
-        models = {"state": link.up, "command": link.down}
+        self._models = {"state": link.up, "command": link.down}
         for number, name in enumerate(DOWN[1:], start=1):
-            models[name] = make_link(spec, seed + number).down
-        self._topics = {name: TopicTraffic(models[name], deliver[name]) for name in (*UP, *DOWN)}
+            self._models[name] = make_link(spec, seed + number).down
+        self._deliver = deliver
+        self._counts = {name: Counter(dict.fromkeys(COUNTS, 0)) for name in self._models}
         self._lock = threading.Lock()
         self._up_line, self._down_line = DelayLine(), DelayLine()
         self._lags_s: deque[float] = deque(maxlen=LAG_WINDOW)
         self._first_state_s: float | None = None
 
-    def handler(self, name: str) -> Publish:
-        """Return what takes a payload of this topic, on any thread."""
-        return self._take_state if name == "state" else partial(self._take, name)
-
     def close(self) -> None:
         """Stop delivering."""
-        for line in (self._up_line, self._down_line):
-            line.close()
+        self._up_line.close()
+        self._down_line.close()
 
     def report(self) -> dict[str, Any]:
-        """Return the counts of each topic, and how late the timers were."""
+        """Return the counts of each topic, and how late the timers were.
+
+        A message that is still under way is among the received only.
+        """
         with self._lock:
             lags_ms = [lag_s * 1e3 for lag_s in self._lags_s or (0.0,)]
-            counts = {name: topic.counts() for name, topic in self._topics.items()}
+            counts = {name: dict(counted) for name, counted in self._counts.items()}
         return {"topics": counts, "timer_lag_ms": quantiles(lags_ms)}
 
-    def _take_state(self, payload: bytes) -> None:
-        state = decode_state(payload)
-        if isinstance(state, State) and state.final:
-            self._pass_final(payload)
-            return
-        with self._lock:
-            if self._first_state_s is None:
-                self._first_state_s = time.monotonic()
-        self._take("state", payload)
+    def take(self, name: str, payload: bytes) -> None:
+        """Take a payload of a topic, on any thread.
 
-    def _pass_final(self, payload: bytes) -> None:
-        """As in `bridge simulate`: no radio link carries the end of a simulation.
-
-        Nothing injected may delay or lose it, and states of the ended episode are forgotten.
+        No radio link carries the end of a simulation: as in ``bridge simulate``, nothing delays or
+        loses the final state, and the states of the ended episode are forgotten.
         """
-        self._up_line.clear()
+        state = decode_state(payload) if name == "state" else None
+        is_final = isinstance(state, State) and state.final
+        line = self._down_line if state is None else self._up_line
+        if is_final:
+            line.clear()
         with self._lock:
-            topic = self._topics["state"]
-            topic.received += 1
-            topic.bytes += len(payload)
-            topic.delivered += 1
-        topic.deliver(payload)
-
-    def _take(self, name: str, payload: bytes) -> None:
-        now_s = time.monotonic()
-        line = self._up_line if name in UP else self._down_line
-        with self._lock:
-            topic = self._topics[name]
+            now_s = time.monotonic()
+            if state is not None and not is_final and self._first_state_s is None:
+                self._first_state_s = now_s
             start_s = now_s if self._first_state_s is None else self._first_state_s
-            arrivals = topic.model.arrivals(now_s - start_s, len(payload))
-            topic.received += 1
-            topic.bytes += len(payload)
-            topic.lost += not arrivals
-            topic.duplicated += len(arrivals) > 1
+            arrivals: tuple[float, ...] = (now_s - start_s,)
+            if not is_final:
+                arrivals = self._models[name].arrivals(now_s - start_s, len(payload))
+            counts = self._counts[name]
+            counts["received"] += 1
+            counts["bytes"] += len(payload)
+            counts["lost"] += not arrivals
+            counts["duplicated"] += len(arrivals) > 1
+        if is_final:
+            self._come_out(name, payload, now_s)
+            return
         for arrival_s in arrivals:
             due_s = start_s + arrival_s
-            line.push(due_s, partial(self._deliver, topic, payload, due_s))
+            line.push(due_s, partial(self._come_out, name, payload, due_s))
 
-    def _deliver(self, topic: TopicTraffic, payload: bytes, due_s: float) -> None:
+    def _come_out(self, name: str, payload: bytes, due_s: float) -> None:
         with self._lock:
             self._lags_s.append(time.monotonic() - due_s)
-            topic.delivered += 1
-        topic.deliver(payload)
+            self._counts[name]["delivered"] += 1
+        self._deliver[name](payload)
 
 
-class TopicTraffic:
-    """One topic on its way: what came in, what came out. The caller holds the lock."""
+def _add_router_arguments(parser: Any) -> None:
+    help_text = f"where all others connect to; may be repeated (default: {DEFAULT_ENDPOINT})"
+    add_options(parser, "--listen", action="append", help=help_text)
+    add_options(parser, "--tls")
+    help_text = (
+        "a vehicle whose parties have rights here, with --tls; may be repeated"
+        f" (default: {DEFAULT_VEHICLE_ID})"
+    )
+    add_options(parser, "--vehicle-id", action="append", default=None, help=help_text)
+    parser.add_argument(
+        "--config",
+        metavar="FILE.json5",
+        help="all settings from a file of `python -m deploy router`, and no other option",
+    )
 
-    def __init__(self, model: LatencyModel, deliver: Publish) -> None:
-        self.model = model
-        self.deliver = deliver
-        self.received = self.bytes = self.lost = self.duplicated = self.delivered = 0
 
-    def counts(self) -> dict[str, int]:
-        """Return the counts for the report; messages still under way are in none but received."""
-        names = ("received", "bytes", "lost", "duplicated", "delivered")
-        return {name: getattr(self, name) for name in names}
+def _run_router(arguments: Any) -> int:
+    """Route until SIGTERM or ^C; without ``--tls``, everything that anybody sends."""
+    listens = list(dict.fromkeys(arguments.listen or [DEFAULT_ENDPOINT]))
+    tls, rules, ready = None, None, f"config={arguments.config}"
+    if arguments.config is None:
+        ready = f"listen={','.join(listens)}"
+        tls = access.tls_for(arguments.tls, *listens)
+    elif arguments.listen or arguments.tls or arguments.vehicle_id:
+        raise UserError("--config goes with no other option: the file says it all")
+    if tls is not None:
+        access.check_name(tls.name, access.ROUTER)
+        rules = access.rules_for_listener(arguments.vehicle_id or [DEFAULT_VEHICLE_ID])
+    with contextlib.suppress(KeyboardInterrupt), sigterm_as_interrupt():
+        if arguments.config is None:
+            session = open_session(listen=listens, mode="router", tls=tls, access=rules)
+        else:
+            session = _open(arguments.config)
+        with contextlib.closing(session):
+            print(f"ready {ready}", flush=True)
+            wait_to_be_told()
+    return 0
+
+
+def _open(path: str) -> zenoh.Session:
+    """A router with the settings of a file, as zenohd would open it."""
+    read_bytes(path, "router's config file")
+    try:
+        return zenoh.open(zenoh.Config.from_file(path))
+    except zenoh.ZError as error:
+        raise UserError(f"Zenoh opens no router with {path}: {error}") from None
+
+
+ROUTER = Command(
+    examples(
+        "python -m bridge router --listen tcp/127.0.0.1:7447",
+        "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+        "    --vehicle-id hunter01 --vehicle-id hunter02",
+    ),
+    _add_router_arguments,
+    _run_router,
+)

@@ -11,44 +11,52 @@ import queue
 import secrets
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
-from bridge.commands import add_tls, add_wait_edge, count_bar
+from bridge.commands import add_options, progress_bar
+from bridge.messages import DECODERS, Heard
 from bridge.ports import SimulatorPort, open_port
-from bridge.recorded import (
-    JUST_AFTER_S,
-    Answer,
-    Exchange,
-    Key,
-    RecordedDrive,
-    RecordedState,
-    key_of,
-    note,
-)
+from bridge.recording import Recording, choose_vehicle, heard_of
 from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
 from edge_runtime.config import NONE, Config, load_config
 from edge_runtime.controller import Controller, LimitRow, Order, Received, limit_rows
-from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.files import write_json_out
 from edge_runtime.policy import Policy, infer, load_policy
-from edge_runtime.safety import SILENCE_S, Event
+from edge_runtime.safety import MAX_INFERENCE_S, SILENCE_S, Event
 from edge_runtime.tls import tls_for
-from edge_runtime.transport import check_endpoint
 from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles.registry import vehicle_limits
-from edge_runtime.wire import SAFE_STOP, Command, check_vehicle_id, decode_command, encode
+from edge_runtime.wire import (
+    SAFE_STOP,
+    Command,
+    Health,
+    State,
+    decode_command,
+    decode_state,
+    encode,
+)
 
+RUNTIME_ENDED = "runtime_ended"
+"""Reason of the farewell of a runtime that is ended; no decision about a state."""
+JUST_AFTER_S = 1e-6
+"""A watchdog wakes at its deadline or later, never before."""
+CLOCK_STEP_S = 1.0
+"""Where the two clocks come apart by more than this, the runtime's has been stepped."""
+RESTART_S = 0.5
+"""Uptimes that disagree by more than this belong to two runtimes."""
+
+Key = tuple[str, int, int]
+"""Session, episode, step."""
 DEFAULT_TOLERANCE = 1e-5
 """Two processors round differently; a graph of the same weights stays far below this."""
 DIFFERENT = 1
 """Exit status where at least one command differs."""
 SHOWN_DIFFERENCES = 10
-Answers = dict[Key, list[Answer]]
-OnState = Callable[[int], None]
-"""Called with the number of states published so far."""
 EXAMPLE = examples(
     "python -m bridge replay hil_tests/recordings/left_turn.mcap \\\n"
     "    --policy results/policies/left_turn.onnx --public-key results/policies/policy.pub",
@@ -63,17 +71,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     through.add_argument(
         "--policy", metavar="POLICY.onnx", help="replay in process, with the recording's times"
     )
-    through.add_argument(
-        "--listen",
-        metavar="PROTOCOL/HOST:PORT",
-        help="replay in real time to an edge runtime that connects here",
-    )
-    through.add_argument(
-        "--connect",
-        metavar="PROTOCOL/HOST:PORT",
-        help="replay in real time to an edge runtime behind this router",
-    )
-    add_tls(parser)
+    help_text = "replay in real time to an edge runtime that connects here"
+    add_options(through, "--listen", help=help_text)
+    help_text = "replay in real time to an edge runtime behind this router"
+    add_options(through, "--connect", default=None, help=help_text)
+    add_options(parser, "--tls", "--wait-edge-s", "--out")
     add_public_key(parser)
     parser.add_argument(
         "--allow-unsigned",
@@ -86,9 +88,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="with --policy: the settings of the edge runtime that was recorded, where a vehicle's"
         " model or scale was not the default",
     )
-    parser.add_argument(
-        "--vehicle-id", metavar="ID", help="which vehicle, where the recording holds several"
-    )
+    help_text = "which vehicle, where the recording holds several"
+    add_options(parser, "--vehicle-id", default=None, help=help_text)
     parser.add_argument(
         "--tolerance",
         metavar="X",
@@ -96,49 +97,53 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=DEFAULT_TOLERANCE,
         help="how far two actions may be apart, of a range of -1 to 1",
     )
-    add_wait_edge(parser)
-    parser.add_argument("--out", metavar="R.json", help="write the report to this file")
 
 
 def run(arguments: Any) -> int:
     """Run the command: 0 where every command is the same, 1 where one differs."""
-    if arguments.out is not None:
-        check_writable(arguments.out)
-    if arguments.vehicle_id is not None:
-        check_vehicle_id(arguments.vehicle_id)
     drive = RecordedDrive(Path(arguments.recording), arguments.vehicle_id)
     policy_id, replayed = _answers(drive, arguments)
     states = [key_of(state) for state in drive.states()]
+    recording, dropped = drive.recording, drive.recording.metadata.get("dropped", "")
     report = {
         "recording": str(arguments.recording),
         "vehicle_id": drive.vehicle_id,
         "policy_id": policy_id,
         "recorded_policy_ids": drive.policy_ids,
-        "cut_off": drive.recording.cut_off,
-        "damaged_places": drive.recording.damaged_places,
-        "damaged_bytes": drive.recording.damaged_bytes,
-        "dropped": _dropped(drive),
+        "cut_off": recording.cut_off,
+        "damaged_places": recording.damaged_places,
+        "damaged_bytes": recording.damaged_bytes,
+        "dropped": int(dropped) if dropped.isdecimal() else 0,  # other programs do not say
         **compare(drive.exchanges, replayed, states, arguments.tolerance),
     }
     if report["compared"] == 0:
         raise UserError(f"{arguments.recording} holds answers, but none of the states they answer")
     write_json_out(arguments.out, report)
-    if drive.recording.trouble():
-        print(
-            f"the recording {drive.recording.trouble()}; what is whole of it was replayed",
-            file=sys.stderr,
-        )
-    _say(report)
+    if trouble := recording.trouble():
+        print(f"the recording {trouble}; what is whole of it was replayed", file=sys.stderr)
+    print(
+        f"{report['compared']} commands compared, {report['different']} differ; largest difference"
+        f" {report['largest_difference']:.3g}, tolerance {report['tolerance']:g};"
+        f" {report['unanswered']} states were never answered"
+    )
+    for row in report["first_differences"][:3]:
+        recorded, ours = _text(row["recorded"]), _text(row["replayed"])
+        place = f"episode {row['episode']} step {row['step']}"
+        print(f"  {place}: recorded {recorded}; replayed {ours}")
     return DIFFERENT if report["different"] else 0
 
 
-def _dropped(drive: RecordedDrive) -> int:
-    """Messages that the recorder had to drop; of another program's recording nothing is known."""
-    dropped = drive.recording.metadata.get("dropped", "")
-    return int(dropped) if dropped.isdecimal() else 0
+def _text(answers: Sequence[Mapping[str, Any]]) -> str:
+    parts = [
+        f"{answer['mode']} {[round(value, 4) for value in answer['action']]}"
+        + (f" ({printable(answer['reason'])})" if answer["reason"] else "")
+        for answer in answers
+    ]
+    return ", then ".join(parts) or "nothing"
 
 
 def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:
+    """The policy's id, and what it answered."""
     if arguments.policy is not None:
         if arguments.tls is not None:
             raise UserError("--tls is for a link, of --listen or --connect; --policy has none")
@@ -147,35 +152,143 @@ def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:
         return policy.policy_id, replay_in_process(drive, policy, config)
     if arguments.config is not None:
         raise UserError("--config is for --policy; an edge runtime that is asked has its own")
-    endpoint = check_endpoint(arguments.listen or arguments.connect)
+    endpoint = arguments.listen or arguments.connect
     wait_s, tls = arguments.wait_edge_s, tls_for(arguments.tls, endpoint)
     with open_port(arguments.listen, drive.vehicle_id, tls, arguments.connect, wait_s) as port:
         port.wait_for_edge(wait_s, endpoint)
-        with count_bar("states", len(drive.exchanges)) as bar:
-            answers = replay_live(drive, port, bar)
-        return port.edge_policy_id(), answers
+        with progress_bar("states") as progress:
+            states = progress.track(drive.answered(), len(drive.exchanges), description="replaying")
+            answers = _Live(port).replay(states)
+        port.note_edge_counts()
+        health = port.edge_counts.newest
+        return health.policy_id if health else "", answers
 
 
-def _say(report: dict[str, Any]) -> None:
-    print(
-        f"{report['compared']} commands compared, {report['different']} differ; largest difference"
-        f" {report['largest_difference']:.3g}, tolerance {report['tolerance']:g};"
-        f" {report['unanswered']} states were never answered"
-    )
-    for row in report["first_differences"][:3]:
-        print(f"  episode {row['episode']} step {row['step']}: {_told(row)}")
+class Answer(NamedTuple):
+    """What was decided about a state; repetitions of the same are one answer."""
+
+    mode: str
+    reason: str
+    action: tuple[float, ...]
 
 
-def _told(row: dict[str, Any]) -> str:
-    def text(answers: list[dict[str, Any]]) -> str:
-        parts = [
-            f"{answer['mode']} {[round(value, 4) for value in answer['action']]}"
-            + (f" ({printable(answer['reason'])})" if answer["reason"] else "")
-            for answer in answers
-        ]
-        return ", then ".join(parts) or "nothing"
+@dataclass
+class Exchange:
+    """The answers to one state, and the times of the first of them."""
 
-    return f"recorded {text(row['recorded'])}; replayed {text(row['replayed'])}"
+    arrived_s: float
+    """When the state reached the runtime, seconds since the recording's first message."""
+    begun_s: float
+    """When the policy began with it."""
+    finished_s: float
+    """When the policy's answer, or the verdict that it took too long, was there."""
+    last_s: float
+    """When the last answer was heard, repetitions included."""
+    answers: list[Answer] = field(default_factory=list)
+
+
+Answers = dict[Key, list[Answer]]
+
+
+class RecordedDrive:
+    """One vehicle's part of a recording; states are read from the file when they are needed."""
+
+    def __init__(self, path: Path, vehicle_id: str | None) -> None:
+        """Read everything but the states; UserError where nothing can be replayed."""
+        self.recording = Recording(path)
+        self.exchanges: dict[Key, Exchange] = {}
+        self.policy_ids: list[str] = []
+        self.vehicle = "none"
+        self.runtime_starts_s: list[float] = []
+        self.vehicle_id = choose_vehicle(self.recording, vehicle_id)
+        self._zero_ns: int | None = None
+        self._lead_s: tuple[int, float] | None = None
+        for heard in heard_of(self.recording, self.vehicle_id):
+            self._take(heard)
+        if not self.exchanges:
+            raise UserError(
+                f"{path} holds no answered state of vehicle {self.vehicle_id} to replay"
+            )
+
+    def states(self) -> Iterator[State]:
+        """Yield every state that can be read, answered or not, in order of arrival."""
+        for heard in heard_of(self.recording, self.vehicle_id):
+            if heard.topic == "state":
+                state = decode_state(heard.payload)
+                if isinstance(state, State):
+                    yield state
+
+    def answered(self) -> Iterator[tuple[State, Exchange]]:
+        """Yield the states that reached the policy, each once."""
+        done: set[Key] = set()
+        for state in self.states():
+            key = key_of(state)
+            if key in self.exchanges and key not in done:
+                done.add(key)
+                yield state, self.exchanges[key]
+
+    def _take(self, heard: Heard) -> None:
+        if self._zero_ns is None:
+            self._zero_ns = heard.arrived_ns
+        heard_s = (heard.arrived_ns - self._zero_ns) * 1e-9
+        if heard.topic not in ("command", "health"):
+            return
+        message = DECODERS[heard.topic](heard.payload)
+        if isinstance(message, Command) and message.reason != RUNTIME_ENDED:
+            self._take_command(message, heard_s)
+        elif isinstance(message, Health):
+            self.vehicle = message.vehicle
+            start_s = heard_s - message.uptime_s
+            if not self.runtime_starts_s or start_s > self.runtime_starts_s[-1] + RESTART_S:
+                self.runtime_starts_s.append(start_s)
+
+    def _take_command(self, command: Command, heard_s: float) -> None:
+        if command.policy_id not in self.policy_ids:
+            self.policy_ids.append(command.policy_id)
+        sent_s = self._sent_s(command, heard_s)
+        key = (command.session, command.episode, command.step)
+        if key not in self.exchanges:
+            self.exchanges[key] = _first_exchange(command, sent_s)
+        self.exchanges[key].last_s = sent_s
+        note(self.exchanges[key].answers, command)
+
+    def _sent_s(self, command: Command, heard_s: float) -> float:
+        """When the command was sent, in the recorder's time.
+
+        The recorder's clock leads the runtime's by as much as at the first command of that
+        runtime, until a step of the latter.
+        """
+        stamp_s = (command.sent_ns - (self._zero_ns or 0)) * 1e-9
+        runtime, lead_s = len(self.runtime_starts_s), heard_s - stamp_s
+        known = self._lead_s
+        if known is None or known[0] != runtime or abs(lead_s - known[1]) > CLOCK_STEP_S:
+            self._lead_s = known = (runtime, lead_s)
+        return stamp_s + known[1]
+
+
+def note(answers: list[Answer], decision: Command | Order) -> None:
+    """Add what was decided to the answers to a state, unless it repeats the last one."""
+    answer = Answer(decision.mode, decision.reason, tuple(decision.action))
+    if not answers or answers[-1] != answer:
+        answers.append(answer)
+
+
+def key_of(state: State) -> Key:
+    """Return what a state and its command have in common."""
+    return state.session, state.episode, state.step
+
+
+def _first_exchange(command: Command, sent_s: float) -> Exchange:
+    """The state arrived as long before its answer as the runtime had it."""
+    thought_s = max(0.0, (command.sent_ns - command.received_ns) * 1e-9)
+    arrived_s = sent_s - thought_s
+    begun_s = max(arrived_s, sent_s - command.inference_ns * 1e-9)
+    finished_s = sent_s
+    if command.inference_ns == 0 and command.reason == Event.TOO_LONG.value:
+        # The watchdog's verdict; the policy is still at it.
+        begun_s = arrived_s
+        finished_s = max(sent_s, begun_s + MAX_INFERENCE_S + JUST_AFTER_S)
+    return Exchange(arrived_s, begun_s, finished_s, sent_s)
 
 
 def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> Answers:
@@ -206,9 +319,9 @@ class _Replay:
         self._answers: Answers = {}
 
     def run(self) -> Answers:
-        for recorded in self._drive.answered():
-            self._restart(recorded.exchange.arrived_s)
-            self._answer(recorded)
+        for state, exchange in self._drive.answered():
+            self._restart(exchange.arrived_s)
+            self._answer(state, exchange)
         self._pass_time(self._last_heard_s)
         return self._answers
 
@@ -221,8 +334,7 @@ class _Replay:
     def _make_controller(self) -> Controller:
         return Controller(self._rows, self._needs_rearm, task=self._policy.manifest.task)
 
-    def _answer(self, recorded: RecordedState) -> None:
-        state, exchange = recorded
+    def _answer(self, state: State, exchange: Exchange) -> None:
         self._pass_time(exchange.begun_s)
         rearmed = any(answer.mode == "drive" for answer in exchange.answers)
         if rearmed and self._controller.waits_for_rearm:
@@ -263,69 +375,52 @@ class _Replay:
             note(self._answers.setdefault(key_of(order.answers.state), []), order)
 
 
-def replay_live(drive: RecordedDrive, port: SimulatorPort, on_state: OnState) -> Answers:
-    """Publish every answered state and return what comes back.
+class _Live:
+    """Publishes every answered state to a running edge runtime, and keeps what comes back.
 
     Each waits for its moment, and for the answer to the one before (2 T at most): a runtime that
     is slower than the recorded one is asked later, not less. Every recorded session becomes a
     fresh one, which the runtime has never heard of.
     """
-    return _Live(drive, port, on_state).run()
 
-
-class _Live:
-    def __init__(self, drive: RecordedDrive, port: SimulatorPort, on_state: OnState) -> None:
-        self._drive = drive
+    def __init__(self, port: SimulatorPort) -> None:
         self._port = port
-        self._on_state = on_state
         self._inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._sessions: dict[str, str] = {}
+        self._fresh: dict[str, str] = {}  # recorded session to the one it is replayed as
+        self._recorded: dict[str, str] = {}  # and back
         self._answers: Answers = {}
 
-    def run(self) -> Answers:
+    def replay(self, states: Iterable[tuple[State, Exchange]]) -> Answers:
         self._port.on_command(self._inbox.put)
         zero_s: float | None = None
         last_s = 0.0
-        for number, recorded in enumerate(self._drive.answered(), start=1):
+        for state, exchange in states:
             if zero_s is None:
-                zero_s = time.monotonic() - recorded.exchange.arrived_s
-            self._listen_until(zero_s + recorded.exchange.arrived_s)
-            self._publish(recorded)
-            zero_s = max(zero_s, time.monotonic() - recorded.exchange.finished_s)
-            last_s = recorded.exchange.last_s
-            self._on_state(number)
+                zero_s = time.monotonic() - exchange.arrived_s
+            self._listen_until(zero_s + exchange.arrived_s)
+            self._publish(state)
+            self._listen_until(time.monotonic() + SILENCE_S, key_of(state))
+            zero_s = max(zero_s, time.monotonic() - exchange.finished_s)
+            last_s = exchange.last_s
         self._listen_until((zero_s or 0.0) + last_s)
         return self._answers
 
-    def _publish(self, recorded: RecordedState) -> None:
-        state, key = recorded.state, key_of(recorded.state)
-        fresh = self._sessions.setdefault(state.session, secrets.token_hex(8))
+    def _publish(self, state: State) -> None:
+        fresh = self._fresh.setdefault(state.session, secrets.token_hex(8))
+        self._recorded[fresh] = state.session
         sent = msgspec.structs.replace(state, session=fresh, sent_ns=time.time_ns())
         self._port.publish_state(encode(sent))
-        give_up_s = time.monotonic() + SILENCE_S
-        while key not in self._answers and time.monotonic() < give_up_s:
-            self._take(give_up_s)
 
-    def _listen_until(self, end_s: float) -> None:
-        while time.monotonic() < end_s:
-            self._take(end_s)
-
-    def _take(self, until_s: float) -> None:
-        """Take one command, if one comes before ``until_s`` (monotonic)."""
-        try:
-            payload = self._inbox.get(timeout=max(0.0, until_s - time.monotonic()))
-        except queue.Empty:
-            return
-        command = decode_command(payload)
-        if isinstance(command, Command):
-            self._note(command)
-
-    def _note(self, command: Command) -> None:
-        names = {fresh: recorded for recorded, fresh in self._sessions.items()}
-        if command.session not in names:
-            return
-        key: Key = (names[command.session], command.episode, command.step)
-        note(self._answers.setdefault(key, []), command)
+    def _listen_until(self, end_s: float, wanted: Key | None = None) -> None:
+        """Take what comes before ``end_s`` (monotonic), or until the wanted answer is there."""
+        while wanted not in self._answers and (left_s := end_s - time.monotonic()) > 0.0:
+            try:
+                command = decode_command(self._inbox.get(timeout=left_s))
+            except queue.Empty:
+                return
+            if isinstance(command, Command) and command.session in self._recorded:
+                key = (self._recorded[command.session], command.episode, command.step)
+                note(self._answers.setdefault(key, []), command)
 
 
 def compare(
@@ -350,11 +445,18 @@ def compare(
     for key, ours, theirs in zip(answered, each_ours, each_theirs, strict=True):
         same_shape, distance = _distance(ours, theirs)
         largest = max(largest, distance)
-        row = kinds.setdefault(_kind(ours[-1]), {"compared": 0, "different": 0})
+        kind = f"{ours[-1].mode}: {ours[-1].reason}".removesuffix(": ")
+        row = kinds.setdefault(kind, {"compared": 0, "different": 0})
         row["compared"] += 1
         if not same_shape or distance > tolerance:
             row["different"] += 1
-            differences.append(_describe(key, ours, theirs))
+            differences.append(
+                {
+                    **dict(zip(("session", "episode", "step"), key, strict=True)),
+                    "recorded": [answer._asdict() for answer in ours],
+                    "replayed": [answer._asdict() for answer in theirs],
+                }
+            )
     return {
         "states": len(states),
         "compared": len(answered),
@@ -391,18 +493,3 @@ def _distance(ours: Sequence[Answer], theirs: Sequence[Answer]) -> tuple[bool, f
         for a, b in zip(one.action, other.action, strict=False)
     ]
     return same, max(apart, default=0.0)
-
-
-def _kind(answer: Answer) -> str:
-    return f"{answer.mode}: {answer.reason}" if answer.reason else answer.mode
-
-
-def _describe(key: Key, ours: Sequence[Answer], theirs: Sequence[Answer]) -> dict[str, Any]:
-    session, episode, step = key
-    return {
-        "session": session,
-        "episode": episode,
-        "step": step,
-        "recorded": [answer._asdict() for answer in ours],
-        "replayed": [answer._asdict() for answer in theirs],
-    }

@@ -2,20 +2,22 @@
 
 `EpisodeResult` and `summarise` serve driving in process (trainer) and over the wire (bridge); the
 rest is for ``bridge simulate``. Pure: numbers in, a dict or a line of text out (contract, section
-2).
+2). `TrackingLog` says how well a vehicle in the loop follows.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bridge.virtual_link import Decision
 from edge_runtime.util import counted, printable
+from edge_runtime.wire import Command, Feedback
 
 GOAL = "goal"
 COLLISION = "collision"
@@ -55,26 +57,27 @@ def summarise(
     """
     if not results:
         raise ValueError("no episode to summarise")
+    outcomes = Counter(result.outcome for result in results)
+    spreads = {
+        "surviving_distance_m": "distance_m",
+        "episode_reward": "reward",
+        "episode_time_s": "time_s",
+        "lateral_acceleration_mps2": "lateral_acceleration_mps2",
+        "longitudinal_acceleration_mps2": "longitudinal_acceleration_mps2",
+    }
     return {
         "scenario": scenario,
         "condition": condition,
         "episodes": len(results),
-        "success_rate": _rate(results, GOAL),
-        "collision_rate": _rate(results, COLLISION),
-        "surviving_distance_m": _spread([r.distance_m for r in results]),
-        "episode_reward": _spread([r.reward for r in results]),
-        "episode_time_s": _spread([r.time_s for r in results]),
-        "lateral_acceleration_mps2": _spread([r.lateral_acceleration_mps2 for r in results]),
-        "longitudinal_acceleration_mps2": _spread(
-            [r.longitudinal_acceleration_mps2 for r in results]
-        ),
+        "success_rate": outcomes[GOAL] / len(results),
+        "collision_rate": outcomes[COLLISION] / len(results),
+        **{
+            key: _spread([getattr(result, name) for result in results])
+            for key, name in spreads.items()
+        },
         "policy_id": policy_id,
         "seed": seed,
     }
-
-
-def _rate(results: Sequence[EpisodeResult], outcome: str) -> float:
-    return sum(result.outcome == outcome for result in results) / len(results)
 
 
 def _spread(values: Sequence[float]) -> dict[str, float]:
@@ -156,40 +159,34 @@ def make_report(
     safe_stop_events: Sequence[SafeStopEvent],
     latencies_ms: Sequence[float],
     command_ages_ms: Sequence[float],
-    counts: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    vehicle: Mapping[str, Any] | None = None,
+    facts: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Join the summary of the episodes with what happened on the wire.
 
-    ``settings`` holds scenario, condition, policy_ids, seed, clock, loop, standing, latency_spec
-    and wall_s; ``vehicle`` is the part of a vehicle in the loop;
-    ``counts`` holds deadline_misses, tick_overruns, missed_ticks, edge_changes,
-    wall_clock_stalls and ``rejections``. The report's policy_id is that of the policy that
-    answered last.
+    ``facts`` are rows of the report as they are: what was asked for, counts, ``policy_ids`` and
+    ``wall_s``. The report's policy_id is that of the policy that answered last.
     """
+    policy_id = next(reversed(facts["policy_ids"]), "")
+    summary = summarise(results, facts["scenario"], facts["condition"], policy_id, facts["seed"])
     return {
-        **summarise(
-            results,
-            scenario=settings["scenario"],
-            condition=settings["condition"],
-            policy_id=settings["policy_ids"][-1] if settings["policy_ids"] else "",
-            seed=settings["seed"],
-        ),
-        "policy_ids": list(settings["policy_ids"]),
+        **summary,
         "latency_ms": quantiles(latencies_ms),
         "answered_states": len(latencies_ms),
         "command_age_ms": quantiles(command_ages_ms),
-        **counts,
+        "vehicle": None,
+        **facts,
         "safe_stops": len(safe_stop_events),
-        **{name: settings[name] for name in ("clock", "loop", "standing")},
-        "latency_spec": settings["latency_spec"],
-        "wall_s": settings["wall_s"],
-        "vehicle": vehicle,
-        "times_real_time": sum(result.time_s for result in results) / settings["wall_s"],
+        "times_real_time": sum(result.time_s for result in results) / facts["wall_s"],
         "safe_stop_events": [asdict(event) for event in safe_stop_events],
-        "per_episode": [result.as_dict() for result in results],
+        "per_episode": [asdict(result) for result in results],
     }
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table in Markdown, without a newline at its end; a ``|`` in a cell becomes a ``/``."""
+    cells = [header, ["---"] * len(header), *rows]
+    lines = (" | ".join(str(cell).replace("|", "/") for cell in row) for row in cells)
+    return "\n".join(f"| {line} |" for line in lines)
 
 
 def summary_line(report: Mapping[str, Any]) -> str:
@@ -238,3 +235,165 @@ def _vehicle_words(vehicle: Mapping[str, Any]) -> str:
     told = {name: lag for name, lag in vehicle["lag_ms"].items() if lag is not None}
     lags = ", ".join(f"{name} {lag:.0f} ms" for name, lag in told.items())
     return f"{vehicle['name']}: lag {lags or 'not measured'}"
+
+
+MAX_LAG_S = 2.0
+LAG_STEP_S = 0.005
+LEAST_SPREAD = 0.02
+"""Standard deviation (of full action, or in m/s) below which too little was asked to tell a lag."""
+MOST_FAULTS = 32
+"""Different words that are counted: a list made up by anybody must not fill the memory."""
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass
+class Series:
+    """One quantity in one episode: when what was asked for, and when what was reached."""
+
+    asked_s: Numbers
+    asked: Numbers
+    reached_s: Numbers
+    reached: Numbers
+    held: bool
+    """What was asked for holds until the next; otherwise it is interpolated."""
+
+    def errors(self, delay_s: float = 0.0) -> Numbers:
+        """Reached minus what was asked for ``delay_s`` before."""
+        at_s = self.reached_s - delay_s
+        if not self.held:
+            return self.reached - np.interp(at_s, self.asked_s, self.asked, left=self.reached[0])
+        values = np.concatenate([self.reached[:1], self.asked])
+        return self.reached - values[np.searchsorted(self.asked_s, at_s, side="right")]
+
+
+def errors(series: Sequence[Series]) -> dict[str, float | None]:
+    """Return rmse and max of the tracking error, as it happened, with the lag in it."""
+    if not series:
+        return {"rmse": None, "max": None}
+    found = np.concatenate([one.errors() for one in series])
+    return {"rmse": float(np.sqrt(np.mean(found**2))), "max": float(np.abs(found).max())}
+
+
+def lag_ms(series: Sequence[Series]) -> float | None:
+    """Return the delay that aligns asked and reached best, in ms; None where nothing can be said.
+
+    It is that, from 0 to MAX_LAG_S in steps of LAG_STEP_S, with the least mean square of
+    reached(t) - asked(t - delay); the middle where several are as good, for feedback at 20 Hz
+    cannot tell steps apart that fall between two reports. For a dead time with a first-order
+    response behind it, it lies between the dead time and the sum of both, and near the sum where
+    what is asked changes slowly. None where next to nothing changed, and where the best delay is
+    the end of what is tried.
+    """
+    if not series or np.std(np.concatenate([one.asked for one in series])) < LEAST_SPREAD:
+        return None
+    delays_s = np.arange(0.0, MAX_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
+    squares = [sum(float(np.sum(one.errors(d) ** 2)) for one in series) for d in delays_s]
+    best_s = delays_s[np.isclose(squares, min(squares), rtol=1e-6, atol=1e-12)]
+    return None if best_s[-1] == delays_s[-1] else round(float(best_s.mean()) * 1e3, 3)
+
+
+@dataclass
+class _Episode:
+    commands: list[Command] = field(default_factory=list)
+    feedback: list[Feedback] = field(default_factory=list)
+
+
+class TrackingLog:
+    """What a vehicle was asked and what it reached, by episode; between two nothing counts.
+
+    All times are the edge runtime's stamps, of commands and feedback alike, so that neither the
+    way to the simulator nor another clock is in any of it. An action is asked for from its command
+    on until the next one; a speed set-point, which the driver moves all the time, is interpolated.
+    Each episode begins at rest, so before its first command what was reached is what was asked.
+
+    A vehicle that brakes by itself follows nobody meanwhile: that feedback is left out.
+    """
+
+    def __init__(self) -> None:
+        self.faults: Counter[str] = Counter()
+        """Words of the vehicle, by the feedback messages that held them."""
+        self.vehicle = ""
+        self._episodes: list[_Episode] = []
+        self._open: _Episode | None = None
+
+    def begin(self) -> None:
+        """Note that an episode begins."""
+        self._open = _Episode()
+        self._episodes.append(self._open)
+
+    def end(self) -> None:
+        """Note that it has ended."""
+        self._open = None
+
+    def command(self, command: Command) -> None:
+        """Take a command, in order."""
+        if self._open is not None:
+            self._open.commands.append(command)
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Take a feedback, in order."""
+        self.vehicle = feedback.vehicle
+        if self._open is None:
+            return
+        for words in feedback.faults:
+            if words in self.faults or len(self.faults) < MOST_FAULTS:
+                self.faults[words] += 1
+        if not feedback.self_braking:
+            self._open.feedback.append(feedback)
+
+    def report(self, action_names: Sequence[str]) -> dict[str, Any]:
+        """Return errors and lags; ``action_names`` in the order of a command's action.
+
+        None stands wherever nothing was measured: a vehicle that takes no speed has no set-point.
+        """
+        speed = [one for episode in self._episodes if (one := _speed(episode)) is not None]
+        actions = {name: self._action(index) for index, name in enumerate(action_names)}
+        return {
+            "name": self.vehicle,
+            "scale": self._scale(),
+            "samples": sum(len(episode.feedback) for episode in self._episodes),
+            "speed_error_mps": errors(speed),
+            "action_error": {name: errors(series) for name, series in actions.items()},
+            "lag_ms": {
+                "speed": lag_ms(speed),
+                **{name: lag_ms(series) for name, series in actions.items()},
+            },
+            "faults": dict(self.faults),
+        }
+
+    def _action(self, index: int) -> list[Series]:
+        found = []
+        for episode in self._episodes:
+            commands, feedback = episode.commands, episode.feedback
+            if commands and feedback:
+                zero_ns = feedback[0].sent_ns
+                asked = _columns(((c.sent_ns, c.action[index]) for c in commands), zero_ns)
+                reached = _columns(((f.sent_ns, f.action[index]) for f in feedback), zero_ns)
+                found.append(Series(*asked, *reached, held=True))
+        return found
+
+    def _scale(self) -> float | None:
+        """Metres of the vehicle for one of the scenario, from where that is told best: at speed."""
+        told = [f for e in self._episodes for f in e.feedback if f.scenario_speed_mps]
+        if not told:
+            return None
+        fastest = max(told, key=lambda f: abs(f.scenario_speed_mps or 0.0))
+        return fastest.speed_mps / (fastest.scenario_speed_mps or 1.0)
+
+
+def _speed(episode: _Episode) -> Series | None:
+    told = [f for f in episode.feedback if f.commanded_speed_mps is not None]
+    if not told:
+        return None
+    zero_ns = told[0].sent_ns
+    asked = _columns(((f.sent_ns, f.commanded_speed_mps or 0.0) for f in told), zero_ns)
+    reached = _columns(((f.sent_ns, f.speed_mps) for f in told), zero_ns)
+    return Series(*asked, *reached, held=False)
+
+
+def _columns(rows: Iterable[tuple[int, float]], zero_ns: int) -> tuple[Numbers, Numbers]:
+    """Times in s since ``zero_ns``, ascending even where a clock was stepped, and the values."""
+    times_ns, values = zip(*sorted(rows, key=lambda row: row[0]), strict=True)
+    seconds = [(time_ns - zero_ns) / 1e9 for time_ns in times_ns]
+    return np.array(seconds), np.array(values, dtype=np.float64)

@@ -18,15 +18,13 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from bridge.commands import add_connect, add_span, add_tls, add_vehicle_id
-from bridge.messages import Heard
-from bridge.ports import Feed, open_feed
-from edge_runtime import wire
+from bridge.commands import add_options
+from bridge.messages import DECODERS, Heard, Pace
+from bridge.ports import open_listener
 from edge_runtime.cli import ArgumentParser, examples, number, sigterm_as_interrupt
 from edge_runtime.commands import ask
-from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.transport import check_endpoint
+from edge_runtime.files import write_json_out
+from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import CARS, ScenarioCar, Similarity
 from edge_runtime.vehicles.ros2 import node as ros
@@ -45,15 +43,12 @@ from edge_runtime.wire import (
     Feedback,
     Rejection,
     State,
-    check_vehicle_id,
 )
 
 MAX_RATE_HZ = 20.0
 RETRY_S = 2.0
-BURST = 2.0
-"""So that jitter of a stream at just this rate costs no message."""
 LONGEST_GAP_S = 0.5
-"""After a longer silence nobody knows how fast it was meanwhile: only so much is made up."""
+"""After a longer silence its speed meanwhile is unknown: only so much is made up."""
 ERROR_PER_METRE = 0.1
 """Guessed, not measured: a standard deviation of 10 % of the way, and 0.1 rad a metre."""
 UNKNOWN = 1e6
@@ -87,9 +82,8 @@ EXAMPLE = (
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    add_connect(parser)
-    add_tls(parser)
-    add_vehicle_id(parser, "the vehicle to show")
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    add_options(parser, "--vehicle-id", help="the vehicle to show")
     side = parser.add_mutually_exclusive_group()
     side.add_argument(
         "--ros2-listen",
@@ -111,64 +105,45 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=MAX_RATE_HZ,
         help="most messages a second on each topic; more are left out",
     )
-    add_span(parser)
-    parser.add_argument("--out", metavar="R.json", help="write the counts to this file at the end")
+    add_options(parser, "--out", help="write the counts to this file at the end")
 
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    check_vehicle_id(arguments.vehicle_id)
-    tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
+    connect, vehicle_id = arguments.connect, arguments.vehicle_id
+    tls = tls_for(arguments.tls, connect)
     for endpoint in (arguments.ros2_listen, arguments.ros2_connect):
         check_ros2_endpoint(endpoint)
-    namespace = arguments.namespace
-    if namespace is None:
-        namespace = namespace_of(arguments.vehicle_id)
+    namespace = arguments.namespace or namespace_of(vehicle_id)
     check_ros_name(namespace, "namespace")
-    if arguments.out is not None:
-        check_writable(arguments.out)
-    report = _run(arguments, namespace, tls)
-    write_json_out(arguments.out, report)
-    print(_summary(report))
-    return 0
-
-
-def _run(arguments: Any, namespace: str, tls: TlsFiles | None) -> dict[str, Any]:
-    status = functools.partial(ask, arguments.connect, arguments.vehicle_id, "status", tls)
+    session = open_ros2_session(arguments.ros2_listen, arguments.ros2_connect)
     with (
+        contextlib.closing(session),
         sigterm_as_interrupt(),
-        contextlib.closing(
-            open_ros2_session(arguments.ros2_listen, arguments.ros2_connect)
-        ) as session,
-        open_feed(arguments.connect, arguments.vehicle_id, arguments.wait_s, tls) as feed,
+        open_listener(connect, vehicle_id, arguments.wait_s, tls) as listener,
         open_node(session, namespace) as node,
     ):
+        status = functools.partial(ask, connect, vehicle_id, "status", tls)
         outlet = Outlet(node, Policies(status), arguments.max_rate_hz)
-        print(f"ready vehicle_id={arguments.vehicle_id} namespace={namespace}", flush=True)
+        print(f"ready vehicle_id={vehicle_id} namespace={namespace}", flush=True)
         # Being interrupted is the ordinary way to end.
         with contextlib.suppress(KeyboardInterrupt):
-            for heard in feed.until_gone(arguments.duration_s):
+            for heard in listener.until_gone(arguments.duration_s):
                 outlet.take(heard)
-        return _report(feed, node, outlet)
-
-
-def _report(feed: Feed, node: Ros2Node, outlet: Outlet) -> dict[str, Any]:
-    return {
-        "sent": node.sent,
-        "rejected": dict(outlet.rejected),
-        "skipped": outlet.skipped,
-        "dropped": feed.dropped,
-    }
-
-
-def _summary(report: dict[str, Any]) -> str:
-    parts = [f"{topic} {count}" for topic, count in report["sent"].items()]
-    text = f"sent: {', '.join(parts)}"
-    for what in ("rejected", "skipped"):
-        if report[what]:
-            counts = ", ".join(f"{name} {count}" for name, count in report[what].items())
-            text += f"; {what}: {counts}"
-    return text
+        counts = {
+            "sent": node.sent,
+            "rejected": dict(outlet.rejected),
+            "skipped": outlet.skipped,
+        }
+        report = {**counts, "dropped": listener.dropped}
+    write_json_out(arguments.out, report)
+    parts = (
+        f"{what}: " + ", ".join(f"{name} {count}" for name, count in found.items())
+        for what, found in counts.items()
+        if found or what == "sent"
+    )
+    print("; ".join(parts))
+    return 0
 
 
 class Outlet:
@@ -180,7 +155,12 @@ class Outlet:
     def __init__(self, node: Ros2Node, policies: Policies, max_rate_hz: float) -> None:
         self.rejected: Counter[str] = Counter()
         self._policies = policies
-        self._bounds = {topic: RateBound(max_rate_hz) for topic in ("state", "command", "feedback")}
+        self._show: dict[str, Callable[[Any, bool], None]] = {
+            "state": self._show_state,
+            "command": self._show_command,
+            "feedback": self._show_feedback,
+        }
+        self._paces = {topic: Pace(1.0 / max_rate_hz) for topic in self._show}
         self._image = node.publisher(IMAGE, ros.Image)
         self._odometry = node.publisher(ODOMETRY, ros.Odometry)
         self._drive = node.publisher(DRIVE, ros.AckermannDriveStamped)
@@ -191,27 +171,26 @@ class Outlet:
     @property
     def skipped(self) -> dict[str, int]:
         """Return how many messages of each topic came faster than the bound."""
-        return {topic: bound.skipped for topic, bound in self._bounds.items() if bound.skipped}
+        return {topic: pace.skipped for topic, pace in self._paces.items() if pace.skipped}
 
     def take(self, heard: Heard) -> None:
         """Show one message; topics that ROS 2 has no standard message for are left out."""
-        row = _ROWS.get(heard.topic)
-        if row is None:
+        if heard.topic not in self._show:
             return
-        decode, show = row
-        message = decode(heard.payload)
+        message = DECODERS[heard.topic](heard.payload)
         if isinstance(message, Rejection):
             self.rejected[f"{heard.topic}_{message.reason.value}"] += 1
         else:
-            show(self, message, self._bounds[heard.topic].lets(heard.arrived_ns * 1e-9))
+            may_publish = self._paces[heard.topic].due(heard.arrived_ns * 1e-9)
+            self._show[heard.topic](message, may_publish)
 
-    def show_state(self, state: State, may_publish: bool) -> None:
+    def _show_state(self, state: State, may_publish: bool) -> None:
         """Publish the newest frame; the speed is kept, whatever the rate."""
         self._speed_mps = state.speed_mps
         if may_publish:
             self._image(image_of(state))
 
-    def show_command(self, command: Command, may_publish: bool) -> None:
+    def _show_command(self, command: Command, may_publish: bool) -> None:
         """Publish the command in both forms, once its policy is known."""
         if not may_publish:
             return
@@ -223,9 +202,11 @@ class Outlet:
         self._drive(drive)
         self._twist(twist_of(drive.drive, policy.car))
 
-    def show_feedback(self, feedback: Feedback, may_publish: bool) -> None:
+    def _show_feedback(self, feedback: Feedback, may_publish: bool) -> None:
         """Go on with the dead reckoning at every message, and publish it at the bounded rate."""
-        self._scale = _scale_of(feedback, self._scale)
+        # The vehicle's metres for one of the scenario, where it moves and reports both speeds.
+        if feedback.scenario_speed_mps and feedback.speed_mps:
+            self._scale = abs(feedback.speed_mps / feedback.scenario_speed_mps)
         policy = self._policies.newest
         curvature = policy and feedback_curvature(feedback, policy, self._scale)
         self._pose.advance(feedback.speed_mps, curvature or 0.0, feedback.sent_ns)
@@ -233,47 +214,11 @@ class Outlet:
             self._odometry(odometry_of(feedback, self._pose, curvature))
 
 
-def _scale_of(feedback: Feedback, last: float) -> float:
-    """Metres of the vehicle for one of the scenario, where it moves and reports both speeds."""
-    if not feedback.scenario_speed_mps or not feedback.speed_mps:
-        return last
-    return abs(feedback.speed_mps / feedback.scenario_speed_mps)
-
-
-_ROWS: dict[str, tuple[Callable[[bytes], Any], Callable[[Outlet, Any, bool], None]]] = {
-    "state": (wire.decode_state, Outlet.show_state),
-    "command": (wire.decode_command, Outlet.show_command),
-    "feedback": (wire.decode_feedback, Outlet.show_feedback),
-}
-
-
-class RateBound:
-    """Lets ``rate_hz`` messages a second through on average, and two at once at most."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self.skipped = 0
-        self._rate_hz = rate_hz
-        self._tokens = BURST
-        self._filled_s: float | None = None
-
-    def lets(self, now_s: float) -> bool:
-        """Return whether a message may pass now; one that may not is counted."""
-        elapsed_s = 0.0 if self._filled_s is None else max(0.0, now_s - self._filled_s)
-        self._filled_s = now_s
-        self._tokens = min(BURST, self._tokens + elapsed_s * self._rate_hz)
-        if self._tokens < 1.0:
-            self.skipped += 1
-            return False
-        self._tokens -= 1.0
-        return True
-
-
 class Policies:
     """Which policy gives the commands: asked of the edge runtime, for the wire has numbers only.
 
-    ``ask`` returns the edge's status, UserError if none answers.
-
-    ``newest`` is what the last call of ``find`` returned.
+    ``ask`` returns the edge's status, UserError if none answers. ``newest`` is what the last call
+    of ``find`` returned.
     """
 
     def __init__(self, ask: Ask, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -283,24 +228,20 @@ class Policies:
         self.newest: Policy | None = None
 
     def find(self, policy_id: str) -> Policy | None:
-        """Return the policy of that id; None while nobody says, and for an unknown scenario.
+        """Return the policy of that id; None until the edge says, and for an unknown scenario.
 
         Waits for the edge's answer once for each new policy, and seldom where none comes.
         """
         if policy_id not in self._known and self._clock_s() >= self._ask_again_s:
             self._ask_again_s = self._clock_s() + RETRY_S
-            self._learn()
+            with contextlib.suppress(UserError):  # the edge has just gone: asked again later
+                self._learn(self._ask())
         self.newest = self._known.get(policy_id)
         return self.newest
 
-    def _learn(self) -> None:
-        try:
-            status = self._ask()
-        except UserError:
-            return  # The edge has just gone; its next command asks again.
+    def _learn(self, status: dict[str, Any]) -> None:
         manifest = status["manifest"]
-        scenario = manifest["scenario"]
-        car = CARS.get(scenario)
+        scenario, car = manifest["scenario"], CARS.get(manifest["scenario"])
         if car is None:
             known = ", ".join(sorted(CARS))
             print(
@@ -344,7 +285,8 @@ def drive_of(command: Command, speed_mps: float, policy: Policy) -> ros.Ackerman
     control period, ``acceleration`` its magnitude; a policy without a pedal asks for no change.
     ``steering_angle`` is that of the wheel whose path has the asked curvature at this wheelbase.
     """
-    acceleration = _acceleration(policy.action(command.action, "pedal") or 0.0, policy.car)
+    pedal = policy.action(command.action, "pedal") or 0.0
+    acceleration = pedal * (policy.car.throttle_mps2 if pedal > 0.0 else policy.car.brake_mps2)
     target_mps = speed_mps + acceleration * CONTROL_PERIOD_S
     curvature = _curvature(policy, command.action, 1.0)
     return ros.AckermannDriveStamped(
@@ -393,10 +335,6 @@ def odometry_of(feedback: Feedback, pose: DeadReckoning, curvature: float | None
             _diagonal(0.0, 0.0, 0.0 if curvature is not None else UNKNOWN),
         ),
     )
-
-
-def _acceleration(pedal: float, car: ScenarioCar) -> float:
-    return pedal * (car.throttle_mps2 if pedal > 0.0 else car.brake_mps2)
 
 
 def _curvature(policy: Policy, values: Sequence[float], scale: float) -> float:

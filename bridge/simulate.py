@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import time
+from argparse import Namespace
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 from rich.progress import Progress
 
-from bridge.clocks import CLOCKS, REALTIME, Clock
-from bridge.commands import (
-    add_tls,
-    add_vehicle_id,
-    add_wait_edge,
-    add_where,
-    check_where,
-    progress_bar,
-)
+from bridge.clocks import CLOCKS, REALTIME, Clock, VehicleClock
+from bridge.commands import add_options, progress_bar
 from bridge.environments import (
     CONDITIONS,
     NOMINAL,
@@ -29,43 +21,21 @@ from bridge.environments import (
     scenario_of,
     task_of,
 )
-from bridge.episode import EpisodeRunner, policy_action
+from bridge.episode import EpisodeRunner, policy_action, vehicle_action
 from bridge.inbound import CommandCheck, FeedbackCheck
-from bridge.network import GRAMMAR, LatencySpec, parse_spec
 from bridge.ports import SimulatorPort, open_port
 from bridge.report import episode_line, make_report, rejections, summary_line
-from bridge.vehicle import VehicleClock, VehicleInLoop
 from bridge.virtual_link import Decision
-from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, sigterm_as_interrupt
-from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
+from edge_runtime.files import write_json_out
+from edge_runtime.policy_file import Manifest
 from edge_runtime.run import rearm_command
-from edge_runtime.tls import TlsFiles, tls_for
+from edge_runtime.tls import tls_for
+from edge_runtime.transport import DEFAULT_ENDPOINT
 from edge_runtime.util import UserError, printable
-from edge_runtime.wire import CONTROL_PERIOD_S, check_vehicle_id
+from edge_runtime.wire import CONTROL_PERIOD_S
 
 POLICY, VEHICLE = LOOPS = ("policy", "vehicle")
-
-
-@dataclass(frozen=True)
-class SimulateSettings:
-    """What the command line asks for, checked."""
-
-    env: str
-    condition: str
-    episodes: int
-    clock: str
-    loop: str
-    standing: bool
-    listen: str | None
-    connect: str | None
-    tls: TlsFiles | None
-    vehicle_id: str
-    latency: LatencySpec
-    seed: int
-    wait_edge_s: float
-    out: str | None
-
-
 EXAMPLE = examples(
     "python -m bridge simulate --env left_turn --episodes 5 --clock realtime --latency 50ms+-10ms",
     "python -m bridge simulate --env congestion --condition variant --episodes 20 --out r.json",
@@ -107,98 +77,71 @@ def add_arguments(parser: ArgumentParser) -> None:
         action="store_true",
         help="the car starts every episode at rest, as with --loop vehicle it always does",
     )
-    add_where(parser)
-    add_tls(parser)
-    add_vehicle_id(parser, "the vehicle to simulate")
-    network = "injected network: " + GRAMMAR.replace("%", "%%")
-    parser.add_argument("--latency", metavar="SPEC", default="none", help=network)
-    parser.add_argument(
-        "--seed",
-        metavar="N",
-        type=not_negative,
-        default=0,
-        help="episode i is reset with seed + i",
-    )
-    add_wait_edge(parser)
-    parser.add_argument("--out", metavar="R.json", help="write the report to this file")
+    where = parser.add_mutually_exclusive_group()
+    add_options(where, "--listen", default=DEFAULT_ENDPOINT)
+    help_text = "share a router with other vehicles instead of listening"
+    add_options(where, "--connect", default=None, help=help_text)
+    add_options(parser, "--tls", "--latency", "--wait-edge-s", "--out")
+    add_options(parser, "--vehicle-id", help="the vehicle to simulate")
+    add_options(parser, "--seed", help="episode i is reset with seed + i")
 
 
-def run(arguments: Any) -> int:
+def run(arguments: Namespace) -> int:
     """Run the command; UserError for anything the caller can put right."""
-    settings = _check(arguments)
-    environment = make_environment(settings.env, settings.condition)
+    if arguments.loop == VEHICLE and arguments.clock != REALTIME:
+        raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
+    arguments.standing |= arguments.loop == VEHICLE
+    arguments.tls = tls_for(arguments.tls, arguments.connect or arguments.listen)
+    environment = make_environment(arguments.env, arguments.condition)
     try:
         with sigterm_as_interrupt():
-            report = _serve(settings, environment)
+            report = _serve(arguments, environment)
     finally:
         environment.close()
-    write_json_out(settings.out, report)
+    write_json_out(arguments.out, report)
     print(summary_line(report))
     return 0
 
 
-def _check(arguments: Any) -> SimulateSettings:
-    listen, connect = check_where(arguments)
-    if arguments.loop == VEHICLE and arguments.clock != REALTIME:
-        raise UserError("--loop vehicle needs --clock realtime: a vehicle waits for no simulation")
-    settings = SimulateSettings(
-        env=arguments.env,
-        condition=arguments.condition,
-        episodes=arguments.episodes,
-        clock=arguments.clock,
-        loop=arguments.loop,
-        standing=arguments.standing or arguments.loop == VEHICLE,
-        listen=listen,
-        connect=connect,
-        tls=tls_for(arguments.tls, str(listen or connect)),
-        vehicle_id=check_vehicle_id(arguments.vehicle_id),
-        latency=parse_spec(arguments.latency),
-        seed=arguments.seed,
-        wait_edge_s=arguments.wait_edge_s,
-        out=arguments.out,
-    )
-    if settings.out is not None:
-        check_writable(settings.out)
-    return settings
-
-
-def _serve(settings: SimulateSettings, environment: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+def _serve(asked: Namespace, environment: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Open both ends of the loop, wait for an edge runtime and its vehicle, and drive."""
+    endpoint, wait_s = asked.connect or asked.listen, asked.wait_edge_s
     action_size = (environment.action_space.shape or (1,))[0]
-    wait_s, tls = settings.wait_edge_s, settings.tls
-    with open_port(settings.listen, settings.vehicle_id, tls, settings.connect, wait_s) as port:
+    with open_port(asked.listen, asked.vehicle_id, asked.tls, asked.connect, wait_s) as port:
         check = CommandCheck(port.session, action_size)
-        clock = _make_clock(settings, port, check, action_size)
-        with contextlib.closing(clock), episode_bar(settings.episodes) as bar:
+        clock: Clock
+        if asked.loop == VEHICLE:
+            feedback = FeedbackCheck(port.session, action_size)
+            clock = VehicleClock(port.publish_state, check, asked.latency, feedback)
+        else:
+            clock = CLOCKS[asked.clock](port.publish_state, check, asked.latency)
+        with contextlib.closing(clock), progress_bar("episodes") as progress:
+            bar = EpisodeBar(progress, asked.episodes)
             port.on_command(clock.receive)
-            port.wait_for_edge(wait_s, str(settings.connect or settings.listen))
-            vehicle = (
-                VehicleInLoop(clock, port, wait_s) if isinstance(clock, VehicleClock) else None
-            )
-            return _drive(settings, environment, port, clock, check, bar, vehicle)
-
-
-def _make_clock(
-    settings: SimulateSettings, port: SimulatorPort, check: CommandCheck, action_size: int
-) -> Clock:
-    if settings.loop == VEHICLE:
-        feedback = FeedbackCheck(port.session, action_size)
-        return VehicleClock(port.publish_state, check, settings.latency, feedback)
-    return CLOCKS[settings.clock](port.publish_state, check, settings.latency)
+            port.wait_for_edge(wait_s, endpoint)
+            manifest = port.edge_manifest()
+            if isinstance(clock, VehicleClock):
+                port.on_feedback(clock.receive_feedback)
+                clock.wait_for_vehicle(wait_s, asked.vehicle_id)
+            return _drive(asked, environment, port, clock, check, bar, manifest)
 
 
 def _drive(
-    settings: SimulateSettings,
+    asked: Namespace,
     environment: gymnasium.Env[Any, Any],
     port: SimulatorPort,
     clock: Clock,
     check: CommandCheck,
     bar: EpisodeBar,
-    vehicle: VehicleInLoop | None,
+    manifest: Manifest | None,
 ) -> dict[str, Any]:
-    rearm = rearm_command(str(settings.connect or settings.listen), settings.vehicle_id)
+    vehicle = clock if isinstance(clock, VehicleClock) else None
+    action_names = [action.name for action in manifest.action] if manifest else []
+    rearm = rearm_command(asked.connect or asked.listen, asked.vehicle_id)
+    edge = port.edge_counts
 
     def on_tick(episode: int, step: int, decision: Decision) -> None:
-        bar.tick(episode, step, decision, rearm if port.edge_counts.waits_for_rearm else "")
+        bar.tick(episode, step, decision, rearm if edge.waits_for_rearm else "")
 
     runner = EpisodeRunner(
         environment,
@@ -206,75 +149,61 @@ def _drive(
         port.session,
         port.publish_scene,
         on_tick,
-        apply=vehicle.apply if vehicle else policy_action,
-        standing=settings.standing,
+        apply=vehicle_action(action_names) if vehicle else policy_action,
+        standing=asked.standing,
         # Copies, made at once: other threads go on counting.
         rejected=lambda: {**check.rejected, **(vehicle.rejected() if vehicle else {})},
-        task=task_of(environment, settings.env),
+        task=task_of(environment, asked.env),
     )
-    _meet(settings, environment, port, runner)
+    if manifest is not None:  # else the edge runtime compares by itself what the states say
+        task = task_of(environment, asked.env, manifest)
+        _refuse_another_task(asked, runner, manifest.task, task)
     results = []
     port.note_edge_counts()
     started_s = time.monotonic()
-    for episode in range(settings.episodes):
+    for episode in range(asked.episodes):
         if vehicle is not None:
-            vehicle.clock.wait_for_standstill()
-        results.append(runner.run(episode, settings.seed + episode))
+            vehicle.wait_for_standstill()
+        results.append(runner.run(episode, asked.seed + episode))
         stops = [event for event in runner.safe_stops.events if event.episode == episode]
-        bar.done(episode + 1, episode_line(episode + 1, settings.episodes, results[-1], stops))
+        bar.done(episode + 1, episode_line(episode + 1, asked.episodes, results[-1], stops))
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
-    unbelieved = Counter(port.edge_counts.unreadable)
+    by_simulator = check.rejected + Counter(edge.unreadable)
     if vehicle is not None:
-        unbelieved += vehicle.rejected()
+        by_simulator += vehicle.rejected()
     return make_report(
         results,
         runner.safe_stops.events,
         clock.latencies_ms,
         runner.command_ages_ms,
-        counts={
+        facts={
+            "scenario": scenario_of(asked.env),
+            **{name: getattr(asked, name) for name in ("condition", "seed", "clock", "loop")},
+            "standing": asked.standing,
+            "latency_spec": str(asked.latency),
+            "policy_ids": check.policy_ids,
             "deadline_misses": runner.deadline_misses,
             "tick_overruns": clock.tick_overruns,
             "missed_ticks": clock.missed_ticks,
             "wall_clock_stalls": clock.wall_clock_stalls,
-            "edge_changes": port.edge_counts.changes,
-            **rejections(port.edge_counts.rejected, check.rejected + unbelieved),
+            "edge_changes": edge.changes,
+            **rejections(edge.rejected, by_simulator),
+            "wall_s": wall_s,
+            "vehicle": vehicle.report(action_names) if vehicle else None,
         },
-        settings={**_as_asked(settings), "policy_ids": check.policy_ids, "wall_s": wall_s},
-        vehicle=vehicle.report() if vehicle else None,
     )
 
 
-def _meet(
-    settings: SimulateSettings,
-    environment: gymnasium.Env[Any, Any],
-    port: SimulatorPort,
-    runner: EpisodeRunner,
-) -> None:
-    """Compare tasks with the edge runtime; UserError where its policy is for another one."""
-    manifest = port.edge_manifest()
-    if manifest is None:
-        return  # It compares by itself what the states say.
-    task = task_of(environment, settings.env, manifest)
-    if manifest.task != task:
-        runner.show_task(settings.seed)
+def _refuse_another_task(asked: Namespace, runner: EpisodeRunner, theirs: str, ours: str) -> None:
+    """Raise UserError where the edge runtime's policy is for another task."""
+    if theirs != ours:
+        runner.show_task(asked.seed)
         time.sleep(CONTROL_PERIOD_S)  # Its safe stop still finds this end of the wire.
         raise UserError(
-            f"the edge runtime's policy is for another task ({manifest.task!r}) than --env"
-            f" {settings.env} ({task!r}); start it with a policy of this, or choose another --env"
+            f"the edge runtime's policy is for another task ({theirs!r}) than --env"
+            f" {asked.env} ({ours!r}); start it with a policy of this, or choose another --env"
         )
-
-
-def _as_asked(settings: SimulateSettings) -> dict[str, Any]:
-    return {
-        "scenario": scenario_of(settings.env),
-        "condition": settings.condition,
-        "seed": settings.seed,
-        "clock": settings.clock,
-        "loop": settings.loop,
-        "standing": settings.standing,
-        "latency_spec": str(settings.latency),
-    }
 
 
 class EpisodeBar:
@@ -308,10 +237,3 @@ class EpisodeBar:
     def _say(self, line: str) -> None:
         """Print a line above the bar, as it is."""
         self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-@contextlib.contextmanager
-def episode_bar(episodes: int) -> Iterator[EpisodeBar]:
-    """Show a bar on stderr while the block runs; lines if stderr is no terminal."""
-    with progress_bar("episodes") as progress:
-        yield EpisodeBar(progress, episodes)

@@ -8,8 +8,7 @@ listen to.
 `VirtualLink` is shared by lock-step and by training under latency. Tick n stands at virtual time
 n T. Its state arrives at the edge runtime after the uplink's delay; the answer takes no time, and
 arrives at the vehicle after the downlink's; the tick is decided at n T + 25 ms from what has
-arrived by then. Who answers is the caller's business: a real edge runtime that is waited for, or a
-function.
+arrived by then. The caller gives the answers: those of a real edge runtime, or of a function.
 
 The edge runtime's rule for silence counts time, and here time is virtual: a real one, which sees
 states come faster than in life, would miss the gaps. So its safety machine runs along, and what it
@@ -134,9 +133,6 @@ COMMAND_BYTES = 217
 """What the messages take on the wire, for links of limited rate: the same for every message, so
 that a longer session name or another digit does not change a drive."""
 
-_SESSION = ""
-"""An episode has one simulator."""
-
 Message = TypeVar("Message")
 
 
@@ -228,10 +224,10 @@ class VirtualLink(Generic[Message]):
 
     def _note_fresh(self, now_s: float) -> None:
         """What the edge runtime's safety machine makes of a fresh state's moment."""
-        gap = classify_arrival(self._safety, _SESSION, now_s - ROUNDING_S, needs_rearm=False)
+        gap = classify_arrival(self._safety, "", now_s - ROUNDING_S, needs_rearm=False)
         if gap is not None:
             self._safety = advance(self._safety, gap)
-        self._safety = note_arrival(self._safety, _SESSION, now_s)
+        self._safety = note_arrival(self._safety, "", now_s)
         fresh = classify_fresh(self._safety, final=False, needs_rearm=False)
         self._safety = advance(self._safety, fresh)
 

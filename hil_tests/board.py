@@ -23,7 +23,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Self
 
 from deploy.__main__ import main as deploy
 from deploy.bundle import NAME, Inputs, build_installer, make_bundle
@@ -31,9 +31,12 @@ from deploy.installer.systemd import MAIN_UNIT
 from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel
 from edge_runtime.cli import examples, positive, sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
-from hil_tests.emulated_board import Computer, free_port, make_image, why_not_emulated
 from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand, wait_until
+
+Keep = Callable[[dict[str, Any]], None]
+"""Given a report, for JSON, each time when it has grown."""
 
 BOARDS = ("aarch64", "python38")
 DEFAULT_CACHE = "build/board"
@@ -42,6 +45,7 @@ ENDPOINT = f"tls/127.0.0.1:{_PORT}"
 _EPISODE_LIMIT_S, _BACK_LIMIT_S = 300.0, 120.0
 _CHANGED_BYTES = 20
 _FACTS = ("Uid", "CapBnd", "CapEff", "NoNewPrivs", "Seccomp", "Cpus_allowed_list")
+INSTALL = f"python3 -I {NAME}"
 _FORBIDDEN = ("/etc/passwd", "/opt/phil/current/policy.onnx", "/usr/bin/new", "/var/lib/new")
 _LIBRARIES = "/opt/libraries"
 _WHAT_IT_IS = "uname -rm; systemctl --version | head -1; python3 --version; ssh -V 2>&1"
@@ -54,323 +58,64 @@ FAULTS = {
 }
 """Releases that must go back by themselves: what Python runs at the start of each."""
 EXAMPLE = examples("python -m hil_tests board --boards python38 --out runs/board.json")
+_PROGRAMS = {
+    "qemu-system-aarch64": "qemu-system-arm",
+    "qemu-img": "qemu-utils",
+    "qemu-aarch64-static": "qemu-user-static",
+    "debootstrap": "debootstrap",
+    "ssh": "openssh-client",
+}
+_BOOT_LIMIT_S = 300.0
 
-
-class Parcels:
-    """Makes bundles: whole ones as a person would, and light ones whose libraries lie there."""
-
-    def __init__(self, folder: Path, wheels: Path, endpoint: str) -> None:
-        self._folder, self._wheels, self._endpoint = folder, wheels, endpoint
-        self.trust, self.certificates = folder / "keys/policy.pub", folder / "certs"
-        with _silent():
-            deploy(["keys", "--out", str(folder / "keys")])
-            deploy(["certs", "--out", str(self.certificates), "--vehicle-id", VEHICLE])
-        self._edge = build_edge_wheel(folder / "edge")
-        (folder / NAME).write_bytes(build_installer())
-
-    def whole(self, target: str) -> Path:
-        """A bundle with every wheel."""
-        with _silent():
-            deploy(
-                ["bundle", "--policy", str(POLICY), "--public-key", str(PUBLIC_KEY),
-                 "--target", target, "--config", str(self._config()), "--key", str(self._key()),
-                 "--tls", str(self.certificates / f"edge-{VEHICLE}"),
-                 "--wheels", str(self._wheels), "--out", str(self._folder / target)]
-            )  # fmt: skip
-        return next((self._folder / target).glob("*.tar"))
-
-    def light(self, line: str) -> Path:
-        """A bundle for the emulated board of which a path file takes the place of most wheels.
-
-        `line` is a further one of that file; Python runs it at its start.
-        """
-        host = self._folder / "host-1.0-py3-none-any.whl"
-        with zipfile.ZipFile(host, "w") as wheel:
-            wheel.writestr("host.pth", f"{_LIBRARIES}\n{line}\n")
-        tls, wheels = self.certificates / f"edge-{VEHICLE}", [self._edge, host]
-        inputs = Inputs(POLICY, PUBLIC_KEY, self._key(), self._config(), tls, wheels)
-        return make_bundle(inputs, TARGETS["linux-aarch64"], self._folder / "light").path
-
-    def _key(self) -> Path:
-        return self.trust.with_suffix(".key")
-
-    def _config(self) -> Path:
-        path = self._folder / "edge.toml"
-        path.write_text(f'connect = "{self._endpoint}"\nvehicle_id = "{VEHICLE}"\n')
-        return path
-
-
-class Installer(NamedTuple):
-    """The installer on an emulated board."""
-
-    board: Computer
-
-    def run(self, bundle: Path) -> subprocess.CompletedProcess[str]:
-        """Install a bundle that was copied there."""
-        return self.board.run(self.command(bundle))
-
-    def command(self, bundle: Path) -> str:
-        """What `run` types."""
-        return f"python3 -I {NAME} install {bundle.name}"
-
-    def upgrade(self, bundle: Path) -> None:
-        """Install one that must be taken. UserError with the installer's line."""
-        self._must(self.run(bundle))
-
-    def roll_back(self) -> None:
-        """Go back to the release before. UserError with the installer's line."""
-        self._must(self.board.run(f"python3 -I {NAME} rollback"))
-
-    @staticmethod
-    def _must(done: subprocess.CompletedProcess[str]) -> None:
-        if done.returncode != 0:
-            raise UserError(f"on the board: {done.stderr.strip()}")
-
-    def send(self, bundle: Path) -> None:
-        """A bundle and its signature to the board."""
-        self.board.copy(bundle, Path(f"{bundle}.sig"))
-
-    def status(self) -> dict[str, Any]:
-        """What the installed release says of itself. UserError where it is not whole."""
-        done = self.board.run(f"python3 /opt/phil/current/{NAME} status --json")
-        if done.returncode != 0:
-            raise UserError(f"the board is broken: {(done.stdout + done.stderr).strip()}")
-        return dict(json.loads(done.stdout))
-
-    def current(self) -> str:
-        """The version that is current, and whole."""
-        return str(self.status()["current"])
-
-
-def prove_aarch64(
-    cache: Path, wheels: Path, cuts: int, keep: Callable[[dict[str, Any]], None]
-) -> None:
-    """Install, drive, upgrade, spoil, hang and cut off an emulated board.
-
-    `keep` is given the report, for JSON, each time when it has grown.
-
-    Raises:
-        UserError: a step failed that must not.
-    """
-    if not (cache / "disk").exists():
-        make_image(cache)
-    with tempfile.TemporaryDirectory(prefix="phil-board-") as place:
-        folder = Path(place)
-        parcels = Parcels(folder, wheels, ENDPOINT)
-        with Computer(cache, folder) as board:
-            installer = Installer(board)
-            report: dict[str, Any] = {"boot_s": board.boot(), "is": board.run(_WHAT_IT_IS).stdout}
-            report |= _push(board, parcels)
-            report["status"] = installer.status()
-            report["episode"] = _drive_through_ssh(board, parcels)
-            report["service"] = _look_at_service(board)
-            report["hung_to_active_s"] = _hang(board)
-            keep(report)
-            lights = [parcels.light(f"# {number}") for number in range(3)]
-            board.run(f"cp -al /opt/phil/current/site-packages {_LIBRARIES}")
-            board.run(f"rm -r {_LIBRARIES}/edge_runtime")
-            board.copy(folder / NAME)
-            for light in lights:
-                installer.send(light)
-            report["rolled_back"] = _upgrade_and_back(installer, lights[0])
-            report["changed_bytes"] = _change_bytes(installer, lights[1])
-            report["faulty"] = {
-                why: _install_faulty(installer, parcels.light(line)) for why, line in FAULTS.items()
-            }
-            keep(report)
-            for cut in _cut(installer, lights, cuts):
-                keep(report | {"power_cuts": cut})
-            report["power_cuts"] = cut
-            board.run(f"python3 -I {NAME} uninstall")
-            left = board.run("ls -d /opt/phil /etc/systemd/system/phil-*.service").stdout.split()
-            keep(report | {"left_after_uninstall": left})
-
-
-def _push(board: Computer, parcels: Parcels) -> dict[str, Any]:
-    """`deploy push` of a whole bundle, over the system's ssh, to a healthy service."""
-    bundle = parcels.whole("linux-aarch64")
-    push = ["push", "board", str(bundle), "--trust", str(parcels.trust), "--no-sudo"]
-    begun_s = time.monotonic()
-    with board.known_to_ssh(), _silent():
-        if deploy(push) != 0:
-            raise UserError("deploy push does not install; its own line above says why")
-    took_s = round(time.monotonic() - begun_s, 1)
-    return {"bundle_mb": bundle.stat().st_size / 1e6, "pushed_and_installed_s": took_s}
-
-
-def _drive_through_ssh(board: Computer, parcels: Parcels) -> dict[str, Any]:
-    """One left turn by the board, which reaches the simulator here through our ssh only."""
-    port = free_port()
-    tunnel = board.ssh("-N", options=("-R", f"{_PORT}:127.0.0.1:{port}"))
-    with subprocess.Popen(tunnel, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as link:
-        try:
-            return _drive(parcels.certificates, port)
-        finally:
-            link.terminate()
-
-
-def _drive(certificates: Path, port: int) -> dict[str, Any]:
-    """One left turn in real time; parts of the simulator's report."""
-    out = certificates / "episode.json"
-    words = [
-        "bridge", "simulate", "--env", "left_turn", "--clock", "realtime", "--episodes", "1",
-        "--listen", f"tls/127.0.0.1:{port}", "--vehicle-id", VEHICLE, "--wait-edge-s", "120",
-        "--tls", str(certificates / f"simulator-{VEHICLE}"), "--out", str(out),
-    ]  # fmt: skip
-    with BackgroundCommand(*words, quiet=True) as simulator:
-        simulator.wait(_EPISODE_LIMIT_S)
-    report = json.loads(out.read_text())
-    kept = ("success_rate", "answered_states", "latency_ms", "safe_stops", "rejected", "policy_id")
-    return {name: report[name] for name in kept} | {"outcome": report["per_episode"][0]["outcome"]}
-
-
-def _look_at_service(board: Computer) -> dict[str, Any]:
-    """What the kernel and systemd say of the service's process, and what it could write."""
-    pid = board.show(MAIN_UNIT, "MainPID")
-    lines = board.run(f"cat /proc/{pid}/status").stdout.splitlines()
-    rows = dict(line.split(":", 1) for line in lines)
-    enter = f"nsenter --target {pid} --mount --root=/proc/{pid}/root --wd=/ touch"
-    said = board.run(f"systemd-analyze security --no-pager {MAIN_UNIT}").stdout
-    return {
-        **{name: " ".join(rows[name].split()) for name in _FACTS},
-        "written": [path for path in _FORBIDDEN if board.run(f"{enter} {path}").returncode == 0],
-        "can_unit": board.show("phil-can", "Result"),
-        "exposure": float(said.split("exposure level for")[1].split(":")[1].split()[0]),
-    }
-
-
-def _hang(board: Computer) -> float:
-    """Stop the process as a hang would; seconds until systemd has another one ready."""
-    pid, begun_s = board.show(MAIN_UNIT, "MainPID"), time.monotonic()
-    board.run(f"kill -STOP {pid}")
-    wait_until(
-        lambda: board.show(MAIN_UNIT, "MainPID") not in ("0", pid), "another process", _BACK_LIMIT_S
-    )
-    _wait_until_active(board)
-    return round(time.monotonic() - begun_s, 1)
-
-
-def _upgrade_and_back(installer: Installer, light: Path) -> bool:
-    """Whether an upgrade became current, and a roll-back the release before."""
-    before = installer.current()
-    installer.upgrade(light)
-    upgraded = installer.current()
-    installer.roll_back()
-    return upgraded != before and installer.current() == before
-
-
-def _change_bytes(installer: Installer, bundle: Path) -> dict[str, Any]:
-    """Change one byte of a bundle, many times: each is refused, with nothing written."""
-    choice, data = random.Random(1), bundle.read_bytes()
-    changed, refused = bundle.with_name("changed.tar"), 0
-    shutil.copyfile(f"{bundle}.sig", f"{changed}.sig")
-    before = installer.board.run(_FINGERPRINT).stdout
-    for place in choice.sample(range(len(data)), _CHANGED_BYTES):
-        changed.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
-        installer.send(changed)
-        done = installer.board.run(installer.command(changed))
-        untouched = installer.board.run(_FINGERPRINT).stdout == before
-        refused += done.returncode == 2 and "is refused" in done.stderr and untouched
-    return {"tried": _CHANGED_BYTES, "refused_and_nothing_written": refused}
-
-
-def _install_faulty(installer: Installer, bundle: Path) -> dict[str, Any]:
-    """Install a release that must go back by itself; what the installer says of it."""
-    before = installer.current()
-    installer.send(bundle)
-    done = installer.run(bundle)
-    return {
-        "status": done.returncode,
-        "said": done.stderr.strip(),
-        "went_back": installer.current() == before
-        and installer.board.show(MAIN_UNIT, "ActiveState") == "active",
-    }
-
-
-def _cut(installer: Installer, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]]:
-    """Cut the power at random moments of an upgrade; look, and let the same command complete it.
-
-    Yields what came of the cuts so far.
-    """
-    board, choice = installer.board, random.Random(1)
-    begun_s = time.monotonic()
-    installer.upgrade(lights[0])
-    whole_s = time.monotonic() - begun_s
-    said_last: Counter[str] = Counter()
-    current: Counter[str] = Counter()
-    broken: list[str] = []
-    boots_s: list[float] = []
-    for number in range(cuts):
-        before, bundle = installer.current(), lights[(number + 1) % len(lights)]
-        run = subprocess.Popen(
-            board.ssh(installer.command(bundle)), text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        time.sleep(choice.uniform(0.0, 1.1 * whole_s))
-        board.cut_power()
-        said = (run.communicate()[0].strip().splitlines() or ["nothing"])[-1].split()[0]
-        boots_s.append(board.boot())
-        said_last[said] += 1
-        try:
-            then = installer.current()
-            current["the old one" if then == before else "the new one"] += 1
-            _wait_until_active(board)
-            installer.upgrade(bundle)
-            if installer.current() == before:
-                raise UserError("the same command does not complete it")
-        except (UserError, TimeoutError) as error:
-            broken.append(f"cut {number}: {error}")
-        yield {
-            "cuts": number + 1, "broken": broken, "killed_after_it_said": dict(said_last),
-            "current_then": dict(current), "a_whole_upgrade_s": round(whole_s, 1),
-            "boots_s": boots_s,
-        }  # fmt: skip
-
-
-def _wait_until_active(board: Computer) -> None:
-    wait_until(lambda: board.show(MAIN_UNIT, "ActiveState") == "active", MAIN_UNIT, _BACK_LIMIT_S)
-
-
-def prove_python38(wheels: Path) -> dict[str, Any]:
-    """Install offline under Python 3.8, run the release as a container would, drive; a report."""
-    python, port = str(find_python38()), free_port()
-    with tempfile.TemporaryDirectory(prefix="phil-python38-") as place:
-        folder = Path(place)
-        parcels = Parcels(folder, wheels, f"tls/127.0.0.1:{port}")
-        bundle, opt = parcels.whole("linux-x86_64"), folder / "opt"
-
-        def run(*words: str) -> str:
-            done = subprocess.run(
-                ["unshare", "--net", python, "-I", folder / NAME, *words, "--root", opt],
-                capture_output=True, text=True, check=False, env={"PATH": os.defpath},
-            )  # fmt: skip
-            if done.returncode != 0:
-                raise UserError(f"install.pyz {words[0]}: {done.stderr.strip()}")
-            return done.stdout
-
-        begun_s = time.monotonic()
-        run("install", str(bundle), "--trust", str(parcels.trust), "--service", "none")
-        report = {
-            "bundle_mb": bundle.stat().st_size / 1e6,
-            "installed_s": round(time.monotonic() - begun_s, 2),
-            "status": json.loads(run("status", "--json")),
-        }
-        words = [str(opt / "current/bin/phil-edge"), "run", "--config", "config.toml"]
-        with subprocess.Popen(words, cwd=opt / "current", stderr=subprocess.DEVNULL) as runtime:
-            try:
-                report["episode"] = _drive(parcels.certificates, port)
-            finally:
-                runtime.terminate()
-        run("uninstall")
-        return {**report, "left_after_uninstall": opt.exists()}
+# The kernel's handler of aarch64 programs has a name of its own, and goes when this ends.
+_MAKE_IMAGE = """\
+cache=$1 key=$2 root=$1/root
+kernel=/proc/sys/fs/binfmt_misc
+[ -e $kernel/register ] || mount -t binfmt_misc binfmt_misc $kernel
+if [ ! -e $kernel/qemu-aarch64 ]; then
+    line=$(sed s/qemu-aarch64:/phil-aarch64:/ /usr/lib/binfmt.d/qemu-aarch64.conf)
+    printf %s "${line%F}F" > $kernel/register
+    trap 'echo -1 > $kernel/phil-aarch64' EXIT
+fi
+debootstrap --arch=arm64 --variant=minbase --include=python3,systemd-sysv,dbus,udev,iproute2,\
+openssh-server,openssh-client,linux-image-cloud-arm64 bullseye "$root" >&2
+cd "$root"
+mkdir -p root/.ssh
+cp "$key" root/.ssh/authorized_keys
+chmod 0700 root/.ssh
+printf '[Match]\\nName=e*\\n[Network]\\nAddress=10.0.2.15/24\\n' > etc/systemd/network/10.network
+ln -s /lib/systemd/system/systemd-networkd.service etc/systemd/system/multi-user.target.wants/
+echo board > etc/hostname
+echo '127.0.0.1 localhost board' > etc/hosts
+echo '/dev/vda / ext4 defaults 0 1' > etc/fstab
+rm -rf debootstrap var/cache/apt/archives/*.deb usr/share/doc usr/share/locale
+cp boot/vmlinuz-* "$cache/kernel"
+cp boot/initrd.img-* "$cache/initrd"
+truncate -s 3G "$cache/draft"
+mkfs.ext4 -q -F -d . "$cache/draft"
+mv "$cache/draft" "$cache/disk"
+"""
+# Its clock counts instructions, 1 ns each, and goes with ours only while it has nothing to do. So
+# it has as much time as a board, however slow the emulation is.
+_EMULATE = """\
+exec setpriv --pdeathsig KILL qemu-system-aarch64 -machine virt -cpu cortex-a72 -smp 2 -m 1024 \
+    -icount shift=0,sleep=on -accel tcg,thread=single -display none -serial none -monitor none \
+    -kernel "$1/kernel" -initrd "$1/initrd" -append "root=/dev/vda rw quiet net.ifnames=0" \
+    -drive "if=virtio,format=qcow2,file=$2" -device virtio-rng-pci \
+    -netdev "user,id=n,restrict=on,hostfwd=tcp:127.0.0.1:$3-:22" \
+    -device virtio-net-pci,netdev=n,romfile=
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--boards", nargs="+", choices=BOARDS, default=list(BOARDS),
+        "--boards",
+        nargs="+",
+        choices=BOARDS,
+        default=list(BOARDS),
         help="an emulated aarch64 computer with systemd; Python 3.8 without systemd",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--cuts", metavar="N", type=positive, default=8, help="power cuts of the emulated one"
     )
@@ -407,10 +152,8 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def prove(
-    board: str, cache: str, wheels: str, cuts: int, keep: Callable[[dict[str, Any]], None]
-) -> None:
-    """Prove one of BOARDS; `keep` is given its report each time when it has grown."""
+def prove(board: str, cache: str, wheels: str, cuts: int, keep: Keep) -> None:
+    """Prove one of BOARDS."""
     if board == "aarch64":
         prove_aarch64(Path(cache), Path(wheels), cuts, keep)
     else:
@@ -423,7 +166,10 @@ def why_not(board: str) -> str:
         return "it needs root"
     if board == "python38":
         return "" if find_python38() else "no Python 3.8 on PATH or under ~/.pyenv"
-    return why_not_emulated()
+    for program, package in _PROGRAMS.items():
+        if shutil.which(program) is None:
+            return f"{program} is not there (Debian's package {package})"
+    return ""
 
 
 def find_python38() -> str | None:
@@ -437,6 +183,392 @@ def find_python38() -> str | None:
         if asked.stdout.startswith("Python 3.8."):
             return candidate
     return None
+
+
+class Parcels:
+    """Makes bundles: whole ones as a person would, and light ones whose libraries lie there."""
+
+    def __init__(self, folder: Path, wheels: Path, endpoint: str) -> None:
+        self._folder, self._wheels = folder, wheels
+        self.trust, self.certificates = folder / "keys/policy.pub", folder / "certs"
+        self._key, self._tls = folder / "keys/policy.key", self.certificates / f"edge-{VEHICLE}"
+        self._config = folder / "edge.toml"
+        self._config.write_text(f'connect = "{endpoint}"\nvehicle_id = "{VEHICLE}"\n')
+        with _silent():
+            deploy(["keys", "--out", str(folder / "keys")])
+            deploy(["certs", "--out", str(self.certificates), "--vehicle-id", VEHICLE])
+        self._edge = build_edge_wheel(folder / "edge")
+        (folder / NAME).write_bytes(build_installer())
+
+    def whole(self, target: str) -> Path:
+        """A bundle with every wheel."""
+        with _silent():
+            deploy(
+                ["bundle", "--policy", str(POLICY), "--public-key", str(PUBLIC_KEY),
+                 "--target", target, "--config", str(self._config), "--key", str(self._key),
+                 "--tls", str(self._tls), "--wheels", str(self._wheels),
+                 "--out", str(self._folder / target)]
+            )  # fmt: skip
+        return next((self._folder / target).glob("*.tar"))
+
+    def light(self, line: str) -> Path:
+        """A bundle for the emulated board of which a path file takes the place of most wheels.
+
+        `line` is a further one of that file; Python runs it at its start.
+        """
+        host = self._folder / "host-1.0-py3-none-any.whl"
+        with zipfile.ZipFile(host, "w") as wheel:
+            wheel.writestr("host.pth", f"{_LIBRARIES}\n{line}\n")
+        wheels = [self._edge, host]
+        inputs = Inputs(POLICY, PUBLIC_KEY, self._key, self._config, self._tls, wheels)
+        return make_bundle(inputs, TARGETS["linux-aarch64"], self._folder / "light").path
+
+
+class Board:
+    """An emulated board with a disk of its own, on or without power, and the installer on it."""
+
+    def __init__(self, cache: Path, folder: Path) -> None:
+        self._cache, self._folder = cache.absolute(), folder
+        self._disk = folder / "disk.qcow2"
+        self._port = _free_port()
+        self._config = folder / "ssh_config"
+        self._config.write_text(
+            f"Host board\n HostName 127.0.0.1\n Port {self._port}\n User root\n"
+            f" IdentityFile {self._cache}/key\n StrictHostKeyChecking no\n"
+            " UserKnownHostsFile /dev/null\n LogLevel ERROR\n"
+        )
+        base = ["-b", str(self._cache / "disk"), "-F", "raw"]
+        subprocess.run(["qemu-img", "create", "-q", "-f", "qcow2", *base, self._disk], check=True)
+        self._machine: subprocess.Popen[bytes] | None = None
+
+    def boot(self) -> float:
+        """Switch it on; how long it took until all of its services were up, s."""
+        words = ["sh", "-c", _EMULATE, "sh", self._cache, self._disk, self._port]
+        begun_s = time.monotonic()
+        self._machine = subprocess.Popen([str(word) for word in words], stdin=subprocess.DEVNULL)
+        wait_until(self._is_up, "the emulated computer is up", _BOOT_LIMIT_S)
+        return round(time.monotonic() - begun_s, 1)
+
+    def cut_power(self) -> None:
+        """Everything in it ends at once, and what was not written to its disk is lost."""
+        if self._machine is not None:
+            self._machine.kill()
+            self._machine.wait()
+            self._machine = None
+
+    def run(self, command: str) -> subprocess.CompletedProcess[str]:
+        """A shell's command, by ssh, to its end."""
+        return subprocess.run(self.ssh(command), capture_output=True, text=True, check=False)
+
+    def ssh(self, *words: str, options: tuple[str, ...] = ()) -> list[str]:
+        """The words that run a command there, or only keep up what `options` ask for."""
+        return ["ssh", "-F", str(self._config), "-o", "ConnectTimeout=5", *options, "board", *words]
+
+    def copy(self, *paths: Path) -> None:
+        """Files into its root's home."""
+        subprocess.run(["scp", "-q", "-F", self._config, *paths, "board:"], check=True)
+
+    @contextlib.contextmanager
+    def known_to_ssh(self) -> Iterator[None]:
+        """Let `ssh board` of any program that we start mean this computer."""
+        programs = self._folder / "programs"
+        programs.mkdir(exist_ok=True)
+        for name in ("ssh", "scp"):
+            there = shutil.which(name)
+            (programs / name).write_text(f'#!/bin/sh\nexec {there} -F {self._config} "$@"\n')
+            (programs / name).chmod(0o755)
+        before = os.environ["PATH"]
+        os.environ["PATH"] = f"{programs}{os.pathsep}{before}"
+        try:
+            yield
+        finally:
+            os.environ["PATH"] = before
+
+    def install(self, bundle: Path) -> subprocess.CompletedProcess[str]:
+        """Install a bundle that was sent there."""
+        return self.run(f"{INSTALL} install {bundle.name}")
+
+    def upgrade(self, bundle: Path) -> None:
+        """Install one that must be taken. UserError with the installer's line."""
+        if (done := self.install(bundle)).returncode != 0:
+            raise UserError(f"on the board: {done.stderr.strip()}")
+
+    def send(self, bundle: Path) -> None:
+        """Copy a bundle and its signature there."""
+        self.copy(bundle, Path(f"{bundle}.sig"))
+
+    def status(self) -> dict[str, Any]:
+        """What the installed release says of itself. UserError where it is not whole."""
+        done = self.run(f"python3 /opt/phil/current/{NAME} status --json")
+        if done.returncode != 0:
+            raise UserError(f"the board is broken: {(done.stdout + done.stderr).strip()}")
+        return dict(json.loads(done.stdout))
+
+    def current(self) -> str:
+        """The version that is current, and whole."""
+        return str(self.status()["current"])
+
+    def wait_until_active(self) -> None:
+        """Until the service is up; TimeoutError."""
+        wait_until(
+            lambda: self.show(MAIN_UNIT, "ActiveState") == "active", MAIN_UNIT, _BACK_LIMIT_S
+        )
+
+    def show(self, unit: str, name: str) -> str:
+        """A property of a unit, as `systemctl show` prints it."""
+        return self.run(f"systemctl show --value --property={name} {unit}").stdout.strip()
+
+    def _is_up(self) -> bool:
+        assert self._machine is not None
+        if self._machine.poll() is not None:
+            raise UserError(f"qemu ended with status {self._machine.returncode}")
+        return self.run("systemctl is-system-running").stdout.strip() in ("running", "degraded")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.cut_power()
+
+
+def make_image(cache: Path) -> None:
+    """A disk with Debian on it, its kernel, and the key that opens it; minutes, once.
+
+    Raises:
+        UserError: debootstrap failed, for instance without a network.
+    """
+    cache.mkdir(parents=True, exist_ok=True)
+    for name in ("key", "key.pub"):
+        (cache / name).unlink(missing_ok=True)
+    shutil.rmtree(cache / "root", ignore_errors=True)
+    key = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(cache / "key")]
+    subprocess.run(key, check=True)
+    # In a mount namespace of its own: what it mounts is gone with it, whatever happens.
+    apart = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-e", "-c"]
+    done = subprocess.run(
+        [*apart, _MAKE_IMAGE, "sh", str(cache.absolute()), str((cache / "key.pub").absolute())],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    shutil.rmtree(cache / "root", ignore_errors=True)
+    if done.returncode != 0:
+        lines = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+        raise UserError(f"no image of the board: {(lines or ['failed'])[-1]}")
+
+
+def prove_aarch64(cache: Path, wheels: Path, cuts: int, keep: Keep) -> None:
+    """Install, drive, upgrade, spoil, hang and cut off an emulated board.
+
+    Raises:
+        UserError: a step failed that must not.
+    """
+    if not (cache / "disk").exists():
+        make_image(cache)
+    with tempfile.TemporaryDirectory(prefix="phil-board-") as place:
+        folder = Path(place)
+        parcels = Parcels(folder, wheels, ENDPOINT)
+        with Board(cache, folder) as board:
+            report: dict[str, Any] = {"boot_s": board.boot(), "is": board.run(_WHAT_IT_IS).stdout}
+            report |= _push(board, parcels)
+            report["status"] = board.status()
+            report["episode"] = _drive_through_ssh(board, parcels)
+            report["service"] = _look_at_service(board)
+            report["hung_to_active_s"] = _hang(board)
+            keep(report)
+            lights = [parcels.light(f"# {number}") for number in range(3)]
+            board.run(f"cp -al /opt/phil/current/site-packages {_LIBRARIES}")
+            board.run(f"rm -r {_LIBRARIES}/edge_runtime")
+            board.copy(folder / NAME)
+            for light in lights:
+                board.send(light)
+            report["rolled_back"] = _upgrade_and_back(board, lights[0])
+            report["changed_bytes"] = _change_bytes(board, lights[1])
+            report["faulty"] = {
+                why: _install_faulty(board, parcels.light(line)) for why, line in FAULTS.items()
+            }
+            keep(report)
+            for cut in _cut(board, lights, cuts):
+                keep(report | {"power_cuts": cut})
+            report["power_cuts"] = cut
+            board.run(f"{INSTALL} uninstall")
+            left = board.run("ls -d /opt/phil /etc/systemd/system/phil-*.service").stdout.split()
+            keep(report | {"left_after_uninstall": left})
+
+
+def _push(board: Board, parcels: Parcels) -> dict[str, Any]:
+    """`deploy push` of a whole bundle, over the system's ssh, to a healthy service."""
+    bundle = parcels.whole("linux-aarch64")
+    push = ["push", "board", str(bundle), "--trust", str(parcels.trust), "--no-sudo"]
+    begun_s = time.monotonic()
+    with board.known_to_ssh(), _silent():
+        if deploy(push) != 0:
+            raise UserError("deploy push does not install; its own line above says why")
+    took_s = round(time.monotonic() - begun_s, 1)
+    return {"bundle_mb": bundle.stat().st_size / 1e6, "pushed_and_installed_s": took_s}
+
+
+def _drive_through_ssh(board: Board, parcels: Parcels) -> dict[str, Any]:
+    """One left turn by the board, which reaches the simulator here through our ssh only."""
+    port = _free_port()
+    tunnel = board.ssh("-N", options=("-R", f"{_PORT}:127.0.0.1:{port}"))
+    with subprocess.Popen(tunnel, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as link:
+        try:
+            return _drive(parcels.certificates, port)
+        finally:
+            link.terminate()
+
+
+def _drive(certificates: Path, port: int) -> dict[str, Any]:
+    """One left turn in real time; parts of the simulator's report."""
+    out = certificates / "episode.json"
+    words = [
+        "bridge", "simulate", "--env", "left_turn", "--clock", "realtime", "--episodes", "1",
+        "--listen", f"tls/127.0.0.1:{port}", "--vehicle-id", VEHICLE, "--wait-edge-s", "120",
+        "--tls", str(certificates / f"simulator-{VEHICLE}"), "--out", str(out),
+    ]  # fmt: skip
+    with BackgroundCommand(*words, quiet=True) as simulator:
+        simulator.wait(_EPISODE_LIMIT_S)
+    report = json.loads(out.read_text())
+    kept = ("success_rate", "answered_states", "latency_ms", "safe_stops", "rejected", "policy_id")
+    return {name: report[name] for name in kept} | {"outcome": report["per_episode"][0]["outcome"]}
+
+
+def _look_at_service(board: Board) -> dict[str, Any]:
+    """What the kernel and systemd say of the service's process, and what it could write."""
+    pid = board.show(MAIN_UNIT, "MainPID")
+    lines = board.run(f"cat /proc/{pid}/status").stdout.splitlines()
+    rows = dict(line.split(":", 1) for line in lines)
+    enter = f"nsenter --target {pid} --mount --root=/proc/{pid}/root --wd=/ touch"
+    said = board.run(f"systemd-analyze security --no-pager {MAIN_UNIT}").stdout
+    return {
+        **{name: " ".join(rows[name].split()) for name in _FACTS},
+        "written": [path for path in _FORBIDDEN if board.run(f"{enter} {path}").returncode == 0],
+        "can_unit": board.show("phil-can", "Result"),
+        "exposure": float(said.split("exposure level for")[1].split(":")[1].split()[0]),
+    }
+
+
+def _hang(board: Board) -> float:
+    """Stop the process as a hang would; seconds until systemd has another one ready."""
+    pid, begun_s = board.show(MAIN_UNIT, "MainPID"), time.monotonic()
+    board.run(f"kill -STOP {pid}")
+    wait_until(
+        lambda: board.show(MAIN_UNIT, "MainPID") not in ("0", pid), "another process", _BACK_LIMIT_S
+    )
+    board.wait_until_active()
+    return round(time.monotonic() - begun_s, 1)
+
+
+def _upgrade_and_back(board: Board, light: Path) -> bool:
+    """Whether an upgrade became current, and a roll-back the release before."""
+    before = board.current()
+    board.upgrade(light)
+    upgraded = board.current()
+    if (done := board.run(f"{INSTALL} rollback")).returncode != 0:
+        raise UserError(f"on the board: {done.stderr.strip()}")
+    return upgraded != before and board.current() == before
+
+
+def _change_bytes(board: Board, bundle: Path) -> dict[str, Any]:
+    """Change one byte of a bundle, many times: each is refused, with nothing written."""
+    choice, data = random.Random(1), bundle.read_bytes()
+    changed, refused = bundle.with_name("changed.tar"), 0
+    shutil.copyfile(f"{bundle}.sig", f"{changed}.sig")
+    before = board.run(_FINGERPRINT).stdout
+    for place in choice.sample(range(len(data)), _CHANGED_BYTES):
+        changed.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        board.send(changed)
+        done = board.install(changed)
+        untouched = board.run(_FINGERPRINT).stdout == before
+        refused += done.returncode == 2 and "is refused" in done.stderr and untouched
+    return {"tried": _CHANGED_BYTES, "refused_and_nothing_written": refused}
+
+
+def _install_faulty(board: Board, bundle: Path) -> dict[str, Any]:
+    """Install a release that must go back by itself; what the installer says of it."""
+    before = board.current()
+    board.send(bundle)
+    done = board.install(bundle)
+    active = board.show(MAIN_UNIT, "ActiveState") == "active"
+    went_back = board.current() == before and active
+    return {"status": done.returncode, "said": done.stderr.strip(), "went_back": went_back}
+
+
+def _cut(board: Board, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]]:
+    """Cut the power at random moments of an upgrade; look, and let the same command complete it.
+
+    Yields what came of the cuts so far.
+    """
+    choice = random.Random(1)
+    begun_s = time.monotonic()
+    board.upgrade(lights[0])
+    whole_s = time.monotonic() - begun_s
+    said_last: Counter[str] = Counter()
+    current: Counter[str] = Counter()
+    broken: list[str] = []
+    boots_s: list[float] = []
+    for number in range(cuts):
+        before, bundle = board.current(), lights[(number + 1) % len(lights)]
+        install = board.ssh(f"{INSTALL} install {bundle.name}")
+        run = subprocess.Popen(
+            install, text=True, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+        time.sleep(choice.uniform(0.0, 1.1 * whole_s))
+        board.cut_power()
+        said = (run.communicate()[0].strip().splitlines() or ["nothing"])[-1].split()[0]
+        boots_s.append(board.boot())
+        said_last[said] += 1
+        try:
+            then = board.current()
+            current["the old one" if then == before else "the new one"] += 1
+            board.wait_until_active()
+            board.upgrade(bundle)
+            if board.current() == before:
+                raise UserError("the same command does not complete it")
+        except (UserError, TimeoutError) as error:
+            broken.append(f"cut {number}: {error}")
+        yield {
+            "cuts": number + 1, "broken": broken, "killed_after_it_said": dict(said_last),
+            "current_then": dict(current), "a_whole_upgrade_s": round(whole_s, 1),
+            "boots_s": boots_s,
+        }  # fmt: skip
+
+
+def prove_python38(wheels: Path) -> dict[str, Any]:
+    """Install offline under Python 3.8, run the release as a container would, drive; a report."""
+    python, port = str(find_python38()), _free_port()
+    with tempfile.TemporaryDirectory(prefix="phil-python38-") as place:
+        folder = Path(place)
+        parcels = Parcels(folder, wheels, f"tls/127.0.0.1:{port}")
+        bundle, opt = parcels.whole("linux-x86_64"), folder / "opt"
+
+        def run(*words: str) -> str:
+            done = subprocess.run(
+                ["unshare", "--net", python, "-I", folder / NAME, *words, "--root", opt],
+                capture_output=True, text=True, check=False, env={"PATH": os.defpath},
+            )  # fmt: skip
+            if done.returncode != 0:
+                raise UserError(f"install.pyz {words[0]}: {done.stderr.strip()}")
+            return done.stdout
+
+        begun_s = time.monotonic()
+        run("install", str(bundle), "--trust", str(parcels.trust), "--service", "none")
+        report = {
+            "bundle_mb": bundle.stat().st_size / 1e6,
+            "installed_s": round(time.monotonic() - begun_s, 2),
+            "status": json.loads(run("status", "--json")),
+        }
+        words = [str(opt / "current/bin/phil-edge"), "run", "--config", "config.toml"]
+        with subprocess.Popen(words, cwd=opt / "current", stderr=subprocess.DEVNULL) as runtime:
+            try:
+                report["episode"] = _drive(parcels.certificates, port)
+            finally:
+                runtime.terminate()
+        run("uninstall")
+        return {**report, "left_after_uninstall": opt.exists()}
+
+
+def _free_port() -> int:
+    return int(free_endpoint().rpartition(":")[2])
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from rich.table import Table
 from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, positive_number
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
-from hil_tests.processes import BackgroundCommand, Operator, run_command
+from hil_tests.processes import BackgroundCommand, operator, run_command
 
 MARKER = ".phil-demo"
 """Says that a directory is a demo's, so that the demo may replace what is in it."""
@@ -211,7 +211,7 @@ class Demo:
                 viewer = stack.enter_context(
                     BackgroundCommand("bridge", "view", "--save", str(recording), *common)
                 )
-            stack.enter_context(Operator(endpoint, VEHICLE))
+            stack.enter_context(operator(endpoint, VEHICLE))
             run_command(
                 "bridge", "simulate", "--env", "left_turn", "--episodes", str(episodes),
                 "--clock", clock, "--latency", latency, "--listen", endpoint,

@@ -1,15 +1,14 @@
 """``python -m hil_tests doctor``: what this machine can and cannot do, and how to get the rest.
 
-Each probe does the thing instead of looking for it. Above it stands what is not there
-without it, and how to get it. It runs in a fresh clone, before anything is installed, so
-only the standard library is imported up here; heavy libraries are tried in a process of their own.
+Each probe does the thing instead of looking for it; CHECKS, at the end, says what is not there
+without it. It runs in a fresh clone, before anything is installed, so only the standard library is
+imported up here; heavy libraries are tried in a process of their own.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import json
 import os
 import platform
@@ -20,11 +19,12 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.util import UserError
@@ -38,42 +38,49 @@ TIMEOUT_S = 60.0
 ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "requirements" / "workstation.txt"
 OLDEST = (3, 11)
-DISK_BYTES = 2 * 10**9
+DISK_GB = 2
 """A training run with its checkpoint takes some 0.5 GB, recordings and pictures come on top."""
-MEMORY_BYTES = 2 * 10**9
+MEMORY_GB = 2
 """A full replay buffer and torch take 1.2 GB."""
 ARRIVAL_S = 5.0
 LOOPBACK = "127.0.0.1"
 _CAN_DEVICE = "280"
 """ARPHRD_CAN of linux/if_arp.h."""
-_EVENTS = Path("/dev/input")
-_TORCH = """
-import json, logging, os, sys
-import torch
-import trainer.learner.kernel as kernel
-why = []
-kernel._LOGGER.addHandler(logging.Handler())
-logging.Handler.emit = lambda self, record: why.append(record.getMessage())
-built = kernel.load("trunk") is not None
-gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else ""
-print(json.dumps({"torch": torch.__version__, "kernel": built, "why": why, "gpu": gpu}))
+_KERNEL = """
+import os, sys, torch
+from trainer.learner.kernel import load
+if load("trunk") is None:  # it has said why
+    sys.exit("turned off by PHIL_KERNEL=0" if os.environ.get("PHIL_KERNEL") == "0" else 1)
+print("the learner's kernel is built and loaded")
 """
-_SDL = """
-import json, os
-os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
-os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
-import pygame
-facts = {"driver": "", "why": "", "controllers": []}
+_GPU = """
+import sys, torch
+if not torch.cuda.is_available():
+    sys.exit(f"torch {torch.__version__} sees no CUDA device")
+print(torch.cuda.get_device_name(0))
+"""
+_WINDOW = """
+import os, sys, pygame
 try:
     pygame.display.init()
-    facts["driver"] = pygame.display.get_driver()
-except pygame.error as error:
-    facts["why"] = str(error)
+    driver = pygame.display.get_driver()
+except pygame.error:
+    driver = "dummy"
+if driver in ("dummy", "offscreen"):
+    shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    where = f"display {shown}" if shown else "neither DISPLAY nor WAYLAND_DISPLAY is set"
+    sys.exit(f"SDL opens no window ({where})")
+print(f"SDL's driver {driver}")
+"""
+_CONTROLLERS = """
+import os, sys
+os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
+import pygame
 pygame.joystick.init()
-for number in range(pygame.joystick.get_count()):
-    stick = pygame.joystick.Joystick(number)
-    facts["controllers"].append(f"{stick.get_name()} ({stick.get_numaxes()} axes)")
-print(json.dumps(facts))
+sticks = [pygame.joystick.Joystick(number) for number in range(pygame.joystick.get_count())]
+if not sticks:
+    sys.exit("SDL sees no game controller")
+print(", ".join(f"{stick.get_name()} ({stick.get_numaxes()} axes)" for stick in sticks))
 """
 EXAMPLE = examples(
     "python -m hil_tests doctor",
@@ -85,7 +92,7 @@ EXAMPLE = examples(
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--only", metavar="GROUP", nargs="+", default=list(CHECKS), help=f"of {', '.join(CHECKS)}"
+        "--only", metavar="GROUP", nargs="+", default=GROUPS, help=f"of {', '.join(GROUPS)}"
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
@@ -97,14 +104,17 @@ def run(arguments: argparse.Namespace) -> int:
         UserError: a group that is not there.
     """
     for group in arguments.only:
-        if group not in CHECKS:
-            raise UserError(f"no group {group!r}: choose from {', '.join(CHECKS)}")
+        if group not in GROUPS:
+            raise UserError(f"no group {group!r}: choose from {', '.join(GROUPS)}")
     found: list[Finding] = []
-    for finding in examine_all(arguments.only):
+    for check in CHECKS:
+        if check.group not in arguments.only:
+            continue
+        finding = examine(check)
         if not arguments.json:
             if not found or found[-1].group != finding.group:
                 print(f"\n{finding.group}")
-            print("\n".join(lines(finding)), flush=True)
+            print(lines(finding), flush=True)
         found.append(finding)
     if arguments.json:
         print(json.dumps({"basics": basics_work(found), "checks": [f._asdict() for f in found]}))
@@ -113,75 +123,22 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if basics_work(found) else NOT_READY
 
 
-def examine_all(groups: list[str]) -> Iterator[Finding]:
-    """Each check of these groups, as soon as it is made."""
-    for group in groups:
-        for check in CHECKS[group]:
-            yield examine(group, check)
-
-
-def basics_work(found: list[Finding]) -> bool:
-    """Whether nothing basic is missing."""
-    return all(finding.ok for finding in found if finding.basic)
-
-
-def lines(finding: Finding) -> list[str]:
-    """A line where it is there; what it is for and how to get it where it is not."""
-    said = f"{finding.name}: {finding.detail}"
-    if finding.ok:
-        return [f"  ok       {said}"]
-    return [
-        f"  missing  {said}",
-        f"           without it: {finding.without}",
-        f"           get it: {finding.remedy}",
-    ]
-
-
-def summary(found: list[Finding]) -> str:
-    """The last line."""
-    missing = [finding.name for finding in found if not finding.ok]
-    if not basics_work(found):
-        basics = ", ".join(finding.name for finding in found if finding.basic and not finding.ok)
-        return f"The basics do not work here: {basics}."
-    basics = "The basics work. " if any(finding.basic for finding in found) else ""
-    if missing:
-        return f"{basics}Missing{' besides' if basics else ''}: {', '.join(missing)}."
-    return f"{basics}Nothing is missing."
-
-
 class MissingError(Exception):
     """The machine has it not; the text says what was tried and what came of it."""
 
 
-Probe = Callable[[], str]
-"""Does it, and says in a few words what it found; any exception says that it is missing."""
-
-
 class Check(NamedTuple):
-    """One thing that a machine may have."""
+    """One thing that a machine may have.
 
+    ``probe`` does it, and says in a few words what it found; any exception says that it is missing.
+    ``without`` says what is left where it is missing, or is not; ``remedy``, how to get it.
+    """
+
+    group: str
     name: str
-    probe: Probe
+    probe: Callable[[], str]
     without: str
-    """What there is where it is missing, or is not."""
     remedy: str
-    """How to get it."""
-
-
-CHECKS: dict[str, list[Check]] = {
-    group: [] for group in (BASICS, "training", "person", "seeing", "ports", "vehicle", "board")
-}
-"""Group -> its checks; `check` puts them there. Nothing much works without the basics."""
-
-
-def check(group: str, name: str, without: str, remedy: str) -> Callable[[Probe], Probe]:
-    """Put a probe into CHECKS."""
-
-    def add(probe: Probe) -> Probe:
-        CHECKS[group].append(Check(name, probe, without, remedy))
-        return probe
-
-    return add
 
 
 class Finding(NamedTuple):
@@ -191,40 +148,61 @@ class Finding(NamedTuple):
     name: str
     ok: bool
     detail: str
-    basic: bool
     without: str
     remedy: str
 
 
-def examine(group: str, check: Check) -> Finding:
+def examine(check: Check) -> Finding:
     """Make a check; whatever goes wrong in it is its finding."""
-    remedy = check.remedy
+    ok, remedy = False, check.remedy
     try:
         ok, detail = True, check.probe()
-    # Whatever it is that was to be tried: it was not come to.
-    except ModuleNotFoundError as error:
-        ok, detail, remedy = False, f"Python finds no module {error.name}", INSTALL
+    except ModuleNotFoundError as error:  # the thing itself was not tried
+        detail, remedy = f"Python finds no module {error.name}", INSTALL
     except (MissingError, UserError) as error:
-        ok, detail = False, str(error)
+        detail = str(error)
     # A broken library may raise anything at all, and the checks after it are still wanted.
     except Exception as error:
-        ok, detail = False, f"{type(error).__name__}: {error}"
+        detail = f"{type(error).__name__}: {error}"
     text = " ".join(detail.split())
-    return Finding(group, check.name, ok, text, group == BASICS, check.without, remedy)
+    return Finding(check.group, check.name, ok, text, check.without, remedy)
 
 
-@check(BASICS, "Python", "nothing", "Python 3.11 or newer; make PYTHON=...")
-def python() -> str:
-    """The interpreter that runs this."""
+def basics_work(found: list[Finding]) -> bool:
+    """Whether nothing basic is missing."""
+    return all(finding.ok for finding in found if finding.group == BASICS)
+
+
+def lines(finding: Finding) -> str:
+    """A line where it is there; what it is for and how to get it where it is not."""
+    said = f"{finding.name}: {finding.detail}"
+    if finding.ok:
+        return f"  ok       {said}"
+    indent = "\n" + 11 * " "
+    return f"  missing  {said}{indent}without it: {finding.without}{indent}get it: {finding.remedy}"
+
+
+def summary(found: list[Finding]) -> str:
+    """The last line."""
+    missing = [finding for finding in found if not finding.ok]
+    if not basics_work(found):
+        names = ", ".join(finding.name for finding in missing if finding.group == BASICS)
+        return f"The basics do not work here: {names}."
+    basics = "The basics work. " if any(finding.group == BASICS for finding in found) else ""
+    if missing:
+        names = ", ".join(finding.name for finding in missing)
+        return f"{basics}Missing{' besides' if basics else ''}: {names}."
+    return f"{basics}Nothing is missing."
+
+
+def _python() -> str:
     number = tuple(map(int, platform.python_version_tuple()[:2]))
     if number < OLDEST:
         raise MissingError(f"this is Python {platform.python_version()}")
     return f"{platform.python_version()}, {sys.executable}"
 
 
-@check(BASICS, "packages", "nothing that imports them", INSTALL)
-def packages() -> str:
-    """Every library that pyproject.toml asks for is there."""
+def _packages() -> str:
     import tomllib  # An older Python has none, and is to say so in the check before.
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -235,12 +213,28 @@ def packages() -> str:
     return f"all {len(wanted)} that pyproject.toml asks for"
 
 
-@check(
-    BASICS, "loopback", "no drive over Zenoh, no `make demo`, no `make test`",
-    "TCP on 127.0.0.1: `ip link set lo up`, or a rule in the firewall",
-)  # fmt: skip
-def zenoh_loopback() -> str:
-    """A message from one Zenoh session to another, over TCP on loopback."""
+def _versions() -> str:
+    locked = dict(line.split("==") for line in LOCK.read_text().splitlines() if "==" in line)
+    found = {name: version for name in locked if (version := _installed(name)) is not None}
+    other = [
+        f"{name} {version} (locked: {locked[name]})"
+        for name, version in found.items()
+        # torch says +cpu or +cu130 behind its version.
+        if version.split("+")[0] != locked[name]
+    ]
+    if other:
+        raise MissingError(f"other versions: {', '.join(other)}")
+    return f"{len(found)} packages as in {LOCK.name}"
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _loopback() -> str:
     from edge_runtime.link_probe import free_endpoint
     from edge_runtime.transport import open_session
 
@@ -259,156 +253,34 @@ def zenoh_loopback() -> str:
     return f"a message went over {endpoint}"
 
 
-@check(
-    BASICS, "disk", "no training, no recordings (--out)",
-    "free some space, or work in another directory",
-)  # fmt: skip
-def disk() -> str:
-    """Room where runs are written by default, and the right to write there."""
+def _disk() -> str:
     with tempfile.NamedTemporaryFile(dir=Path.cwd(), prefix=".doctor-") as file:
         file.write(b"doctor")
-    free = shutil.disk_usage(Path.cwd()).free
-    if free < DISK_BYTES:
-        raise MissingError(f"{free / 1e9:.1f} GB are free here, {DISK_BYTES / 1e9:.0f} are wanted")
-    return f"{free / 1e9:.0f} GB free in {Path.cwd()}"
+    return _enough(shutil.disk_usage(Path.cwd()).free, DISK_GB, f"free in {Path.cwd()}")
 
 
-@check(BASICS, "memory", "no training", "end other programs")
-def memory() -> str:
-    """Memory that could be had now."""
-    lines = Path("/proc/meminfo").read_text().splitlines()
-    available = next(int(line.split()[1]) * 1024 for line in lines if "MemAvailable" in line)
-    if available < MEMORY_BYTES:
-        raise MissingError(f"{available / 1e9:.1f} GB available, {MEMORY_BYTES / 1e9:.0f} wanted")
-    return f"{available / 1e9:.0f} GB available, {os.cpu_count()} cores"
+def _memory() -> str:
+    rows = Path("/proc/meminfo").read_text().splitlines()
+    available = next(int(row.split()[1]) * 1024 for row in rows if "MemAvailable" in row)
+    return _enough(available, MEMORY_GB, f"available, {os.cpu_count()} cores")
 
 
-@check("training", "locked versions", "everything, but not to the last bits of results/", INSTALL)
-def versions() -> str:
-    """What is installed is what the lock names."""
-    locked = dict(line.split("==") for line in LOCK.read_text().splitlines() if "==" in line)
-    found = {name: version for name in locked if (version := _installed(name)) is not None}
-    other = [
-        f"{name} {version} (locked: {locked[name]})"
-        for name, version in found.items()
-        # torch says +cpu or +cu130 behind its version.
-        if version.split("+")[0] != locked[name]
-    ]
-    if other:
-        raise MissingError(f"other versions: {', '.join(other)}")
-    return f"{len(found)} packages as in {LOCK.name}"
+def _enough(size: int, wanted_gb: int, what: str) -> str:
+    said = f"{size / 1e9:.1f} GB {what}"
+    if size < wanted_gb * 10**9:
+        raise MissingError(f"{said}; {wanted_gb} are wanted")
+    return said
 
 
-@check(
-    "training", "C++ kernel", "everything, but `trainer train` takes several times as long",
-    "a C++ compiler: apt install g++",
-)  # fmt: skip
-def kernel() -> str:
-    """The learner's C++ kernel builds and loads."""
-    facts = _torch_facts()
-    if not facts["kernel"]:
-        raise MissingError("; ".join(facts["why"]) or "turned off by PHIL_KERNEL=0")
-    return "the learner's kernel is built and loaded"
-
-
-@check(
-    "training", "GPU", "no `trainer train --device cuda`; the processor trains, too",
-    "an NVIDIA GPU with its driver, and torch with CUDA",
-)  # fmt: skip
-def gpu() -> str:
-    """Torch sees a CUDA device."""
-    facts = _torch_facts()
-    if not facts["gpu"]:
-        raise MissingError(f"torch {facts['torch']} sees no CUDA device")
-    return str(facts["gpu"])
-
-
-@check(
-    "person", "window", "no `--human keyboard`, `gamepad` or `wheel`, no rerun window (--spawn)",
-    "a desktop session; without one: --human web, and --serve or --save",
-)  # fmt: skip
-def window() -> str:
-    """SDL opens the display that pygame's window would be on."""
-    facts = _sdl()
-    if facts["driver"] in ("", "dummy", "offscreen"):
-        shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        where = f"display {shown}" if shown else "neither DISPLAY nor WAYLAND_DISPLAY is set"
-        raise MissingError(f"SDL opens no window ({where})")
-    return f"SDL's driver {facts['driver']}"
-
-
-@check(
-    "person", "gamepad or wheel", "no `--human gamepad`, no `--human wheel`",
-    "plug one in; if it is: the right to read /dev/input/* (group input)",
-)  # fmt: skip
-def controller() -> str:
-    """SDL sees a gamepad or a steering wheel."""
-    found = _sdl()["controllers"]
-    if found:
-        return ", ".join(found)
-    unreadable = [
-        str(path)
-        for path in [*_EVENTS.glob("event*"), *_EVENTS.glob("js*")]
-        if not os.access(path, os.R_OK)
-    ]
-    if unreadable:
-        raise MissingError(f"none that may be read: no right to {', '.join(sorted(unreadable))}")
-    raise MissingError("SDL sees no game controller")
-
-
-@check("person", "Xvfb", "tests and pictures of the window skip", "apt install xvfb")
-def xvfb() -> str:
-    """An X server without a screen starts, and ends."""
-    reader, writer = os.pipe()
-    command = [_program("Xvfb"), "-displayfd", str(writer), "-nolisten", "tcp"]
-    server = subprocess.Popen(command, pass_fds=[writer], stderr=subprocess.DEVNULL)
-    os.close(writer)
-    try:
-        with os.fdopen(reader) as pipe:
-            display = pipe.readline().strip()
-    finally:
-        server.terminate()
-        server.wait()
-    if not display:
-        raise MissingError("Xvfb ends at once")
-    return f"display :{display} came up and went"
-
-
-def program(name: str, *arguments: str) -> Callable[[], str]:
-    """A probe: the program runs, and says what it is."""
-
-    def probe() -> str:
-        path = _program(name)
-        return (output_of(path, *arguments).splitlines() or [path])[0]
-
-    return probe
-
-
-check("person", "xdotool", "tests that press real keys skip", "apt install xdotool")(
-    program("xdotool", "--version")
-)
-
-
-@check(
-    "person", "Chromium", "tests of the browser cockpit skip, no picture of it",
-    "apt install chromium; any browser shows the cockpit",
-)  # fmt: skip
-def chromium() -> str:
-    """A browser that runs without a screen."""
+def _chromium() -> str:
     from trainer.util import CHROMIUM, find_chromium
 
     if (path := find_chromium()) is None:
         raise MissingError(f"none of {', '.join(CHROMIUM)} is installed")
-    return output_of(path, "--version")
+    return program_says(path, "--version")
 
 
-@check(
-    "seeing", "rerun's viewer",
-    "no rerun window (--spawn), no pictures of rerun; --serve and --save do",
-    "a graphics card with Vulkan, or apt install mesa-vulkan-drivers",
-)  # fmt: skip
-def rerun_viewer() -> str:
-    """Rerun's viewer comes up without a screen, and goes."""
+def _viewer() -> str:
     from hil_tests.processes import headless_viewer
 
     with headless_viewer() as client:
@@ -416,41 +288,17 @@ def rerun_viewer() -> str:
     return f"came up and drew a picture of {len(picture) / 1000:.0f} kB"
 
 
-def port(number: int) -> Callable[[], str]:
-    """A probe: the port is free on loopback."""
-
-    def probe() -> str:
-        with socket.socket() as listener:
-            # As a server does: links of one that has just ended are no bar.
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                listener.bind((LOOPBACK, number))
-                listener.listen()
-            except OSError as error:
-                raise MissingError(f"{LOOPBACK}:{number}: {error.strerror}") from None
-        return f"{LOOPBACK}:{number} is free"
-
-    return probe
+def port(number: int) -> str:
+    """Listen on a port of loopback."""
+    with socket.socket() as listener:
+        # As a server does: links of one that has just ended are no bar.
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((LOOPBACK, number))
+        listener.listen()
+    return f"{LOOPBACK}:{number} is free"
 
 
-check(
-    "ports", "7447", "no `bridge simulate`, no `bridge router` without options",
-    "end who listens there, or give --listen and --connect another port",
-)(port(7447))  # fmt: skip
-check(
-    "ports", "7448", "no `bridge ros2` without options",
-    "end who listens there, or give --ros2-listen another port",
-)(port(7448))  # fmt: skip
-check("ports", "9876", "no --serve, no --spawn", "end the other rerun")(port(9876))
-check("ports", "9090", "no --serve", "end the other rerun")(port(9090))
-
-
-@check(
-    "vehicle", "CAN over UDP", "no `hil_tests mock_hunter` without options",
-    "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`",
-)  # fmt: skip
-def multicast_can() -> str:
-    """A CAN frame from one bus to another on a group and port of their own."""
+def _can_over_udp() -> str:
     import can
 
     from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
@@ -467,16 +315,8 @@ def multicast_can() -> str:
     return "a frame went through UDP multicast on loopback"
 
 
-@check(
-    "vehicle", "CAN interface", "no `edge_runtime run --bus socketcan:can0`",
-    "a CAN adapter: `ip link set can0 up type can bitrate 500000`",
-)  # fmt: skip
-def can_interface() -> str:
-    """SocketCAN's sockets open, and there is an interface to bind them to."""
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except OSError as error:
-        raise MissingError(f"this kernel opens no CAN socket: {error.strerror}") from None
+def _can_interface() -> str:
+    socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()  # the kernel has them
     kinds = {path.parent.name: path.read_text() for path in Path("/sys/class/net").glob("*/type")}
     found = sorted(name for name, kind in kinds.items() if kind.strip() == _CAN_DEVICE)
     if not found:
@@ -484,89 +324,30 @@ def can_interface() -> str:
     return ", ".join(found)
 
 
-@check(
-    "vehicle", "virtual CAN", "no `--bus socketcan:vcan0`; udp_multicast does it",
-    "root, and `modprobe vcan`: `ip link add vcan0 type vcan`",
-)  # fmt: skip
-def virtual_can() -> str:
-    """The kernel makes a vcan device, in a network namespace that goes with the command."""
-    _program("unshare")
+def _virtual_can() -> str:
+    # In a network namespace, which goes with the command.
     mine = () if os.geteuid() == 0 else ("--user", "--map-root-user")
     words = ("ip", "link", "add", "dev", "doctor0", "type", "vcan")
-    output_of("unshare", *mine, "--net", *words, name="ip link add type vcan")
+    program_says("unshare", *mine, "--net", *words)
     return "a vcan device could be made"
 
 
-@check(
-    "vehicle", "real-time priority",
-    "`edge_runtime run`, but a busy machine may make its commands late",
-    "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)",
-)  # fmt: skip
-def realtime_priority() -> str:
-    """A thread gets the priority that `edge_runtime run` may ask for."""
-    try:
-        # The thread keeps the priority to itself, and ends with it.
-        with ThreadPoolExecutor(1) as thread:
-            thread.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).result()
-    except OSError as error:
-        raise MissingError(f"SCHED_FIFO is refused: {error.strerror}") from None
+def _realtime_priority() -> str:
+    # The thread keeps the priority to itself, and ends with it.
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).result()
     return "SCHED_FIFO was given to a thread"
 
 
-@check("board", "ssh", "no `deploy push`", "apt install openssh-client")
-def ssh() -> str:
-    """OpenSSH says its version on stderr."""
-    path = _program("ssh")
-    output_of(path, "-V")
-    return path
+def _board(name: str) -> str:
+    from hil_tests.board import why_not
+
+    if reason := why_not(name):
+        raise MissingError(reason)
+    return f"hil_tests board --boards {name} can run"
 
 
-def board(name: str) -> Callable[[], str]:
-    """A probe: this machine can be the board, as `hil_tests board` would find out."""
-
-    def probe() -> str:
-        from hil_tests.board import why_not
-
-        if reason := why_not(name):
-            raise MissingError(reason)
-        return f"hil_tests board --boards {name} can run"
-
-    return probe
-
-
-check(
-    "board", "aarch64", "no `hil_tests board --boards aarch64`",
-    "root, apt install debootstrap qemu-user-static qemu-system-arm qemu-utils",
-)(board("aarch64"))  # fmt: skip
-check(
-    "board", "Python 3.8", "no `hil_tests board --boards python38`",
-    "root, and a python3.8 (pyenv install 3.8)",
-)(board("python38"))  # fmt: skip
-
-
-def _installed(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-@functools.lru_cache(maxsize=None)  # noqa: UP033
-def _torch_facts() -> dict[str, Any]:
-    # A driver that does not fit may end the process that asks for it.
-    facts: dict[str, Any] = json.loads(output_of_python(_TORCH).splitlines()[-1])
-    return facts
-
-
-# Not functools.cache: an older Python, too, is to hear that it is too old.
-@functools.lru_cache(maxsize=None)  # noqa: UP033
-def _sdl() -> dict[str, Any]:
-    # In a process of its own: a display that is gone may end it.
-    facts: dict[str, Any] = json.loads(output_of_python(_SDL).splitlines()[-1])
-    return facts
-
-
-def output_of_python(script: str) -> str:
+def python_says(script: str) -> str:
     """What a script prints, in a process of its own.
 
     Raises:
@@ -574,37 +355,94 @@ def output_of_python(script: str) -> str:
         MissingError: it fails in another way.
     """
     try:
-        return output_of(sys.executable, "-c", script)
+        return program_says(sys.executable, "-c", script)
     except MissingError as error:
-        absent = re.search(r"ModuleNotFoundError: No module named '([\w.]+)'", str(error))
-        if absent is None:
-            raise
-        raise ModuleNotFoundError(name=absent[1]) from None
+        said = str(error).partition(": ")[2]
+        if said.startswith("ModuleNotFoundError"):
+            raise ModuleNotFoundError(name=said.split("'")[1]) from None
+        raise MissingError(said) from None
 
 
-def output_of(*command: str, name: str = "") -> str:
-    """What a program prints; ``name`` is for the error, the program's own if not given.
+def program_says(*command: str) -> str:
+    """The first line that a program prints, or where it is if it prints none.
 
     Raises:
         MissingError: it is not there, fails, or does not end.
     """
-    name = name or command[0].rpartition("/")[2]
+    name = Path(command[0]).name
+    if (path := shutil.which(command[0])) is None:
+        raise MissingError(f"{name} is not installed")
+    quiet = {**os.environ, "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S
+            command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S, env=quiet
         )
-    except FileNotFoundError:
-        raise MissingError(f"{name} is not installed") from None
     except (OSError, subprocess.TimeoutExpired) as error:
         raise MissingError(f"{name}: {error}") from None
     if done.returncode != 0:
-        lines = (done.stderr or done.stdout).strip().splitlines()
-        raise MissingError(f"{name}: {(lines or [f'exit status {done.returncode}'])[-1]}")
-    return done.stdout.strip()
+        said = (done.stderr or done.stdout).strip() or f"exit status {done.returncode}"
+        raise MissingError(f"{name}: {said.splitlines()[-1]}")
+    return done.stdout.partition("\n")[0] or path
 
 
-def _program(name: str) -> str:
-    """Where it is."""
-    if (path := shutil.which(name)) is None:
-        raise MissingError(f"{name} is not installed")
-    return path
+CHECKS = (
+    Check(BASICS, "Python", _python, "nothing", "Python 3.11 or newer; make PYTHON=..."),
+    Check(BASICS, "packages", _packages, "nothing that imports them", INSTALL),
+    Check(BASICS, "loopback", _loopback, "no drive over Zenoh, no `make demo`, no `make test`",
+          "TCP on 127.0.0.1: `ip link set lo up`, or a rule in the firewall"),
+    Check(BASICS, "disk", _disk, "no training, no recordings (--out)",
+          "free some space, or work in another directory"),
+    Check(BASICS, "memory", _memory, "no training", "end other programs"),
+    Check("training", "locked versions", _versions,
+          "everything, but not to the last bits of results/", INSTALL),
+    Check("training", "C++ kernel", partial(python_says, _KERNEL),
+          "everything, but `trainer train` takes several times as long",
+          "a C++ compiler: apt install g++"),
+    Check("training", "GPU", partial(python_says, _GPU),
+          "no `trainer train --device cuda`; the processor trains, too",
+          "an NVIDIA GPU with its driver, and torch with CUDA"),
+    Check("person", "window", partial(python_says, _WINDOW),
+          "no `--human keyboard`, `gamepad` or `wheel`, no rerun window (--spawn)",
+          "a desktop session; without one: --human web, and --serve or --save"),
+    Check("person", "gamepad or wheel", partial(python_says, _CONTROLLERS),
+          "no `--human gamepad`, no `--human wheel`",
+          "plug one in; if it is: the right to read /dev/input/* (group input)"),
+    Check("person", "Xvfb", partial(program_says, "Xvfb", "-help"),
+          "tests and pictures of the window skip", "apt install xvfb"),
+    Check("person", "xdotool", partial(program_says, "xdotool", "--version"),
+          "tests that press real keys skip", "apt install xdotool"),
+    Check("person", "Chromium", _chromium,
+          "tests of the browser cockpit skip, no picture of it",
+          "apt install chromium; any browser shows the cockpit"),
+    Check("seeing", "rerun's viewer", _viewer,
+          "no rerun window (--spawn), no pictures of rerun; --serve and --save do",
+          "a graphics card with Vulkan, or apt install mesa-vulkan-drivers"),
+    Check("ports", "7447", partial(port, 7447),
+          "no `bridge simulate`, no `bridge router` without options",
+          "end who listens there, or give --listen and --connect another port"),
+    Check("ports", "7448", partial(port, 7448), "no `bridge ros2` without options",
+          "end who listens there, or give --ros2-listen another port"),
+    Check("ports", "9876", partial(port, 9876), "no --serve, no --spawn", "end the other rerun"),
+    Check("ports", "9090", partial(port, 9090), "no --serve", "end the other rerun"),
+    Check("vehicle", "CAN over UDP", _can_over_udp, "no `hil_tests mock_hunter` without options",
+          "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`"),
+    Check("vehicle", "CAN interface", _can_interface,
+          "no `edge_runtime run --bus socketcan:can0`",
+          "a CAN adapter: `ip link set can0 up type can bitrate 500000`"),
+    Check("vehicle", "virtual CAN", _virtual_can,
+          "no `--bus socketcan:vcan0`; udp_multicast does it",
+          "root, and `modprobe vcan`: `ip link add vcan0 type vcan`"),
+    Check("vehicle", "real-time priority", _realtime_priority,
+          "`edge_runtime run`, but a busy machine may make its commands late",
+          "CAP_SYS_NICE, or `ulimit -r 99` (LimitRTPRIO=99 in a service)"),
+    Check("board", "ssh", partial(program_says, "ssh", "-V"), "no `deploy push`",
+          "apt install openssh-client"),
+    Check("board", "aarch64", partial(_board, "aarch64"),
+          "no `hil_tests board --boards aarch64`",
+          "root, apt install debootstrap qemu-user-static qemu-system-arm qemu-utils"),
+    Check("board", "Python 3.8", partial(_board, "python38"),
+          "no `hil_tests board --boards python38`",
+          "root, and a python3.8 (pyenv install 3.8)"),
+)  # fmt: skip
+"""In the order of the output. Nothing much works without the basics."""
+GROUPS = tuple(dict.fromkeys(check.group for check in CHECKS))

@@ -1,30 +1,47 @@
-"""``python -m hil_tests pictures``: every picture of the READMEs, made by commands."""
+"""``python -m hil_tests pictures``: every picture of the READMEs, made by commands.
+
+The loop's own pictures are drawn from a recording: the shipped policy in real time, with a mock
+vehicle and a network that fails once.
+"""
 
 from __future__ import annotations
 
 import argparse
-import io
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
+from matplotlib.figure import Figure
 
+from bridge.messages import Scene, decode_scene
+from bridge.recording import Recording, read_heard
+from bridge.rerun.wire_view import Timeline
+from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.files import check_writable, make_directory, write_atomic
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
-from hil_tests.loop_picture import VEHICLE_ID, loop, recorded_drive
-from hil_tests.processes import headless_viewer, run_command
-from hil_tests.report import write_figures
+from edge_runtime.wire import CONTROL_PERIOD_S
+from hil_tests.processes import (
+    POLICY,
+    PUBLIC_KEY,
+    BackgroundCommand,
+    headless_viewer,
+    operator,
+    run_command,
+)
+from hil_tests.report import write_figures, write_png
 from trainer.drivers import load_driver, make_environment
-from trainer.scenarios import SCENARIOS
 from trainer.training.metrics import read_metrics
 
-MOMENTS = {"left_turn": (8, 3.4), "congestion": (3, 5.0)}
+MOMENTS = {"left_turn": ("8", "3.4"), "congestion": ("3", "5.0")}
 """Scenario -> seed and time, s."""
 FILM_POLICY, FILM_SEED = "constant:0.3", "40"
 """Always the same throttle, and a drive in which it would meet a car, once: the guide brakes, hands
@@ -33,17 +50,27 @@ RUNS = Path("results/units/left_turn/phil_td3/normal")
 SHIPPED = Path("results/latency/left_turn/shipped.json")
 LOADED_S, DRAWN_S = 20.0, 5.0
 """Until some 10 MB are in the viewer, and until it has drawn them, in software."""
-LOOP_TIME_S = 8.0
 TRAINING = ("--episodes", "40", "--seed", "1", "--set", "batch_size=32",
             "--set", "evaluate_every_steps=10", "--set", "evaluation_runs=10")  # fmt: skip
-SCALE, MARGIN, TITLE_PIXELS = 5, 16, 26
-PAPER, INK = (255, 255, 255), (30, 34, 40)
+VEHICLE_ID = "pictures"
+LATENCY = "50ms+-10ms,outage=0.4s@3s"
+EPISODES, SEED = "2", "8"
+LOOP_TIME_S = 8.0
+RECORDER_LIMIT_S = 30.0
+PARTS = {
+    "uplink": "#2878e6",
+    "inference and queue": "#3caa5a",
+    "downlink (where the simulator told it)": "#9650c8",
+}
+STOPPED, LOST = "#dc3232", "0.5"
 SOME_MISSING = 1
 """Exit status where a picture could not be made here."""
 EXAMPLE = examples(
     "python -m hil_tests pictures --out docs",
     "python -m hil_tests pictures take_over.gif loop.png --out runs",
 )
+Make = Callable[[Path, Path], None]
+"""Writes a picture, given its path and a directory for what is made on the way."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -60,7 +87,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make them; returns the exit status.
+    """Make them, each as far as it can be made here; returns the exit status.
 
     Raises:
         UserError: no such picture, or nowhere to put it.
@@ -69,84 +96,44 @@ def run(arguments: argparse.Namespace) -> int:
     for name in names:
         if name not in PICTURES:
             raise UserError(f"no picture {name!r}: choose from {', '.join(PICTURES)}")
-    out = Path(arguments.out)
+    out, status = Path(arguments.out), 0
     for name in names:
         check_writable(out / name)
-    if arguments.work is not None:
-        make_directory(Path(arguments.work))
-        return _make(names, out, Path(arguments.work))
-    with tempfile.TemporaryDirectory(prefix="phil-pictures-") as work:
-        return _make(names, out, Path(work))
+    with tempfile.TemporaryDirectory(prefix="phil-pictures-") as folder:
+        work = Path(arguments.work or folder)
+        make_directory(work)
+        for name in names:
+            try:
+                PICTURES[name](out / name, work)
+            except UserError as error:
+                status = SOME_MISSING
+                print(f"{name}: not made: {error}", file=sys.stderr)
+            else:
+                print(f"{out / name}: {(out / name).stat().st_size / 1000:.0f} kB")
+    return status
 
 
-def _make(names: list[str], out: Path, work: Path) -> int:
-    """Make each; one that cannot be made here does not keep the others from it."""
-    missing = []
-    for name in names:
-        try:
-            PICTURES[name](out / name, work)
-        except UserError as error:
-            missing.append(name)
-            print(f"{name}: not made: {error}", file=sys.stderr)
-        else:
-            print(f"{out / name}: {(out / name).stat().st_size / 1000:.0f} kB")
-    return SOME_MISSING if missing else 0
+def _by_command(*words: str) -> Make:
+    return lambda out, _work: run_command(*words, "--out", str(out))
 
 
-def left_turn(out: Path, _work: Path) -> None:
-    """The left turn from above."""
-    _from_above("left_turn", out)
-
-
-def congestion(out: Path, _work: Path) -> None:
-    """The congestion from above."""
-    _from_above("congestion", out)
-
-
-def _from_above(scenario: str, out: Path) -> None:
+def _from_above(scenario: str) -> Make:
     seed, time_s = MOMENTS[scenario]
-    moment = ("--scenario", scenario, "--seed", str(seed), "--time", f"{time_s:g}")
-    run_command("trainer", "picture", "expert", *moment, "--out", str(out))
+    moment = ("--scenario", scenario, "--seed", seed, "--time", time_s)
+    return _by_command("trainer", "picture", "expert", *moment)
 
 
 def policy_sees(out: Path, _work: Path) -> None:
     """Both frames of both scenarios, enlarged pixel by pixel."""
-    rows = [_row(scenario, *MOMENTS[scenario]) for scenario in SCENARIOS]
-    width = max(row.width for row in rows)
-    picture = Image.new("RGB", (width, sum(row.height for row in rows)), PAPER)
-    top = 0
-    for row in rows:
-        picture.paste(row, (0, top))
-        top += row.height
-    buffer = io.BytesIO()
-    picture.save(buffer, format="png", optimize=True)
-    write_atomic(out, buffer.getvalue())
-
-
-def take_over(out: Path, _work: Path) -> None:
-    """The same throttle throughout, and the scripted expert brakes for a car."""
-    words = ("--human", "expert", "--seed", FILM_SEED, "--time", "15")
-    run_command("trainer", "picture", FILM_POLICY, *words, "--out", str(out))
-
-
-def cockpit(out: Path, _work: Path) -> None:
-    """The browser cockpit in the middle of a take-over; needs Chromium."""
-    run_command("trainer.person.tests.browser", "--picture", str(out))
-
-
-def _row(scenario: str, seed: int, time_s: float) -> Image.Image:
-    frames = _frames(scenario, seed, time_s)
-    size = (frames.shape[2] * SCALE, frames.shape[1] * SCALE)
-    width = MARGIN + 2 * (size[0] + MARGIN)
-    row = Image.new("RGB", (width, TITLE_PIXELS + size[1] + MARGIN), PAPER)
-    pen = ImageDraw.Draw(row)
-    for number, (frame, when) in enumerate(zip(frames, ("0.1 s ago", "now"), strict=True)):
-        left = MARGIN + number * (size[0] + MARGIN)
-        enlarged = Image.fromarray(frame).resize(size, Image.Resampling.NEAREST)
-        row.paste(enlarged.convert("RGB"), (left, TITLE_PIXELS))
-        title = f"{scenario.replace('_', ' ')}, {when}: 80 x 45 pixels"
-        pen.text((left, TITLE_PIXELS - 7), title, fill=INK, anchor="ls", font_size=15)
-    return row
+    figure = Figure(figsize=(8.6, 5.6), layout="constrained")
+    for row, (scenario, (seed, time_s)) in enumerate(MOMENTS.items()):
+        frames = _frames(scenario, int(seed), float(time_s))
+        for column, (frame, when) in enumerate(zip(frames, ("0.1 s ago", "now"), strict=True)):
+            panel = figure.add_subplot(len(MOMENTS), 2, 2 * row + column + 1)
+            panel.imshow(frame, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+            panel.set_title(f"{scenario.replace('_', ' ')}, {when}: 80 x 45 pixels", fontsize=10)
+            panel.set_axis_off()
+    write_png(out, figure)
 
 
 def _frames(scenario: str, seed: int, time_s: float) -> np.ndarray:
@@ -175,9 +162,8 @@ def success_against_latency(out: Path, work: Path) -> None:
 def rerun_loop(out: Path, work: Path) -> None:
     """The view of the loop, some seconds into the recorded drive."""
     rrd = work / "loop.rrd"
-    recording = str(recorded_drive(work))
     words = ("--vehicle-id", VEHICLE_ID, "--save", str(rrd))
-    run_command("bridge", "view", recording, *words)
+    run_command("bridge", "view", str(recorded_drive(work)), *words)
     write_atomic(out, screenshot(rrd, "sim_time", duration=LOOP_TIME_S))
 
 
@@ -211,16 +197,161 @@ def screenshot(rrd: Path, timeline: str, **moment: float) -> bytes:
         return picture
 
 
-PICTURES: dict[str, Callable[[Path, Path], None]] = {
-    "left_turn.png": left_turn,
-    "congestion.png": congestion,
+def recorded_drive(work: Path) -> Path:
+    """The recording of the drive, made once for all pictures of it."""
+    out = work / "drive.mcap"
+    if out.exists():
+        return out
+    endpoint = free_endpoint()
+    common = ("--connect", endpoint, "--vehicle-id", VEHICLE_ID)
+    trust = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
+    with ExitStack() as stack:
+        edge = ("edge_runtime", "run", *trust, *common, "--vehicle", "mock")
+        stack.enter_context(BackgroundCommand(*edge, ready="ready"))
+        record = ("bridge", "record", "--out", str(out), *common, "--wait-s", "30")
+        recorder = stack.enter_context(BackgroundCommand(*record))
+        stack.enter_context(operator(endpoint, VEHICLE_ID))
+        run_command(
+            "bridge", "simulate", "--env", "left_turn", "--clock", "realtime",
+            "--latency", LATENCY, "--episodes", EPISODES, "--seed", SEED,
+            "--listen", endpoint, "--vehicle-id", VEHICLE_ID,
+        )  # fmt: skip
+        recorder.wait(RECORDER_LIMIT_S)
+    return out
+
+
+@dataclass
+class Trip:
+    """One state and its answer."""
+
+    time_s: float
+    sent_ns: int
+    speed_mps: float
+    received_ns: int | None = None
+    answered_ns: int | None = None
+    round_trip_ms: float | None = None
+    mode: str = ""
+
+    @property
+    def parts_ms(self) -> tuple[float, float, float]:
+        """Uplink, runtime and downlink; 0 for what nobody has told."""
+        if self.received_ns is None or self.answered_ns is None:
+            return 0.0, 0.0, 0.0
+        up_ms = (self.received_ns - self.sent_ns) * 1e-6
+        inside_ms = (self.answered_ns - self.received_ns) * 1e-6
+        if self.round_trip_ms is None:
+            return up_ms, inside_ms, 0.0
+        return up_ms, inside_ms, max(0.0, self.round_trip_ms - up_ms - inside_ms)
+
+
+Trips = Mapping[tuple[int, int], Trip]
+"""By episode and step, in their order."""
+
+
+def trips_of(messages: Iterable[Any]) -> Trips:
+    """A drive's states with their answers, from the messages of its wire."""
+    trips: dict[tuple[int, int], Trip] = {}
+    timeline = Timeline()
+    for message in messages:
+        if isinstance(message, wire.State) and not message.final:
+            key = (message.episode, message.step)
+            time_s = timeline.place(*key).sim_time_s
+            trips[key] = Trip(time_s, message.sent_ns, message.speed_mps)
+        elif isinstance(message, wire.Command):
+            trip = trips.get((message.episode, message.step))
+            if trip is not None and trip.answered_ns is None:
+                trip.received_ns, trip.answered_ns = message.received_ns, message.sent_ns
+                trip.mode = message.mode
+        elif isinstance(message, Scene) and message.answered_step is not None:
+            trip = trips.get((message.episode, message.answered_step))
+            if trip is not None:
+                trip.round_trip_ms = message.round_trip_ms
+    return trips
+
+
+def begins_s(trips: Trips) -> list[float]:
+    """When the first episode ended and the next ones began."""
+    first_s: dict[int, float] = {}
+    for (episode, _), trip in trips.items():
+        first_s.setdefault(episode, trip.time_s)
+    return sorted(first_s.values())[1:]
+
+
+def lost_s(trips: Trips) -> list[float]:
+    """When a state was due that never came out of the network, since the first one that did."""
+    there = {round(trip.time_s / CONTROL_PERIOD_S) for trip in trips.values()}
+    return [n * CONTROL_PERIOD_S for n in range(min(there), max(there)) if n not in there]
+
+
+def _messages(recording: Path) -> Iterator[Any]:
+    decoders: dict[str, Callable[[bytes], Any]] = {
+        "state": wire.decode_state,
+        "command": wire.decode_command,
+        "scene": decode_scene,
+    }
+    for heard in read_heard(Recording(recording), VEHICLE_ID):
+        if heard.topic in decoders:
+            yield decoders[heard.topic](heard.payload)
+
+
+def loop(out: Path, work: Path) -> None:
+    """Speed and mode above, and each state's round trip in its parts below."""
+    found = trips_of(_messages(recorded_drive(work)))
+    trips = sorted(found.values(), key=lambda trip: trip.time_s)
+    times_s = [trip.time_s for trip in trips]
+    figure = Figure(figsize=(10, 5.4), layout="constrained")
+    speed, latency = figure.subplots(2, 1, sharex=True, height_ratios=(1, 1.5))
+    speed.plot(times_s, [trip.speed_mps for trip in trips], color="0.2")
+    speed.set_ylabel("speed, m/s")
+    low, high = speed.get_ylim()
+    bars = {"width": CONTROL_PERIOD_S, "align": "edge", "linewidth": 0}
+    for at_s, colour, label in (
+        (lost_s(found), LOST, "the state was lost"),
+        ([trip.time_s for trip in trips if trip.mode == wire.SAFE_STOP], STOPPED,
+         "answered with a safe stop"),
+    ):  # fmt: skip
+        style = {"color": colour, "alpha": 0.35, "zorder": 0, "label": label, **bars}
+        speed.bar(at_s, high - low, bottom=low, **style)
+    speed.set_ylim(low, high)
+    speed.legend(loc="lower right", fontsize=9)
+    speed.grid(alpha=0.3)
+    bottoms = np.zeros(len(trips))
+    for (label, colour), heights in zip(
+        PARTS.items(), np.array([trip.parts_ms for trip in trips]).T, strict=True
+    ):
+        latency.bar(times_s, heights, bottom=bottoms, color=colour, label=label, **bars)
+        bottoms = bottoms + heights
+    latency.set_ylabel("state sent to command received, ms")
+    latency.set_xlabel("simulated time, s, the episodes end to end")
+    latency.legend(loc="upper right", fontsize=9, ncols=3)
+    latency.grid(alpha=0.3, axis="y")
+    latency.set_ylim(0, 1.25 * max(bottoms))
+    for begin_s in begins_s(found):
+        for panel in (speed, latency):
+            panel.axvline(begin_s, color="black", linestyle="--", linewidth=1)
+        speed.annotate(
+            "next episode", (begin_s, 1.0), (4, -4), xycoords=("data", "axes fraction"),
+            textcoords="offset points", va="top", fontsize=9,
+        )  # fmt: skip
+    figure.suptitle(f"bridge simulate --clock realtime --latency {LATENCY}", fontsize=11)
+    write_png(out, figure)
+
+
+PICTURES: dict[str, Make] = {
+    "left_turn.png": _from_above("left_turn"),
+    "congestion.png": _from_above("congestion"),
     "policy_sees.png": policy_sees,
-    "take_over.gif": take_over,
-    "cockpit.png": cockpit,
+    # The same throttle throughout, and the scripted expert brakes for a car.
+    "take_over.gif": _by_command(
+        "trainer", "picture", FILM_POLICY, "--human", "expert", "--seed", FILM_SEED, "--time", "15"
+    ),
+    # In the middle of a take-over; needs Chromium.
+    "cockpit.png": lambda out, _work: run_command(
+        "trainer.person.tests.browser", "--picture", str(out)
+    ),
     "learning_curve.png": learning_curve,
     "success_against_latency.png": success_against_latency,
     "loop.png": loop,
     "rerun.png": rerun_loop,
     "rerun_training.png": rerun_training,
 }
-"""File -> writes it, given its path and a directory for what is made on the way."""

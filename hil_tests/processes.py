@@ -7,20 +7,22 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from edge_runtime.commands import ask
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
 
 Item = TypeVar("Item")
@@ -51,7 +53,6 @@ class Process:
         environment: variables beside ours.
         told: it reads its standard input, and `tell` writes there.
         on_line: called with the time and text of each line, in a thread.
-        prefix: words of a program that runs it, as in ``nsenter --net``.
     """
 
     def __init__(
@@ -60,13 +61,12 @@ class Process:
         environment: Mapping[str, str] | None = None,
         told: bool = False,
         on_line: Callable[[float, str], None] = lambda seen_s, line: None,
-        prefix: Sequence[str] = (),
     ) -> None:
         self.lines: list[tuple[float, str]] = []
         self._ended_by_us = False
         self._on_line = on_line
         self._process = subprocess.Popen(
-            [*prefix, sys.executable, "-m", *arguments],
+            [sys.executable, "-m", *arguments],
             stdin=subprocess.PIPE if told else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -162,24 +162,17 @@ class BackgroundCommand(Process):
     Args:
         arguments: the module and its arguments.
         ready: text of its output that says it has started; None: no wait.
-        prefix: words of a program that runs it.
         quiet: do not print the command.
 
     Raises:
         UserError: it ended, or said nothing for too long, before it was ready.
     """
 
-    def __init__(
-        self,
-        *arguments: str,
-        ready: str | None = None,
-        prefix: Sequence[str] = (),
-        quiet: bool = False,
-    ) -> None:
+    def __init__(self, *arguments: str, ready: str | None = None, quiet: bool = False) -> None:
         if not quiet:
             print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
         self.name = " ".join(arguments[:2])
-        super().__init__(*arguments, prefix=prefix)
+        super().__init__(*arguments)
         if ready is None:
             return
         try:
@@ -206,54 +199,37 @@ class BackgroundCommand(Process):
             raise self._failure()
         return status
 
-    def said(self) -> str:
-        """All of its output so far."""
-        return "\n".join(line for _, line in self.lines)
-
     def _failure(self) -> UserError:
-        last = (self.said().strip().splitlines() or ["it said nothing"])[-1]
+        said = [line for _, line in self.lines if line.strip()]
+        last = said[-1].strip() if said else "it said nothing"
         return UserError(f"python -m {self.name}: {last}")
 
 
-class Operator:
-    """Watches a vehicle for the length of a ``with`` block, and re-arms it after a safe stop.
+@contextlib.contextmanager
+def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
+    """Watch a vehicle for the length of a ``with`` block, and re-arm it after a safe stop.
 
     A runtime with a vehicle never drives again by itself: this stands in for the person who is
     missing in an unattended drive, and says each time what it does.
     """
+    end = threading.Event()
 
-    def __init__(self, endpoint: str, vehicle_id: str) -> None:
-        self.endpoint, self.vehicle_id = endpoint, vehicle_id
-        self._end = threading.Event()
-        self._failure: Exception | None = None
-        self._thread = threading.Thread(target=self._watch, name="operator")
+    def watch() -> None:
+        while not end.wait(OPERATOR_LOOKS_EVERY_S):
+            # Simulator or runtime not up yet, or already gone: nothing to re-arm.
+            with contextlib.suppress(UserError):
+                status = ask(endpoint, vehicle_id, "status")
+                stopped = status["needs_rearm"] and status["mode"] == "safe_stop"
+                if stopped and ask(endpoint, vehicle_id, "rearm")["accepted"]:
+                    print(f"operator: re-armed {vehicle_id} after {status['reason']}", flush=True)
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-        if self._failure is not None:
-            raise self._failure
-
-    def _watch(self) -> None:
+    with ThreadPoolExecutor(1, "operator") as pool:
+        watching = pool.submit(watch)
         try:
-            while not self._end.wait(OPERATOR_LOOKS_EVERY_S):
-                # Simulator or runtime not up yet, or already gone: nothing to re-arm.
-                with contextlib.suppress(UserError):
-                    self._rearm_if_needed()
-        except Exception as error:
-            # Nobody would re-arm any more: who waits for this drive must hear of it.
-            self._failure = error
-
-    def _rearm_if_needed(self) -> None:
-        status = ask(self.endpoint, self.vehicle_id, "status")
-        if not status["needs_rearm"] or status["mode"] != "safe_stop":
-            return
-        if ask(self.endpoint, self.vehicle_id, "rearm")["accepted"]:
-            print(f"operator: re-armed {self.vehicle_id} after {status['reason']}", flush=True)
+            yield
+        finally:
+            end.set()
+        watching.result()  # Where it failed, nobody would have re-armed any more.
 
 
 def run_command(*arguments: str) -> None:
@@ -285,26 +261,45 @@ def end_children() -> None:
                 os.kill(int(child), signal.SIGTERM)
 
 
-def in_threads(
+def in_parallel(
     work: Callable[[Item], Result],
     items: Sequence[Item],
     jobs: int,
     on_done: Callable[[Item, Result], None],
+    processes: bool = False,
 ) -> None:
     """Do the work of each item, ``jobs`` at a time; ``on_done`` is called here, as they end.
 
-    After a failure, and on ^C, what has not begun is not begun any more, and every process that
-    the others wait for is asked to end.
+    In threads, which suits work that waits for processes, or in processes. After a failure, and on
+    ^C, what has not begun is not begun any more, and every process under way is asked to end.
+
+    Raises:
+        UserError: a process of ours died.
     """
-    with ThreadPoolExecutor(min(jobs, len(items)) or 1) as pool:
+    jobs = min(jobs, len(items)) or 1
+    pool: Executor = ThreadPoolExecutor(jobs)
+    if processes:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(jobs, context, initializer=_follow_the_parent)
+    with pool:
         futures = {pool.submit(work, item): item for item in items}
         try:
             for future in as_completed(futures):
                 on_done(futures[future], future.result())
-        except BaseException:
+        except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
             end_children()
+            if isinstance(error, BrokenProcessPool):
+                raise UserError("a worker process died; use fewer --jobs") from error
             raise
+
+
+def _follow_the_parent() -> None:
+    """Leave ^C to the parent, and end where it is killed."""
+    from trainer.evaluate import die_with_parent
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=die_with_parent, daemon=True).start()
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
@@ -327,17 +322,15 @@ def headless_viewer() -> Iterator[Any]:
     Raises:
         UserError: it does not start here, or ends as soon as it is to draw.
     """
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    host, _, port = free_endpoint().removeprefix("tcp/").rpartition(":")
     command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
-    command += ["--bind", "127.0.0.1", "--port", str(port), "--window-size", VIEWER_SIZE]
+    command += ["--bind", host, "--port", port, "--window-size", VIEWER_SIZE]
     # A group of its own: the module starts the real viewer as a child, which must end with it.
     viewer = subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     )
     try:
-        yield _connect_viewer(viewer, f"rerun+http://127.0.0.1:{port}/proxy")
+        yield _connect_viewer(viewer, f"rerun+http://{host}:{port}/proxy")
     except ConnectionError as error:
         raise UserError(f"rerun's viewer ends as it draws ({error}): {VIEWER_NEEDS}") from None
     finally:

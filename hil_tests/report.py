@@ -74,20 +74,10 @@ def fault_verdict(row: Found) -> str:
 
 
 def render_latency(latency: Found, figures: Mapping[str, str], others: Mapping[str, Found]) -> str:
-    """Sentences of the budgets, pictures, what real time says, and a table for each axis."""
-    lines = _budgets(latency, figures, others) if latency["axes"] else []
-    if latency["realtime_check"]:
-        lines += [*_realtime(latency["realtime_check"]), ""]
-    for axis in latency["axes"]:
-        title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
-        lines += [title, "", *_latency_table(axis, latency["rows"]), ""]
-    return "\n".join(lines)
-
-
-def _budgets(latency: Found, figures: Mapping[str, str], others: Mapping[str, Found]) -> list[str]:
+    """Sentences of the budgets, pictures, and a table for each axis."""
     sentences = [part["budget"]["sentence"] for part in (latency, *others.values())]
     speed = f"{latency['faster_than_real_time']:.1f} times real time in each worker"
-    return [
+    lines = [
         *(f"{sentence}\n" for sentence in sentences),
         "A limit is the largest tested value up to which, at every tested value, the share of "
         f"successes over {latency['runs']} episodes (the same seeds in every row) is at the "
@@ -96,22 +86,10 @@ def _budgets(latency: Found, figures: Mapping[str, str], others: Mapping[str, Fo
         "",
         *(f"![{name}]({path})\n" for name, path in figures.items()),
     ]
-
-
-def _realtime(check: Found) -> list[str]:
-    verdict = "agree" if check["agree"] else "do NOT all agree"
-    head = ("network", "virtual", "real", "safe stops an episode: virtual", "real", "agree")
-    rows = []
-    for row in check["rows"]:
-        stops = (f"{row[f'{clock}_safe_stops_per_episode']:.2f}" for clock in ("virtual", "real"))
-        shares = share(row["virtual"]), share(row["real"])
-        rows.append((f"`{row['spec']}`", *shares, *stops, "yes" if row["agree"] else "**no**"))
-    return [
-        f"Real and virtual time {verdict} within their intervals "
-        f"({check['runs']} episodes, the same seeds):",
-        "",
-        *table(head, rows),
-    ]
+    for axis in latency["axes"]:
+        title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
+        lines += [title, "", *_latency_table(axis, latency["rows"]), ""]
+    return "\n".join(lines)
 
 
 def _latency_table(axis: Found, rows: Found) -> list[str]:

@@ -11,11 +11,12 @@ import argparse
 import shlex
 import statistics
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from bridge.environments import CONDITIONS, NOMINAL
 from bridge.network import parse_spec
@@ -29,6 +30,9 @@ from trainer.drivers import make_environment
 from trainer.experiments.plan import digest
 from trainer.experiments.statistics import Estimate, mean_estimate, success_estimate
 from trainer.options import add_scenario
+from trainer.util import ProgressBar
+
+Item = TypeVar("Item")
 
 LOOPS = POLICY, VEHICLE = ("policy", "vehicle")
 """What may be in the loop."""
@@ -180,32 +184,32 @@ def _sentence(
     return "; ".join([held, *missed]) + "."
 
 
-def make_row(spec: str, chunks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Join what was driven over the wire under one specification.
+def make_row(spec: str, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Join what was driven over the wire under one specification, each part `worth_keeping`.
 
-    Latencies are from state sent to command received: the median of the chunks' p50 and the
+    Latencies are from state sent to command received: the median of the parts' p50 and the
     largest p99.
     """
-    episodes = [episode for chunk in chunks for episode in chunk["episodes"]]
+    episodes = [episode for part in parts for episode in part["episodes"]]
     outcomes = Counter(episode["outcome"] for episode in episodes)
     count = len(episodes)
-    heard = [chunk["latency_ms"] for chunk in chunks if chunk["latency_ms"]["p50"] is not None]
+    heard = [part["latency_ms"] for part in parts if part["latency_ms"]["p50"] is not None]
     steps = sum(episode["steps"] for episode in episodes)
     return {
         "spec": spec,
         "episodes": count,
         **summary(episodes),
         "collision_rate": outcomes[COLLISION] / count,
-        "safe_stops_per_episode": sum(chunk["safe_stops"] for chunk in chunks) / count,
-        "ticks_without_new_command": sum(chunk["deadline_misses"] for chunk in chunks) / steps,
+        "safe_stops_per_episode": sum(part["safe_stops"] for part in parts) / count,
+        "ticks_without_new_command": sum(part["deadline_misses"] for part in parts) / steps,
         "latency_ms": {
             "p50": statistics.median(latency["p50"] for latency in heard) if heard else None,
             "p99": max(latency["p99"] for latency in heard) if heard else None,
         },
-        "rejected": dict(sum((Counter(chunk["rejected"]) for chunk in chunks), Counter())),
+        "rejected": dict(sum((Counter(part["rejected"]) for part in parts), Counter())),
         "driven_s": sum(episode["time_s"] for episode in episodes),
-        "wall_s": sum(chunk["wall_s"] for chunk in chunks),
-        "command": chunks[0]["command"],
+        "wall_s": sum(part["wall_s"] for part in parts),
+        "command": parts[0]["command"],
         "per_episode": episodes,
     }
 
@@ -226,48 +230,110 @@ def interval(estimate: Estimate) -> dict[str, float]:
     return {"value": estimate.value, "low": estimate.low, "high": estimate.high}
 
 
+class Task(NamedTuple):
+    """What every drive of a campaign has in common. ``changes``: parameters of the mock Hunter."""
+
+    policy: Path
+    policy_id: str
+    scenario: str
+    condition: str
+    seed: int
+    runs: int
+    public_key: str | None = None
+    changes: Mapping[str, float] = {}
+
+    def facts(self) -> dict[str, Any]:
+        """As it stands in a report."""
+        names = ("policy_id", "scenario", "condition", "seed", "runs")
+        return {"policy": str(self.policy), **{name: getattr(self, name) for name in names}}
+
+
+def task_of(arguments: argparse.Namespace) -> Task:
+    """The task that is asked for; UserError where its policy does not load.
+
+    The edge runtime checks signatures where it matters; here the loop is measured.
+    """
+    policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
+    loaded = load_policy(str(policy), arguments.public_key, allow_unsigned=True)
+    return Task(
+        policy, loaded.policy_id, arguments.scenario, arguments.condition, arguments.seed,
+        arguments.runs, arguments.public_key,
+    )  # fmt: skip
+
+
+def turns(seed: int, runs: int, size: int) -> list[tuple[int, int]]:
+    """First seed and number of episodes of turns that cover each seed once."""
+    return [(seed + done, min(size, runs - done)) for done in range(0, runs, size)]
+
+
 class KeptResults:
     """A file for each result, named by a hash of all that decides it.
 
     Args:
         directory: where; it is made.
-        scenario: its environment's settings decide, too,
-        condition: under this condition.
-        deciding: what all results have in common.
+        task: whose scenario and condition, with the environment's settings, decide, too.
+        deciding: what else all results have in common.
 
     Raises:
         UserError: there can be no such directory.
     """
 
-    def __init__(
-        self, directory: Path, scenario: str, condition: str, deciding: Mapping[str, Any]
-    ) -> None:
-        config = make_environment(scenario, condition).config
-        shared = {"scenario": scenario, "condition": condition, "environment": asdict(config)}
-        self._deciding = {**deciding, **shared}
+    def __init__(self, directory: Path, task: Task, deciding: Mapping[str, Any]) -> None:
+        config = make_environment(task.scenario, task.condition).config
+        shared = {"scenario": task.scenario, "condition": task.condition}
+        self._deciding = {**deciding, **shared, "environment": asdict(config)}
         self._directory = directory
         make_directory(directory)
 
-    def load(self, one: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The kept result of ``one``; None where there is none. UserError: it is no JSON."""
-        path = self._path(one)
-        if not path.is_file():
-            return None
-        try:
-            result: dict[str, Any] = read_json(path, "kept result")
-        except UserError as error:
-            raise UserError(f"{error}; remove it") from None
-        return result
+    def complete(
+        self,
+        what: str,
+        items: Sequence[Item],
+        name: Callable[[Item], Mapping[str, Any]],
+        drive: Callable[[list[Item], Callable[[Item, dict[str, Any]], None]], None],
+        figures: Callable[[Item, dict[str, Any]], dict[str, str]],
+    ) -> dict[Item, dict[str, Any]]:
+        """The result of each item: those that are kept, and those that ``drive`` adds now.
 
-    def save(self, one: Mapping[str, Any], result: Mapping[str, Any]) -> None:
-        """Keep the result of ``one``."""
-        write_json(self._path(one), result)
+        Args:
+            what: is counted by the progress bar.
+            items: in any order.
+            name: an item's part of what decides its result.
+            drive: called with the missing items, and with what is to be called with each result.
+            figures: shown beside the bar after each.
+
+        Raises:
+            UserError: a kept result is no JSON.
+        """
+        paths = {item: self._path(name(item)) for item in items}
+        found = {item: _read_kept(path) for item, path in paths.items() if path.is_file()}
+        missing = [item for item in items if item not in found]
+        with ProgressBar(what, len(items), len(found)) as bar:
+
+            def on_done(item: Item, result: dict[str, Any]) -> None:
+                found[item] = result
+                write_json(paths[item], result)
+                bar.advance(figures(item, result))
+
+            if missing:
+                drive(missing, on_done)
+        return found
 
     def _path(self, one: Mapping[str, Any]) -> Path:
         return self._directory / f"{digest({**self._deciding, **one})}.json"
 
 
-def add_sweep_arguments(parser: ArgumentParser, runs: int, runs_help: str, target: float) -> None:
+def _read_kept(path: Path) -> dict[str, Any]:
+    try:
+        result: dict[str, Any] = read_json(path, "kept result")
+    except UserError as error:
+        raise UserError(f"{error}; remove it") from None
+    return result
+
+
+def add_sweep_arguments(
+    parser: ArgumentParser, parts: Sequence[str], runs: int, runs_help: str, target: float
+) -> None:
     """The options that both campaigns have."""
     parser.add_argument(
         "--out",
@@ -275,34 +341,31 @@ def add_sweep_arguments(parser: ArgumentParser, runs: int, runs_help: str, targe
         metavar="R.json",
         help="the report; R.md, pictures and R_rows/ (what is done already) go beside it",
     )
-    parser.add_argument(
-        "--policy",
-        metavar="P.onnx",
-        help="policy file (default: results/policies/SCENARIO.onnx)",
-    )
+    default = "policy file (default: results/policies/SCENARIO.onnx)"
+    parser.add_argument("--policy", metavar="P.onnx", help=default)
     add_public_key(parser)
     add_scenario(parser)
     parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
-    parser.add_argument("--runs", type=several, default=runs, help=runs_help)
-    parser.add_argument("--seed", type=not_negative, default=0, help="of the first episode")
-    parser.add_argument("--target", type=share, default=target, help="success that is asked for")
+    parser.add_argument("--only", choices=parts, help="one part (default: both)")
+    for name, kind, value, text in (
+        ("--runs", _several, runs, runs_help),
+        ("--seed", not_negative, 0, "of the first episode"),
+        ("--target", share, target, "success that is asked for"),
+        (
+            "--jobs",
+            not_negative,
+            0,
+            "drives or faults side by side; 0: one a core",
+        ),
+    ):
+        parser.add_argument(name, type=kind, default=value, help=text)
 
 
-def several(text: str) -> int:
-    """Read how many episodes a share of successes is taken over: at least 2."""
+def _several(text: str) -> int:
     count = positive(text)
     if count < 2:
         raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
     return count
-
-
-def policy_of(arguments: argparse.Namespace) -> tuple[Path, str]:
-    """The policy that is asked for, and its id; UserError where it does not load.
-
-    The edge runtime checks signatures where it matters; here the loop is measured.
-    """
-    policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
-    return policy, load_policy(str(policy), arguments.public_key, allow_unsigned=True).policy_id
 
 
 def this_command() -> str:
@@ -313,17 +376,24 @@ def this_command() -> str:
 def simulate(endpoint: str, vehicle_id: str, out: Path, limit_s: float, *words: str) -> Any:
     """Run ``bridge simulate`` beside an edge runtime; its report, with the command.
 
+    ``wall_s`` of the report includes the simulator's start.
+
     Raises:
         UserError: it failed, or did not end (CommandTimeoutError).
     """
     arguments = ("bridge", "simulate", *words)
     here = ("--listen", endpoint, "--vehicle-id", vehicle_id, "--out", str(out))
+    began_s = time.monotonic()
     with BackgroundCommand(*arguments, *here, quiet=True) as simulator:
         simulator.wait(limit_s)
-    return {**read_json(out, "report"), "command": f"python -m {shlex.join(arguments)}"}
+    wall_s = round(time.monotonic() - began_s, 3)
+    command = f"python -m {shlex.join(arguments)}"
+    return {**read_json(out, "report"), "command": command, "wall_s": wall_s}
 
 
-def episodes_of(report: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What a campaign keeps of each episode of such a report."""
-    names = ("seed", "outcome", "distance_m", "time_s", "steps")
-    return [{name: row[name] for name in names} for row in report["per_episode"]]
+def worth_keeping(report: Mapping[str, Any]) -> dict[str, Any]:
+    """What a campaign keeps of such a report."""
+    names = ("command", "wall_s", "latency_ms", "deadline_misses", "safe_stops", "rejected")
+    of_each = ("seed", "outcome", "distance_m", "time_s", "steps")
+    episodes = [{name: row[name] for name in of_each} for row in report["per_episode"]]
+    return {**{name: report[name] for name in names}, "episodes": episodes}

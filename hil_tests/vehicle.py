@@ -7,27 +7,22 @@ Hunter; `sweep` drives every lag of a table in virtual time.
 from __future__ import annotations
 
 import argparse
-import math
-import multiprocessing
 import statistics
 import tempfile
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from bridge.report import GOAL
-from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, sigterm_as_interrupt
+from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests.faults.rig import free_bus
 from hil_tests.mock_hunter.body import make_parameters, read_changes
-from hil_tests.processes import BackgroundCommand, Operator, in_threads, trusting
+from hil_tests.processes import BackgroundCommand, in_parallel, operator, trusting
 from hil_tests.report import (
     check_report,
     comparison_verdict,
@@ -45,19 +40,21 @@ from hil_tests.sweep import (
     VEHICLE,
     KeptResults,
     Lag,
+    Task,
     add_sweep_arguments,
     budget,
-    episodes_of,
     interval,
     make_row,
-    policy_of,
     simulate,
     summary,
+    task_of,
     this_command,
+    turns,
+    worth_keeping,
 )
 from hil_tests.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
-from trainer.evaluate import cores, die_with_parent, interrupts_blocked
+from trainer.evaluate import cores
 from trainer.experiments.statistics import mean_estimate
 from trainer.util import ProgressBar
 
@@ -70,8 +67,6 @@ LONGEST_EPISODE_S = 60.0
 """With the wait for a stand before it; the scenarios time out after 30 s."""
 FORMAT = 1
 """Raise it where the same point begins to mean another drive: kept points become void."""
-Told = Callable[[dict[str, Any]], None]
-"""Called with each part's report, or each point's row."""
 EXAMPLE = examples(
     "python -m hil_tests vehicle --out runs/vehicle.json",
     "python -m hil_tests vehicle --only sweep --lags 50+100,200+300 --runs 20 --out runs/lags.json",
@@ -80,22 +75,9 @@ EXAMPLE = examples(
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    add_sweep_arguments(parser, 50, "episodes of each loop and of each lag", 0.95)
-    parser.add_argument("--only", choices=PARTS, help="one part (default: both)")
-    parser.add_argument(
-        "--rigs",
-        type=positive,
-        default=4,
-        metavar="N",
-        help="simulators in real time side by side, each with a vehicle of its own",
-    )
-    parser.add_argument(
-        "--jobs",
-        type=not_negative,
-        default=0,
-        metavar="N",
-        help="processes of the sweep, which is in virtual time; 0: one a core",
-    )
+    add_sweep_arguments(parser, PARTS, 50, "episodes of each loop and of each lag", 0.95)
+    rigs = "simulators in real time side by side, each with a vehicle of its own"
+    parser.add_argument("--rigs", type=positive, default=4, metavar="N", help=rigs)
     parser.add_argument(
         "--set",
         action="append",
@@ -110,64 +92,27 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
 
 
-class Drive(NamedTuple):
-    """What is to be driven. ``changes``: parameters of the mock."""
-
-    policy: Path
-    scenario: str
-    condition: str
-    first_seed: int
-    episodes: int
-    changes: Mapping[str, float]
-    public_key: str | None = None
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where the vehicle in the loop is below the target."""
     out = Path(arguments.out)
     check_report(out)
-    policy, policy_id = policy_of(arguments)
-    changes = read_changes(arguments.set)
-    make_parameters(MODEL, changes)  # refuses what the mock does not know, before anything runs
+    task = task_of(arguments)._replace(changes=read_changes(arguments.set))
+    make_parameters(MODEL, task.changes)  # refuses what the mock does not know
     lags = _lags(arguments.lags)
-    drive = Drive(
-        policy, arguments.scenario, arguments.condition, arguments.seed, arguments.runs, changes,
-        arguments.public_key,
-    )  # fmt: skip
-    report: dict[str, Any] = {"command": this_command(), "policy_id": policy_id}
-    title = f"# Vehicle in the loop: {policy.name}, {arguments.scenario}"
+    report: dict[str, Any] = {"command": this_command(), "policy_id": task.policy_id}
+    title = f"# Vehicle in the loop: {task.policy.name}, {arguments.scenario}"
     text = [title, "", f"`{this_command()}`"]
     with sigterm_as_interrupt():  # Whoever ends it ends its processes.
         if arguments.only != "sweep":
-            report["comparison"] = found = _compare(drive, arguments)
+            report["comparison"] = found = run_comparison(task, arguments.target, arguments.rigs)
             text += ["", "## In real time", "", render_comparison(found)]
         if arguments.only != "compare":
-            kept = kept_points(out.with_name(f"{out.stem}_rows"), drive, policy_id)
-            report["sweep"] = found = _sweep(drive, lags, kept, arguments)
+            keep, jobs = out.with_name(f"{out.stem}_rows"), arguments.jobs or cores()
+            report["sweep"] = found = run_sweep(task, lags, arguments.target, jobs, keep)
             found["figures"] = write_lag_figures(out, found)
             text += ["", "## Lag, in virtual time", "", render_sweep(found, found["figures"])]
     write_report(out, report, text)
     return _conclude(out, report)
-
-
-def _compare(drive: Drive, arguments: argparse.Namespace) -> dict[str, Any]:
-    with ProgressBar("drives", 2 * math.ceil(drive.episodes / PART_EPISODES)) as bar:
-
-        def on_part(report: dict[str, Any]) -> None:
-            bar.advance({"success": f"{report['success_rate']:.2f}", "loop": report["loop"]})
-
-        return run_comparison(drive, arguments.target, arguments.rigs, on_part)
-
-
-def _sweep(
-    drive: Drive, lags: list[Lag], kept: KeptResults, arguments: argparse.Namespace
-) -> dict[str, Any]:
-    with ProgressBar("lags", len(lags)) as bar:
-
-        def on_point(row: dict[str, Any]) -> None:
-            bar.advance({"success": f"{row['success']['value']:.2f}", "at": row["spec"]})
-
-        return run_sweep(drive, lags, arguments.target, arguments.jobs or cores(), kept, on_point)
 
 
 def _conclude(out: Path, report: dict[str, Any]) -> int:
@@ -193,35 +138,29 @@ def _lags(text: str | None) -> list[Lag]:
     return list(dict.fromkeys(lags))
 
 
-def _drive_facts(drive: Drive) -> dict[str, Any]:
-    """What stands in both parts of the report."""
-    return {
-        "policy": str(drive.policy),
-        "scenario": drive.scenario,
-        "condition": drive.condition,
-        "seed": drive.first_seed,
-        "runs": drive.episodes,
-        "mock": dict(drive.changes),
-    }
-
-
-def run_comparison(drive: Drive, target: float, rigs: int, on_part: Told) -> dict[str, Any]:
+def run_comparison(task: Task, target: float, rigs: int) -> dict[str, Any]:
     """Drive both loops, ``rigs`` at a time; the report's part ``comparison``.
 
     Raises:
         UserError: a command failed.
     """
-    reports: list[dict[str, Any]] = []
+    reports: dict[str, list[dict[str, Any]]] = {loop: [] for loop in LOOPS}
+    parts = [
+        (loop, task._replace(seed=seed, runs=runs))
+        for loop in LOOPS
+        for seed, runs in turns(task.seed, task.runs, PART_EPISODES)
+    ]
+    with ProgressBar("drives", len(parts)) as bar:
 
-    def on_done(_: tuple[Drive, str], report: dict[str, Any]) -> None:
-        reports.append(report)
-        on_part(report)
+        def on_done(part: tuple[str, Task], report: dict[str, Any]) -> None:
+            reports[part[0]].append(report)
+            bar.advance({"success": f"{report['success_rate']:.2f}", "loop": report["loop"]})
 
-    turns = [(part, loop) for loop in LOOPS for part in parts(drive)]
-    in_threads(lambda turn: run_rig(*turn), turns, rigs, on_done)
-    rows = {loop: loop_row(loop, [r for r in reports if r["loop"] == loop]) for loop in LOOPS}
+        in_parallel(lambda part: run_rig(part[1], part[0]), parts, rigs, on_done)
+    rows = {loop: loop_row(loop, some) for loop, some in reports.items()}
     return {
-        **_drive_facts(drive),
+        **task.facts(),
+        "mock": task.changes,
         "rows": rows,
         "cost": cost(rows[POLICY]["per_episode"], rows[VEHICLE]["per_episode"]),
         "target_success": target,
@@ -229,16 +168,7 @@ def run_comparison(drive: Drive, target: float, rigs: int, on_part: Told) -> dic
     }
 
 
-def parts(drive: Drive) -> list[Drive]:
-    """The drive in turns of PART_EPISODES."""
-    end = drive.first_seed + drive.episodes
-    return [
-        drive._replace(first_seed=seed, episodes=min(PART_EPISODES, end - seed))
-        for seed in range(drive.first_seed, end, PART_EPISODES)
-    ]
-
-
-def run_rig(drive: Drive, loop: str) -> dict[str, Any]:
+def run_rig(task: Task, loop: str) -> dict[str, Any]:
     """Edge runtime, simulator and (with a vehicle in the loop) mock Hunter and operator.
 
     All are processes, set up for this drive and cleared away after it; the simulator's report,
@@ -249,30 +179,30 @@ def run_rig(drive: Drive, loop: str) -> dict[str, Any]:
     """
     endpoint = free_endpoint()
     with tempfile.TemporaryDirectory(prefix="phil-rig-") as folder, ExitStack() as stack:
-        options = _start_vehicle(drive, Path(folder), stack) if loop == VEHICLE else ()
+        options = _start_vehicle(task, Path(folder), stack) if loop == VEHICLE else ()
         stack.enter_context(
             BackgroundCommand(
-                "edge_runtime", "run", *trusting(drive.policy, drive.public_key),
+                "edge_runtime", "run", *trusting(task.policy, task.public_key),
                 "--connect", endpoint, "--vehicle-id", VEHICLE_ID, *options,
                 ready="ready", quiet=True,
             )
         )  # fmt: skip
         if loop == VEHICLE:
-            stack.enter_context(Operator(endpoint, VEHICLE_ID))
-        limit_s = LONGEST_EPISODE_S * (1 + drive.episodes)
+            stack.enter_context(operator(endpoint, VEHICLE_ID))
+        limit_s = LONGEST_EPISODE_S * (1 + task.runs)
         report: dict[str, Any] = simulate(
             endpoint, VEHICLE_ID, Path(folder) / "report.json", limit_s,
-            "--env", drive.scenario, "--condition", drive.condition,
+            "--env", task.scenario, "--condition", task.condition,
             "--clock", "realtime", "--loop", loop, "--standing",
-            "--episodes", str(drive.episodes), "--seed", str(drive.first_seed),
+            "--episodes", str(task.runs), "--seed", str(task.seed),
         )  # fmt: skip
         return report
 
 
-def _start_vehicle(drive: Drive, directory: Path, stack: ExitStack) -> tuple[str, ...]:
+def _start_vehicle(task: Task, directory: Path, stack: ExitStack) -> tuple[str, ...]:
     """Start a mock Hunter on a bus of its own; the edge runtime's options to drive it."""
     bus = free_bus()
-    settings = [f"--set={name}={value}" for name, value in drive.changes.items()]
+    settings = [f"--set={name}={value}" for name, value in task.changes.items()]
     chassis = ("hil_tests", "mock_hunter", "--bus", bus, *settings)
     stack.enter_context(BackgroundCommand(*chassis, ready="ready", quiet=True))
     config = directory / "edge.toml"
@@ -286,7 +216,7 @@ def loop_row(loop: str, reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     reasons = Counter(e["reason"] for report in ordered for e in report["safe_stop_events"])
     vehicles = [report["vehicle"] for report in ordered if report["vehicle"] is not None]
     return {
-        **make_row(loop, [{**report, "episodes": episodes_of(report)} for report in ordered]),
+        **make_row(loop, [worth_keeping(report) for report in ordered]),
         "safe_stop_reasons": dict(reasons),
         "tick_overruns": sum(report["tick_overruns"] for report in ordered),
         "vehicle": join_vehicles(vehicles) if vehicles else None,
@@ -298,15 +228,14 @@ def join_vehicles(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     The largest stands for ``max`` and ``p99``.
     """
-    samples = [part["samples"] for part in parts]
     ages = [part["feedback_age_ms"] for part in parts]
     return {
         "name": parts[0]["name"],
         "scale": parts[0]["scale"],
-        "samples": sum(samples),
-        "speed_error_mps": _pool(samples, [part["speed_error_mps"] for part in parts]),
+        "samples": sum(part["samples"] for part in parts),
+        "speed_error_mps": _pool([(part["samples"], part["speed_error_mps"]) for part in parts]),
         "action_error": {
-            name: _pool(samples, [part["action_error"][name] for part in parts])
+            name: _pool([(part["samples"], part["action_error"][name]) for part in parts])
             for name in parts[0]["action_error"]
         },
         "lag_ms": {
@@ -322,17 +251,13 @@ def join_vehicles(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _pool(samples: Sequence[int], errors: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    told = [
-        (n, error) for n, error in zip(samples, errors, strict=True) if error["rmse"] is not None
-    ]
+def _pool(errors: Sequence[tuple[int, Mapping[str, float]]]) -> dict[str, float | None]:
+    told = [(samples, error) for samples, error in errors if error["rmse"] is not None]
     if not told:
         return {"rmse": None, "max": None}
-    squares = sum(n * error["rmse"] ** 2 for n, error in told)
-    return {
-        "rmse": (squares / sum(n for n, _ in told)) ** 0.5,
-        "max": max(error["max"] for _, error in told),
-    }
+    squares = sum(samples * error["rmse"] ** 2 for samples, error in told)
+    rmse = (squares / sum(samples for samples, _ in told)) ** 0.5
+    return {"rmse": rmse, "max": max(error["max"] for _, error in told)}
 
 
 def _of_told(join: Callable[[list[float]], float], values: Sequence[float | None]) -> float | None:
@@ -353,85 +278,48 @@ def cost(
     return {"seeds": len(longer), "longer_s": interval(mean_estimate(longer))}
 
 
-def kept_points(directory: Path, drive: Drive, policy_id: str) -> KeptResults:
-    """Where the points of a drive are kept, whatever its policy's file is called."""
-    deciding = {
-        "format": FORMAT,
-        "policy_id": policy_id,
-        "first_seed": drive.first_seed,
-        "runs": drive.episodes,
-        "changes": drive.changes,
-    }
-    return KeptResults(directory, drive.scenario, drive.condition, deciding)
-
-
 def run_sweep(
-    drive: Drive,
-    lags: Sequence[Lag],
-    target: float,
-    jobs: int,
-    kept: KeptResults,
-    on_point: Told = lambda row: None,
+    task: Task, lags: Sequence[Lag], target: float, jobs: int, keep: Path
 ) -> dict[str, Any]:
     """Drive every point that is not kept, ``jobs`` at a time; the report's part ``sweep``.
 
     Raises:
         UserError: the policy does not load, or a worker died.
     """
-    found = {lag: row for lag in lags if (row := kept.load({"lag": lag.spec})) is not None}
-    for row in found.values():
-        on_point(row)
-    for row in _drive_points(drive, [lag for lag in lags if lag not in found], jobs):
-        lag = Lag(row["dead_ms"], row["constant_ms"])
-        kept.save({"lag": lag.spec}, row)
-        found[lag] = row
-        on_point(row)
+    deciding = {
+        "format": FORMAT,
+        "policy_id": task.policy_id,  # whatever its file is called
+        "first_seed": task.seed,
+        "runs": task.runs,
+        "changes": task.changes,
+    }
+    found = KeptResults(keep, task, deciding).complete(
+        "lags",
+        lags,
+        lambda lag: {"lag": lag.spec},
+        lambda missing, on_done: in_parallel(
+            partial(drive_point, task), missing, jobs, on_done, processes=True
+        ),
+        lambda lag, row: {"success": f"{row['success']['value']:.2f}", "at": lag.spec},
+    )
     rows = {lag.spec: found[lag] for lag in lags}
     axes = [axis for axis in LAG_AXES if set(axis.specs) <= set(rows)]
     return {
-        **_drive_facts(drive),
+        **task.facts(),
+        "mock": task.changes,
         "axes": [axis.as_dict() for axis in axes],
         "rows": rows,
-        "budget": budget(axes, rows, target, drive.policy.stem) if axes else None,
+        "budget": budget(axes, rows, target, task.policy.stem) if axes else None,
         "lag_budget": lag_budget(list(rows.values()), target),
     }
 
 
-def _drive_points(drive: Drive, lags: Sequence[Lag], jobs: int) -> Iterator[dict[str, Any]]:
-    """The rows, each as soon as it is there; one job is this process."""
-    if jobs == 1:
-        yield from (drive_point(drive, lag) for lag in lags)
-        return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, initializer=_watch_the_parent)
-    try:
-        with interrupts_blocked():
-            futures: list[Future[dict[str, Any]]] = [
-                pool.submit(drive_point, drive, lag) for lag in lags
-            ]
-        for future in as_completed(futures):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise UserError("a worker process of the sweep died; use fewer --jobs") from error
-    except BaseException:
-        # Also on ^C: a point takes long, and is of no use any more.
-        for worker in multiprocessing.active_children():
-            worker.kill()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _watch_the_parent() -> None:
-    threading.Thread(target=die_with_parent, daemon=True).start()
-
-
-def drive_point(drive: Drive, lag: Lag) -> dict[str, Any]:
+def drive_point(task: Task, lag: Lag) -> dict[str, Any]:
     """Drive the episodes of one point; its row."""
-    env, driver = _cockpit(drive.policy, drive.scenario, drive.condition, drive.public_key)
-    parameters = make_parameters(MODEL, {**drive.changes, **lag.changes()})
+    env, driver = _cockpit(task.policy, task.scenario, task.condition, task.public_key)
+    parameters = make_parameters(MODEL, {**task.changes, **lag.changes()})
     virtual = VirtualDrive(env, driver, parameters)
-    driven = [virtual.episode(drive.first_seed + number) for number in range(drive.episodes)]
+    driven = [virtual.episode(task.seed + number) for number in range(task.runs)]
     return lag_row(lag, driven, virtual.tracking.report(virtual.action_names))
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from bridge.episode import vehicle_action
 from bridge.inbound import VehicleDecision
-from bridge.tracking import TrackingLog
+from bridge.report import TrackingLog
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter.core import HunterCore
@@ -37,7 +37,7 @@ ROUNDING_S = 1e-6
 """The mock adds its periods up: a time that is due may come out later by a rounding."""
 REARM_MS = 700
 """From a stop until an operator has seen it and five fresh states have come: 0.25 s (half of what
-`processes.Operator` lets pass between two looks) and 0.5 s, in whole control periods."""
+`processes.operator` lets pass between two looks) and 0.5 s, in whole control periods."""
 
 
 class Driven(NamedTuple):

@@ -7,7 +7,7 @@ import sys
 from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "train": ("trainer.commands.train", "train a policy with human guidance"),
+    "train": ("trainer.training.command", "train a policy with human guidance"),
     "drive": ("trainer.person.drive", "drive yourself, or take over from a policy; recorded"),
     "human": ("trainer.commands.human", "train the human model from interventions (DAgger)"),
     "evaluate": ("trainer.evaluate", "drive test episodes and report how well it does"),
@@ -16,7 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "picture": ("trainer.picture", "draw a moment of an episode from above, or film it"),
     "view": ("trainer.view", "show recorded sittings in rerun"),
     "bench": ("trainer.bench", "measure learner, environments and training beside peers"),
-    "experiment": ("trainer.commands.experiment", "run the paper's experiments, judge its claims"),
+    "experiment": ("trainer.experiments.command", "run the paper's experiments, judge its claims"),
 }
 
 

@@ -160,28 +160,23 @@ def compare(ours: Rounds, peer: Rounds) -> dict[str, float]:
     return {"of_medians": median(peer) / median(ours), "median_of_rounds": float(np.median(each))}
 
 
-class Updates:
-    """Whole updates of a learner of ours: drawing, update, new priorities."""
-
-    def __init__(self, learner: TD3Learner, replay: ReplayBuffer, batch_size: int) -> None:
-        self.learner, self.replay, self.batch_size = learner, replay, batch_size
-        self.random = np.random.default_rng(0)
-
-    def run(self, count: int) -> list[float]:
-        """Milliseconds of each of ``count`` updates."""
-        return [timed_ms(self._update) for _ in range(count)]
-
-    def _update(self) -> None:
-        batch = self.replay.sample(self.batch_size, self.random)
-        losses = self.learner.update(batch, 0.0)
-        self.replay.update_priorities(batch.indices, losses.priorities)
-
-
 def timed_ms(work: Callable[[], object]) -> float:
     """How long a call takes, ms."""
     began_s = time.perf_counter()
     work()
     return 1e3 * (time.perf_counter() - began_s)
+
+
+def updates(learner: TD3Learner, replay: ReplayBuffer, batch_size: int, count: int) -> Contender:
+    """Whole updates of a learner of ours, ms each: drawing, update, new priorities."""
+    random = np.random.default_rng(0)
+
+    def update() -> None:
+        batch = replay.sample(batch_size, random)
+        losses = learner.update(batch, 0.0)
+        replay.update_priorities(batch.indices, losses.priorities)
+
+    return lambda: [timed_ms(update) for _ in range(count)]
 
 
 def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
@@ -190,34 +185,35 @@ def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
     Ours in float32 is beside them where the processor has bfloat16; elsewhere ours is just that.
     """
     config, experience = LearnerConfig(batch_size=effort.batch_size), gather(TRANSITIONS)
+    count = effort.updates_per_round
     precision = config.precision if multiplies_bfloat16("cpu") else "float32"
     configs = {OURS: config}
     if precision != "float32":
         configs[FLOAT32] = replace(config, precision="float32")
-    contenders: dict[str, Contender] = {}
-    for name, own in configs.items():
-        updates = Updates(TD3Learner(own, PHIL, seed=0), filled(experience), own.batch_size)
-        contenders[name] = partial(updates.run, effort.updates_per_round)
+    contenders: dict[str, Contender] = {
+        name: updates(TD3Learner(own, PHIL, seed=0), filled(experience), own.batch_size, count)
+        for name, own in configs.items()
+    }
     with contextlib.suppress(ImportError):
         model = make_sb3_model(experience)
         train = partial(model.train, gradient_steps=1, batch_size=config.batch_size)
-        contenders[SB3] = lambda: [timed_ms(train) for _ in range(effort.updates_per_round)]
-    figures = learner_figures(take_turns(contenders, effort.rounds, tick))
-    return {"batch_size": config.batch_size, "precision": precision, **figures}
+        contenders[SB3] = lambda: [timed_ms(train) for _ in range(count)]
+    found = figures(take_turns(contenders, effort.rounds, tick), "ms_per_update")
+    more = {"batch_size": config.batch_size, "precision": precision}
+    return {**more, **found, "updates_per_s": 1e3 / found["ms_per_update"]}
 
 
-def learner_figures(times_ms: dict[str, Rounds]) -> dict[str, Any]:
-    """Medians of ours and of each peer, and how many times as long a peer takes."""
-    ours = times_ms[OURS]
-    return {
-        "ms_per_update": median(ours),
-        "updates_per_s": 1e3 / median(ours),
-        "peers": {
-            name: {"ms_per_update": median(rounds), "ratio": compare(ours, rounds)}
-            for name, rounds in times_ms.items()
-            if name != OURS
-        },
+def figures(
+    times: dict[str, Rounds], name: str, of: Callable[[float], float] = float
+) -> dict[str, Any]:
+    """A figure ``of`` the median time of ours and of each peer, and each peer's ratio to ours."""
+    ours = times[OURS]
+    peers = {
+        peer: {name: of(median(rounds)), "ratio": compare(ours, rounds)}
+        for peer, rounds in times.items()
+        if peer != OURS
     }
+    return {name: of(median(ours)), "peers": peers}
 
 
 class Drive:
@@ -239,13 +235,12 @@ class Drive:
     def run(self, steps: int) -> list[float]:
         """Seconds a step, resets included, under actions at random."""
         actions = self._random.uniform(-1, 1, (steps, 1)).astype(np.float32)
-        return [1e-3 * timed_ms(partial(self._drive, actions)) / steps]
-
-    def _drive(self, actions: NDArray[np.float32]) -> None:
+        began_s = time.perf_counter()
         for action in actions:
             if self._step(action):
                 self.episodes += 1
                 self._reset(self.episodes)
+        return [(time.perf_counter() - began_s) / steps]
 
 
 def our_drive(scenario: str) -> Drive:
@@ -264,17 +259,8 @@ def highway_drive(scenario: str) -> Drive:
 def measure_environment(scenario: str, effort: Effort, tick: Tick) -> dict[str, Any]:
     """The scenario's steps a second with observation, and its peer's."""
     drives = {OURS: our_drive(scenario), HIGHWAY: highway_drive(scenario)}
-    contenders = {
-        name: partial(drive.run, effort.steps_per_round) for name, drive in drives.items()
-    }
-    return environment_figures(take_turns(contenders, effort.rounds, tick))
-
-
-def environment_figures(times_s: dict[str, Rounds]) -> dict[str, Any]:
-    """Steps a second of ours and of the peer, and how many times as fast ours are."""
-    ours, peer = times_s[OURS], times_s[HIGHWAY]
-    theirs = {"steps_per_s": 1.0 / median(peer), "ratio": compare(ours, peer)}
-    return {"steps_per_s": 1.0 / median(ours), "peers": {HIGHWAY: theirs}}
+    contenders = {name: partial(each.run, effort.steps_per_round) for name, each in drives.items()}
+    return figures(take_turns(contenders, effort.rounds, tick), "steps_per_s", lambda s: 1.0 / s)
 
 
 def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
@@ -318,8 +304,8 @@ class Row(NamedTuple):
 
 def show(report: dict[str, Any]) -> None:
     """Print the table to stdout."""
-    cores = f"{report['machine']['cores']} cores"
-    title = f"{report['machine']['processor']}, {cores}, threads: {report['threads']}"
+    machine = report["machine"]
+    title = f"{machine['processor']}, {machine['cores']} cores, threads: {report['threads']}"
     table = Table(title=title, box=box.SIMPLE, title_justify="left")
     for name in Row._fields:
         number = name in ("ours", "ratio")
@@ -333,30 +319,24 @@ def show(report: dict[str, Any]) -> None:
 
 def rows(report: dict[str, Any]) -> Iterator[Row]:
     """The lines of what was measured."""
-    learner, training = report["learner"], report["training"]
+    learner, seconds = report["learner"], report["training"]["s_per_10k_steps"]
     what = f"PHIL-TD3 update, batch {learner['batch_size']}, ms"
-    for name, peer in learner["peers"].items():
-        bar = SB3_BAR if name == SB3 else None
-        yield _row(what, learner, peer, "ms_per_update", name, bar)
+    yield from _beside(what, learner, "ms_per_update", {SB3: SB3_BAR})
     if SB3 not in learner["peers"]:
         yield Row(what, f"{learner['ms_per_update']:.1f}", f"{PEERS[SB3]} is not installed")
-    for scenario, figures in report["environment"].items():
-        peer, what = figures["peers"][HIGHWAY], f"{scenario} with observation, steps/s"
-        yield _row(what, figures, peer, "steps_per_s", HIGHWAY, ENVIRONMENT_BARS[scenario])
-    seconds = training["s_per_10k_steps"]
+    for scenario, found in report["environment"].items():
+        bars = {HIGHWAY: ENVIRONMENT_BARS[scenario]}
+        yield from _beside(f"{scenario} with observation, steps/s", found, "steps_per_s", bars)
     yield Row("training, s per 10,000 steps", f"{seconds['total']:.1f}")
     for name in PARTS:
         yield Row(f"  of it {name}", f"{seconds[name]:.1f}")
 
 
-def _row(
-    what: str, ours: dict[str, Any], peer: dict[str, Any], key: str, name: str, bar: float | None
-) -> Row:
-    """Ours beside a peer's, and whether the ratio is as high as it is to be."""
-    ratio = peer["ratio"]["of_medians"]
-    said = "" if bar is None else f"≥ {bar:g}  {_verdict(ratio >= bar)}"
-    return Row(what, f"{ours[key]:.1f}", f"{peer[key]:.1f}  {PEERS[name]}", f"{ratio:.2f}", said)
-
-
-def _verdict(met: bool) -> str:
-    return "met" if met else "MISSED"
+def _beside(what: str, found: dict[str, Any], key: str, bars: dict[str, float]) -> Iterator[Row]:
+    """Ours beside each peer's, and whether the ratio is as high as it is to be."""
+    for name, peer in found["peers"].items():
+        ratio, bar = peer["ratio"]["of_medians"], ""
+        if name in bars:
+            bar = f"≥ {bars[name]:g}  {'met' if ratio >= bars[name] else 'MISSED'}"
+        theirs = f"{peer[key]:.1f}  {PEERS[name]}"
+        yield Row(what, f"{found[key]:.1f}", theirs, f"{ratio:.2f}", bar)

@@ -114,12 +114,9 @@ def make_sb3_model(experience: Experience) -> Any:
 class HighwayPicture:
     """A scenario of ours whose frames highway-env's GrayscaleObservation draws.
 
-    The same as in the scenario: the road network, the cars and their motion, the ego car, reward,
-    end of the episode, size of the frames, the stack of two, and the part of the ground in view.
-    Different: each frame is drawn by highway-env (lanes, markings and cars by pygame, then RGB to
-    grey), and our rasteriser draws nothing. What a real highway-env environment pays on top is left
-    out, in its favour: its own traffic step with the search for neighbours, and a new viewer at
-    each reset.
+    All else is the scenario's: road, cars and their motion, reward, size and number of the frames,
+    the ground in view. highway-env draws each frame (by pygame, then RGB to grey), our rasteriser
+    nothing. Left out, in its favour: its own traffic step, and a new viewer at each reset.
 
     Args:
         env: the scenario's environment, without wrappers; it must not be used elsewhere.

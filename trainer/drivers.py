@@ -104,9 +104,11 @@ class NetworkDriver:
 
 
 class ConstantDriver:
-    """One action throughout, whatever it sees."""
+    """One action throughout, whatever it sees; ValueError unless it is from -1 to 1."""
 
     def __init__(self, action: float) -> None:
+        if not -1.0 <= action <= 1.0:
+            raise ValueError(action)
         self.action = np.array([action], np.float32)
 
     def reset(self) -> None:
@@ -115,6 +117,10 @@ class ConstantDriver:
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The action, float32 [1]."""
         return self.action
+
+    def act_together(self, observations: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The same for n observations: float32 [n, 1]."""
+        return np.tile(self.action, (len(observations), 1))
 
 
 class OnnxDriver:
@@ -166,50 +172,34 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
     if policy == "expert":
         return EXPERTS[env.scenario](env), "expert"
     if policy.startswith(CONSTANT):
-        return ConstantDriver(_constant_action(policy)), policy
+        try:
+            return ConstantDriver(float(policy.removeprefix(CONSTANT))), policy
+        except ValueError:
+            message = f"{policy}: expected an action from -1 to 1, as in {CONSTANT}0.5"
+            raise UserError(message) from None
     path = Path(policy)
     if path.suffix == ".onnx":
-        driver = OnnxDriver(path, public_key)
-        _check_action(driver, env.scenario, policy)
+        driver, wanted = OnnxDriver(path, public_key), ACTIONS[env.scenario].name
+        names = [action.name for action in driver.policy.manifest.action]
+        if names != [wanted]:
+            raise UserError(
+                f"{policy} answers with {', '.join(names)}, and {env.scenario} asks for {wanted}"
+            )
         return driver, driver.policy.policy_id
     if (path / MODEL_FILE).is_file():
         actor, about = load_human_model(path)
-        _check_scenario(about["scenario"], env.scenario, policy)
-        return NetworkDriver(actor), f"human:{path.name}"
-    if not path.is_dir():
+        policy_id = f"human:{path.name}"
+    elif path.is_dir():
+        actor, about = load_actor(path)
+        policy_id = f"run:{path.name}:{about['episode']}"
+    else:
         raise UserError(
             f"{policy} is no policy: expected an .onnx file, a training run, "
             "a human model's directory, the word expert, or constant:ACTION"
         )
-    actor, state = load_actor(path)
-    _check_scenario(state["scenario"], env.scenario, policy)
-    return NetworkDriver(actor), f"run:{path.name}:{state['episode']}"
-
-
-def _constant_action(policy: str) -> float:
-    """The action behind the word, from -1 to 1."""
-    try:
-        action = float(policy.removeprefix(CONSTANT))
-    except ValueError:
-        action = float("nan")
-    if not -1.0 <= action <= 1.0:
-        raise UserError(f"{policy}: expected an action from -1 to 1, as in {CONSTANT}0.5")
-    return action
-
-
-def _check_scenario(trained_in: str, scenario: str, policy: str) -> None:
-    if trained_in != scenario:
-        raise UserError(f"{policy} was trained in {trained_in}, not in {scenario}")
-
-
-def _check_action(driver: OnnxDriver, scenario: str, policy: str) -> None:
-    """Refuse a file whose action means something else than the scenario's."""
-    names = [action.name for action in driver.policy.manifest.action]
-    wanted = ACTIONS[scenario].name
-    if names != [wanted]:
-        raise UserError(
-            f"{policy} answers with {', '.join(names)}, and {scenario} asks for {wanted}"
-        )
+    if about["scenario"] != env.scenario:
+        raise UserError(f"{policy} was trained in {about['scenario']}, not in {env.scenario}")
+    return NetworkDriver(actor), policy_id
 
 
 def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:

@@ -11,10 +11,10 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from edge_runtime.util import UserError, counted
 from trainer.drivers import CONDITIONS, load_driver, make_environment
 from trainer.human.guide import Action, Driver
 from trainer.options import add_latency, add_scenario, add_seed, set_threads
-from trainer.training.delayed import RemoteDriver
+from trainer.training.delayed import VehicleEnd
 from trainer.util import ProgressBar
 
 EXAMPLE = examples(
@@ -100,20 +100,13 @@ def run(arguments: argparse.Namespace) -> int:
             goals += result.outcome == GOAL
             bar.advance({"success": f"{goals / (bar.done + 1):.2f}"})
 
+        condition, more = arguments.condition, (on_episode, latency)
         if jobs == 1:
             set_threads(1)  # As each worker: the last bits must not depend on how many drive.
-            results = drive_episodes(env, driver, seeds, arguments.condition, on_episode, latency)
+            results = drive_episodes(env, driver, seeds, condition, *more)
         else:
-            results = drive_episodes_in_parallel(
-                arguments.policy,
-                arguments.scenario,
-                seeds,
-                jobs,
-                arguments.condition,
-                on_episode,
-                latency,
-                arguments.public_key,
-            )
+            named = arguments.policy, arguments.scenario, seeds, jobs
+            results = drive_episodes_in_parallel(*named, condition, *more, arguments.public_key)
     report = summarise(results, arguments.scenario, arguments.condition, policy_id, arguments.seed)
     report["latency_spec"] = str(latency)
     if not arguments.out:
@@ -187,11 +180,11 @@ def drive_episode(
     The other arguments are as for ``Drive``.
     """
     drive = Drive(env, seed, noise_std)
-    if latency != NO_NETWORK:
-        driver = RemoteDriver(driver, env, latency, seed)
     driver.reset()
+    network = None if latency == NO_NETWORK else VehicleEnd(env, latency, seed)
     while not drive.over:
-        drive.step(driver.act(drive.observation))
+        seen = drive.observation
+        drive.step(network.tick(seen, driver.act) if network else driver.act(seen))
     return drive.result()
 
 
@@ -270,7 +263,7 @@ def drive_episodes_in_parallel(
     """Drive one episode for each seed under a condition, in ``jobs`` worker processes.
 
     Args:
-        policy: who drives, as in `trainer.drivers.load_driver`.
+        policy: what drives, as in `trainer.drivers.load_driver`.
         scenario: what is driven.
         seeds: of the episodes.
         jobs: number of processes.
@@ -288,13 +281,13 @@ def drive_episodes_in_parallel(
     """
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, context, initializer=_start_worker)
-    results = []
+    drive = partial(_drive, policy, scenario, condition, public_key, latency)
+    results: list[EpisodeResult] = []
     try:
         with interrupts_blocked():
-            futures: list[Future[EpisodeResult]] = [
-                pool.submit(_drive, policy, scenario, seed, condition, latency, public_key)
-                for seed in seeds
-            ]
+            # Not `pool.map`: it cancels what is left where a worker has died, and the pool's own
+            # thread breaks over that and leaves the other workers behind (Python 3.11).
+            futures = [pool.submit(drive, seed) for seed in seeds]
         for future in futures:
             results.append(future.result())
             on_episode(results[-1])
@@ -351,10 +344,10 @@ def _cockpit(
 def _drive(
     policy: str,
     scenario: str,
-    seed: int,
     condition: str,
-    latency: LatencySpec,
     public_key: str | None,
+    latency: LatencySpec,
+    seed: int,
 ) -> EpisodeResult:
     env, driver = _cockpit(policy, scenario, condition, public_key)
     return drive_episodes(env, driver, [seed], condition, latency=latency)[0]

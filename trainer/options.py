@@ -63,12 +63,8 @@ def add_latency(parser: Group, what: str) -> None:
 
 def add_time_limit(parser: Group, what: str) -> None:
     """``--max-minutes``; ``what`` says what becomes of the work then."""
-    parser.add_argument(
-        "--max-minutes",
-        type=positive_number,
-        metavar="MIN",
-        help=f"{what} (default: no limit)",
-    )
+    text = f"{what} (default: no limit)"
+    parser.add_argument("--max-minutes", type=positive_number, metavar="MIN", help=text)
 
 
 def deadline_s(arguments: argparse.Namespace, clock: Callable[[], float] = time.monotonic) -> float:

@@ -24,7 +24,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -65,7 +64,7 @@ def _text(low: float, high: float) -> str:
 
 
 def save_torch(path: Path, state: Any) -> None:
-    """Write ``state`` so that a kill at any moment leaves the old file or the new one."""
+    """Write a state whole or not at all."""
     import torch
 
     buffer = io.BytesIO()
@@ -91,26 +90,6 @@ def load_torch(path: Path) -> Any:
         raise UserError(f"{path} is not a checkpoint of this project") from error
 
 
-def as_tensors(values: dict[str, Any]) -> dict[str, Any]:
-    """The same with arrays as tensors: what ``load_torch`` reads without arbitrary unpickling."""
-    import torch
-
-    return {
-        name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
-        for name, value in values.items()
-    }
-
-
-def as_arrays(values: dict[str, Any]) -> dict[str, Any]:
-    """The inverse of ``as_tensors``."""
-    import torch
-
-    return {
-        name: value.numpy() if isinstance(value, torch.Tensor) else value
-        for name, value in values.items()
-    }
-
-
 @contextmanager
 def claimed(directory: Path) -> Iterator[None]:
     """Be the only process that trains in a directory.
@@ -125,8 +104,8 @@ def claimed(directory: Path) -> Iterator[None]:
     try:
         with held(directory / LOCK_FILE) as mine:
             if not mine:
-                who = holder(directory / LOCK_FILE)
-                raise UserError(f"{directory} is being trained in by {who}")
+                by = holder(directory / LOCK_FILE)
+                raise UserError(f"{directory} is being trained in by {by}")
             yield
     finally:
         with suppress(OSError):  # It holds something.
@@ -144,46 +123,44 @@ def held(path: Path, patience_s: float = 0.0) -> Iterator[bool]:
     Raises:
         UserError: the file cannot be written or locked.
     """
+    end_s, descriptor = time.monotonic() + patience_s, -1
     try:
-        descriptor = _locked(path, time.monotonic() + patience_s)
+        while (descriptor := _locked(path)) < 0 and time.monotonic() < end_s:
+            time.sleep(0.01)
     except OSError as error:
         raise UserError(f"cannot lock {path}: {error.strerror}") from None
-    if descriptor is None:
-        yield False
-        return
     try:
-        yield True
+        yield descriptor >= 0
     finally:
-        if _is(path, descriptor):
-            path.unlink()
-        os.close(descriptor)
+        if descriptor >= 0:
+            if _is(path, descriptor):
+                path.unlink()
+            os.close(descriptor)
 
 
 def holder(path: Path) -> str:
-    """Who holds a lock, in words."""
+    """Which process holds a lock, in words."""
     try:
-        who = json.loads(path.read_bytes())
-        return f"process {who['pid']} on {who['host']}"
+        found = json.loads(path.read_bytes())
+        return f"process {found['pid']} on {found['host']}"
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return "another process"
 
 
-def _locked(path: Path, end_s: float) -> int | None:
-    """The locked file, opened and with this process's name in it; None where another has it."""
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        mine = try_to_lock_file(descriptor)
-        # The process that lets go removes the file. A lock on one without a name excludes nobody.
-        if mine and _is(path, descriptor):
-            os.ftruncate(descriptor, 0)
-            me = {"pid": os.getpid(), "host": socket.gethostname()}
-            os.pwrite(descriptor, json.dumps(me).encode(), 0)
-            return descriptor
+def _locked(path: Path) -> int:
+    """The locked file, opened and with this process's name in it; -1 where another has it."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    if not try_to_lock_file(descriptor):
         os.close(descriptor)
-        if not mine:
-            if time.monotonic() >= end_s:
-                return None
-            time.sleep(0.01)
+        return -1
+    if not _is(path, descriptor):
+        # The process before has just let go and removed the file: this lock excludes nobody.
+        os.close(descriptor)
+        return _locked(path)
+    os.ftruncate(descriptor, 0)
+    me = {"pid": os.getpid(), "host": socket.gethostname()}
+    os.pwrite(descriptor, json.dumps(me).encode(), 0)
+    return descriptor
 
 
 def _is(path: Path, descriptor: int) -> bool:
@@ -205,9 +182,12 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
     """
     before = {number: signal.getsignal(number) for number in SIGNALS}
 
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
     def stop(number: int, frame: Any) -> None:
-        for name, handler in before.items():
-            signal.signal(name, handler)
+        restore()
         if not ask():
             os.kill(os.getpid(), number)
 
@@ -216,12 +196,11 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        restore()
 
 
 class ProgressBar:
-    """Counts to ``total`` and shows a few live figures; written to stderr.
+    """Counts to ``total`` and shows a few live figures on stderr: a bar, or now and then a line.
 
     Use as a context manager and call ``advance`` with the figures, e.g. ``{"success": "0.85"}``.
     """
@@ -230,42 +209,35 @@ class ProgressBar:
         self.what, self.total, self.done = what, total, done
         self._began_s = self._line_s = time.monotonic()
         self._began_at = done
-        self._bar: Progress | None = None
-        if sys.stderr.isatty():
-            self._bar = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[figures]}"),
-                TextColumn("ETA"),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-            )
-            self._task = self._bar.add_task(what, total=total, completed=done, figures="")
+        self._bar = Progress(
+            *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
+            *(TextColumn("{task.fields[figures]}"), TextColumn("ETA"), TimeRemainingColumn()),
+            console=Console(stderr=True),
+            disable=not sys.stderr.isatty(),
+        )
+        self._task = self._bar.add_task(what, total=total, completed=done, figures="")
 
     def __enter__(self) -> ProgressBar:
-        if self._bar:
-            self._bar.start()
+        self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar:
-            self._bar.stop()
+        self._bar.stop()
 
     def advance(self, figures: dict[str, str], count: int = 1) -> None:
         """``count`` more are done; ``figures`` are shown as name and value."""
         self.done += count
         text = "  ".join(f"{name} {value}" for name, value in figures.items())
-        if self._bar:
-            self._bar.update(self._task, completed=self.done, figures=text)
-        elif time.monotonic() - self._line_s > LINE_INTERVAL_S or self.done == self.total:
-            self._line_s = time.monotonic()
-            line = f"{self.what}: {self.done}/{self.total}  {text}  ETA {self._eta_s():.0f} s"
+        self._bar.update(self._task, completed=self.done, figures=text)
+        now_s = time.monotonic()
+        if self._bar.disable and (
+            now_s - self._line_s > LINE_INTERVAL_S or self.done == self.total
+        ):
+            self._line_s = now_s
+            each_s = (now_s - self._began_s) / max(self.done - self._began_at, 1)
+            left = f"ETA {each_s * (self.total - self.done):.0f} s"
+            line = f"{self.what}: {self.done}/{self.total}  {text}  {left}"
             print(line, file=sys.stderr, flush=True)
-
-    def _eta_s(self) -> float:
-        elapsed_s = time.monotonic() - self._began_s
-        return elapsed_s / max(self.done - self._began_at, 1) * (self.total - self.done)
 
 
 @cache

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from bridge.rerun.draw import PICTURE_INTERVAL_S, Pace
+from bridge.messages import Pace
+from bridge.rerun.draw import PICTURE_INTERVAL_S
 from bridge.rerun.sinks import (
     SERVE,
     Sink,

@@ -7,8 +7,8 @@ turned.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -49,32 +49,22 @@ def draw_ground(recording: rr.RecordingStream, scene: SeenScene) -> None:
         )
 
 
-def draw_cars(
-    recording: rr.RecordingStream, scene: SeenScene, ego_colour: tuple[int, int, int]
-) -> None:
+def draw_cars(recording: rr.RecordingStream, scene: SeenScene, ego_colour: Colour) -> None:
     """Draw the cars; the ego car's colour may say what it does, or by whose will."""
     for name, ego in (("traffic", False), ("ego", True)):
+        path, colour = f"road/{name}", ego_colour if ego else TRAFFIC
         cars = [car for car in scene.vehicles if car.ego == ego]
-        _draw_cars(recording, f"road/{name}", cars, ego_colour if ego else TRAFFIC)
-
-
-def _draw_cars(
-    recording: rr.RecordingStream,
-    path: str,
-    cars: Sequence[SeenCar],
-    colour: tuple[int, int, int],
-) -> None:
-    half_widths = [car.width_m / 2 for car in cars]
-    _lines(recording, f"{path}/body", [body(car) for car in cars], colour, half_widths, order=3.0)
-    _lines(recording, f"{path}/outline", [outline(car) for car in cars], GLASS, 0.1, order=4.0)
-    _lines(recording, f"{path}/glass", [windscreen(car) for car in cars], GLASS, 0.3, order=5.0)
+        half_m = [car.width_m / 2 for car in cars]
+        _lines(recording, f"{path}/body", [body(car) for car in cars], colour, half_m, order=3.0)
+        _lines(recording, f"{path}/outline", [outline(car) for car in cars], GLASS, 0.1, order=4.0)
+        _lines(recording, f"{path}/glass", [windscreen(car) for car in cars], GLASS, 0.3, order=5.0)
 
 
 def _lines(
     recording: rr.RecordingStream,
     path: str,
     strips: Sequence[Sequence[Sequence[float]]],
-    colour: tuple[int, int, int],
+    colour: Colour,
     radii_m: float | list[float],
     order: float,
 ) -> None:
@@ -171,41 +161,17 @@ def plot_view(plot: Plot, shown: rrb.TimeRange = ALL_OF_IT) -> rrb.TimeSeriesVie
 
 def style_lines(recording: rr.RecordingStream, lines: Mapping[str, Colour]) -> None:
     """Name and colour lines by their entities; the name is the path's last part."""
-    for path, colour in lines.items():
-        name = path.rpartition("/")[2].replace("_", " ")
-        style = rr.SeriesLines(colors=[colour], names=[name], widths=[2.0])
-        recording.log(path, style, static=True)
+    _style(recording, lines, lambda **style: rr.SeriesLines(widths=[2.0], **style))
 
 
 def style_points(recording: rr.RecordingStream, points: Mapping[str, Colour]) -> None:
     """The same for what happens now and then: dots instead of a line."""
-    for path, colour in points.items():
+    _style(recording, points, lambda **style: rr.SeriesPoints(marker_sizes=[4.0], **style))
+
+
+def _style(
+    recording: rr.RecordingStream, colours: Mapping[str, Colour], kind: Callable[..., Any]
+) -> None:
+    for path, colour in colours.items():
         name = path.rpartition("/")[2].replace("_", " ")
-        style = rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[4.0])
-        recording.log(path, style, static=True)
-
-
-class Pace:
-    """Says when the next one is due, so that in the long run no more than one an interval is.
-
-    An interval of 0 s takes all.
-
-    One that comes up to half an interval early is taken: what is sent every 0.1 s arrives with
-    some jitter, and waiting for the next would lose every second one.
-    """
-
-    def __init__(self, interval_s: float) -> None:
-        self.interval_s = interval_s
-        self._next_s: float | None = None
-
-    def due(self, now_s: float) -> bool:
-        """Whether one may come now; if so, it is counted."""
-        if not self.interval_s:
-            return True
-        half_s = 0.5 * self.interval_s
-        if self._next_s is None:
-            self._next_s = now_s
-        if now_s < self._next_s - half_s:
-            return False
-        self._next_s = max(self._next_s, now_s - half_s) + self.interval_s
-        return True
+        recording.log(path, kind(colors=[colour], names=[name]), static=True)

@@ -17,7 +17,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
@@ -108,9 +107,17 @@ def check_sink(sink: Sink) -> None:
     if sink.path:
         check_writable(sink.path)
     elif sink.kind == SERVE:
-        check_ports()
-    else:
-        check_display()
+        for port in (GRPC_PORT, WEB_PORT):  # a view of somebody else may be there
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind((LOOPBACK, port))
+                except OSError:
+                    raise UserError(f"port {port} is in use; end the other rerun first") from None
+    elif sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise UserError("no display for a window here: serve a page, or save a file")
 
 
 @contextlib.contextmanager
@@ -119,8 +126,9 @@ def open_sink(
 ) -> Iterator[rr.RecordingStream]:
     """A recording that goes there; ``application`` keeps layouts of different kinds apart.
 
-    SIGTERM raises KeyboardInterrupt meanwhile, unless the command has another use for it: a file
-    is to be finished, and a server not to be left behind.
+    A window stays open afterwards; a page is served until then. SIGTERM raises KeyboardInterrupt
+    meanwhile, unless the command has another use for it: a file is to be finished, and a server
+    not to be left behind.
 
     Raises:
         ViewerGone: there is none any more, or none has come.
@@ -128,22 +136,13 @@ def open_sink(
     import rerun as rr
 
     recording = rr.RecordingStream(application)
-    with sigterm_as_interrupt(), _opened(recording, sink, blueprint):
+    opened = _saved(recording, sink.path, blueprint) if sink.path else None
+    with sigterm_as_interrupt(), opened or _shown(recording, sink.kind, blueprint):
         yield recording
 
 
-def _opened(
-    recording: rr.RecordingStream, sink: Sink, blueprint: rrb.Blueprint
-) -> AbstractContextManager[rr.RecordingStream]:
-    if sink.path:
-        return save_to(recording, sink.path, blueprint)
-    return (serve_page if sink.kind == SERVE else spawn_window)(recording, blueprint)
-
-
 @contextlib.contextmanager
-def save_to(
-    recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint
-) -> Iterator[rr.RecordingStream]:
+def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -> Iterator[None]:
     """Record into a file that appears under its name when it is complete."""
     target = behind_link(path)
     make_directory(target.parent)
@@ -151,7 +150,7 @@ def save_to(
     try:
         recording.save(temporary, default_blueprint=blueprint)
         try:
-            yield recording
+            yield
         finally:
             recording.flush()
             recording.disconnect()  # Writes the footer.
@@ -160,60 +159,22 @@ def save_to(
         temporary.unlink(missing_ok=True)
 
 
-def check_display() -> None:
-    """Raise UserError where no window could open."""
-    displays = (os.environ.get("DISPLAY"), os.environ.get("WAYLAND_DISPLAY"))
-    if sys.platform.startswith("linux") and not any(displays):
-        raise UserError("no display for a window here: serve a page, or save a file")
-
-
 @contextlib.contextmanager
-def spawn_window(
-    recording: rr.RecordingStream, blueprint: rrb.Blueprint
-) -> Iterator[rr.RecordingStream]:
-    """Show in rerun's own window, which stays open afterwards."""
-    port = free_port()
-    viewer = Viewer(["--port", str(port), "--expect-data-soon"], [port])
-    with _connected(recording, viewer, port, blueprint):
-        yield recording
-
-
-def check_ports() -> None:
-    """Raise UserError where the page could not be served: a view of somebody else is there."""
-    for port in (GRPC_PORT, WEB_PORT):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((LOOPBACK, port))
-            except OSError:
-                raise UserError(f"port {port} is in use; end the other rerun first") from None
-
-
-@contextlib.contextmanager
-def serve_page(
-    recording: rr.RecordingStream, blueprint: rrb.Blueprint
-) -> Iterator[rr.RecordingStream]:
-    """Show in a browser on this machine only."""
-    options = ["--serve-web", "--port", str(GRPC_PORT), "--web-viewer-port", str(WEB_PORT)]
-    viewer = Viewer(options, [GRPC_PORT, WEB_PORT])
+def _shown(recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint) -> Iterator[None]:
+    """Draw for a window or a page; ViewerGone where it does not last."""
+    port = GRPC_PORT if kind == SERVE else free_port()
+    if kind == SERVE:
+        page = ["--serve-web", "--port", str(port), "--web-viewer-port", str(WEB_PORT)]
+        viewer = Viewer(page, [port, WEB_PORT])
+    else:
+        viewer = Viewer(["--port", str(port), "--expect-data-soon"], [port])
     try:
-        with _connected(recording, viewer, GRPC_PORT, blueprint) as url:
+        url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+        recording.connect_grpc(url, default_blueprint=blueprint)
+        if kind == SERVE:
             print(f"open http://{LOOPBACK}:{WEB_PORT}/?url={quote(url, safe='')}", flush=True)
-            yield recording
-    finally:
-        viewer.end()
-
-
-@contextlib.contextmanager
-def _connected(
-    recording: rr.RecordingStream, viewer: Viewer, port: int, blueprint: rrb.Blueprint
-) -> Iterator[str]:
-    """Draw for a viewer, at the address that is yielded; ViewerGone where it does not last."""
-    url = f"rerun+http://{LOOPBACK}:{port}/proxy"
-    recording.connect_grpc(url, default_blueprint=blueprint)
-    try:
         try:
-            yield url
+            yield
         finally:
             flush(recording)
     except ViewerGone as gone:
@@ -221,7 +182,11 @@ def _connected(
         viewer.end()
         raise ViewerGone(why) from None
     finally:
-        viewer.leave(recording)
+        try:
+            viewer.leave(recording)
+        finally:
+            if kind == SERVE:
+                viewer.end()
 
 
 class Viewer:
@@ -237,7 +202,7 @@ class Viewer:
 
     def __init__(self, options: Sequence[str], ports: Sequence[int]) -> None:
         command = [sys.executable, "-m", "rerun_cli", "--bind", LOOPBACK, *options]
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 (closed by the last who writes)
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 (open for as long as the viewer writes)
         # A group of its own: ^C is not for it, and it ends with the child that the module starts.
         self._process = subprocess.Popen(
             command,
@@ -288,7 +253,7 @@ class Viewer:
 
 
 def free_port() -> int:
-    """One on which nobody listens."""
+    """A port that is not in use."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,36 +13,17 @@ from typing import Any, NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.commands import add_connect, add_span, add_tls, wait_to_be_told
-from bridge.messages import MESSAGES, Heard, Scene
-from bridge.ports import open_feed
+from bridge.commands import add_options, wait_to_be_told
+from bridge.messages import DECODERS, Heard, Pace, Scene
+from bridge.ports import open_listener
 from bridge.recording import Recording, read_heard
-from bridge.rerun import APPLIED, POLICY
-from bridge.rerun.draw import (
-    ALL_OF_IT,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PICTURE_INTERVAL_S,
-    PURPLE,
-    RED,
-    Pace,
-    Plot,
-    draw_cars,
-    draw_ground,
-    frames_view,
-    full_blueprint,
-    plot_view,
-    road_view,
-    style_lines,
-)
+from bridge.rerun import APPLIED, POLICY, draw
+from bridge.rerun.draw import Plot
 from bridge.rerun.sinks import SERVE, Sink, add_sink, check_sink, chosen_sink, flush, open_sink
 from bridge.virtual_link import SILENCE_LIMIT_S
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
 from edge_runtime.tls import TlsFiles, tls_for
-from edge_runtime.transport import check_endpoint
 from edge_runtime.wire import CONTROL_PERIOD_S, DEFAULT_VEHICLE_ID, Command, Feedback, Health, State
 
 APPLICATION = "phil_hil"
@@ -63,30 +43,21 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="show what bridge record has written, instead of listening",
     )
     add_sink(parser)
-    add_connect(parser)
-    add_tls(parser)
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        help=f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)",
+    add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
+    help_text = (
+        f"the vehicle to watch (default: {DEFAULT_VEHICLE_ID}; of a recording: the only one)"
     )
-    add_span(parser)
+    add_options(parser, "--vehicle-id", default=None, help=help_text)
 
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    if arguments.vehicle_id is not None:
-        wire.check_vehicle_id(arguments.vehicle_id)
     sink = chosen_sink(arguments)
+    check_sink(sink)
     if arguments.recording is not None:
-        check_sink(sink)
         _show_recording(arguments, sink)
     else:
-        tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
-        check_sink(sink)
-        dropped = _watch(arguments, sink, tls)
-        if dropped:
-            print(f"{dropped} messages came faster than they could be drawn", file=sys.stderr)
+        _watch(arguments, sink, tls_for(arguments.tls, arguments.connect))
     if sink.path:
         print(f"wrote {sink.path}")
     return 0
@@ -104,7 +75,7 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
     ):
         log = WireLog(recording)
         for each in chain([first] if first else [], heard):
-            _write(log, each)
+            log.write(each)
         if file.trouble():
             text = f"the recording {file.trouble()}; what is whole of it is shown"
             print(text, file=sys.stderr, flush=True)
@@ -114,31 +85,21 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
             wait_to_be_told()
 
 
-def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> int:
-    """Draw until there is a reason to stop; return how many messages had to be dropped."""
+def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> None:
+    """Draw until there is a reason to stop."""
     vehicle_id = arguments.vehicle_id or DEFAULT_VEHICLE_ID
     with (
         sigterm_as_interrupt(),
-        open_feed(arguments.connect, vehicle_id, arguments.wait_s, tls) as feed,
+        open_listener(arguments.connect, vehicle_id, arguments.wait_s, tls) as listener,
         open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
         # Being interrupted is the ordinary way to end a view: what was drawn is kept.
         contextlib.suppress(KeyboardInterrupt),
     ):
-        log = WireLog(recording, PICTURE_INTERVAL_S if sink.is_live else 0.0)
-        for heard in feed.until_gone(arguments.duration_s):
-            _write(log, heard)
-    return feed.dropped
-
-
-def _write(log: WireLog, heard: Heard) -> None:
-    row = MESSAGES.get(heard.topic)
-    if row is None:
-        return  # A token: it shows as silence.
-    message = row.decode(heard.payload)
-    if message is None or isinstance(message, wire.Rejection):
-        log.write_unreadable(heard.topic, message.detail if message else "not a scene")
-    else:
-        getattr(log, f"write_{heard.topic}")(message, heard.arrived_ns)
+        log = WireLog(recording, draw.PICTURE_INTERVAL_S if sink.is_live else 0.0)
+        for heard in listener.until_gone(arguments.duration_s):
+            log.write(heard)
+    if listener.dropped:
+        print(f"{listener.dropped} messages came faster than they could be drawn", file=sys.stderr)
 
 
 PLOTS = (
@@ -151,30 +112,28 @@ PLOTS = (
 SERIES = {
     "action/asked": POLICY,
     "action/achieved": APPLIED,
-    "speed/simulated": BLUE,
-    "speed/vehicle": ORANGE,
-    "latency/uplink": BLUE,
-    "latency/inference": GREEN,
-    "latency/downlink": PURPLE,
-    "latency/round_trip": ORANGE,
+    "speed/simulated": draw.BLUE,
+    "speed/vehicle": draw.ORANGE,
+    "latency/uplink": draw.BLUE,
+    "latency/inference": draw.GREEN,
+    "latency/downlink": draw.PURPLE,
+    "latency/round_trip": draw.ORANGE,
 }
 """Lines that are there from the start; those of rejections come with their reasons."""
 
 
 def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
-    left = rrb.Vertical(road_view(scene, "Road from above"), frames_view(), row_shares=[3, 1.4])
-    return full_blueprint(left, _numbers(), [3, 2], "sim_time")
-
-
-def _numbers() -> rrb.Vertical:
-    return rrb.Vertical(
+    left = rrb.Vertical(
+        draw.road_view(scene, "Road from above"), draw.frames_view(), row_shares=[3, 1.4]
+    )
+    right = rrb.Vertical(
         rrb.StateTimelineView(
             origin="mode",
             name="Mode, and why it does not drive",
-            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+            time_view=rrb.TimeAxis(view_range=draw.ALL_OF_IT),
         ),
-        *map(plot_view, PLOTS),
+        *map(draw.plot_view, PLOTS),
         rrb.TextLogView(
             origin="events",
             name="Events: modes, rejections, episodes",
@@ -182,18 +141,19 @@ def _numbers() -> rrb.Vertical:
         ),
         row_shares=[2.2, 2, 2, 2, 1.6, 1.8],
     )
+    return draw.full_blueprint(left, right, [3, 2], "sim_time")
 
 
 SILENT = "no command"
 NOTHING_WRONG = "-"
 REMEMBERED_STATES = 64
 """States whose sending time is kept, for the latency of their commands."""
-EGO = {"drive": POLICY, "safe_stop": RED, SILENT: (160, 30, 120)}
+EGO = {"drive": POLICY, "safe_stop": draw.RED, SILENT: (160, 30, 120)}
 """Colour of the ego car by what it is told."""
 ALL = "all"
 """The sum over the reasons, which has a line from the start."""
-SIDES = {"edge": ORANGE, "simulator": BLUE}
-"""Who rejects, and the colour of all that it has rejected."""
+SIDES = {"edge": draw.ORANGE, "simulator": draw.BLUE}
+"""The side that rejects, and the colour of all that it has rejected."""
 
 
 class WireLog:
@@ -211,8 +171,8 @@ class WireLog:
         self._timeline = Timeline()
         self._told, self._reason = "", ""
         self._heard_command_ns: int | None = None
-        self._sent_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
-        self._answered_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._sent_ns: dict[tuple[int, int], int] = {}
+        self._answered_ns: dict[tuple[int, int], int] = {}
         """From the sending of a state to that of its command, by the stamps of both."""
         self._split: tuple[int, int] | None = None
         """The state whose round trip was drawn in its parts last."""
@@ -220,12 +180,29 @@ class WireLog:
         self._reasons: set[tuple[str, str]] = set()
         self._drawn_episode = -1
         self._health: Health | None = None
-        self._define_series()
+        draw.style_lines(recording, SERIES)
+        for side, colour in SIDES.items():
+            self._style_rejections(side, ALL, colour)
+        lanes = rr.StateConfiguration(values=list(EGO), labels=list(EGO), colors=list(EGO.values()))
+        recording.log("mode/mode", lanes, static=True)
+        quiet = rr.StateConfiguration(values=[NOTHING_WRONG], labels=[" "], colors=[draw.GREY])
+        recording.log("mode/reason", quiet, static=True)
+
+    def write(self, heard: Heard) -> None:
+        """Draw one message as it came; a token shows as silence."""
+        if heard.topic not in DECODERS:
+            return
+        message = DECODERS[heard.topic](heard.payload)
+        if message is None or isinstance(message, wire.Rejection):
+            why = message.detail if message else "not a scene"
+            self._event(f"unreadable {heard.topic}: {why}", rr.TextLogLevel.ERROR)
+        else:
+            getattr(self, f"write_{heard.topic}")(message, heard.arrived_ns)
 
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
         self._stand_at(self._timeline.place(state.episode, state.step))
-        self._remember(state)
+        _keep(self._sent_ns, (state.episode, state.step), state.sent_ns)
         if self._frames_pace.due(arrived_ns * 1e-9):
             before, now = state.frames_array()
             self._recording.log("frames/before", rr.Image(before, color_model="L"))
@@ -239,7 +216,7 @@ class WireLog:
             # A viewer that comes late has not yet had the time to hear one.
             self._heard_command_ns = arrived_ns
         silent = arrived_ns - self._heard_command_ns > SILENCE_LIMIT_S * 1e9
-        # Between two episodes nobody owes a command.
+        # Between two episodes no command is due.
         if silent and state.step > 0 and not state.final:
             self._scalar("action/asked", math.nan)  # A gap in the line: nothing is asked.
             self._tell(SILENT, "the simulator brakes by itself", rr.TextLogLevel.WARN)
@@ -248,7 +225,7 @@ class WireLog:
         """Draw what is asked, the mode, and where the time went."""
         self._stand_at(self._timeline.place(command.episode, command.step))
         self._heard_command_ns = arrived_ns
-        self._action("action/asked", command.action)
+        self._recording.log("action/asked", rr.Scalars(list(command.action)))
         sent_ns = self._sent_ns.get((command.episode, command.step))
         if sent_ns is not None:
             self._scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
@@ -263,7 +240,7 @@ class WireLog:
 
     def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
         """Draw what the vehicle has reached."""
-        self._action("action/achieved", feedback.action)
+        self._recording.log("action/achieved", rr.Scalars(list(feedback.action)))
         self._scalar("speed/vehicle", feedback.speed_mps)
 
     def write_health(self, health: Health, _arrived_ns: int) -> None:
@@ -284,24 +261,11 @@ class WireLog:
             self._recording.send_blueprint(make_blueprint(scene))
         if self._drawn_episode != scene.episode:
             self._drawn_episode = scene.episode
-            draw_ground(self._recording, scene)
+            draw.draw_ground(self._recording, scene)
         self._round_trip(scene)
         self._rejections("simulator", scene.rejected)
         if self._cars_pace.due(arrived_ns * 1e-9):
-            draw_cars(self._recording, scene, EGO[self._told or SILENT])
-
-    def write_unreadable(self, topic: str, why: str) -> None:
-        """Note a message that the viewer cannot read."""
-        self._event(f"unreadable {topic}: {why}", rr.TextLogLevel.ERROR)
-
-    def _define_series(self) -> None:
-        style_lines(self._recording, SERIES)
-        for side, colour in SIDES.items():
-            self._style_rejections(side, ALL, colour)
-        lanes = rr.StateConfiguration(values=list(EGO), labels=list(EGO), colors=list(EGO.values()))
-        self._recording.log("mode/mode", lanes, static=True)
-        quiet = rr.StateConfiguration(values=[NOTHING_WRONG], labels=[" "], colors=[GREY])
-        self._recording.log("mode/reason", quiet, static=True)
+            draw.draw_cars(self._recording, scene, EGO[self._told or SILENT])
 
     def _stand_at(self, moment: Moment) -> None:
         recording = self._recording
@@ -309,9 +273,6 @@ class WireLog:
         recording.set_time("sim_time", duration=moment.sim_time_s)
         recording.set_time("step", sequence=moment.total_step)
         recording.set_time(f"episode_{moment.episode}", duration=moment.episode_time_s)
-
-    def _remember(self, state: State) -> None:
-        _keep(self._sent_ns, (state.episode, state.step), state.sent_ns)
 
     def _round_trip(self, scene: Scene) -> None:
         """The newest round trip, and what is left of it for the way down."""
@@ -330,7 +291,7 @@ class WireLog:
         for reason, count in counts.items():
             if count and (side, reason) not in self._reasons:
                 self._reasons.add((side, reason))
-                self._style_rejections(side, reason, GREY)
+                self._style_rejections(side, reason, draw.GREY)
                 self._scalar(f"rejected/{side}/{reason}", 0)
             if count:
                 self._scalar(f"rejected/{side}/{reason}", count)
@@ -349,9 +310,6 @@ class WireLog:
         self._event(f"{mode}: {reason}" if reason else mode, level)
         self._write_status()
 
-    def _action(self, path: str, action: Sequence[float]) -> None:
-        self._recording.log(path, rr.Scalars(list(action)))
-
     def _scalar(self, path: str, value: float) -> None:
         self._recording.log(path, rr.Scalars(value))
 
@@ -366,10 +324,11 @@ class WireLog:
         self._recording.log("status", rr.TextDocument(text, media_type="text/markdown"))
 
 
-def _keep(table: OrderedDict[tuple[int, int], int], key: tuple[int, int], value: int) -> None:
+def _keep(table: dict[tuple[int, int], int], key: tuple[int, int], value: int) -> None:
+    """Remember a value, and forget the oldest where there are too many."""
     table[key] = value
     if len(table) > REMEMBERED_STATES:
-        table.popitem(last=False)
+        del table[next(iter(table))]
 
 
 def _health_lines(health: Health) -> list[str]:

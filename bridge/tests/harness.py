@@ -149,6 +149,12 @@ def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
+def rerun(*arguments: str) -> str:
+    """Run rerun's own reader; what it prints."""
+    command = [sys.executable, "-m", "rerun", *arguments]
+    return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
+
+
 def make_command(step: int, **changes: Any) -> Command:
     """Make a valid command of session ``here``, episode 0; ``changes`` replace its fields."""
     fields: dict[str, Any] = {

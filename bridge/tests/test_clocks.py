@@ -59,21 +59,22 @@ def used(decisions):
     return [None if d.command is None else d.command.step for d in decisions]
 
 
-def test_without_latency_every_state_meets_its_own_command():
-    rig = Rig()
-    assert used(rig.drive(10)) == list(range(10))
-    assert not rig.check.rejected
-
-
-def test_a_command_inside_the_window_acts_in_its_tick_and_outside_it_in_the_next():
-    assert used(Rig("up.delay=10ms,down.delay=15ms").drive(4)) == [0, 1, 2, 3]
-    assert used(Rig("up.delay=10ms,down.delay=15.1ms").drive(4)) == [None, 0, 1, 2]
-
-
-def test_the_action_is_as_old_as_the_latency():
-    decisions = Rig("100ms").drive(6)
-    assert used(decisions) == [None, None, 0, 1, 2, 3]
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        ("none", [0, 1, 2, 3, 4, 5]),
+        # A command inside the window acts in its tick, and outside it in the next.
+        ("up.delay=10ms,down.delay=15ms", [0, 1, 2, 3, 4, 5]),
+        ("up.delay=10ms,down.delay=15.1ms", [None, 0, 1, 2, 3, 4]),
+        ("100ms", [None, None, 0, 1, 2, 3]),
+    ],
+)
+def test_a_command_acts_as_late_as_the_latency_says(spec, expected):
+    rig = Rig(spec)
+    decisions = rig.drive(6)
+    assert used(decisions) == expected
     assert not any(decision.brake_reason for decision in decisions)
+    assert not rig.check.rejected
 
 
 def test_the_latency_reported_is_the_virtual_one():

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from bridge.ports import ANY_VEHICLE, SimulatorPort, open_feed
+from bridge.ports import ANY_VEHICLE, SimulatorPort, open_listener
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.transport import open_session
 from edge_runtime.wire import TOPICS
@@ -46,14 +46,14 @@ def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
     time.sleep(HEARS_S)
     port.close()
     assert heard == [b"own"] * 2
-    assert port.edge_counts.policy_id == ""
+    assert port.edge_counts.newest is None
 
 
 @pytest.mark.parametrize("vehicle_id", ["v1", ANY_VEHICLE])
 def test_a_listener_hears_what_was_put_to_one_vehicle(sessions, vehicle_id):
     endpoint, router, client = sessions
     port = SimulatorPort(router, "v1")
-    with open_feed(endpoint, vehicle_id, 5.0) as feed:
+    with open_listener(endpoint, vehicle_id, 5.0) as feed:
         for topic in ("state", "command", "feedback", "health"):
             put_wildly(client, topic)
         time.sleep(HEARS_S)

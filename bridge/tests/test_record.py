@@ -6,8 +6,6 @@ import collections
 import contextlib
 import resource
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,11 +16,10 @@ import zenoh
 from mcap.reader import NonSeekingReader, make_reader
 
 from bridge.messages import WIRE_TOPICS, Heard, Stamps, encode_scene
-from bridge.ports import QUEUE_MESSAGES, Feed
+from bridge.ports import QUEUE_MESSAGES, WireListener
 from bridge.record import RecordingWriter, _listen
-from bridge.recorded import RecordedDrive
 from bridge.recording import Recording
-from bridge.replay import replay_in_process
+from bridge.replay import RecordedDrive, replay_in_process
 from bridge.tests.harness import (
     SLOW_TOY,
     BridgeProcess,
@@ -30,6 +27,7 @@ from bridge.tests.harness import (
     make_command,
     make_policy,
     read,
+    rerun,
     start_edge,
     start_simulate,
 )
@@ -134,12 +132,6 @@ def states_in(path: Path) -> list[tuple[int, State]]:
             assert isinstance(state, State)
             found.append((stored.message.log_time, state))
     return found
-
-
-def rerun(*arguments: str) -> str:
-    """Run rerun's own reader; what it prints."""
-    command = [sys.executable, "-m", "rerun", *arguments]
-    return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +250,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
 
 
 def test_a_feed_that_falls_behind_drops_and_counts():
-    feed, endpoint = Feed(), free_endpoint()
+    feed, endpoint = WireListener(), free_endpoint()
     session = open_session(listen=endpoint, mode="router")
     try:
         subscriber = session.declare_subscriber("phil/v/state", feed.hearer("state"))
@@ -271,7 +263,7 @@ def test_a_feed_that_falls_behind_drops_and_counts():
     assert feed.waiting == QUEUE_MESSAGES
 
 
-class WithoutSimulator(Feed):
+class WithoutSimulator(WireListener):
     """An edge runtime behind a router, whose simulator has gone: it goes on saying how it is."""
 
     def __init__(self) -> None:
@@ -309,24 +301,3 @@ def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
             assert recorder.wait(PATIENCE_S) == 0, recorder.errors
     sessions = {state.session for _, state in states_in(recording)}
     assert len(sessions) == 2
-
-
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        (["record", "--out", "there.mcap"], "exists"),
-        (["record", "--out", "/dev/null/a.mcap"], "Not a directory"),
-        (["record", "--out", "a.mcap", "--vehicle-id", "a/b"], "vehicle id"),
-        (["record", "--out", "a.mcap", "--connect", "here"], "endpoint"),
-        (["record", "--out", "a.mcap", "--connect", free_endpoint(), "--wait-s", "0"], "nobody"),
-        (["repair", "none.mcap"], "No such file"),
-        (["repair", "there.mcap"], "no MCAP recording"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(options, part, capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "there.mcap").write_bytes(b"mine")
-    assert bridge_status(options) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
-    assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]

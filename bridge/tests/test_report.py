@@ -13,6 +13,7 @@ from bridge.report import (
     SafeStopEvent,
     episode_line,
     make_report,
+    markdown_table,
     summarise,
     summary_line,
 )
@@ -36,11 +37,9 @@ def report_of(outcomes, stops=(), rejected=None):
         [SafeStopEvent(0, 3, reason, 0.2) for reason in stops],
         latencies_ms=[1.0],
         command_ages_ms=[1.0],
-        counts={"deadline_misses": 38, "rejected": rejected or {}},
-        settings={
+        facts={
             "scenario": "toy", "condition": "nominal", "policy_ids": ["p"], "seed": 0,
-            "clock": "realtime", "loop": "policy", "standing": False, "latency_spec": "none",
-            "wall_s": 1.0,
+            "deadline_misses": 38, "rejected": rejected or {}, "wall_s": 1.0,
         },
     )  # fmt: skip
 
@@ -88,6 +87,11 @@ def test_summarise_by_hand():
     json.dumps(report, allow_nan=False)
     with pytest.raises(ValueError, match="no episode"):
         summarise([], "left_turn", "nominal", "id", 7)
+
+
+def test_a_table_in_markdown():
+    table = markdown_table(["row", "p50"], [["a|b", 1], ["c", None]])
+    assert table == "| row | p50 |\n| --- | --- |\n| a/b | 1 |\n| c | None |"
 
 
 def test_without_a_terminal_each_episode_is_told_as_it_ends(tmp_path):

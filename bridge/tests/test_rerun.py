@@ -13,11 +13,13 @@ import time
 import pytest
 import rerun as rr
 import rerun.blueprint as rrb
+from hypothesis import given
+from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
-from bridge.messages import SeenCar, SeenScene, read_scene
+from bridge.messages import Pace, SeenCar, SeenScene, read_scene
 from bridge.rerun import sinks
-from bridge.rerun.draw import Pace, outline, view_bounds
+from bridge.rerun.draw import outline, view_bounds
 from bridge.rerun.sinks import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.wire_view import Timeline
 from bridge.tests.viewers import NO_GPU, in_place, listens
@@ -67,11 +69,20 @@ def test_a_scene_is_read_without_what_is_not_drawn():
     assert seen.vehicles == [SeenCar(1.0, 2.0, 0.0, 4.0, 2.0, ego=True)]
 
 
-@pytest.mark.parametrize("jitter_s", [0.0, 0.02])
-def test_what_comes_at_the_pace_is_taken_whole(jitter_s):
-    pace = Pace(0.1)
-    times_s = [0.1 * n + jitter_s * (-1) ** n for n in range(100)]
-    assert all(pace.due(now_s) for now_s in times_s)
+@given(st.lists(st.floats(0, 0.2), min_size=1, max_size=300), st.floats(1, 100))
+def test_no_rate_is_passed(steps, rate_hz):
+    pace, now_s, passed = Pace(1.0 / rate_hz), 0.0, 0
+    for step in steps:
+        now_s += step
+        passed += pace.due(now_s)
+    assert passed <= rate_hz * now_s + 2
+    assert pace.skipped == len(steps) - passed
+
+
+@given(st.lists(st.floats(-0.02, 0.02), min_size=50, max_size=200))
+def test_jitter_at_the_rate_itself_costs_nothing(jitters):
+    pace = Pace(0.05)
+    assert all(pace.due(step * 0.05 + jitter) for step, jitter in enumerate(jitters))
 
 
 def test_what_comes_faster_is_thinned_out_and_a_pause_brings_no_burst():

@@ -21,13 +21,13 @@ from bridge.ros2 import (
     Outlet,
     Policies,
     Policy,
-    RateBound,
     drive_of,
     feedback_curvature,
     image_of,
     odometry_of,
     twist_of,
 )
+from bridge.tests import harness
 from bridge.tests.harness import (
     SLOW_TOY,
     BridgeProcess,
@@ -44,25 +44,19 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import CARS
 from edge_runtime.vehicles.ros2 import names
 from edge_runtime.vehicles.ros2.tests import second
-from edge_runtime.wire import Command, Feedback, encode
+from edge_runtime.wire import encode
 
 PEDAL = Policy(["pedal"], CARS["left_turn"])
 STEERING = Policy(["steering"], CARS["congestion"])
 S = 10**9
 
 
-def make_command(*action, policy_id="p"):
-    return Command(
-        session="a", episode=0, step=1, mode="drive", action=list(action), policy_id=policy_id,
-        received_ns=1, inference_ns=1, sent_ns=3 * S + 5,
-    )  # fmt: skip
+def make_command(*action):
+    return harness.make_command(1, action=list(action), sent_ns=3 * S + 5)
 
 
 def make_feedback(speed_mps, *action, sent_ns=0):
-    return Feedback(
-        vehicle="mock", session="a", episode=0, step=1, mode="drive", action=list(action),
-        speed_mps=speed_mps, self_braking=False, faults=[], sent_ns=sent_ns,
-    )  # fmt: skip
+    return harness.make_feedback(1, speed_mps=speed_mps, action=list(action), sent_ns=sent_ns)
 
 
 def test_the_newer_frame_is_shown():
@@ -145,22 +139,6 @@ def test_the_odometry_says_what_it_does_not_know():
     assert message.pose.covariance[35] == pytest.approx(0.05**2)
 
 
-@given(st.lists(st.floats(0, 0.2), min_size=1, max_size=300), st.floats(1, 100))
-def test_no_rate_is_passed(steps, rate_hz):
-    bound, now_s, passed = RateBound(rate_hz), 0.0, 0
-    for step in steps:
-        now_s += step
-        passed += bound.lets(now_s)
-    assert passed <= rate_hz * now_s + 2
-    assert bound.skipped == len(steps) - passed
-
-
-@given(st.lists(st.floats(-0.02, 0.02), min_size=50, max_size=200))
-def test_jitter_at_the_rate_itself_costs_nothing(jitters):
-    bound = RateBound(20.0)
-    assert all(bound.lets(step * 0.05 + jitter) for step, jitter in enumerate(jitters))
-
-
 class FakeNode:
     """Where an Outlet would publish to: what was published, by topic."""
 
@@ -181,14 +159,13 @@ def outlet_with(status, rate_hz=20.0):
     return node, Outlet(node, Policies(status, clock_s=lambda: 0.0), rate_hz)
 
 
-def left_turn_status():
-    manifest = {"scenario": "left_turn", "action": [{"name": "pedal"}]}
-    return {"policy_id": "p", "manifest": manifest}
+def status_of(scenario, *names):
+    manifest = {"scenario": scenario, "action": [{"name": name} for name in names]}
+    return lambda: {"policy_id": "p", "manifest": manifest}
 
 
-def congestion_status():
-    manifest = {"scenario": "congestion", "action": [{"name": "steering"}]}
-    return {"policy_id": "p", "manifest": manifest}
+left_turn_status = status_of("left_turn", "pedal")
+congestion_status = status_of("congestion", "steering")
 
 
 def nobody():
@@ -216,10 +193,7 @@ def test_commands_are_shown_once_the_edge_says_whose_they_are():
 
 
 def test_a_policy_of_an_unknown_car_is_said_once(capsys):
-    def status():
-        return {"policy_id": "p", "manifest": {"scenario": "parking", "action": []}}
-
-    _, outlet = outlet_with(status)
+    _, outlet = outlet_with(status_of("parking"))
     for _ in range(2):
         outlet.take(heard("command", encode(make_command(1.0))))
     assert capsys.readouterr().err.count("'parking' is not known") == 1
@@ -350,30 +324,6 @@ def test_a_sigterm_ends_it_with_its_counts(tmp_path):
         shown.process.send_signal(signal.SIGTERM)
         assert shown.wait(20) == 0, shown.errors
     assert read(out)["rejected"]["feedback_malformed"] >= 1
-
-
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        (["--wait-s", "0"], "nobody answers"),
-        (["--vehicle-id", "a/b"], "vehicle id"),
-        (["--namespace", "9/x"], "namespace '9/x'"),
-        (["--namespace", ""], "empty value after --namespace"),
-        (["--ros2-listen", "tls/127.0.0.1:7448"], "plain text"),
-        (["--ros2-listen", "nowhere"], "endpoint 'nowhere'"),
-        (["--ros2-listen", "tcp/a:1", "--ros2-connect", "tcp/a:1"], "not allowed with"),
-        (["--max-rate-hz", "0"], "is not a rate"),
-        (["--max-rate-hz", "nan"], "is not a rate"),
-        (["--out", "/dev/null/a.json"], "Not a directory"),
-        (["--tls", "nowhere"], "plain text despite --tls"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(options, part, capsys):
-    if not any(option.startswith("--ros2") for option in options):
-        options = [*options, "--ros2-listen", free_endpoint()]
-    assert bridge_status(["ros2", "--connect", free_endpoint(), *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
 
 
 def test_a_busy_ros_2_port_names_the_option_to_change(capsys):

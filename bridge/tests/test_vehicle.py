@@ -10,12 +10,13 @@ import time
 import numpy as np
 import pytest
 
+from bridge.clocks import VehicleClock
 from bridge.inbound import NO_FEEDBACK, CommandCheck, FeedbackCheck
 from bridge.network import parse_spec
 from bridge.ports import connect_client
+from bridge.report import LAG_STEP_S, TrackingLog
 from bridge.tests.harness import (
     SHORT_TOY,
-    bridge_status,
     make_command,
     make_feedback,
     make_policy,
@@ -23,8 +24,6 @@ from bridge.tests.harness import (
     start_edge,
     start_simulate,
 )
-from bridge.tracking import LAG_STEP_S, TrackingLog
-from bridge.vehicle import VehicleClock
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
 from edge_runtime.util import UserError
@@ -253,7 +252,7 @@ def test_without_any_vehicle_it_says_what_to_do():
 
 
 def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
-    monkeypatch.setattr("bridge.vehicle.STANDSTILL_WAIT_S", 0.3)
+    monkeypatch.setattr("bridge.clocks.STANDSTILL_WAIT_S", 0.3)
     with rig_of() as rig:
         rig.clock.begin(0, seed=0)
         rig.report(-1, speed_mps=1.0, session="", episode=-1)
@@ -266,11 +265,6 @@ def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
         wait_until(lambda: rig.check.heard == make_feedback(1, speed_mps=0.5, sent_ns=6), "it")
         rig.clock.wait_for_standstill()
     assert rig.clock.moving_starts == 1
-
-
-def test_lock_step_cannot_have_a_vehicle(capsys):
-    assert bridge_status(["simulate", "--env", SHORT_TOY, "--loop", "vehicle"]) == 2
-    assert "--loop vehicle needs --clock realtime" in capsys.readouterr().err
 
 
 class Stranger:

@@ -18,24 +18,14 @@ from pathlib import Path
 from bridge.recording import Recording
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import VEHICLE
-from hil_tests.faults.observe import last_drive_s
 from hil_tests.faults.rig import Rig, address
 from hil_tests.faults.row import (
     GAP,
     Try,
-    at_any_phase,
     drives_on,
     drove_on,
     fault,
-    last_answered_s,
-    last_state_s,
-    logged_stop,
-    longest_gap,
-    must_stop_first,
-    own_brake_s,
-    recovered_after_s,
     sleep_until,
-    stop_command,
 )
 from hil_tests.processes import Process, wait_until
 
@@ -65,77 +55,69 @@ _THROUGH_LINK = "last state through the link to safe_stop in the edge's log"
 @fault("SIGKILL to the edge runtime; a new one", _EXPECT_OWN, _TO_BRAKE)
 def edge_killed(rig: Rig, number: int) -> Try:
     """The simulator brakes by itself; a new edge runtime drives on."""
-    at_any_phase(number)
     begin_s = time.monotonic()
     rig.edge.kill()
-    reaction_s = own_brake_s(rig, begin_s) - last_drive_s(rig.timeline)
+    reaction_s = rig.own_brake_s(begin_s) - rig.last_drive_s()
     rig.edge = rig.start_edge()
     ended_s = rig.edge.wait_for_line("ready")
-    return Try(reaction_s, recovered_after_s(rig, ended_s), "no_command")
+    return Try(reaction_s, rig.recovered_after_s(ended_s), "no_command")
 
 
 @fault("edge runtime stopped for 1 s and continued", _EXPECT_OWN, _TO_BRAKE, flows=True)
 def edge_stopped(rig: Rig, number: int) -> Try:
     """SIGSTOP: the simulator brakes by itself; what piled up is not driven on."""
-    at_any_phase(number)
     begin_s = time.monotonic()
     rig.edge.send(signal.SIGSTOP)
-    reaction_s = own_brake_s(rig, begin_s) - last_drive_s(rig.timeline)
+    reaction_s = rig.own_brake_s(begin_s) - rig.last_drive_s()
     sleep_until(begin_s + STOPPED_S)
     ended_s = time.monotonic()
     rig.edge.send(signal.SIGCONT)
-    recovered_s = recovered_after_s(rig, ended_s)
-    return Try(reaction_s, recovered_s, "no_command", wrong=must_stop_first(rig, ended_s))
+    recovered_s = rig.recovered_after_s(ended_s)
+    return Try(reaction_s, recovered_s, "no_command", wrong=rig.must_stop_first(ended_s))
 
 
 @fault("SIGKILL to the simulator; a new one", _EXPECT_EDGE, _TO_STOP)
 def simulator_killed(rig: Rig, number: int) -> Try:
     """The edge runtime's safe stop; a new simulator has a new session."""
-    at_any_phase(number)
-    assert rig.simulator is not None
     begin_s = time.monotonic()
     rig.simulator.kill()
-    stop = stop_command(rig, begin_s)
-    last_s = last_state_s(rig, before_s=stop.seen_s)
+    stop = rig.stop_command(begin_s)
+    last_s = rig.last_state_s(before_s=stop.seen_s)
     known = set(rig.timeline.states)
     rig.simulator = rig.start_simulator()
     new = wait_until(lambda: set(rig.timeline.states) - known, "the new simulator's states")
     ended_s = min(rig.timeline.states[place] for place in new)
-    return Try(stop.seen_s - last_s, recovered_after_s(rig, ended_s), stop.reason)
+    return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
 @fault("TCP cut for 1 s and restored", _EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
 def link_cut(rig: Rig, number: int) -> Try:
     """Every connection broken and refused for a second: both ends stop, each by itself."""
-    assert rig.link is not None
-    at_any_phase(number)
-    begin_s, drive_s = time.monotonic(), last_drive_s(rig.timeline)
+    begin_s, drive_s = time.monotonic(), rig.last_drive_s()
     rig.link.cut()
     last_s = rig.link.last_state_s
-    stopped_s, reason = logged_stop(rig, begin_s)
-    brake_s = own_brake_s(rig, begin_s) - max(drive_s, last_drive_s(rig.timeline))
+    stop = rig.logged_stop(begin_s)
+    brake_s = rig.own_brake_s(begin_s) - max(drive_s, rig.last_drive_s())
     sleep_until(begin_s + CUT_S)
     ended_s = time.monotonic()
     rig.link.restore()
-    recovered_s = recovered_after_s(rig, ended_s)
+    recovered_s = rig.recovered_after_s(ended_s)
     figures = {"simulator brakes, ms": brake_s * 1e3}
-    return Try(stopped_s - last_s, recovered_s, reason, figures=figures)
+    return Try(stop.seen_s - last_s, recovered_s, stop.reason, figures=figures)
 
 
 @fault("TCP held for 0.6 s, then all at once", _EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
 def link_stalled(rig: Rig, number: int) -> Try:
     """The link holds everything for a while, then brings it all at once."""
-    assert rig.link is not None
-    at_any_phase(number)
     begin_s = time.monotonic()
     rig.link.stall()
-    stopped_s, reason = logged_stop(rig, begin_s)
+    stop = rig.logged_stop(begin_s)
     last_s = rig.link.last_state_s
     sleep_until(begin_s + STALLED_S)
     ended_s = time.monotonic()
     rig.link.restore()
-    recovered_s = recovered_after_s(rig, ended_s)
-    return Try(stopped_s - last_s, recovered_s, reason, wrong=must_stop_first(rig, ended_s))
+    recovered_s = rig.recovered_after_s(ended_s)
+    return Try(stop.seen_s - last_s, recovered_s, stop.reason, wrong=rig.must_stop_first(ended_s))
 
 
 @fault(
@@ -144,15 +126,13 @@ def link_stalled(rig: Rig, number: int) -> Try:
 )  # fmt: skip
 def router_restarted(rig: Rig, number: int) -> Try:
     """The router between the ends is gone, and a new one comes on the same port."""
-    assert rig.router is not None
-    at_any_phase(number)
     begin_s = time.monotonic()
     rig.router.kill()
-    stopped_s, reason = logged_stop(rig, begin_s)
+    stop = rig.logged_stop(begin_s)
     rig.router = rig.start_router()
-    ended_s = wait_until(lambda: _listens_s(rig.router_endpoint), "the new router")
-    reaction_s = stopped_s - last_state_s(rig, before_s=begin_s)
-    return Try(reaction_s, recovered_after_s(rig, ended_s), reason)
+    ended_s = wait_until(lambda: _listens_s(rig.edge_endpoint), "the new router")
+    reaction_s = stop.seen_s - rig.last_state_s(before_s=begin_s)
+    return Try(reaction_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
 @drives_on("edge's wall clock 1 h ahead and back", "drives on", by_arrival=True)
@@ -164,7 +144,6 @@ def clock_stepped_edge(rig: Rig, number: int) -> Try:
 @drives_on("simulator's wall clock 1 h ahead and back", "drives on")
 def clock_stepped_simulator(rig: Rig, number: int) -> Try:
     """The simulator's wall clock jumps an hour ahead, then back."""
-    assert rig.simulator is not None
     return _stepped(rig, rig.simulator, number)
 
 
@@ -175,23 +154,21 @@ def clock_stepped_simulator(rig: Rig, number: int) -> Try:
 )  # fmt: skip
 def slow_inference(rig: Rig, number: int) -> Try:
     """Frames on which the policy takes longer than T; the last good state is the one before."""
-    at_any_phase(number)
     begin_s = time.monotonic()
     rig.bright(True)
     try:
-        stop = stop_command(rig, begin_s)
-        last_s = last_answered_s(rig, stop.seen_s)
+        stop = rig.stop_command(begin_s)
+        last_s = rig.last_answered_s(stop.seen_s)
         sleep_until(begin_s + BRIGHT_S)
     finally:
         rig.bright(False)
     ended_s = time.monotonic()
-    return Try(stop.seen_s - last_s, recovered_after_s(rig, ended_s), stop.reason)
+    return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
 @fault("two spinning processes for each core, 2 s", "drives on or safe_stop", GAP, alone=True)
 def cpu_starved(rig: Rig, number: int) -> Try:
     """The spinning processes have the same priority as all others."""
-    at_any_phase(number)
     spinners = [
         multiprocessing.get_context("spawn").Process(target=_spin, daemon=True)
         for _ in range(2 * (os.cpu_count() or 1))
@@ -204,18 +181,17 @@ def cpu_starved(rig: Rig, number: int) -> Try:
     for spinner in spinners:
         spinner.kill()
         spinner.join()
-    recovered_s = recovered_after_s(rig, ended_s)
+    recovered_s = rig.recovered_after_s(ended_s)
     stops = sum(begin_s < m.seen_s < ended_s and m.mode == SAFE_STOP for m in rig.timeline.modes)
-    return Try(longest_gap(rig, begin_s, ended_s), recovered_s, figures={"safe stops": stops})
+    return Try(rig.longest_gap(begin_s, ended_s), recovered_s, figures={"safe stops": stops})
 
 
 def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     """Stops for the fault, stays stopped when it is over, and drives again once re-armed."""
     time.sleep(SETTLED_S)
-    at_any_phase(number)
     begin_s = time.monotonic()
     rig.switch(VEHICLE, word)
-    stop = stop_command(rig, begin_s)
+    stop = rig.stop_command(begin_s)
     # A silent vehicle may still speak between the mark and the switch, and what it says counts.
     # What another says after the switch is no good any more.
     end_s = stop.seen_s if word == "silent" else begin_s
@@ -230,7 +206,7 @@ def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     rig.rearm()
     rearmed_s = time.monotonic()
     rig.wait_until_driving()
-    recovered_s = recovered_after_s(rig, rearmed_s)
+    recovered_s = rig.recovered_after_s(rearmed_s)
     return Try(stop.seen_s - last_s, recovered_s, stop.reason, wrong=wrong)
 
 
@@ -270,7 +246,6 @@ def recorder_killed(rig: Rig, number: int) -> Try:
     path, recorder = _start_recorder(rig, number)
     begin_s = time.monotonic()
     time.sleep(RECORDED_S)
-    at_any_phase(number)
     sent = len(rig.timeline.states)
     recorder.kill()
     end_s = time.monotonic()
@@ -321,7 +296,6 @@ def _spin() -> None:
 
 
 def _stepped(rig: Rig, process: Process, number: int) -> Try:
-    at_any_phase(number)
     begin_s = time.monotonic()
     process.send(signal.SIGUSR1 if number % 2 == 0 else signal.SIGUSR2)
     time.sleep(STEPPED_S)

@@ -23,8 +23,8 @@ from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S
 from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
 from edge_runtime.wire import DRIVE
 from hil_tests.faults.observe import REACTION_LIMIT_S, CanMonitor, CommandSeen, Heard
-from hil_tests.faults.rig import ChassisProcess, Rig
-from hil_tests.faults.row import Try, at_any_phase, fault, recovered_after_s, stop_command
+from hil_tests.faults.rig import Rig
+from hil_tests.faults.row import Try, at_any_phase, fault
 from hil_tests.mock_hunter.body import MODELS
 from hil_tests.mock_hunter.chassis import BITS, FAULTS
 
@@ -58,55 +58,61 @@ def speed_mps(frame: Heard) -> float:
 
 def at_fault(expect: Expect, rig: Rig, number: int) -> Try:
     """Stops for it, stands when it is over, and drives again once re-armed."""
-    chassis, monitor = rig.chassis, rig.monitor
-    assert chassis is not None
-    assert monitor is not None
-    rig.wait_until_driving(ready=lambda: _drives(monitor))
+    rig.wait_until_driving(ready=lambda: _drives(rig.monitor))
     at_any_phase(number)
-    on_s = chassis.switch(expect.name, True)
-    stop = stop_command(rig, on_s)
-    stands_s = chassis.stands_s(on_s, STANDS_WITHIN_S)
+    on_s = rig.chassis.switch(expect.name, True)
+    stop = rig.stop_command(on_s)
+    stands_s = rig.chassis.stands_s(on_s, STANDS_WITHIN_S)
     taken = expect.name in _REFUSED and rig.try_rearm()
     wrong = ["was re-armed while the fault lasted"] if taken else []
-    known_s = _known_s(expect, monitor, on_s)
-    chassis.switch(expect.name, False)
-    time.sleep(QUIET_S)
-    quiet_s = time.monotonic()
-    wrong += _stayed(rig, chassis, stop, stands_s, quiet_s)
-    wrong += _named(rig, expect, on_s)
-    told_s = _told_s(monitor, on_s, quiet_s)
+    known_s = _known_s(expect, rig.monitor, on_s)
     figures = {"stands, ms": (stands_s - on_s) * 1e3, "safe_stop, ms": (stop.seen_s - on_s) * 1e3}
-    done = Try(told_s - known_s, None, stop.reason, wrong=wrong, figures=figures)
-    return _rearmed(rig, done)
+    done = _when_over(rig, expect, on_s, known_s, stop, stands_s)
+    return replace(done, wrong=wrong + done.wrong, figures=figures)
 
 
 def stuck(rig: Rig, number: int) -> Try:
     """Its motors hold their speed; nobody can know before it is asked for another one."""
-    chassis, monitor = rig.chassis, rig.monitor
-    assert chassis is not None
-    assert monitor is not None
     rig.bright(True)
-    rig.wait_until_driving(ready=lambda: _drives(monitor))
+    rig.wait_until_driving(ready=lambda: _drives(rig.monitor))
     at_any_phase(number)
-    on_s = chassis.switch("stuck", True)
-    held_mps = speed_mps(monitor.of(0x221)[-1])
+    on_s = rig.chassis.switch("stuck", True)
+    held_mps = speed_mps(rig.monitor.of(0x221)[-1])
     rig.bright(False)
-    stop = stop_command(rig, on_s)
-    stands_s = chassis.stands_s(stop.seen_s, STANDS_WITHIN_S)
-    asked = [
-        one.seen_s for one in monitor.of(0x111, on_s) if held_mps - speed_mps(one) > _DIFFERS_MPS
-    ]
-    known_s = asked[0]  # the stop at the latest: its set-point is 0
-    chassis.switch("stuck", False)
+    stop = rig.stop_command(on_s)
+    stands_s = rig.chassis.stands_s(stop.seen_s, STANDS_WITHIN_S)
+    known_s = next(  # the stop at the latest: its set-point is 0
+        one.seen_s
+        for one in rig.monitor.of(0x111, on_s)
+        if held_mps - speed_mps(one) > _DIFFERS_MPS
+    )
     rig.bright(True)
+    expect = Expect("stuck", "stuck|speed stays")
+    done = _when_over(rig, expect, on_s, known_s, stop, stands_s)
+    return replace(done, figures={"stands after the stop, ms": (stands_s - stop.seen_s) * 1e3})
+
+
+def _when_over(
+    rig: Rig, expect: Expect, on_s: float, known_s: float, stop: CommandSeen, stands_s: float
+) -> Try:
+    """Switch the fault off, look whether it stays as it is, and re-arm until it moves in fact.
+
+    The recovery lasts to the first drive command.
+    """
+    rig.chassis.switch(expect.name, False)
     time.sleep(QUIET_S)
     quiet_s = time.monotonic()
-    wrong = _stayed(rig, chassis, stop, stands_s, quiet_s)
-    wrong += _named(rig, Expect("stuck", "stuck|speed stays"), on_s)
-    told_s = _told_s(monitor, on_s, quiet_s)
-    figures = {"stands after the stop, ms": (stands_s - stop.seen_s) * 1e3}
-    done = Try(told_s - known_s, None, stop.reason, wrong=wrong, figures=figures)
-    return _rearmed(rig, done)
+    wrong = _stayed(rig, stop, stands_s, quiet_s) + _named(rig, expect, on_s)
+    told_s = _told_s(rig.monitor, on_s, quiet_s)
+    rig.rearm()
+    rearmed_s = time.monotonic()
+    rig.wait_until_driving(ready=lambda: rig.chassis.moves)
+    recovered_s = rig.recovered_after_s(rearmed_s)
+    drove_s = rearmed_s + recovered_s
+    # Between a re-arm and the first drive feedback has nothing to say, or it was stopped again.
+    said = {w for s, w in list(rig.timeline.named) if rearmed_s + _SAID_BEFORE_S < s < drove_s}
+    notes = [f"after the re-arm: {', '.join(sorted(said))}"] if said else []
+    return Try(told_s - known_s, recovered_s, stop.reason, wrong=wrong, notes=notes)
 
 
 def _drives(monitor: CanMonitor) -> bool:
@@ -118,12 +124,10 @@ def _drives(monitor: CanMonitor) -> bool:
 def _known_s(expect: Expect, monitor: CanMonitor, on_s: float) -> float:
     if expect.name in _NO_FRAME_TO_SHOW_IT:
         return max(one.seen_s for one in monitor.of(0x221) if one.seen_s <= on_s)
-    heard = list(monitor.heard)
-    shown = (one.seen_s for one in heard if one.seen_s > on_s and expect.shown(one))
-    known_s = next(shown, None)
-    if known_s is None:
-        raise TimeoutError(f"no frame shows {expect.name}")
-    return known_s
+    for one in list(monitor.heard):
+        if one.seen_s > on_s and expect.shown(one):
+            return one.seen_s
+    raise TimeoutError(f"no frame shows {expect.name}")
 
 
 def _told_s(monitor: CanMonitor, on_s: float, until_s: float) -> float:
@@ -134,14 +138,11 @@ def _told_s(monitor: CanMonitor, on_s: float, until_s: float) -> float:
     return after[0].seen_s if after else until_s
 
 
-def _stayed(
-    rig: Rig, chassis: ChassisProcess, stop: CommandSeen, stands_s: float, until_s: float
-) -> list[str]:
-    assert rig.monitor is not None
+def _stayed(rig: Rig, stop: CommandSeen, stands_s: float, until_s: float) -> list[str]:
     wrong = _kept_to_its_own(rig.monitor)
     if stop.reason != Event.VEHICLE.value:
         wrong.append(f"stopped for {stop.reason}")
-    if chassis.moved_between(stands_s, until_s):
+    if rig.chassis.moved_between(stands_s, until_s):
         wrong.append("moved before it was re-armed")
     if any(c.mode == DRIVE and stop.seen_s < c.seen_s < until_s for c in rig.timeline.commands):
         wrong.append("was commanded to drive before it was re-armed")
@@ -163,20 +164,6 @@ def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
     if any(one in text for one in expect.says.split("|") for text in said):
         return []
     return [f"feedback says {sorted(set(said))}, not {expect.says!r}"]
-
-
-def _rearmed(rig: Rig, done: Try) -> Try:
-    """Re-arm, and wait until it moves in fact; the recovery lasts to the first drive command."""
-    assert rig.chassis is not None
-    rig.rearm()
-    rearmed_s = time.monotonic()
-    rig.wait_until_driving(ready=lambda: rig.chassis is not None and rig.chassis.moves)
-    recovered_s = recovered_after_s(rig, rearmed_s)
-    drove_s = rearmed_s + recovered_s
-    # Between a re-arm and the first drive feedback has nothing to say, or it was stopped again.
-    said = {w for s, w in list(rig.timeline.named) if rearmed_s + _SAID_BEFORE_S < s < drove_s}
-    notes = [f"after the re-arm: {', '.join(sorted(said))}"] if said else []
-    return replace(done, recovery_s=recovered_s, notes=notes)
 
 
 def _reported_mps(frame: Heard) -> float:

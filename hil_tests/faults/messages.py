@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 
 import msgspec
@@ -26,14 +26,9 @@ from hil_tests.faults.rig import Rig, make_state
 from hil_tests.faults.row import (
     GAP,
     Try,
-    at_any_phase,
     drives_on,
     drove_on,
-    edge_counts,
     fault,
-    longest_gap,
-    recovered_after_s,
-    simulator_counts,
 )
 from hil_tests.processes import wait_until
 
@@ -58,9 +53,7 @@ counted_at_its_end = partial(counted, flows=False, new_rig_each_try=True)
 )
 def bad_states(rig: Rig, number: int) -> Try:
     """Each kind of bad state between the good ones of the same simulator."""
-    assert rig.sender is not None
-    at_any_phase(number)
-    before, begin_s = edge_counts(rig), time.monotonic()
+    before, begin_s = rig.edge_counts(), time.monotonic()
     wanted: Counter[str] = Counter()
     for _ in range(BAD_STATE_ROUNDS):
         with rig.sender.lock:
@@ -70,20 +63,20 @@ def bad_states(rig: Rig, number: int) -> Try:
             _send_reordered(rig, wanted)
         time.sleep(CONTROL_PERIOD_S / 2)
     end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, edge_counts(rig) - before)
+    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
 
 
 @counted("states of 10 MB")
 def oversized(rig: Rig, number: int) -> Try:
     """Five times; the memory must not grow by them."""
     payload = bytes(OVERSIZED_BYTES)
-    before, begin_s = edge_counts(rig), time.monotonic()
+    before, begin_s = rig.edge_counts(), time.monotonic()
     memory_mb = rig.edge.resident_mb()
     for _ in range(5):
         rig.probe.put("state", payload)
         time.sleep(CONTROL_PERIOD_S)
     end_s = time.monotonic()
-    found = edge_counts(rig) - before
+    found = rig.edge_counts() - before
     figures = {"memory grown, MB": rig.edge.resident_mb() - memory_mb}
     return drove_on(rig, begin_s, end_s, Counter(oversized=5), found, figures=figures)
 
@@ -94,7 +87,6 @@ def oversized(rig: Rig, number: int) -> Try:
 )  # fmt: skip
 def flood(rig: Rig, number: int) -> Try:
     """Valid states of one simulator at a hundred times the rate and more."""
-    assert rig.sender is not None
     rig.sender.running.clear()
     memory_mb, begin_s = rig.edge.resident_mb(), time.monotonic()
     sent = 0
@@ -105,19 +97,18 @@ def flood(rig: Rig, number: int) -> Try:
         time.sleep(0.001)
     end_s = time.monotonic()
     rig.sender.running.set()
-    recovered_s = recovered_after_s(rig, end_s)
+    recovered_s = rig.recovered_after_s(end_s)
     figures = {
         "states/s": sent / (end_s - begin_s),
         "memory grown, MB": rig.edge.resident_mb() - memory_mb,
     }
-    return Try(longest_gap(rig, begin_s, end_s), recovered_s, figures=figures)
+    return Try(rig.longest_gap(begin_s, end_s), recovered_s, figures=figures)
 
 
 @counted("a second simulator with the same id")
 def second_simulator(rig: Rig, number: int) -> Try:
     """States of another session on the same key, as a second simulator sends them."""
-    at_any_phase(number)
-    before, begin_s = edge_counts(rig), time.monotonic()
+    before, begin_s = rig.edge_counts(), time.monotonic()
     wanted: Counter[str] = Counter()
     for step in range(round(SECOND_S / CONTROL_PERIOD_S)):
         # Where the first one is silent for 2 T it may be answered: it is no garbage.
@@ -126,7 +117,7 @@ def second_simulator(rig: Rig, number: int) -> Try:
         wanted["foreign_session"] += 1
         time.sleep(CONTROL_PERIOD_S)
     end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, edge_counts(rig) - before)
+    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
 
 
 @counted_at_its_end(
@@ -134,7 +125,6 @@ def second_simulator(rig: Rig, number: int) -> Try:
 )
 def second_edge(rig: Rig, number: int) -> Try:
     """A second edge runtime with the same id gives way; the first answer to a state counts."""
-    at_any_phase(number)
     second = rig.start_edge()
     begin_s = time.monotonic()
     status = second.wait()
@@ -145,7 +135,7 @@ def second_edge(rig: Rig, number: int) -> Try:
     wanted = Counter(stale=sum(count - 1 for count in answers.values()))
     ended = f"the second one ended with status {status}: {second.lines[-1:]}"
     wrong = [] if status == BAD_INPUT else [ended]
-    return drove_on(rig, begin_s, end_s, wanted, simulator_counts(rig), wrong=wrong)
+    return drove_on(rig, begin_s, end_s, wanted, rig.simulator_counts(), wrong=wrong)
 
 
 @counted(f"{COUNT:,} random and mutated states")
@@ -153,11 +143,11 @@ def garbage_states(rig: Rig, number: int) -> Try:
     """On the state's key; the edge runtime counts each by reason."""
     payloads = list(mutated(encode(make_state(1, session=_FOREIGN)), COUNT, number))
     wanted = Counter(_reason(wire.decode_state(payload)) for payload in payloads)
-    before = edge_counts(rig)
+    before = rig.edge_counts()
     begin_s = time.monotonic()
     _put_all(rig, "state", payloads)
     end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, edge_counts(rig) - before)
+    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
 
 
 @counted_at_its_end(f"{COUNT:,} random and mutated commands; future, old, wrong size")
@@ -178,7 +168,7 @@ def garbage_commands(rig: Rig, number: int) -> Try:
     end_s = time.monotonic()
     # Its own answers are in order, so that every rejection is one of these.
     rig.end_drive()
-    return drove_on(rig, begin_s, end_s, wanted, simulator_counts(rig))
+    return drove_on(rig, begin_s, end_s, wanted, rig.simulator_counts())
 
 
 @counted(f"{COUNT:,} random and mutated feedback messages", expected="drives on")
@@ -205,7 +195,7 @@ def garbage_health(rig: Rig, number: int) -> Try:
     _put_all(rig, "health", payloads)
     end_s = time.monotonic()
     rig.end_drive()
-    counts = simulator_counts(rig)
+    counts = rig.simulator_counts()
     unread = Counter({name: n for name, n in counts.items() if name.startswith("health_")})
     return drove_on(rig, begin_s, end_s, wanted, unread)
 
@@ -226,7 +216,6 @@ def _bad_of(step: int) -> Iterable[tuple[str, bytes]]:
 
 def _send_reordered(rig: Rig, wanted: Counter[str]) -> None:
     """Two states that have overtaken one another, and one that says it comes from the future."""
-    assert rig.sender is not None
     rig.sender.step += 3
     step = rig.sender.step
     rig.sender.send(make_state(step - 1))
@@ -269,7 +258,33 @@ def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
     """``count`` payloads; the n-th is the same for the same seed. Some may be valid still."""
     generator = np.random.default_rng(seed)
     for _ in range(count):
-        yield _MUTATORS[int(generator.integers(len(_MUTATORS)))](valid, generator)
+        yield _mutant(valid, generator)
+
+
+def _mutant(valid: bytes, generator: np.random.Generator) -> bytes:
+    def below(limit: int) -> int:
+        return int(generator.integers(limit))
+
+    match below(7):
+        case 0:
+            return generator.bytes(below(_LONGEST_RANDOM))
+        case 1:
+            data = bytearray(valid)
+            for _ in range(1 + below(4)):
+                data[below(len(data))] ^= 1 << below(8)
+            return bytes(data)
+        case 2:
+            return valid[: below(len(valid))]
+        case 3:
+            return valid + generator.bytes(1 + below(_SPLICED))
+        case 4:  # a stretch of it replaced by a random one of another length
+            begin, end = sorted((below(len(valid)), below(len(valid))))
+            return valid[:begin] + generator.bytes(below(_SPLICED)) + valid[end:]
+    names = sorted(msgspec.msgpack.decode(valid))
+    name = names[below(len(names))]
+    if below(2):
+        return without(valid, name)
+    return with_fields(valid, **{name: _ABSURD[below(len(_ABSURD))]})
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:
@@ -284,49 +299,7 @@ def without(valid: bytes, name: str) -> bytes:
     return msgspec.msgpack.encode(fields)
 
 
-def _random(valid: bytes, generator: np.random.Generator) -> bytes:
-    return generator.bytes(int(generator.integers(0, _LONGEST_RANDOM)))
-
-
-def _flipped(valid: bytes, generator: np.random.Generator) -> bytes:
-    data = bytearray(valid)
-    for place in generator.integers(0, len(data), int(generator.integers(1, 5))):
-        data[place] ^= 1 << int(generator.integers(8))
-    return bytes(data)
-
-
-def _truncated(valid: bytes, generator: np.random.Generator) -> bytes:
-    return valid[: int(generator.integers(0, len(valid)))]
-
-
-def _extended(valid: bytes, generator: np.random.Generator) -> bytes:
-    return valid + generator.bytes(int(generator.integers(1, _SPLICED)))
-
-
-def _spliced(valid: bytes, generator: np.random.Generator) -> bytes:
-    """A stretch of it replaced by a random one of another length."""
-    begin, end = sorted(int(place) for place in generator.integers(0, len(valid), 2))
-    return valid[:begin] + generator.bytes(int(generator.integers(0, _SPLICED))) + valid[end:]
-
-
-def _wrong_field(valid: bytes, generator: np.random.Generator) -> bytes:
-    """One field of a wrong type or with an absurd value."""
-    fields = msgspec.msgpack.decode(valid)
-    name = sorted(fields)[int(generator.integers(len(fields)))]
-    value = _ABSURD[int(generator.integers(len(_ABSURD)))]
-    return msgspec.msgpack.encode({**fields, name: value})
-
-
-def _missing_field(valid: bytes, generator: np.random.Generator) -> bytes:
-    fields = msgspec.msgpack.decode(valid)
-    del fields[sorted(fields)[int(generator.integers(len(fields)))]]
-    return msgspec.msgpack.encode(fields)
-
-
 _ABSURD: tuple[object, ...] = (
     None, True, -1, 2**63, -(2**63), float("nan"), float("inf"), 1e308, "", "x" * 300,
     b"", b"\xff" * 70_000, [], [float("nan")], [2.0], [[[[]]]], {}, {"a": {"b": {}}}, "drive",
-)  # fmt: skip
-_MUTATORS: tuple[Callable[[bytes, np.random.Generator], bytes], ...] = (
-    _random, _flipped, _truncated, _extended, _spliced, _wrong_field, _missing_field,
 )  # fmt: skip

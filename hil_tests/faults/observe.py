@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import can
 import zenoh
@@ -31,7 +31,6 @@ RECOVERY_LIMIT_S = 1.0
 
 Place = tuple[str, int, int]
 """Session, episode and step of a state."""
-E = TypeVar("E")
 _POLL_S = 0.1
 
 
@@ -76,17 +75,6 @@ class Timeline:
     """When the feedback said what was wrong with the vehicle."""
     unreadable: int = 0
     """Commands that no receiver would take: outside their limits, or no commands at all."""
-
-
-def first(events: Iterable[E], wanted: Callable[[E], bool]) -> E | None:
-    """The first event of that kind."""
-    return next((event for event in events if wanted(event)), None)
-
-
-def last_drive_s(timeline: Timeline) -> float:
-    """When the newest drive command came; -inf before the first."""
-    times = (c.seen_s for c in reversed(timeline.commands) if c.mode == DRIVE)
-    return next(times, float("-inf"))
 
 
 def unsafe_commands(
@@ -173,10 +161,6 @@ class Probe:
     def put(self, topic: str, payload: bytes) -> None:
         """Send bytes as they are."""
         self._publishers[topic].put(payload)
-
-    def rejected(self) -> dict[str, int]:
-        """The edge runtime's counts of rejected states, by its newest health message."""
-        return dict(self.health[-1].rejected) if self.health else {}
 
     def close(self) -> None:
         """Undeclare all, then close."""

@@ -8,13 +8,15 @@ The simulator may also be the rig's own sender, where a row sends states of its 
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 
@@ -22,20 +24,32 @@ from edge_runtime.commands import ask
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import bus as multicast
-from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE, State, encode
+from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, FRAMES_SHAPE, SAFE_STOP, State, encode
 from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
-from hil_tests.faults.observe import BrakeSeen, CanMonitor, ModeSeen, Probe, Timeline, last_drive_s
+from hil_tests.faults.observe import (
+    BrakeSeen,
+    CanMonitor,
+    CommandSeen,
+    ModeSeen,
+    Probe,
+    Timeline,
+    longest_gap_s,
+)
 from hil_tests.processes import Process, wait_until
 
+E = TypeVar("E")
 VEHICLE_ID = "faults"
 SESSION = "campaign"
 HEARD = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
 """What is kept of the CAN bus: all commands, the chassis's state, its speed."""
+_INSIDE = "hil_tests.faults.inside"
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
 _TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(\w+)")
 _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
 _REARM_EVERY_S = 2.0
+_HEALTH_S = 0.6
+"""Longer than a period of the health message."""
 _CHUNK_BYTES = 65536
 _STATE_BYTES = 20
 """More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
@@ -43,7 +57,26 @@ _STATE_BYTES = 20
 
 
 class Rig:
-    """Start it with ``with``; it ends every process that it started."""
+    """Start it with ``with``; it ends every process that it started.
+
+    ``simulator`` or ``sender``, ``link``, ``router``, ``chassis`` and ``monitor`` are there where
+    the options ask for them.
+
+    Args:
+        policy: the edge runtime's options for its policy.
+        directory: an empty one, for switches and reports.
+        between: ``link`` or ``router``: what edge runtime and probe meet at.
+        vehicle: the edge runtime's ``--vehicle``.
+        sender: send states here, without a simulator.
+        model: of a mock Hunter, on a CAN bus.
+    """
+
+    simulator: Process
+    sender: Sender
+    link: Link
+    router: Process
+    chassis: ChassisProcess
+    monitor: CanMonitor
 
     def __init__(
         self,
@@ -59,48 +92,59 @@ class Rig:
         self.crashes: list[str] = []
         self._policy, self._vehicle = policy, vehicle
         self._processes: list[tuple[str, Process]] = []
+        self._closing = contextlib.ExitStack()
         (directory / BRAKES).touch()
         self._simulator_endpoint, self._hub = free_endpoint(), free_endpoint()
-        self.simulator = None if sender else self.start_simulator()
+        if not sender:
+            self.simulator = self.start_simulator()
         connect = None if sender else self._simulator_endpoint
         self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline)
-        self.sender = Sender(self.probe) if sender else None
-        self.link = Link(self._hub) if between == "link" else None
-        self.router_endpoint = free_endpoint() if between == "router" else ""
-        self.router = self.start_router() if self.router_endpoint else None
+        self._closing.callback(self.probe.close)
+        self.edge_endpoint = self._hub
+        """Where the edge runtime connects."""
+        if between == "link":
+            self.link = Link(self._hub)
+            self._closing.callback(self.link.close)
+            self.edge_endpoint = self.link.endpoint
+        if between == "router":
+            self.edge_endpoint = free_endpoint()
+            self.router = self.start_router()
         self._bus = free_bus() if model else ""
-        self.chassis = ChassisProcess(self._bus, "--model", model) if model else None
-        self.monitor = CanMonitor(self._bus, HEARD) if model else None
-        if self.chassis is not None:
+        if model:
+            self.chassis = ChassisProcess(self._bus, "--model", model)
             self._processes.append(("chassis", self.chassis.process))
+            self.monitor = CanMonitor(self._bus, HEARD)
+            self._closing.callback(self.monitor.close)
         self.edge = self.start_edge()
+        self._closing.callback(self._end_processes)
+        if sender:
+            self.sender = Sender(self.probe)
+            self._closing.callback(self.sender.stop)
 
     def start_edge(self) -> Process:
         """The edge runtime, not waited for."""
-        endpoint = self.link.endpoint if self.link else self.router_endpoint or self._hub
-        arguments = ["edge_runtime", "run", *self._policy, "--connect", endpoint]
-        arguments += ["--vehicle-id", VEHICLE_ID, "--vehicle", self._vehicle]
-        if self._bus:
-            arguments += ["--bus", self._bus]
-        return self._start("edge", "hil_tests.faults.inside", *arguments)
+        bus = ("--bus", self._bus) if self._bus else ()
+        return self._start(
+            "edge", _INSIDE, "edge_runtime", "run", *self._policy, "--connect", self.edge_endpoint,
+            "--vehicle-id", VEHICLE_ID, "--vehicle", self._vehicle, *bus,
+        )  # fmt: skip
 
     def start_simulator(self) -> Process:
         """`bridge simulate` in real time, not waited for."""
-        arguments = ["bridge", "simulate", "--env", ENVIRONMENT, "--clock", "realtime"]
-        arguments += ["--listen", self._simulator_endpoint, "--vehicle-id", VEHICLE_ID]
-        arguments += ["--out", str(self.directory / "report.json")]
-        return self._start("simulator", "hil_tests.faults.inside", *arguments)
+        return self._start(
+            "simulator", _INSIDE, "bridge", "simulate", "--env", ENVIRONMENT,
+            "--clock", "realtime", "--listen", self._simulator_endpoint,
+            "--vehicle-id", VEHICLE_ID, "--out", str(self.directory / "report.json"),
+        )  # fmt: skip
 
     def start_recorder(self, path: Path) -> Process:
         """`bridge record` of this drive, not waited for."""
-        arguments = ["bridge", "record", "--out", str(path), "--connect", self._hub]
-        return self._start("recorder", *arguments, "--vehicle-id", VEHICLE_ID)
+        record = ("bridge", "record", "--out", str(path), "--connect", self._hub)
+        return self._start("recorder", *record, "--vehicle-id", VEHICLE_ID)
 
     def start_router(self) -> Process:
         """The router process between edge and probe, not waited for."""
-        return self._start(
-            "router", "hil_tests.faults.inside", "router", self.router_endpoint, self._hub
-        )
+        return self._start("router", _INSIDE, "router", self.edge_endpoint, self._hub)
 
     def wait_until_driving(
         self, timeout_s: float = 30.0, ready: Callable[[], bool] = lambda: True
@@ -136,6 +180,10 @@ class Rig:
         temporary.write_text(word)
         temporary.replace(path)
 
+    def bright(self, on: bool) -> None:
+        """Turn the frames white, or back."""
+        self.switch(BRIGHT, "" if on else None)
+
     def rearm(self) -> None:
         """As an operator does, until the runtime takes it."""
         wait_until(self.try_rearm, "the vehicle to be re-armed")
@@ -146,44 +194,99 @@ class Rig:
             return bool(ask(self._hub, VEHICLE_ID, "rearm")["accepted"])
         return False
 
-    def bright(self, on: bool) -> None:
-        """Turn the frames white, or back."""
-        self.switch(BRIGHT, "" if on else None)
-
     def end_drive(self) -> None:
         """Let the simulator end its episode and write its report."""
-        assert self.simulator is not None
         self.switch(END, "")
         self.simulator.wait()
 
-    def close(self) -> None:
-        """End everything; crashes are noted first."""
-        if self.sender is not None:
-            self.sender.stop()
-        for name, process in self._processes:
-            if process.crashed():
-                self.crashes.append(f"{name}: {process.lines[-1:]}")
-        # The simulator first: it says its episode's end to an edge that still listens.
-        for _, process in reversed(self._processes):
-            process.end()
-        if self.link is not None:
-            self.link.close()
-        if self.monitor is not None:
-            self.monitor.close()
-        self.probe.close()
+    def last_drive_s(self) -> float:
+        """When the newest drive command came; -inf before the first."""
+        times = (c.seen_s for c in reversed(self.timeline.commands) if c.mode == DRIVE)
+        return next(times, float("-inf"))
 
-    def __enter__(self) -> Rig:
+    def last_state_s(self, before_s: float) -> float:
+        """When the probe saw the newest state before ``before_s``."""
+        return max(s for s in list(self.timeline.states.values()) if s < before_s)
+
+    def last_answered_s(self, before_s: float) -> float:
+        """When the probe saw the newest state that a drive command had answered by then."""
+        states, commands = self.timeline.states, self.timeline.commands
+        answered = (c.place for c in commands if c.mode == DRIVE and c.seen_s < before_s)
+        return max(states[place] for place in answered if place in states)
+
+    def own_brake_s(self, since_s: float) -> float:
+        """When the simulated vehicle's brake went on after ``since_s``."""
+        return _await_first(
+            self.brakes, lambda b: b.pressed and b.seen_s > since_s, "the simulator's own brake"
+        ).seen_s
+
+    def stop_command(self, since_s: float) -> CommandSeen:
+        """The first safe_stop command after ``since_s``."""
+        return _await_first(
+            lambda: self.timeline.commands,
+            lambda c: c.seen_s > since_s and c.mode == SAFE_STOP,
+            "a safe_stop command",
+        )
+
+    def logged_stop(self, since_s: float) -> ModeSeen:
+        """When the edge runtime went into safe stop by its log, and why."""
+        return _await_first(
+            lambda: self.timeline.modes,
+            lambda m: m.seen_s > since_s and m.mode == SAFE_STOP,
+            "safe_stop in the log",
+        )
+
+    def recovered_after_s(self, ended_s: float) -> float:
+        """From the fault's end to the arrival of the first drive command after it."""
+        # By its sending: what a link held up was driven before.
+        command = _await_first(
+            lambda: self.timeline.commands,
+            lambda c: c.sent_s > ended_s and c.mode == DRIVE,
+            "a drive command",
+        )
+        return command.seen_s - ended_s
+
+    def must_stop_first(self, since_s: float) -> list[str]:
+        """Wrong where the first command after a silence is a drive."""
+        modes = (c.mode for c in self.timeline.commands if c.sent_s > since_s)
+        return ["drove on without a safe stop"] if next(modes, "") == DRIVE else []
+
+    def longest_gap(self, begin_s: float, end_s: float) -> float:
+        """The longest time without a command at the probe, s."""
+        return longest_gap_s((c.seen_s for c in list(self.timeline.commands)), begin_s, end_s)
+
+    def edge_counts(self) -> Counter[str]:
+        """The edge's rejections by reason, by a health message sent after all sent so far."""
+        time.sleep(_HEALTH_S)
+        seen = len(self.probe.health)
+        wait_until(lambda: len(self.probe.health) > seen, "a health message")
+        return Counter(self.probe.health[-1].rejected)
+
+    def simulator_counts(self) -> Counter[str]:
+        """The simulator's rejections by reason, from the report that it wrote at its end."""
+        report = json.loads((self.directory / "report.json").read_text())
+        return Counter(report["rejected_by_simulator"])
+
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self.close()
+        self._closing.close()
+
+    def _end_processes(self) -> None:
+        """Crashes are noted first."""
+        for name, process in self._processes:
+            if process.crashed():
+                self.crashes.append(f"{name}: {process.lines[-1:]}")
+        for _, process in reversed(self._processes):
+            process.end()
 
     def _is_driving(self) -> bool:
         now_s = time.monotonic()
         recent = [c for c in self.timeline.commands[-10:] if now_s - c.seen_s < _SETTLED_S]
         steady = len(recent) >= _SETTLED_COMMANDS and {c.mode for c in recent} == {"drive"}
         brakes = self.brakes()
-        fresh = now_s - last_drive_s(self.timeline) < _SETTLED_S
+        fresh = now_s - self.last_drive_s() < _SETTLED_S
         return steady and fresh and not (brakes and brakes[-1].pressed)
 
     def _start(self, name: str, *arguments: str) -> Process:
@@ -193,10 +296,15 @@ class Rig:
         return process
 
     def _on_edge_line(self, seen_s: float, line: str) -> None:
-        found = _MODE.search(line)
-        if found:
+        if found := _MODE.search(line):
             mode, reason = found.group(1), found.group(2) or ""
             self.timeline.modes.append(ModeSeen(seen_s, mode, reason))
+
+
+def _await_first(events: Callable[[], list[E]], wanted: Callable[[E], bool], what: str) -> E:
+    """The first event of that kind, as soon as it is there; TimeoutError."""
+    found = wait_until(lambda: [event for event in events() if wanted(event)][:1], what)
+    return cast(E, found[0])
 
 
 class Sender:
@@ -299,11 +407,10 @@ class ChassisProcess:
         return any(one.moves for one in before + inside)
 
     def _on_line(self, seen_s: float, line: str) -> None:
-        told, switched = _TOLD.match(line), _SWITCHED.match(line)
-        if told:
-            moves = told.group(4) == "moves"
-            self.truth.append(Truth(float(told.group(1)), told.group(2), told.group(3), moves))
-        if switched:
+        if told := _TOLD.match(line):
+            since_s, control, condition, motion = told.groups()
+            self.truth.append(Truth(float(since_s), control, condition, motion == "moves"))
+        if switched := _SWITCHED.match(line):
             applied_s, name, word = switched.groups()
             self.switched.append((float(applied_s), name, word))
 
@@ -338,7 +445,8 @@ class Link:
         """Break every connection and refuse new ones; what was under way is lost."""
         with self._lock:
             self._is_cut = True
-            self._break()
+            _shut(*self._open)
+            self._open.clear()
 
     def stall(self) -> None:
         """Keep the connections and hold what comes, as a radio link that repeats does."""
@@ -358,19 +466,15 @@ class Link:
         self._listener.close()
 
     def _accept(self) -> None:
-        while True:
-            try:
-                near, _ = self._listener.accept()
-            except OSError:
-                return
-            self._join(near)
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                self._join(self._listener.accept()[0])
 
     def _join(self, near: socket.socket) -> None:
         with self._lock:
-            if self._is_cut:
-                near.close()
-                return
             try:
+                if self._is_cut:
+                    raise ConnectionError
                 far = socket.create_connection(self._target, timeout=1.0)
             except OSError:
                 near.close()
@@ -379,8 +483,8 @@ class Link:
             for end in (near, far):
                 end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._open += [near, far]
-        threading.Thread(target=self._pump, args=(near, far, False), daemon=True).start()
-        threading.Thread(target=self._pump, args=(far, near, True), daemon=True).start()
+        for pair in ((near, far, False), (far, near, True)):
+            threading.Thread(target=self._pump, args=pair, daemon=True).start()
 
     def _pump(self, source: socket.socket, sink: socket.socket, to_caller: bool) -> None:
         with contextlib.suppress(OSError):
@@ -390,10 +494,6 @@ class Link:
                 if to_caller and len(data) > _STATE_BYTES:
                     self.last_state_s = time.monotonic()
         _shut(source, sink)
-
-    def _break(self) -> None:
-        _shut(*self._open)
-        self._open.clear()
 
 
 def address(endpoint: str) -> tuple[str, int]:

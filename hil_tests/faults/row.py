@@ -1,4 +1,4 @@
-"""A row of the fault table, and the steps of which rows are made.
+"""A row of the fault table.
 
 A new row is a function that takes a driving rig and the number of its try, does the fault once,
 undoes it, and returns a `Try`; `fault` above it puts it into ROWS. The modules with rows are named
@@ -7,7 +7,6 @@ in `run.py`.
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -17,21 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP
-from hil_tests.faults.observe import (
-    REACTION_LIMIT_S,
-    RECOVERY_LIMIT_S,
-    CommandSeen,
-    first,
-    longest_gap_s,
-    stops_between,
-)
+from edge_runtime.wire import CONTROL_PERIOD_S
+from hil_tests.faults.observe import REACTION_LIMIT_S, RECOVERY_LIMIT_S, stops_between
 from hil_tests.faults.rig import Rig
-from hil_tests.processes import wait_until
 
 GAP = "longest gap between commands"
-_HEALTH_S = 0.6
-"""Longer than a period of the health message."""
 
 
 @dataclass(frozen=True)
@@ -113,65 +102,6 @@ def sleep_until(time_s: float) -> None:
     time.sleep(max(0.0, time_s - time.monotonic()))
 
 
-def own_brake_s(rig: Rig, since_s: float) -> float:
-    """When the simulated vehicle's brake went on after ``since_s``."""
-    return wait_until(
-        lambda: first(rig.brakes(), lambda b: b.pressed and b.seen_s > since_s),
-        "the simulator's own brake",
-    ).seen_s
-
-
-def stop_command(rig: Rig, since_s: float) -> CommandSeen:
-    """The first safe_stop command after ``since_s``."""
-    return wait_until(
-        lambda: first(rig.timeline.commands, lambda c: c.seen_s > since_s and c.mode == SAFE_STOP),
-        "a safe_stop command",
-    )
-
-
-def logged_stop(rig: Rig, since_s: float) -> tuple[float, str]:
-    """When the edge runtime went into safe stop by its log, and why."""
-    mode = wait_until(
-        lambda: first(rig.timeline.modes, lambda m: m.seen_s > since_s and m.mode == SAFE_STOP),
-        "safe_stop in the log",
-    )
-    return mode.seen_s, mode.reason
-
-
-def recovered_after_s(rig: Rig, ended_s: float) -> float:
-    """From the fault's end to the arrival of the first drive command after it."""
-    # By its sending: what a link held up was driven before.
-    command = wait_until(
-        lambda: first(rig.timeline.commands, lambda c: c.sent_s > ended_s and c.mode == DRIVE),
-        "a drive command",
-    )
-    return command.seen_s - ended_s
-
-
-def last_state_s(rig: Rig, before_s: float) -> float:
-    """When the probe saw the newest state before ``before_s``."""
-    return max(s for s in list(rig.timeline.states.values()) if s < before_s)
-
-
-def last_answered_s(rig: Rig, before_s: float) -> float:
-    """When the probe saw the newest state that a drive command answered before ``before_s``."""
-    answered = (c.place for c in rig.timeline.commands if c.mode == DRIVE and c.seen_s < before_s)
-    return max(rig.timeline.states[place] for place in answered if place in rig.timeline.states)
-
-
-def must_stop_first(rig: Rig, since_s: float) -> list[str]:
-    """Wrong where the first command after a silence is a drive."""
-    command = first(rig.timeline.commands, lambda c: c.sent_s > since_s)
-    if command is not None and command.mode == DRIVE:
-        return ["drove on without a safe stop"]
-    return []
-
-
-def longest_gap(rig: Rig, begin_s: float, end_s: float) -> float:
-    """The longest time without a command at the probe, s."""
-    return longest_gap_s((c.seen_s for c in list(rig.timeline.commands)), begin_s, end_s)
-
-
 def drove_on(
     rig: Rig,
     begin_s: float,
@@ -180,32 +110,13 @@ def drove_on(
     counted: Counter[str] | None = None,
     **more: Any,
 ) -> Try:
-    """The try of a row in which nothing is to happen, but perhaps counting; ``more`` of its fields.
+    """The try of a row in which nothing was to happen between two moments, but perhaps counting.
 
-    Args:
-        rig: where it was tried.
-        begin_s: from here on it had to drive,
-        end_s: up to here.
-        wanted: how many messages had to be rejected, by reason.
-        counted: how many were.
-        more: further fields of the `Try`.
+    ``wanted`` messages had to be rejected, by reason, and ``counted`` ones were; ``more`` are
+    further fields of the `Try`.
     """
     wanted, counted = wanted or Counter(), counted or Counter()
     wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
     # Safe stops come as steadily as drives: the gaps alone would not tell.
     wrong += [*stops_between(rig.timeline.commands, begin_s, end_s), *more.pop("wrong", [])]
-    return Try(longest_gap(rig, begin_s, end_s), rejected=dict(counted), wrong=wrong, **more)
-
-
-def edge_counts(rig: Rig) -> Counter[str]:
-    """The edge's counts, by a health message that was sent after all that was sent so far."""
-    time.sleep(_HEALTH_S)
-    seen = len(rig.probe.health)
-    wait_until(lambda: len(rig.probe.health) > seen, "a health message")
-    return Counter(rig.probe.rejected())
-
-
-def simulator_counts(rig: Rig) -> Counter[str]:
-    """The simulator's counts, from the report that it wrote at its end."""
-    report = json.loads((rig.directory / "report.json").read_text())
-    return Counter(report["rejected_by_simulator"])
+    return Try(rig.longest_gap(begin_s, end_s), rejected=dict(counted), wrong=wrong, **more)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
 import tempfile
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,15 +20,15 @@ from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE
 from hil_tests.faults import ends, hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.row import ROWS, Row, Try
-from hil_tests.processes import POLICY, PUBLIC_KEY, trusting
+from hil_tests.faults.row import ROWS, Row, Try, at_any_phase
+from hil_tests.processes import POLICY, PUBLIC_KEY, in_parallel, trusting
 
 SLOW_S = 2.5 * CONTROL_PERIOD_S
 STALLED_S = 1.5 * CONTROL_PERIOD_S
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
-OnProgress = Callable[[str, int, int], None]
-"""Told the row, and how many of all tries are done."""
+OnTry = Callable[[str], None]
+"""Told the row, after every try."""
 
 
 def write_slow(path: Path) -> None:
@@ -72,7 +69,7 @@ def run_faults(
     tries: int,
     rows: Sequence[str] | None = None,
     policy: Path | None = None,
-    on_progress: OnProgress = lambda row, done, total: None,
+    on_try: OnTry = lambda row: None,
     jobs: int = 2,
     public_key: str | None = None,
 ) -> dict[str, Any]:
@@ -82,7 +79,7 @@ def run_faults(
         tries: of each row.
         rows: names of the table's rows, or patterns of them (``hunter_*``); None for all.
         policy: an exported policy; None for the repository's own left turn.
-        on_progress: called after every try.
+        on_try: called after every try.
         jobs: rigs at once; rows that need the machine for themselves run after the others.
         public_key: what the policy is verified with.
 
@@ -93,12 +90,21 @@ def run_faults(
     trust = trusting(policy, public_key)
     if policy is None:
         trust = ("--policy", str(POLICY), "--public-key", public_key or str(PUBLIC_KEY))
-    with tempfile.TemporaryDirectory(prefix="phil-faults-") as work:
-        campaign = _Campaign(Path(work), trust, tries, chosen, on_progress)
-        with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
-            futures = {row.name: pool.submit(campaign.run, row) for row in chosen if not row.alone}
-            outcomes = {name: future.result() for name, future in futures.items()}
-        outcomes |= {row.name: campaign.run(row) for row in chosen if row.alone}
+    with tempfile.TemporaryDirectory(prefix="phil-faults-") as folder:
+        work = Path(folder)
+        policies = {"given": trust}
+        for kind in {row.policy for row in chosen} & set(POLICIES):
+            path = work / f"{kind}.onnx"
+            POLICIES[kind](path)
+            policies[kind] = trusting(path, None)
+        outcomes: dict[str, Outcome] = {}
+        for alone in (False, True):
+            in_parallel(
+                lambda row: run_row(row, policies[row.policy], work, tries, on_try),
+                [row for row in chosen if row.alone == alone],
+                1 if alone else jobs,
+                lambda row, outcome: outcomes.update({row.name: outcome}),
+            )
     found = [report_row(row, outcomes[row.name]) for row in chosen]
     return {
         "tries": tries,
@@ -124,73 +130,45 @@ def choose_rows(names: Sequence[str] | None) -> list[Row]:
     return [row for row in ROWS if any(fnmatch.fnmatch(row.name, name) for name in names)]
 
 
-class _Campaign:
-    def __init__(
-        self,
-        work: Path,
-        trust: Sequence[str],
-        tries: int,
-        rows: Sequence[Row],
-        on_progress: OnProgress,
-    ) -> None:
-        self._work, self._tries, self._on_progress = work, tries, on_progress
-        self._done, self._total = 0, tries * len(rows)
-        self._lock = threading.Lock()
-        self._policies = {"given": trust}
-        for kind in {row.policy for row in rows} & set(POLICIES):
-            path = work / f"{kind}.onnx"
-            POLICIES[kind](path)
-            self._policies[kind] = trusting(path, None)
+def run_row(row: Row, trust: Sequence[str], work: Path, tries: int, on_try: OnTry) -> Outcome:
+    """All tries of a row; a rig in which a try came to no end is replaced.
 
-    def run(self, row: Row) -> Outcome:
-        """All tries of a row; a rig in which a try came to no end is replaced."""
-        outcome, number = Outcome(), 0
-        while number < self._tries:
-            with self._rig(row, outcome) as rig:
-                going = True
-                while going and number < self._tries:
-                    disturbed = outcome.disturbed
-                    going = self._try(row, rig, number, outcome) and not row.new_rig_each_try
-                    if outcome.disturbed == disturbed:
-                        number += 1
-                        self._tick(row)
-                _judge(row, rig, outcome)
-        return outcome
-
-    def _try(self, row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
-        """Whether the rig can be used again."""
-        try:
-            rig.wait_until_driving()
-            begin_s = time.monotonic()
-            done = row.run(rig, number)
-        except TimeoutError as error:
-            outcome.failures.append(f"try {number}: {error}")
-            return False
-        gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
-        if row.flows and gap_s > STALLED_S and outcome.disturbed < MOST_DISTURBED:
-            outcome.disturbed += 1
-        else:
-            outcome.tries.append(done)
-        return True
-
-    @contextlib.contextmanager
-    def _rig(self, row: Row, outcome: Outcome) -> Iterator[Rig]:
-        directory = Path(tempfile.mkdtemp(dir=self._work))
-        with Rig(self._policies[row.policy], directory, **row.rig) as rig:
-            yield rig
+    ``trust`` are the options of its edge runtimes; rigs have their directories in ``work``.
+    """
+    outcome, number = Outcome(), 0
+    while number < tries:
+        with Rig(trust, Path(tempfile.mkdtemp(dir=work)), **row.rig) as rig:
+            going = True
+            while going and number < tries:
+                disturbed = outcome.disturbed
+                going = _try(row, rig, number, outcome) and not row.new_rig_each_try
+                if outcome.disturbed == disturbed:
+                    number += 1
+                    on_try(row.name)
+            seen = rig.timeline
+            outcome.unsafe += unsafe_commands(seen.commands, seen.states, row.by_arrival)
+            if seen.unreadable:
+                outcome.unsafe.append(f"{seen.unreadable} commands that nobody would take")
         outcome.crashes += rig.crashes
-
-    def _tick(self, row: Row) -> None:
-        with self._lock:
-            self._done += 1
-            self._on_progress(row.name, self._done, self._total)
+    return outcome
 
 
-def _judge(row: Row, rig: Rig, outcome: Outcome) -> None:
-    timeline = rig.timeline
-    outcome.unsafe += unsafe_commands(timeline.commands, timeline.states, by_arrival=row.by_arrival)
-    if timeline.unreadable:
-        outcome.unsafe.append(f"{timeline.unreadable} commands that nobody would take")
+def _try(row: Row, rig: Rig, number: int, outcome: Outcome) -> bool:
+    """Whether the rig can be used again."""
+    try:
+        rig.wait_until_driving()
+        at_any_phase(number)
+        begin_s = time.monotonic()
+        done = row.run(rig, number)
+    except TimeoutError as error:
+        outcome.failures.append(f"try {number}: {error}")
+        return False
+    gap_s = longest_gap_s(list(rig.timeline.flow_s), begin_s, time.monotonic())
+    if row.flows and gap_s > STALLED_S and outcome.disturbed < MOST_DISTURBED:
+        outcome.disturbed += 1
+    else:
+        outcome.tries.append(done)
+    return True
 
 
 def report_row(row: Row, outcome: Outcome) -> dict[str, Any]:

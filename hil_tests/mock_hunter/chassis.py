@@ -9,7 +9,7 @@ one is documented). No clock, no bus, no body.
 
 from __future__ import annotations
 
-from enum import Enum, StrEnum
+from enum import StrEnum
 from typing import NamedTuple
 
 from edge_runtime.util import UserError
@@ -111,60 +111,27 @@ class Event(StrEnum):
     ERRORS_OVER = "no error left that stops it"
 
 
-_S, _C, _L = Control.STANDBY, Control.CAN, Control.LINK_LOST
-_R, _O = Control.REMOTE, Control.REMOTE_OVER_CAN
-CONTROL: dict[tuple[Control, Event], Control] = {
-    (_S, Event.CAN_MODE): _C,
-    (_S, Event.STANDBY_MODE): _S,
-    (_S, Event.COMMAND): _S,
-    (_S, Event.TIMEOUT): _S,
-    (_S, Event.REMOTE_ON): _R,
-    (_S, Event.REMOTE_OFF): _S,
-    (_C, Event.CAN_MODE): _C,
-    (_C, Event.STANDBY_MODE): _S,
-    (_C, Event.COMMAND): _C,
-    (_C, Event.TIMEOUT): _L,
-    (_C, Event.REMOTE_ON): _O,
-    (_C, Event.REMOTE_OFF): _C,
-    (_L, Event.CAN_MODE): _C,
-    (_L, Event.STANDBY_MODE): _S,
-    (_L, Event.COMMAND): _C,  # the trap: control comes back without anyone asking for it
-    (_L, Event.TIMEOUT): _L,
-    (_L, Event.REMOTE_ON): _O,
-    (_L, Event.REMOTE_OFF): _L,
-    (_R, Event.CAN_MODE): _R,  # the remote control always outranks the bus
-    (_R, Event.STANDBY_MODE): _R,
-    (_R, Event.COMMAND): _R,
-    (_R, Event.TIMEOUT): _R,
-    (_R, Event.REMOTE_ON): _R,
-    (_R, Event.REMOTE_OFF): _S,
-    (_O, Event.CAN_MODE): _O,
-    (_O, Event.STANDBY_MODE): _R,
-    (_O, Event.COMMAND): _O,
-    (_O, Event.TIMEOUT): _O,
-    (_O, Event.REMOTE_ON): _O,
-    (_O, Event.REMOTE_OFF): _C,
-}
+_S, _C, _L, _R, _O = Control
+CONTROL: dict[Event, tuple[Control, ...]] = {
+    # in:               standby, can, link_lost, remote, remote_over_can
+    Event.CAN_MODE:     (_C, _C, _C, _R, _O),  # the remote control always outranks the bus
+    Event.STANDBY_MODE: (_S, _S, _S, _R, _R),
+    Event.COMMAND:      (_S, _C, _C, _R, _O),  # the trap: from link_lost, nobody having asked
+    Event.TIMEOUT:      (_S, _L, _L, _R, _O),
+    Event.REMOTE_ON:    (_R, _O, _O, _R, _O),
+    Event.REMOTE_OFF:   (_S, _C, _L, _S, _C),
+}  # fmt: skip
+"""Event -> the state after it, for each state before it in the order of `Control`."""
 
 _K, _E, _X, _B = Condition
-CONDITION: dict[tuple[Condition, Event], Condition] = {
-    (_K, Event.ESTOP_ON): _E,
-    (_K, Event.ESTOP_OFF): _K,
-    (_K, Event.ERRORS): _X,
-    (_K, Event.ERRORS_OVER): _K,
-    (_E, Event.ESTOP_ON): _E,
-    (_E, Event.ESTOP_OFF): _K,
-    (_E, Event.ERRORS): _B,
-    (_E, Event.ERRORS_OVER): _E,
-    (_X, Event.ESTOP_ON): _B,
-    (_X, Event.ESTOP_OFF): _X,
-    (_X, Event.ERRORS): _X,
-    (_X, Event.ERRORS_OVER): _K,
-    (_B, Event.ESTOP_ON): _B,
-    (_B, Event.ESTOP_OFF): _X,
-    (_B, Event.ERRORS): _B,
-    (_B, Event.ERRORS_OVER): _E,
-}
+CONDITION: dict[Event, tuple[Condition, ...]] = {
+    # in:               ok, estop, exception, estop_and_exception
+    Event.ESTOP_ON:     (_E, _E, _B, _B),
+    Event.ESTOP_OFF:    (_K, _K, _X, _X),
+    Event.ERRORS:       (_X, _B, _X, _B),
+    Event.ERRORS_OVER:  (_K, _E, _K, _E),
+}  # fmt: skip
+"""The same for `Condition`."""
 
 
 class Chassis(NamedTuple):
@@ -185,9 +152,10 @@ class Chassis(NamedTuple):
 
 def advance(chassis: Chassis, event: Event) -> Chassis:
     """The state after an event."""
-    if (chassis.control, event) in CONTROL:
-        return chassis._replace(control=CONTROL[chassis.control, event])
-    return chassis._replace(condition=CONDITION[chassis.condition, event])
+    if event in CONTROL:
+        return chassis._replace(control=CONTROL[event][list(Control).index(chassis.control)])
+    place = list(Condition).index(chassis.condition)
+    return chassis._replace(condition=CONDITION[event][place])
 
 
 def take_can_mode(chassis: Chassis, now_s: float) -> Chassis:
@@ -232,18 +200,3 @@ def obeys(chassis: Chassis) -> bool:
 def _settle(chassis: Chassis) -> Chassis:
     stopped = any(BITS[error].stops for error in chassis.errors)
     return advance(chassis, Event.ERRORS if stopped else Event.ERRORS_OVER)
-
-
-def render_tables() -> str:
-    """Both tables as Markdown: a row for each event, a column for each state."""
-    return "\n\n".join((_render(CONTROL, Control), _render(CONDITION, Condition)))
-
-
-def _render(table: dict, states: type[Enum]) -> str:
-    events = list(dict.fromkeys(event for _, event in table))
-    lines = ["| event | " + " | ".join(f"in {state.value}" for state in states) + " |"]
-    lines.append("|---" * (len(states) + 1) + "|")
-    for event in events:
-        cells = (table[state, event].value for state in states)
-        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)

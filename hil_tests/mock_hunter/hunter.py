@@ -16,15 +16,13 @@ from hil_tests.mock_hunter.chassis import (
     BITS,
     LATE_S,
     LIE_MPS,
-    REAR_LEFT,
-    REAR_RIGHT,
     STEERING,
     Chassis,
     Condition,
     Control,
     Event,
     check_fault,
-)
+)  # fmt: skip
 
 FAST_S = 0.02
 SLOW_EVERY = 5
@@ -45,16 +43,7 @@ _STATES = {
     Condition.EXCEPTION: codec.STATE_EXCEPTION,
     Condition.ESTOP_AND_EXCEPTION: codec.STATE_ESTOP,
 }
-_FAST = {
-    STEERING: codec.STEER_MOTOR_FAST,
-    REAR_RIGHT: codec.REAR_RIGHT_FAST,
-    REAR_LEFT: codec.REAR_LEFT_FAST,
-}
-_SLOW = {
-    STEERING: codec.STEER_MOTOR_SLOW,
-    REAR_RIGHT: codec.REAR_RIGHT_SLOW,
-    REAR_LEFT: codec.REAR_LEFT_SLOW,
-}
+_SLOW = (codec.STEER_MOTOR_SLOW, codec.REAR_RIGHT_SLOW, codec.REAR_LEFT_SLOW)
 _ENABLED = 1 << 6
 _COOL_C, _HOT_C = 35, 105
 _INT32 = 2**32
@@ -215,19 +204,17 @@ def fast_frames(reported: Reported, parameters: Parameters) -> list[tuple[int, b
     motion = codec.MotionStatus(speed_mps, body.inner_rad)
     found = [_frame(codec.MOTION_STATUS, motion)]
     half = curvature(body.inner_rad, parameters) * parameters.track_m / 2
-    for motor, way_m, share in (
-        (REAR_RIGHT, body.right_m, 1 + half),
-        (REAR_LEFT, body.left_m, 1 - half),
+    drive, steer = parameters.motor_revolutions_per_m, parameters.steer_revolutions_per_rad
+    each_a = reported.amperes / 2
+    for row, turns, speed, way, amperes in (
+        (codec.REAR_RIGHT_FAST, drive, body.speed_mps * (1 + half), body.right_m, each_a),
+        (codec.REAR_LEFT_FAST, drive, body.speed_mps * (1 - half), body.left_m, each_a),
+        (codec.STEER_MOTOR_FAST, steer, body.steering_radps, body.inner_rad, 0.0),
     ):
-        turns = parameters.motor_revolutions_per_m
-        rpm = round(body.speed_mps * share * turns * 60)
-        pulses = way_m * turns * parameters.pulses_per_revolution
-        fast = codec.MotorFast(rpm, reported.amperes / 2, _wrapped(pulses))
-        found.append(_frame(_FAST[motor], fast))
-    turns = parameters.steer_revolutions_per_rad
-    rpm = round(body.steering_radps * turns * 60)
-    pulses = body.inner_rad * turns * parameters.pulses_per_revolution
-    return [*found, _frame(_FAST[STEERING], codec.MotorFast(rpm, 0.0, _wrapped(pulses)))]
+        pulses = way * turns * parameters.pulses_per_revolution
+        fast = codec.MotorFast(round(speed * turns * 60), amperes, _wrapped(pulses))
+        found.append(_frame(row, fast))
+    return found
 
 
 def slow_frames(
@@ -235,7 +222,7 @@ def slow_frames(
 ) -> list[tuple[int, bytes]]:
     """0x211 and 0x261 to 0x263: every 100 ms."""
     found = [_frame(codec.SYSTEM_STATUS, status(reported, profile))]
-    for motor, row in _SLOW.items():
+    for motor, row in enumerate(_SLOW):
         bits = _ENABLED | sum(
             BITS[error].motor_bits
             for error in reported.chassis.errors

@@ -14,7 +14,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TextIO
+from functools import partial
+from typing import Any
 
 import can
 
@@ -39,26 +40,15 @@ def parse_switch(line: str) -> Switch:
     return check_fault(name), _WORDS[word]
 
 
-class Orders:
-    """Lines of a text stream, read by a thread so that nobody waits for them."""
-
-    def __init__(self, lines: TextIO, complain: Callable[[str], None]) -> None:
-        self._queue: queue.SimpleQueue[Switch] = queue.SimpleQueue()
-        self._complain = complain
-        threading.Thread(target=self._read, args=(lines,), daemon=True).start()
-
-    def newest(self) -> Iterable[Switch]:
-        """What was ordered since the last call."""
-        with contextlib.suppress(queue.Empty):
-            while True:
-                yield self._queue.get_nowait()
-
-    def _read(self, lines: TextIO) -> None:
-        for line in lines:
-            try:
-                self._queue.put(parse_switch(line))
-            except UserError as error:
-                self._complain(f"error: {error}")
+def read_orders(
+    lines: Iterable[str], obey: Callable[[Switch], None], complain: Callable[[str], None]
+) -> None:
+    """Read lines to their end, in a thread of its own so that nobody waits for them."""
+    for line in lines:
+        try:
+            obey(parse_switch(line))
+        except UserError as error:
+            complain(f"error: {error}")
 
 
 class Server:
@@ -71,6 +61,8 @@ class Server:
         tell: Callable[[str], None] = lambda line: None,
         later: Sequence[tuple[float, str]] = (),
     ) -> None:
+        self.orders: queue.SimpleQueue[Switch] = queue.SimpleQueue()
+        """Switches to obey next, from any thread."""
         self._hunter, self._bus, self._tell = hunter, bus, tell
         self._later = sorted(later)
         self._ending = threading.Event()
@@ -81,15 +73,15 @@ class Server:
         """End `run`, from a signal handler or another thread."""
         self._ending.set()
 
-    def run(self, orders: Callable[[], Iterable[Switch]] = tuple) -> None:
-        """Obey and report. ``orders`` is asked for switches at every turn."""
+    def run(self) -> None:
+        """Obey and report."""
         begun_s = time.monotonic()
         while not self._ending.is_set():
             now_s = time.monotonic()
             while self._later and now_s - begun_s >= self._later[0][0]:
                 self._switch(self._later.pop(0)[1], True)
-            for name, on in orders():
-                self._switch(name, on)
+            while not self.orders.empty():
+                self._switch(*self.orders.get())
             for frame in self._hunter.due(time.monotonic()):
                 self._send(frame.can_id, frame.data)
             self._say()
@@ -175,18 +167,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Be a Hunter until a signal comes."""
     parameters = make_parameters(arguments.model, read_changes(arguments.set or []))
-    bus = open_bus(_check_reachable(arguments.bus))
+    bus, tell = open_bus(_check_reachable(arguments.bus)), partial(print, flush=True)
     try:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
-        server = Server(hunter, bus, _tell, arguments.fault or ())
+        server = Server(hunter, bus, tell, arguments.fault or ())
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: server.stop())
         if isinstance(sys.stdin, io.TextIOWrapper):
             # A byte that is no text is a wrong order, not the end of all orders.
             sys.stdin.reconfigure(errors="replace")
-        orders = Orders(sys.stdin, lambda line: print(line, file=sys.stderr, flush=True))
-        _tell(f"ready bus={arguments.bus} model={arguments.model}")
-        server.run(orders.newest)
+        complain = partial(print, file=sys.stderr, flush=True)
+        reader = (sys.stdin, server.orders.put, complain)
+        threading.Thread(target=read_orders, args=reader, daemon=True).start()
+        tell(f"ready bus={arguments.bus} model={arguments.model}")
+        server.run()
     finally:
         bus.shutdown()
     return 0
@@ -200,10 +194,6 @@ def _check_reachable(text: str) -> BusName:
             f" use {MULTICAST_BUS} or socketcan:vcan0"
         )
     return bus
-
-
-def _tell(line: str) -> None:
-    print(line, flush=True)
 
 
 def _fault(text: str) -> tuple[float, str]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hil_tests.bench_loop import compare, lines
+from hil_tests.bench_loop import compare, rows
 
 
 def test_ratios_by_hand():
@@ -46,11 +46,11 @@ def report(ratio=1.1, end_mb=100.0, idle=0.01, start_s=1.0, times=40.0):
 
 
 def test_every_bar_is_met_or_missed_by_its_own_figure():
-    met = [line.bar for line in lines(report()) if line.bar]
+    met = [row[-1] for row in rows(report()) if row[-1]]
     assert len(met) == 6
     assert all(bar.endswith("met") for bar in met)
     for missed in (
         {"ratio": 1.26}, {"end_mb": 110.1}, {"idle": 0.021}, {"start_s": 1.6}, {"times": 29.0},
     ):  # fmt: skip
-        bars = [line.bar for line in lines(report(**missed))]
+        bars = [row[-1] for row in rows(report(**missed))]
         assert sum(bar.endswith("MISSED") for bar in bars) == 1

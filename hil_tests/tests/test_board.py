@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from edge_runtime.util import UserError
-from hil_tests import emulated_board
+from hil_tests import board as boards
 from hil_tests.__main__ import main
 from hil_tests.board import BOARDS, FAULTS, prove, why_not
 
@@ -26,7 +26,7 @@ def test_what_is_missing_is_said(board, monkeypatch, tmp_path):
 
 def test_a_program_that_is_missing_is_named_with_its_package(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    monkeypatch.setattr(emulated_board.shutil, "which", lambda name: None)
+    monkeypatch.setattr(boards.shutil, "which", lambda name: None)
     assert why_not("aarch64").endswith("is not there (Debian's package qemu-system-arm)")
 
 

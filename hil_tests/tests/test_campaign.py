@@ -10,9 +10,9 @@ from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError
 from hil_tests import campaign
 from hil_tests.__main__ import main
-from hil_tests.campaign import Chunk, Task, agree, chunks_of
+from hil_tests.campaign import Chunk
 from hil_tests.report import check_report, write_report
-from hil_tests.sweep import NETWORK_AXES, Axis, budget, limit_of, make_row
+from hil_tests.sweep import NETWORK_AXES, Axis, Task, budget, limit_of, make_row, turns
 
 DELAY = Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms", "none", "{} of delay")
 LOSS = Axis("loss", "loss", "%", (0, 10), "loss={}%", "none", "{} of loss")
@@ -72,9 +72,8 @@ def test_every_axis_can_be_read_and_begins_without_trouble():
     assert {0, 25, 250} <= set(delays)  # 0 to 500 ms there and back
 
 
-def test_chunks_cover_each_seed_once():
-    chunks = chunks_of("none", seed=7, runs=60, size=25)
-    assert [(chunk.first_seed, chunk.episodes) for chunk in chunks] == [(7, 25), (32, 25), (57, 10)]
+def test_turns_cover_each_seed_once():
+    assert turns(seed=7, runs=60, size=25) == [(7, 25), (32, 25), (57, 10)]
 
 
 def chunk_report(outcomes, p99):
@@ -107,15 +106,9 @@ def test_a_row_joins_its_chunks():
     assert row["rejected"] == {"stale": 4}
 
 
-def test_intervals_that_do_not_meet_do_not_agree():
-    assert agree({"low": 0.8, "high": 0.9}, {"low": 0.9, "high": 1.0})
-    assert not agree({"low": 0.8, "high": 0.9}, {"low": 0.91, "high": 1.0})
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--check-realtime", "delay=5"], "is not understood"),
         (["--rows", "lag", "--only", "latency"], "no latency axis 'lag'"),
         (["--rows", "delay,edge_kiled"], "no fault 'edge_kiled'"),
         (["--rows", "delay", "--only", "faults"], "no fault"),
@@ -180,7 +173,7 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
 
 def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeypatch):
     policy = Path("results/policies/left_turn.onnx")
-    task = Task(policy, "any", "left_turn", "nominal", "lockstep")
+    task = Task(policy, "any", "left_turn", "nominal", 1, 1)
     edges, limits_s = [], chain((0.1,), repeat(120.0))
     start_edge, wait = campaign.Worker.start_edge, campaign.BackgroundCommand.wait
 
@@ -195,7 +188,7 @@ def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeyp
     reports = []
     chunk = Chunk("none", 1, 1)
     campaign.drive_chunks(task, [chunk], 1, lambda _chunk, found: reports.append(found))
-    assert [len(report["episodes"]) for report in reports] == [1]
+    assert [len(part["episodes"]) for report in reports for part in report["parts"]] == [1]
     assert len(edges) == 2
 
 

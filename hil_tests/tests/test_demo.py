@@ -65,7 +65,6 @@ def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(
         ("demo", "--seed", "-3"),
         ("demo", "--minutes", "0"),
         ("demo", "--runs", "none"),
-        (),
     ],
 )
 def test_bad_input_gets_one_line_and_touches_nothing(arguments, capsys, tmp_path):

@@ -18,8 +18,15 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles.ros2.names import DEFAULT_ROS2_ENDPOINT
 from hil_tests import pictures, processes
 from hil_tests.__main__ import main
-from hil_tests.loop_picture import Trips
-from hil_tests.pictures import FILM_POLICY, FILM_SEED, policy_sees, success_against_latency
+from hil_tests.pictures import (
+    FILM_POLICY,
+    FILM_SEED,
+    begins_s,
+    lost_s,
+    policy_sees,
+    success_against_latency,
+    trips_of,
+)
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.picture import drive_moments
@@ -142,32 +149,31 @@ def test_the_guide_in_the_film_brakes_for_the_crash_and_hands_the_wheel_back():
 
 
 def test_a_round_trip_is_drawn_in_its_parts_and_a_lost_state_as_lost():
-    trips = Trips()
+    messages = []
     for step in (0, 1, 3):
         sent_ns = step * 100 * MS
-        trips.take(make_state(step, sent_ns=sent_ns))
-        trips.take(make_command(step, received_ns=sent_ns + 40 * MS, sent_ns=sent_ns + 43 * MS))
-    trips.take(Scene(episode=0, step=3, sim_time_s=0.3, round_trip_ms=90.0, answered_step=1))
-    for trip, downlink_ms in zip(trips.trips.values(), (0.0, 47.0, 0.0), strict=True):
+        answer = make_command(step, received_ns=sent_ns + 40 * MS, sent_ns=sent_ns + 43 * MS)
+        messages += [make_state(step, sent_ns=sent_ns), answer]
+    seen = Scene(episode=0, step=3, sim_time_s=0.3, round_trip_ms=90.0, answered_step=1)
+    trips = trips_of([*messages, seen])
+    for trip, downlink_ms in zip(trips.values(), (0.0, 47.0, 0.0), strict=True):
         assert trip.parts_ms == pytest.approx((40.0, 3.0, downlink_ms))
-    assert trips.lost_s() == pytest.approx([0.2])
+    assert lost_s(trips) == pytest.approx([0.2])
 
 
 def test_a_new_episode_begins_behind_the_last_one():
-    trips = Trips()
-    for episode, step in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 1)):
-        trips.take(make_state(step, episode=episode))
-    *times_s, last_s = (trip.time_s for trip in trips.trips.values())
-    assert trips.begins_s() == [times_s[3], last_s]
+    places = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 1))
+    trips = trips_of(make_state(step, episode=episode) for episode, step in places)
+    *times_s, last_s = (trip.time_s for trip in trips.values())
+    assert begins_s(trips) == [times_s[3], last_s]
 
 
 def test_only_the_first_answer_to_a_state_counts():
-    trips = Trips()
-    trips.take(make_state(0, sent_ns=0))
-    for sent_ns in (50 * MS, 250 * MS):  # A safe stop is repeated.
-        command_ = make_command(0, mode="safe_stop", received_ns=45 * MS, sent_ns=sent_ns)
-        trips.take(command_)
-    (trip,) = trips.trips.values()
+    answers = [  # A safe stop is repeated.
+        make_command(0, mode="safe_stop", received_ns=45 * MS, sent_ns=sent_ns)
+        for sent_ns in (50 * MS, 250 * MS)
+    ]
+    (trip,) = trips_of([make_state(0, sent_ns=0), *answers]).values()
     assert trip.parts_ms == pytest.approx((45.0, 5.0, 0.0))
     assert trip.mode == "safe_stop"
 

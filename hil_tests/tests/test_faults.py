@@ -144,7 +144,7 @@ def test_every_row_has_a_name_of_its_own_and_others_are_refused():
     names = [row.name for row in ROWS]
     assert len(set(names)) == len(names)
     for other in ("meteor", "meteor_*"):
-        with pytest.raises(UserError, match=r"no fault 'meteor.*'; choose from edge_killed"):
+        with pytest.raises(UserError, match=r"no fault 'meteor.*'; choose from .*edge_killed"):
             run_faults(1, [other])
 
 
@@ -154,15 +154,15 @@ def test_patterns_choose_rows_once_and_in_the_tables_order():
 
 
 def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on():
-    progress = []
-    report = run_faults(1, ["edge_killed"], on_progress=lambda *told: progress.append(told))
+    progress: list[str] = []
+    report = run_faults(1, ["edge_killed"], on_try=progress.append)
     (row,) = report["rows"]
     assert (row["wrong"], row["unsafe"], row["crashes"]) == ([], [], [])
     assert row["reasons"] == {"no_command": 1}
     # Measured, and not before its time; how fast it is is the campaign's business.
     assert row["reaction_ms"]["min"] > 100.0
     assert row["recovery_ms"]["min"] > 0.0
-    assert progress == [("edge_killed", 1, 1)]
+    assert progress == ["edge_killed"]
     assert "SIGKILL to the edge runtime" in render_faults(report)
 
 

@@ -14,7 +14,7 @@ import pytest
 import zenoh
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
-from bridge.ports import SimulatorPort, open_feed
+from bridge.ports import SimulatorPort, open_listener
 from deploy.certs import CLOCK_SLACK, issue, read_authority
 from edge_runtime import wire
 from edge_runtime.link_probe import free_endpoint, why_no_link
@@ -189,7 +189,7 @@ def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(par
             port = SimulatorPort(simulator, "hunter01")
             port.on_command(answered.append)
             port.wait_for_edge(10.0, place)
-            with open_feed(place, "hunter01", 5.0, load_tls(parties / "viewer")) as feed:
+            with open_listener(place, "hunter01", 5.0, load_tls(parties / "viewer")) as feed:
                 drive(port, answered, 0)
                 heard = [feed.next(1.0) for _ in range(8)]
                 assert {"state", "command"} <= {each.topic for each in heard if each}
@@ -209,6 +209,6 @@ def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(par
 def test_who_may_not_listen_is_told_so_and_not_that_nobody_is_there(parties, name):
     with (
         pytest.raises(UserError, match=f"of {name}, and this takes that of viewer"),
-        open_feed(free_endpoint("tls"), "hunter01", 0.0, load_tls(parties / name)),
+        open_listener(free_endpoint("tls"), "hunter01", 0.0, load_tls(parties / name)),
     ):
         pass

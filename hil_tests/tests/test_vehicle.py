@@ -9,17 +9,8 @@ from hil_tests.__main__ import main
 from hil_tests.mock_hunter.body import make_parameters
 from hil_tests.processes import POLICY
 from hil_tests.report import lag_sentence, render_comparison, render_sweep
-from hil_tests.sweep import LAG_AXES, LAGS, VEHICLE, Lag
-from hil_tests.vehicle import (
-    Drive,
-    cost,
-    join_vehicles,
-    lag_budget,
-    lag_row,
-    loop_row,
-    parts,
-    run_rig,
-)
+from hil_tests.sweep import LAG_AXES, LAGS, VEHICLE, Lag, Task
+from hil_tests.vehicle import cost, join_vehicles, lag_budget, lag_row, loop_row, run_rig
 from hil_tests.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
 
@@ -27,9 +18,9 @@ SHORT_TOY = "bridge.tests.toy:BridgeToyShort-v0"
 
 
 def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it():
-    drive = Drive(POLICY, SHORT_TOY, "nominal", 0, 1, {"dead_time_s": 0.1})
+    task = Task(POLICY, "any", SHORT_TOY, "nominal", 0, 1, changes={"dead_time_s": 0.1})
     for _ in range(3):  # A busy machine may pause a process for over 2 T.
-        report = run_rig(drive, VEHICLE)
+        report = run_rig(task, VEHICLE)
         if not report["safe_stops"]:
             break
     vehicle = report["vehicle"]
@@ -111,11 +102,6 @@ def test_the_table_shows_lags_that_were_not_told_as_such():
     text = render_sweep(sweep, {"table": "r_table.png"})
     assert "| 100 | 100% (90) | - |" in text
     assert "| 200 | - | 50%* (-) |" in text
-
-
-def test_the_turns_cover_each_seed_once():
-    found = parts(Drive(POLICY, "left_turn", "nominal", 7, 12, {}))
-    assert [(p.first_seed, p.episodes) for p in found] == [(7, 5), (12, 5), (17, 2)]
 
 
 def report_of(seed, outcomes, times_s, vehicle=None):

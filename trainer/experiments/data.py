@@ -15,15 +15,16 @@ from edge_runtime.util import UserError
 from trainer.drivers import CONDITIONS
 from trainer.experiments.plan import (
     FULL_PATH_M,
-    HUMAN_MODEL,
+    LABELS,
     NORMAL,
+    ONE_FRAME,
     PAPER_TESTS,
     SCENARIOS,
     TESTED_ONLY,
     Unit,
     units_of,
 )
-from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
+from trainer.experiments.store import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
 
 Numbers = NDArray[np.float64]
 BySeed = dict[int, float]
@@ -35,9 +36,11 @@ END_STEPS = 1_500
 SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
 TIME_S, LATERAL, LONGITUDINAL = "time_s", *TEST_COLUMNS[-2:]
 ARRIVED_ONLY = (TIME_S, LATERAL, LONGITUDINAL)
-"""Compared over drives that reach the goal only: who crashes at once was quick and smooth."""
+"""Compared over drives that reach the goal only: a car that crashes at once is quick and smooth."""
 SPREAD = "spread_m"
 """Standard deviation of the surviving distance from drive to drive."""
+KEPT, LOST, DROPPED = "kept with one frame", "lost with one frame", "dropped in the variant"
+"""Shares of the final distance, one frame against two; success, nominal minus variant scene."""
 TRAINING, ALONE = "in training", "alone"
 """A curve of the training episodes, in which the human helps (the paper's), or of the policy alone,
 on validation seeds."""
@@ -48,6 +51,12 @@ class Line(NamedTuple):
 
     algorithm: str
     setting: str = NORMAL
+
+    @property
+    def name(self) -> str:
+        """The algorithm in words, with its setting where that is not the normal one."""
+        setting = "" if self.setting == NORMAL else f" ({words(self.setting)})"
+        return LABELS[self.algorithm] + setting
 
 
 class Scene(NamedTuple):
@@ -61,6 +70,15 @@ class Scene(NamedTuple):
         """As in the paper's figure 9: L, L-N, L-V, C, ..."""
         letter = self.scenario[0].upper()
         return letter if self.condition == "nominal" else f"{letter}-{self.condition[0].upper()}"
+
+
+Place = str | Scene
+"""A scenario, for its trainings, or a scene of the tests."""
+
+
+def words(place: Place) -> str:
+    """A scenario, a setting or a scene as it is shown."""
+    return place.replace("_", " ") if isinstance(place, str) else place.label
 
 
 SCENES = tuple(Scene(scenario, condition) for scenario in SCENARIOS for condition in CONDITIONS)
@@ -133,11 +151,7 @@ class Result:
 
 def grid_of(budget: int) -> Numbers:
     """The multiples of ``GRID_STEPS`` up to a budget, or the budget alone."""
-    return (
-        np.arange(GRID_STEPS, budget + 1, GRID_STEPS, dtype=float)
-        if (budget >= GRID_STEPS)
-        else np.array([float(budget)])
-    )
+    return np.arange(min(GRID_STEPS, budget), budget + 1, GRID_STEPS, dtype=float)
 
 
 class Results:
@@ -170,16 +184,41 @@ class Results:
         trained = (r for r in self.found.values() if r.unit.trained)
         return max((r.budget for r in trained if r.unit.scenario == scenario), default=0)
 
-    def ends(self, scenario: str, line: Line, kind: str, metric: str) -> BySeed:
-        """Where the trainings of a line end."""
-        return {r.unit.seed: r.end(kind, metric) for r in self.of(scenario, line)}
+    def numbers(self, place: Place, line: Line, quantity: str, kind: str = ALONE) -> BySeed:
+        """One number a training: where it ends in a scenario, or its test drives' mean in a scene.
 
-    def tested(self, scene: Scene, line: Line, quantity: str) -> BySeed:
-        """Mean of a quantity over each seed's test drives."""
-        return {
-            result.unit.seed: _amount(result, scene.condition, quantity)
-            for result in self.of(scene.scenario, line)
-        }
+        ``kind`` is that of the curves in a scenario.
+        """
+        if quantity == LOST:
+            kept = self.numbers(place, line, KEPT, kind)
+            return {seed: 1.0 - share for seed, share in kept.items()}
+        if isinstance(place, Scene):
+            found = self.of(place.scenario, line)
+            return {r.unit.seed: _amount(r, place.condition, quantity) for r in found}
+        if quantity == KEPT:
+            return self._kept(place, line, kind)
+        if quantity == DROPPED:
+            nominal, variant = (
+                self.numbers(Scene(place, condition), line, SUCCESS)
+                for condition in ("nominal", "variant")
+            )
+            return {seed: nominal[seed] - variant[seed] for seed in nominal}
+        return {r.unit.seed: r.end(kind, quantity) for r in self.of(place, line)}
+
+    def _kept(self, scenario: str, line: Line, kind: str) -> BySeed:
+        """Each seed's part in the ratio of the final distances, one frame over two.
+
+        The mean of these is the ratio of the means, and their spread that ratio's to first order.
+        A mean of the seeds' own ratios would be ruled by a seed that learned next to nothing.
+        """
+        two = self.numbers(scenario, line, DISTANCE, kind)
+        one = self.numbers(scenario, Line(line.algorithm, ONE_FRAME), DISTANCE, kind)
+        seeds = sorted(two.keys() & one.keys())
+        mean = float(np.mean([two[seed] for seed in seeds])) if seeds else 0.0
+        if not mean:
+            return {}
+        ratio = float(np.mean([one[seed] for seed in seeds])) / mean
+        return {seed: ratio + (one[seed] - ratio * two[seed]) / mean for seed in seeds}
 
     def pooled(self, scene: Scene, line: Line, quantity: str, paper: bool = False) -> Numbers:
         """A quantity of all drives of all seeds; of those with the paper's seeds alone."""
@@ -187,25 +226,33 @@ class Results:
         parts = [r.drives(scene.condition, quantity)[:count] for r in self.of(scene.scenario, line)]
         return np.concatenate([np.zeros(0), *parts])
 
-    def differences(self, scene: Scene, first: Line, second: Line, quantity: str) -> BySeed:
-        """First minus second in the test drives, paired by training seed.
+    def differences(
+        self, place: Place, first: Line, second: Line, quantity: str, kind: str = ALONE
+    ) -> BySeed:
+        """First minus second, paired by training seed; arguments as for ``numbers``.
 
-        What is compared of arrivals only is the mean over the drives in which both arrive.
+        What is compared of arrivals only is the mean over the test drives in which both arrive.
         """
-        theirs = {r.unit.seed: r for r in self.of(scene.scenario, second)}
+
+        def partner(seed: int) -> int:
+            return 0 if second.algorithm in TESTED_ONLY else seed
+
+        if quantity not in ARRIVED_ONLY:
+            own, other = (self.numbers(place, line, quantity, kind) for line in (first, second))
+            return {
+                seed: own[seed] - other[partner(seed)] for seed in own if partner(seed) in other
+            }
+        assert isinstance(place, Scene)
+        theirs = {result.unit.seed: result for result in self.of(place.scenario, second)}
         found = {}
-        for result in self.of(scene.scenario, first):
-            other = theirs.get(0 if second.algorithm in TESTED_ONLY else result.unit.seed)
-            if other is None:
+        for result in self.of(place.scenario, first):
+            its = theirs.get(partner(result.unit.seed))
+            if its is None:
                 continue
-            if quantity not in ARRIVED_ONLY:
-                value = _amount(result, scene.condition, quantity)
-                found[result.unit.seed] = value - _amount(other, scene.condition, quantity)
-                continue
-            both = result.reached(scene.condition) & other.reached(scene.condition)
+            both = result.reached(place.condition) & its.reached(place.condition)
             if both.any():
-                own, its = (r.drives(scene.condition, quantity)[both] for r in (result, other))
-                found[result.unit.seed] = float((own - its).mean())
+                pair = (r.drives(place.condition, quantity)[both] for r in (result, its))
+                found[result.unit.seed] = float(np.subtract(*pair).mean())
         return found
 
 
@@ -251,6 +298,3 @@ def _checked(record: Mapping[str, Any], path: Any) -> Mapping[str, Any]:
         if len({len(columns[column]) for column in wanted}) != 1 or not columns[wanted[0]]:
             raise UserError(f"{path}: the record of {unit} is cut off in {name}")
     return record
-
-
-HUMAN = Line(HUMAN_MODEL)

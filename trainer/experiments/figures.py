@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -30,8 +30,8 @@ from trainer.experiments.data import (
     Results,
     Scene,
     grid_of,
+    words,
 )
-from trainer.experiments.judges import name_of
 from trainer.experiments.plan import (
     BIASED,
     EXPERIMENTS,
@@ -61,6 +61,8 @@ SMOOTHNESS = {
     "left_turn": (LONGITUDINAL, "mean |longitudinal acceleration|, m/s²"),
     "congestion": BOXES["congestion"],
 }
+HATCHED = {"alpha": 0.45, "hatch": "//"}
+LEGEND: dict[str, Any] = {"fontsize": 8, "ncols": 6, "loc": "outside upper center"}
 SCENE_KEY = "L: left turn, C: congestion, -N: command noise, -V: variant, -D: dense"
 
 
@@ -71,28 +73,44 @@ def colour(line: Line, place: int = 0) -> str:
 
 def _counted(results: Results, scenario: str, line: Line) -> str:
     count = len(results.of(scenario, line))
-    return name_of(line) + (
-        "" if count == results.seeds else f" ({count} of {results.seeds} seeds)"
-    )
+    return line.name + ("" if count == results.seeds else f" ({count} of {results.seeds} seeds)")
+
+
+def _curve_panels(figure: Figure, **options: Any) -> Iterator[tuple[Any, str, str, str]]:
+    """A panel for each scenario and curve, with its title: panel, scenario, kind, metric."""
+    panels = figure.subplots(2, len(CURVES), **options)
+    for panel, (scenario, (kind, metric)) in zip(
+        panels.flat, product(SCENARIOS, CURVES), strict=True
+    ):
+        panel.set_title(f"{words(scenario)}: {TITLES[metric]}, {kind}", fontsize=10)
+        yield panel, scenario, kind, metric
 
 
 def draw_curves(results: Results, lines: Sequence[Line]) -> Figure:
     """A row a scenario: training episodes with the human's help, then the policy alone."""
     figure = Figure(figsize=(16.0, 6.8), layout="constrained")
-    panels = figure.subplots(2, len(CURVES), sharex="row")
-    for panel, (scenario, (kind, metric)) in zip(
-        panels.flat, product(SCENARIOS, CURVES), strict=True
-    ):
-        panel.set_title(f"{scenario.replace('_', ' ')}: {TITLES[metric]}, {kind}", fontsize=10)
+    for panel, scenario, kind, metric in _curve_panels(figure, sharex="row"):
         for place, line in enumerate(lines):
-            _draw_curve(panel, results, scenario, line, kind, metric, place)
+            if metric == REWARD and line.setting == PRINTED:
+                continue  # on another scale
+            found, named = results.of(scenario, line), _counted(results, scenario, line)
+            look = {"ls": "-" if line.setting == NORMAL else "--", "color": colour(line, place)}
+            if not found:
+                panel.plot([], [], **look, alpha=0.4, label=named)
+                continue
+            curves = np.stack([result.curve(kind, metric) for result in found])
+            grid, mean, spread = grid_of(found[0].budget), curves.mean(axis=0), curves.std(axis=0)
+            panel.plot(grid, mean, **look, lw=1.8, label=named)
+            panel.fill_between(
+                grid, mean - spread, mean + spread, color=look["color"], alpha=0.15, lw=0
+            )
         if metric != REWARD:
             best = 1.0 if metric == SUCCESS else FULL_PATH_M[scenario]
             panel.axhline(best, color="0.6", lw=0.8, ls=":")
             panel.set_ylim(0.0, 1.05 * best)
         _finish(panel)
-    for row in panels:
-        row[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
+        if (kind, metric) == CURVES[-1]:
+            panel.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
     figure.supxlabel(
         "environment steps; in training: episodes in which the human may take over; "
         "alone: validation drives without help; band: standard deviation over the seeds",
@@ -101,51 +119,30 @@ def draw_curves(results: Results, lines: Sequence[Line]) -> Figure:
     return figure
 
 
-def _draw_curve(
-    panel: Any, results: Results, scenario: str, line: Line, kind: str, metric: str, place: int
-) -> None:
-    if metric == REWARD and line.setting == PRINTED:
-        return  # on another scale
-    found, named = results.of(scenario, line), _counted(results, scenario, line)
-    style = "-" if line.setting == NORMAL else "--"
-    if not found:
-        panel.plot([], [], style, color=colour(line, place), alpha=0.4, label=named)
-        return
-    curves = np.stack([result.curve(kind, metric) for result in found])
-    grid, mean, spread = grid_of(found[0].budget), curves.mean(axis=0), curves.std(axis=0)
-    panel.plot(grid, mean, style, color=colour(line, place), lw=1.8, label=named)
-    panel.fill_between(
-        grid, mean - spread, mean + spread, color=colour(line, place), alpha=0.15, lw=0
-    )
-
-
 def draw_settings(results: Results, algorithms: Sequence[str], other: str) -> Figure:
     """Where the trainings end, in the normal setting and in another one; number: the ratio."""
     figure = Figure(figsize=(16.0, 6.4), layout="constrained")
-    panels = figure.subplots(2, len(CURVES))
-    for panel, (scenario, (kind, metric)) in zip(
-        panels.flat, product(SCENARIOS, CURVES), strict=True
-    ):
-        panel.set_title(f"{scenario.replace('_', ' ')}: {TITLES[metric]}, {kind}", fontsize=10)
+    for panel, scenario, kind, metric in _curve_panels(figure):
         for place, algorithm in enumerate(algorithms):
             means = []
             for side, setting in ((-0.2, NORMAL), (0.2, other)):
                 line = Line(algorithm, setting)
-                ends = list(results.ends(scenario, line, kind, metric).values())
+                ends = list(results.numbers(scenario, line, metric, kind).values())
                 if not ends:
                     continue
                 means.append(float(np.mean(ends)))
-                look = {"alpha": 0.45, "hatch": "//"} if setting == other else {}
+                look = HATCHED if setting == other else {}
                 panel.bar(place + side, means[-1], 0.38, yerr=np.std(ends), capsize=3,
                           color=colour(line), **look)  # fmt: skip
             if len(means) == 2 and means[0] > 0.0 and metric != REWARD:
-                panel.text(
-                    place + 0.2, means[1], f"{means[1] / means[0]:.2f}\n", ha="center", fontsize=8
-                )
-        _finish(panel, [name_of(Line(name)) for name in algorithms])
+                ratio = f"{means[1] / means[0]:.2f}\n"
+                panel.text(place + 0.2, means[1], ratio, ha="center", fontsize=8)
+        _finish(panel, [Line(name).name for name in algorithms])
     figure.supxlabel(
-        f"plain: normal; hatched: {other.replace('_', ' ')}; number: ratio; "
-        "bar: standard deviation over the seeds", fontsize=9)  # fmt: skip
+        f"plain: normal; hatched: {words(other)}; number: ratio; "
+        "bar: standard deviation over the seeds",
+        fontsize=9,
+    )
     return figure
 
 
@@ -162,33 +159,40 @@ def draw_tests(results: Results, algorithms: Sequence[str]) -> Figure:
             heat.text(column, row, f"{100 * share:.0f} %", ha="center", va="center", fontsize=9,
                       color="white" if share > 0.6 else "black")  # fmt: skip
     heat.imshow(shares, cmap="YlGn", vmin=0.0, vmax=1.0, aspect="auto")
-    heat.set_xticks(range(len(lines)), [name_of(line) for line in lines], fontsize=7, rotation=20)
+    heat.set_xticks(range(len(lines)), [line.name for line in lines], fontsize=7, rotation=20)
     heat.set_yticks(range(len(SCENES)), [scene.label for scene in SCENES])
     heat.set_title("success", fontsize=10)
     for panel, scenario in zip(bars, SCENARIOS, strict=True):
-        scenes = [scene for scene in SCENES if scene.scenario == scenario]
-        panel.set_title(f"{scenario.replace('_', ' ')}: surviving distance, m", fontsize=10)
+        panel.set_title(f"{words(scenario)}: surviving distance, m", fontsize=10)
         width = 0.8 / len(lines)
-        for (group, scene), (place, line) in product(enumerate(scenes), enumerate(lines)):
+        for group, scene, place, line in _groups(panel, scenario, lines):
             values = results.pooled(scene, line, DISTANCE)
             if not len(values):
                 continue
             x = group + (place - 0.5 * (len(lines) - 1)) * width
-            named = None if group else name_of(line)
+            named = None if group else line.name
             panel.bar(x, values.mean(), width, yerr=values.std(), capsize=2, error_kw={"lw": 0.8},
                       color=colour(line, place), label=named)  # fmt: skip
             mark = _stars(results, scene, lines[0], line, DISTANCE) if place else ""
             panel.text(x, 1.2 * FULL_PATH_M[scenario], mark, ha="center", fontsize=8, rotation=90)
         panel.set_ylim(0.0, 1.35 * FULL_PATH_M[scenario])
-        _finish(panel, [scene.label for scene in scenes])
-    figure.legend(
-        *bars[0].get_legend_handles_labels(), fontsize=8, ncols=6, loc="outside upper center"
-    )
+    figure.legend(*bars[0].get_legend_handles_labels(), **LEGEND)
     figure.supxlabel(
         f"{SCENE_KEY}; error bar: standard deviation over all drives; nothing beyond the "
         "goal counts\nstars: paired t-test against PHIL-TD3 over all drives of all seeds",
-        fontsize=8)  # fmt: skip
+        fontsize=8,
+    )
     return figure
+
+
+def _groups(
+    panel: Any, scenario: str, lines: Sequence[Line]
+) -> Iterator[tuple[int, Scene, int, Line]]:
+    """The lines in each scene of a scenario, both numbered; then the panel is finished."""
+    scenes = [scene for scene in SCENES if scene.scenario == scenario]
+    for (group, scene), (place, line) in product(enumerate(scenes), enumerate(lines)):
+        yield group, scene, place, line
+    _finish(panel, [scene.label for scene in scenes])
 
 
 def _stars(results: Results, scene: Scene, first: Line, second: Line, quantity: str) -> str:
@@ -214,9 +218,8 @@ def draw_boxes(results: Results, algorithms: Sequence[str]) -> Figure:
     lines = [Line(name) for name in algorithms]
     for panel, scenario in zip(figure.subplots(1, 2), SCENARIOS, strict=True):
         quantity, title = BOXES[scenario]
-        scenes = [scene for scene in SCENES if scene.scenario == scenario]
-        panel.set_title(f"{scenario.replace('_', ' ')}: {title}", fontsize=10)
-        for (group, scene), (place, line) in product(enumerate(scenes), enumerate(lines)):
+        panel.set_title(f"{words(scenario)}: {title}", fontsize=10)
+        for group, scene, place, line in _groups(panel, scenario, lines):
             arrived = results.pooled(scene, line, SUCCESS) > 0.0
             values = results.pooled(scene, line, quantity)[arrived]
             if not len(values):
@@ -230,14 +233,13 @@ def draw_boxes(results: Results, algorithms: Sequence[str]) -> Figure:
                 x, 0.96, mark, transform=panel.get_xaxis_transform(), ha="center", fontsize=8
             )
         named = [Patch(fc=colour(line), label=_counted(results, scenario, line)) for line in lines]
-        panel.legend(
-            handles=named, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.06)
-        )
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.06)}
+        panel.legend(handles=named, fontsize=8, ncols=4, **below)
         panel.margins(y=0.12)
-        _finish(panel, [scene.label for scene in scenes])
     figure.supxlabel(
         f"{SCENE_KEY}; drives that arrive; stars: paired t-test against PHIL-TD3 where both arrive",
-        fontsize=8)  # fmt: skip
+        fontsize=8,
+    )
     return figure
 
 
@@ -248,25 +250,20 @@ def draw_guidance(results: Results, algorithms: Sequence[str]) -> Figure:
     for panel, (setting, algorithm) in zip(
         panels.flat, product((RANDOM, BIASED), algorithms), strict=True
     ):
-        poor_line = Line(algorithm, setting)
-        panel.set_title(name_of(poor_line), fontsize=10)
+        lines = Line(algorithm), Line(algorithm, setting)
+        panel.set_title(lines[1].name, fontsize=10)
         for place, scene in enumerate(PAPER_SCENES):
-            good = results.pooled(scene, Line(algorithm), DISTANCE)
-            poor = results.pooled(scene, poor_line, DISTANCE)
-            if not len(good) or not len(poor):
+            pooled = [results.pooled(scene, line, DISTANCE) for line in lines]
+            if not all(map(len, pooled)):
                 continue
-            share = good.mean() / (good.mean() + poor.mean())
-            panel.bar(place, share, color=colour(poor_line))
-            panel.bar(
-                place, 1.0 - share, bottom=share, color=colour(poor_line), alpha=0.45, hatch="//"
-            )
-            for middle, part, mean_m in (
-                (share / 2, share, good.mean()),
-                ((1.0 + share) / 2, 1.0 - share, poor.mean()),
-            ):
-                text = f"{100 * part:.1f} %\n{mean_m:.1f} m"
-                panel.text(place, middle, text, ha="center", va="center", fontsize=7,
+            means_m, bottom = [values.mean() for values in pooled], 0.0
+            for mean_m, look in zip(means_m, ({}, HATCHED), strict=True):
+                share = mean_m / sum(means_m)
+                panel.bar(place, share, bottom=bottom, color=colour(lines[1]), **look)
+                text = f"{100 * share:.1f} %\n{mean_m:.1f} m"
+                panel.text(place, bottom + share / 2, text, ha="center", va="center", fontsize=7,
                            bbox={"fc": "white", "alpha": 0.7, "lw": 0})  # fmt: skip
+                bottom += share
         panel.axhline(0.5, color="black", lw=0.8, ls=":")
         panel.set_ylim(0.0, 1.0)
         _finish(panel, [scene.label for scene in PAPER_SCENES])
@@ -278,26 +275,22 @@ def draw_distributions(results: Results, algorithms: Sequence[str]) -> Figure:
     """How often each mean acceleration occurs: after poor guidance solid, after good dotted."""
     figure = Figure(figsize=(14.0, 6.8), layout="constrained")
     panels = figure.subplots(2, 3)
+    lines = [Line(name, setting) for name, setting in product(algorithms, (RANDOM, NORMAL))]
     for panel, scene in zip(panels.flat, PAPER_SCENES, strict=True):
         quantity, title = SMOOTHNESS[scene.scenario]
         panel.set_title(scene.label, fontsize=10)
         panel.set_xlabel(title, fontsize=8)
-        groups = {}
-        for line in [
-            Line(name, setting) for name, setting in product(algorithms, (RANDOM, NORMAL))
-        ]:
-            values = results.pooled(scene, line, quantity)
-            if len(values):
-                groups[line] = values
-        everything = np.concatenate([np.zeros(1), *groups.values()])
+        found = {line: results.pooled(scene, line, quantity) for line in lines}
+        everything = np.concatenate([np.zeros(1), *found.values()])
         edges = np.linspace(everything.min(), everything.max() + 1e-9, 31)
-        for line, values in groups.items():
+        for line, values in found.items():
+            if not len(values):
+                continue
             style = {"ls": ":", "lw": 1.0} if line.setting == NORMAL else {"ls": "-", "lw": 1.6}
             shares = np.histogram(values, edges)[0] / len(values)
-            panel.stairs(shares, edges, color=colour(line), label=name_of(line), **style)
+            panel.stairs(shares, edges, color=colour(line), label=line.name, **style)
         _finish(panel)
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), fontsize=8, ncols=6,
-                  loc="outside upper center")  # fmt: skip
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), **LEGEND)
     figure.supxlabel("share of all test drives", fontsize=8)
     return figure
 
@@ -315,10 +308,8 @@ def _finish(panel: Any, names: Sequence[str] = ()) -> None:
 
 def _curves_of(name: str) -> Callable[[Results], Figure]:
     one = EXPERIMENTS[name]
-    lines = [
-        Line(algorithm, setting) for setting, algorithm in product(one.settings, one.algorithms)
-    ]
-    return partial(draw_curves, lines=lines)
+    pairs = product(one.settings, one.algorithms)
+    return partial(draw_curves, lines=[Line(algorithm, setting) for setting, algorithm in pairs])
 
 
 FIGURES: Mapping[str, Callable[[Results], Figure]] = {
@@ -326,13 +317,10 @@ FIGURES: Mapping[str, Callable[[Results], Figure]] = {
     "fig8": partial(draw_settings, algorithms=FOUR, other=ONE_FRAME),
     "fig9": partial(draw_tests, algorithms=EXPERIMENTS["fig9"].algorithms),
     "fig10": partial(draw_boxes, algorithms=FOUR),
-    "fig11": _curves_of("fig11"),
-    "fig12": _curves_of("fig12"),
-    "fig13": _curves_of("fig13"),
+    **{name: _curves_of(name) for name in ("fig11", "fig12", "fig13")},
     "fig14": partial(draw_guidance, algorithms=GUIDED),
     "fig15": partial(draw_distributions, algorithms=GUIDED),
-    "ablation": _curves_of("ablation"),
-    "printed": _curves_of("printed"),
+    **{name: _curves_of(name) for name in ("ablation", "printed")},
 }
 """Name of the experiment, and of the PNG -> how it is drawn."""
 

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from trainer.experiments.data import (
     ALONE,
     DISTANCE,
-    HUMAN,
+    DROPPED,
+    KEPT,
     LATERAL,
     LONGITUDINAL,
+    LOST,
     PAPER_SCENES,
     REWARD,
     SPREAD,
@@ -27,12 +29,14 @@ from trainer.experiments.data import (
     TIME_S,
     BySeed,
     Line,
+    Place,
     Result,
     Results,
     Scene,
     grid_of,
+    words,
 )
-from trainer.experiments.plan import FOUR, LABELS, NORMAL, ONE_FRAME, PAPER_TESTS, RANDOM, SCENARIOS
+from trainer.experiments.plan import ONE_FRAME, PAPER_TESTS, RANDOM, SCENARIOS
 from trainer.experiments.statistics import (
     NOTHING,
     RESAMPLES,
@@ -46,10 +50,6 @@ from trainer.experiments.statistics import (
     within,
 )
 
-Judge = Callable[[Results, str], "Finding"]
-"""Of the results, and of a kind of curves: those in training or those of the policy alone."""
-Place = str | Scene
-"""A scenario, of whose trainings a claim speaks, or a scene of the tests."""
 SAME_LEVEL = 0.05
 """What is on one level differs by no more than this share, or by so much success."""
 UNITS = {
@@ -60,10 +60,16 @@ UNITS = {
     TIME_S: (1.0, 2, " s"),
     LATERAL: (1.0, 3, " m/s²"),
     LONGITUDINAL: (1.0, 3, " m/s²"),
+    KEPT: (100.0, 1, " %"),
+    LOST: (100.0, 1, " % lost"),
+    DROPPED: (100.0, 1, " points lost"),
 }
 """Quantity -> factor, digits and unit as it is shown."""
-WORDS = {DISTANCE: "distance", REWARD: "reward", SUCCESS: "success"}
-PHIL, IA, HI, PER = map(Line, FOUR)
+SHORT = {DISTANCE: "distance", REWARD: "reward", SUCCESS: "success"}
+UNLEARNED = 0.02
+"""Success by which a policy may end below its best."""
+LATE = 3
+"""Validations whose mean counts: a single one of 50 drives is off by some points."""
 
 
 class Finding(NamedTuple):
@@ -85,40 +91,31 @@ class Comparison(NamedTuple):
     """Scenarios and lines whose trainings must all be there."""
 
 
-def decided(judge: Callable[..., Iterator[Comparison]]) -> Callable[..., Finding]:
-    """A judge that takes all of the comparisons together; undecided where trainings are missing."""
-
-    @wraps(judge)
-    def finding(results: Results, kind: str, **arguments: Any) -> Finding:
-        made = list(judge(results, kind, **arguments))
-        holds = all_of([one.holds for one in made])
-        measured = [one for one in made if one.holds == holds and not np.isnan(one.margin)]
-        if not measured:
-            return Finding("undecided", "not measured")
-        complete = all(results.complete(*need) for one in made for need in one.needs)
-        worst = min(measured, key=lambda one: one.margin)
-        return Finding(holds if complete else "undecided", worst.text)
-
-    return finding
+Judge = Callable[[Results, str], Finding]
+"""Of the results, and of a kind of curves: those in training or those of the policy alone."""
 
 
-def name_of(line: Line) -> str:
-    """An algorithm in words, with its setting where that is not the normal one."""
-    setting = "" if line.setting == NORMAL else f" ({line.setting.replace('_', ' ')})"
-    return LABELS[line.algorithm] + setting
+def judge(compare: Callable[..., Iterator[Comparison]]) -> Callable[..., Judge]:
+    """Make a function whose arguments say what is compared, and whose value judges the results.
 
+    All comparisons count together; it is undecided where trainings are missing.
+    """
 
-def _words(place: Place) -> str:
-    return place.replace("_", " ") if isinstance(place, str) else place.label
+    @wraps(compare)
+    def of(*arguments: Any, **options: Any) -> Judge:
+        def finding(results: Results, kind: str) -> Finding:
+            made = list(compare(results, kind, *arguments, **options))
+            holds = all_of([one.holds for one in made])
+            measured = [one for one in made if one.holds == holds and not np.isnan(one.margin)]
+            if not measured:
+                return Finding("undecided", "not measured")
+            complete = all(results.complete(*need) for one in made for need in one.needs)
+            worst = min(measured, key=lambda one: one.margin)
+            return Finding(holds if complete else "undecided", worst.text)
 
+        return finding
 
-def _one_frame(line: Line) -> Line:
-    return Line(line.algorithm, ONE_FRAME)
-
-
-def difference(first: BySeed, second: BySeed) -> Estimate:
-    """Mean of first minus second over the seeds that both have."""
-    return mean_estimate(first[seed] - second[seed] for seed in first if seed in second)
+    return of
 
 
 def in_units(one: Estimate, quantity: str) -> str:
@@ -127,11 +124,19 @@ def in_units(one: Estimate, quantity: str) -> str:
     return one.times(factor).text(digits) + unit
 
 
-def _percent(one: Estimate) -> str:
-    return f"{one.times(100.0).text(1)} %"
+def _poor(line: Line) -> Line:
+    return Line(line.algorithm, RANDOM)
 
 
-@decided
+def _needed(place: Place, lines: Sequence[Line], quantity: str) -> list[tuple[str, Line]]:
+    """What must be there to compare a quantity of these lines in this place."""
+    if quantity in (KEPT, LOST):
+        lines = [*lines, *(Line(line.algorithm, ONE_FRAME) for line in lines)]
+    scenario = place.scenario if isinstance(place, Scene) else place
+    return [(scenario, line) for line in lines]
+
+
+@judge
 def ahead(
     results: Results,
     kind: str,
@@ -145,23 +150,30 @@ def ahead(
     0, whether it is on their level.
     """
     for place, quantity, first, second in product(places, quantities, ours, others):
-        if isinstance(place, Scene):
-            own, scenario = results.tested(place, first, quantity), place.scenario
-            one = mean_estimate(results.differences(place, first, second, quantity).values())
+        one = mean_estimate(results.differences(place, first, second, quantity, kind).values())
+        text = f"{in_units(one, quantity)}: {first.name} over {second.name}, {words(place)}"
+        text += f", {SHORT[quantity]}" if len(quantities) > 1 else ""
+        if sign:
+            holds, margin = above(one.times(sign)), sign * one.value
         else:
-            own, scenario = results.ends(place, first, kind, quantity), place
-            one = difference(own, results.ends(place, second, kind, quantity))
-        scale = 1.0 if quantity == SUCCESS else abs(mean_estimate(own.values()).value)
-        text = (
-            f"{in_units(one, quantity)}: {name_of(first)} over {name_of(second)}, {_words(place)}"
-        )
-        text += f", {WORDS.get(quantity, quantity)}" if len(quantities) > 1 else ""
-        holds = above(one.times(sign)) if sign else within(one, SAME_LEVEL * scale)
-        margin = sign * one.value if sign else -abs(one.value)
-        yield Comparison(text, holds, margin, [(scenario, first), (scenario, second)])
+            own = mean_estimate(results.numbers(place, first, quantity, kind).values()).value
+            scale = 1.0 if quantity == SUCCESS else abs(own)
+            holds, margin = within(one, SAME_LEVEL * scale), -abs(one.value)
+        yield Comparison(text, holds, margin, _needed(place, [first, second], quantity))
 
 
 level = partial(ahead, sign=0.0)
+
+
+@judge
+def positive(
+    results: Results, kind: str, places: Sequence[Place], lines: Sequence[Line], quantity: str
+) -> Iterator[Comparison]:
+    """Whether a quantity of each line, such as what it loses, is above zero in every place."""
+    for place, line in product(places, lines):
+        one = mean_estimate(results.numbers(place, line, quantity, kind).values())
+        text = f"{in_units(one, quantity)}: {line.name}, {words(place)}"
+        yield Comparison(text, above(one), one.value, _needed(place, [line], quantity))
 
 
 def first_reached(grid: Numbers, curve: Numbers, least: float) -> float:
@@ -195,16 +207,16 @@ def sooner_by(
 ) -> tuple[Estimate, str]:
     """How many times as soon one line gets where another one ends, and both in steps.
 
+    A line that never gets there does so somewhere beyond the budget, so the ratio has bounds, and
+    its interval, a bootstrap over the seeds of both, reaches from the lower ones to the upper ones.
+
     Args:
         own: the trainings of one line.
-        other: of the other.
+        other: those of the other.
         kind: in training, or the policy alone.
         quantity: of the curves.
         common: the level is the lower end of the two, so that both can reach it.
         least: the level, where it is given.
-
-    Who never gets there does so somewhere beyond the budget, so that the ratio has bounds, and its
-    interval, a bootstrap over the seeds of both, reaches from the lower bounds to the upper ones.
     """
     if not own or not other:
         return NOTHING, ""
@@ -212,38 +224,35 @@ def sooner_by(
     curves = [np.stack([r.curve(kind, quantity) for r in each]) for each in (own, other)]
     ends = [np.array([r.end(kind, quantity) for r in each]) for each in (own, other)]
 
-    def reached(rows: Sequence[NDArray[np.int64]]) -> tuple[float, float]:
-        goal = least
-        if goal is None:
-            means = [end[row].mean() for end, row in zip(ends, rows, strict=True)]
-            goal = min(means) if common else means[1]
-        first, second = (
+    def reached(rows: Sequence[NDArray[np.int64]]) -> list[float]:
+        means = [end[row].mean() for end, row in zip(ends, rows, strict=True)]
+        goal = least if least is not None else min(means) if common else means[1]
+        return [
             first_reached(grid, curve[row].mean(axis=0), goal)
             for curve, row in zip(curves, rows, strict=True)
-        )
-        return first, second
+        ]
 
     budget, random = float(grid[-1]), np.random.default_rng(0)
     counts = [len(curve) for curve in curves]
     drawn = [
         reached([random.integers(count, size=count) for count in counts]) for _ in range(RESAMPLES)
     ]
-    least_ratios = [min(second, budget) / first for first, second in drawn]
-    most_ratios = [second / min(first, budget) for first, second in drawn]
     first, second = reached([np.arange(count) for count in counts])
+    lowest = bootstrap(
+        [min(its, budget) / ours for ours, its in drawn], min(second, budget) / first, min(counts)
+    )
+    highest = bootstrap([its / min(ours, budget) for ours, its in drawn], 0.0, min(counts))
     said = [f"{steps:,.0f}" if np.isfinite(steps) else "never" for steps in (first, second)]
-    found = bootstrap(least_ratios, min(second, budget) / first, min(counts))
-    found = found._replace(high=bootstrap(most_ratios, 0.0, min(counts)).high)
-    return found, f"{said[0]} against {said[1]} steps"
+    return lowest._replace(high=highest.high), f"{said[0]} against {said[1]} steps"
 
 
 def best_of(results: Results, place: str, lines: Sequence[Line], kind: str, quantity: str) -> Line:
     """The line that ends highest; the first where there is none at all."""
-    ends = {line: results.ends(place, line, kind, quantity).values() for line in lines}
+    ends = {line: results.numbers(place, line, quantity, kind).values() for line in lines}
     return max(lines, key=lambda line: np.mean([*ends[line]]) if ends[line] else -np.inf)
 
 
-@decided
+@judge
 def sooner(
     results: Results,
     kind: str,
@@ -266,70 +275,18 @@ def sooner(
         for first, second in product(ours, rivals):
             own, other = results.of(place, first), results.of(place, second)
             one, steps = sooner_by(own, other, kind, quantity, common, least)
-            text = f"{one.text(1)} times, {steps}: {name_of(first)} before {name_of(second)}"
-            text += f", {_words(place)}"
-            text += f", {WORDS[quantity]}" if len(quantities) > 1 else ""
+            text = f"{one.text(1)} times, {steps}: {first.name} before {second.name}"
+            text += f", {words(place)}"
+            text += f", {SHORT[quantity]}" if len(quantities) > 1 else ""
             holds = above(one, times)
             if by_mean and one.size:
                 bound: Holds = "undecided" if steps.endswith("never steps") else "no"
                 holds = "yes" if one.value >= times else bound
-            needs = [(place, line) for line in (first, *others)]
+            needs = _needed(place, [first, *others], quantity)
             yield Comparison(text, holds, one.value - times, needs)
 
 
-def kept_shares(results: Results, scenario: str, line: Line, kind: str) -> BySeed:
-    """Seed -> its part in the ratio of the final distances, one frame over two.
-
-    The mean of these is the ratio of the means, and their spread that ratio's to first order. A
-    mean of the seeds' own ratios would be ruled by whichever learned next to nothing with two.
-    """
-    two = results.ends(scenario, line, kind, DISTANCE)
-    one = results.ends(scenario, _one_frame(line), kind, DISTANCE)
-    seeds = sorted(two.keys() & one.keys())
-    mean = float(np.mean([two[seed] for seed in seeds])) if seeds else 0.0
-    if not mean:
-        return {}
-    ratio = float(np.mean([one[seed] for seed in seeds])) / mean
-    return {seed: ratio + (one[seed] - ratio * two[seed]) / mean for seed in seeds}
-
-
-@decided
-def kept(
-    results: Results, kind: str, places: Sequence[str], ours: Sequence[Line], others: Sequence[Line]
-) -> Iterator[Comparison]:
-    """Whether each of ours keeps a larger share of its distance with one frame than the others."""
-    for place, first, second in product(places, ours, others):
-        one = difference(*(kept_shares(results, place, line, kind) for line in (first, second)))
-        text = f"{_percent(one)}: {name_of(first)} over {name_of(second)}, {_words(place)}"
-        lines = (first, second, _one_frame(first), _one_frame(second))
-        yield Comparison(text, above(one), one.value, [(place, line) for line in lines])
-
-
-@decided
-def lost(
-    results: Results, kind: str, places: Sequence[str], ours: Sequence[Line]
-) -> Iterator[Comparison]:
-    """Whether one frame instead of two costs each of ours a share of its distance."""
-    for place, line in product(places, ours):
-        shares = kept_shares(results, place, line, kind)
-        one = mean_estimate(1.0 - share for share in shares.values())
-        text = f"{_percent(one)} lost: {name_of(line)}, {_words(place)}"
-        yield Comparison(text, above(one), one.value, [(place, line), (place, _one_frame(line))])
-
-
-@decided
-def dropped(
-    results: Results, kind: str, places: Sequence[str], ours: Sequence[Line]
-) -> Iterator[Comparison]:
-    """Whether the variant scene costs each of ours success."""
-    for place, line in product(places, ours):
-        scenes = (Scene(place, condition) for condition in ("nominal", "variant"))
-        one = difference(*(results.tested(scene, line, SUCCESS) for scene in scenes))
-        text = f"{in_units(one, SUCCESS)} lost: {name_of(line)}, {_words(place)}"
-        yield Comparison(text, above(one), one.value, [(place, line)])
-
-
-@decided
+@judge
 def same_ranking(
     results: Results, kind: str, places: Sequence[str], lines: Sequence[Line]
 ) -> Iterator[Comparison]:
@@ -337,26 +294,29 @@ def same_ranking(
 
     Yes where every neighbour is ahead in both, no where two have changed places for sure.
     """
-    numbers = range(len(lines))
+    settings = (lines, [Line(line.algorithm, ONE_FRAME) for line in lines])
     for place in places:
-        settings = (lines, [_one_frame(line) for line in lines])
-        both = [[results.ends(place, line, kind, DISTANCE) for line in each] for each in settings]
-        means = [[mean_estimate(end.values()).value for end in ends] for ends in both]
+
+        def is_ahead(each: Sequence[Line], i: int, j: int, place: str = place) -> Holds:
+            found = results.differences(place, each[i], each[j], DISTANCE, kind)
+            return above(mean_estimate(found.values()))
+
+        numbers = [[results.numbers(place, x, DISTANCE, kind) for x in each] for each in settings]
+        means = [[mean_estimate(each.values()).value for each in ends] for ends in numbers]
         orders = [list(np.argsort(np.negative(each), kind="stable")) for each in means]
         swapped = any(
-            above(difference(both[0][i], both[0][j])) == "yes"
-            and above(difference(both[1][i], both[1][j])) == "no"
-            for i, j in permutations(numbers, 2)
+            is_ahead(settings[0], i, j) == "yes" and is_ahead(settings[1], i, j) == "no"
+            for i, j in permutations(range(len(lines)), 2)
         )
         apart = all(
-            above(difference(ends[i], ends[j])) == "yes"
-            for ends, order in zip(both, orders, strict=True)
+            is_ahead(each, i, j) == "yes"
+            for each, order in zip(settings, orders, strict=True)
             for i, j in pairwise(order)
         )
-        shown = [" > ".join(name_of(lines[i]) for i in order) for order in orders]
+        shown = [" > ".join(lines[i].name for i in order) for order in orders]
         same: Holds = "yes" if apart and orders[0] == orders[1] else "undecided"
-        text = f"{_words(place)}: two frames {shown[0]}, one {shown[1]}"
-        needs = [(place, line) for each in settings for line in each]
+        text = f"{words(place)}: two frames {shown[0]}, one {shown[1]}"
+        needs = _needed(place, lines, KEPT)
         yield Comparison(text, "no" if swapped else same, float(np.sum(means)), needs)
 
 
@@ -364,14 +324,13 @@ def changes(results: Results, line: Line, scenes: Sequence[Scene]) -> BySeed:
     """Seed -> relative change of the surviving distance by random poor guidance, over scenes."""
     by_seed: dict[int, list[float]] = {}
     for scene in scenes:
-        good = results.tested(scene, line, DISTANCE)
-        poor = results.tested(scene, Line(line.algorithm, RANDOM), DISTANCE)
+        good, poor = (results.numbers(scene, one, DISTANCE) for one in (line, _poor(line)))
         for seed in good.keys() & poor.keys():
             by_seed.setdefault(seed, []).append(poor[seed] / good[seed] - 1.0)
     return {seed: float(np.mean(values)) for seed, values in by_seed.items()}
 
 
-@decided
+@judge
 def changed(
     results: Results,
     kind: str,
@@ -382,54 +341,51 @@ def changed(
 ) -> Iterator[Comparison]:
     """How random poor guidance changes a line's distance, or how much more than another's."""
     lines = [line, than] if than else [line]
-    poor = [Line(one.algorithm, RANDOM) for one in lines]
+    needs = list(product(SCENARIOS, [*lines, *map(_poor, lines)]))
     for scenes in groups:
-        found = [changes(results, one, scenes) for one in lines]
-        one = difference(*found) if than else mean_estimate(found[0].values())
+        own, *others = (changes(results, one, scenes) for one in lines)
+        for its in others:
+            own = {seed: own[seed] - its[seed] for seed in own if seed in its}
+        one = mean_estimate(own.values())
         where = scenes[0].label if len(scenes) == 1 else "mean of the scenes"
-        text = f"{_percent(one)}: {' against '.join(map(name_of, lines))}, {where}"
-        yield Comparison(
-            text, judged(one), -abs(one.value), list(product(SCENARIOS, [*lines, *poor]))
-        )
+        text = f"{one.times(100.0).text(1)} %: {' against '.join(x.name for x in lines)}, {where}"
+        yield Comparison(text, judged(one), -abs(one.value), needs)
 
 
-@decided
+@judge
 def success_bar(
     results: Results, kind: str, scene: Scene, line: Line, least: float
 ) -> Iterator[Comparison]:
     """Whether the mean of the seeds' success is at least so much."""
-    one = mean_estimate(results.tested(scene, line, SUCCESS).values())
-    found = results.of(scene.scenario, line)
+    one = mean_estimate(results.numbers(scene, line, SUCCESS).values())
     text = f"{one.as_share()} %"
-    for words, part in ((f"the paper's {PAPER_TESTS} seeds", slice(PAPER_TESTS)),
+    for whose, part in ((f"the paper's {PAPER_TESTS} seeds", slice(PAPER_TESTS)),
                         ("others", slice(PAPER_TESTS, None))):  # fmt: skip
+        found = results.of(scene.scenario, line)
         drives = [result.drives(scene.condition, SUCCESS)[part] for result in found]
-        text += f"; {words} {100 * np.mean(drives):.1f} %" if np.size(drives) else ""
+        text += f"; {whose} {100 * np.mean(drives):.1f} %" if np.size(drives) else ""
     holds: Holds = "yes" if one.value >= least - 1e-9 else "no"
-    yield Comparison(text, holds, one.value, [(scene.scenario, line)])
+    yield Comparison(text, holds, one.value, _needed(scene, [line], SUCCESS))
 
 
-@decided
-def ahead_in(results: Results, kind: str, least: int) -> Iterator[Comparison]:
-    """Whether PHIL-TD3 is ahead of its human in success or distance in so many scenes."""
+@judge
+def ahead_in(
+    results: Results, kind: str, ours: Line, other: Line, least: int
+) -> Iterator[Comparison]:
+    """Whether a line is ahead of another in success or distance in so many of the six scenes."""
     said = []
     for scene in PAPER_SCENES:
         for quantity in (SUCCESS, DISTANCE):
-            one = mean_estimate(results.differences(scene, PHIL, HUMAN, quantity).values())
+            one = mean_estimate(results.differences(scene, ours, other, quantity).values())
             if above(one) == "yes":
                 said.append(f"{scene.label} {in_units(one, quantity)}")
                 break
     holds: Holds = "yes" if len(said) >= least else "no"
-    needs = list(product(SCENARIOS, [PHIL, HUMAN]))
+    needs = list(product(SCENARIOS, [ours, other]))
     yield Comparison(f"{len(said)} of 6: {', '.join(said)}", holds, len(said), needs)
 
 
-UNLEARNED = 0.02
-LATE = 3
-"""Validations whose mean counts: a single one of 50 drives is off by some points."""
-
-
-@decided
+@judge
 def unlearned(results: Results, kind: str, place: str, line: Line) -> Iterator[Comparison]:
     """Whether the policy alone ends at most 2 points below its best, as a mean of the seeds."""
     below = []
@@ -443,8 +399,11 @@ def unlearned(results: Results, kind: str, place: str, line: Line) -> Iterator[C
     yield Comparison(in_units(one, SUCCESS), holds, -one.value, [(place, line)])
 
 
-def either(results: Results, kind: str, judges: Sequence[Judge]) -> Finding:
+def either(*judges: Judge) -> Judge:
     """Whether one of several claims holds, and the one that says most for it."""
-    findings = [judge(results, kind) for judge in judges]
     order = ("yes", "undecided", "no")
-    return min(findings, key=lambda finding: order.index(finding.holds))
+
+    def finding(results: Results, kind: str) -> Finding:
+        return min((one(results, kind) for one in judges), key=lambda one: order.index(one.holds))
+
+    return finding

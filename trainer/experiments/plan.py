@@ -208,15 +208,15 @@ def units_of(names: Collection[str], seeds: int, scenario: str | None = None) ->
         for line in product(one.scenarios, one.algorithms, one.settings)
         if scenario in (None, line[0])
     }
-    units = []
+    units = {}
     for priority, setting, algorithms in LINES:
-        for place, algorithm in enumerate(algorithms):
-            numbers = [0] if algorithm in TESTED_ONLY else range(1, seeds + 1)
-            for (turn, where), seed in product(enumerate(SCENARIOS), numbers):
-                if (where, algorithm, setting) in wanted:
-                    order = (priority, seed, turn, place)
-                    units.append((order, Unit(where, algorithm, setting, seed)))
-    return [unit for _, unit in sorted(units)]
+        for (place, algorithm), (turn, where) in product(
+            enumerate(algorithms), enumerate(SCENARIOS)
+        ):
+            if (where, algorithm, setting) in wanted:
+                for seed in [0] if algorithm in TESTED_ONLY else range(1, seeds + 1):
+                    units[priority, seed, turn, place] = Unit(where, algorithm, setting, seed)
+    return [units[order] for order in sorted(units)]
 
 
 def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:
@@ -240,6 +240,7 @@ def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:
     )
 
 
+ID_LENGTH = 12
 NOT_DECIDING = ("device", "threads", "checkpoint_every", "human")
 """Fields of a run's config that do not decide its result: the human does, but by the model's
 contents and not by where it lies."""
@@ -274,12 +275,9 @@ def deciding(unit: Unit, plan: Plan, humans: Path) -> dict[str, Any]:
 
 
 def testing(unit: Unit, plan: Plan) -> dict[str, Any]:
-    """What decides a unit's tests beside its training."""
+    """What decides a unit's tests, beside its training."""
     scenes = {name: behaviour(unit.scenario, name) for name in CONDITIONS}
     return {"runs": plan.test_runs, "noise_std": COMMAND_NOISE, "scenes": scenes}
-
-
-ID_LENGTH = 12
 
 
 def training_id(unit: Unit, plan: Plan, humans: Path) -> str:

@@ -19,16 +19,8 @@ import torch
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
-from trainer.experiments.run import (
-    BUSY,
-    FAILED,
-    FINISHED,
-    PATIENCE_S,
-    STOPPED,
-    Task,
-    make_record,
-    say,
-)
+from trainer.experiments.run import PATIENCE_S, Task, make_record, say
+from trainer.experiments.store import BUSY, FAILED, FINISHED
 from trainer.human.model import MODEL_FILE
 from trainer.training.metrics import METRICS_FILE
 
@@ -72,11 +64,7 @@ def keep(parcel: Parcel) -> str:
     """Keep what a node made; how the unit ended."""
     store, unit = parcel.task.store, parcel.task.unit
     _write(store.run_dir(unit), parcel.working)
-    if parcel.record is None:
-        return STOPPED
-    store.put(unit, parcel.record)
-    (store.run_dir(unit) / CHECKPOINT_FILE).unlink(missing_ok=True)
-    return FINISHED
+    return store.keep(unit, parcel.record)
 
 
 def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:

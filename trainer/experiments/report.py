@@ -22,9 +22,10 @@ from trainer.experiments.data import (
     Line,
     Results,
     load,
+    words,
 )
 from trainer.experiments.figures import FIGURES, write_figure
-from trainer.experiments.judges import SAME_LEVEL, Finding, name_of, steps_to
+from trainer.experiments.judges import SAME_LEVEL, Finding, steps_to
 from trainer.experiments.plan import (
     CONSTANT,
     EXPERIMENTS,
@@ -36,8 +37,8 @@ from trainer.experiments.plan import (
     TIME,
     units_of,
 )
-from trainer.experiments.run import Store
 from trainer.experiments.statistics import Estimate, mean_estimate, within
+from trainer.experiments.store import Store
 from trainer.experiments.timing import PAPER_S, TIME_FILE, Turns, ratio, seconds
 
 COMMAND = "python -m trainer experiment"
@@ -56,6 +57,10 @@ PAPER_TABLES: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 """Tables I and II of the paper: surviving distance, m, by scene."""
+EVERY_LINE = [Line(name, setting) for _, setting, names in LINES for name in names]
+"""Every line that is computed, in the order of work."""
+COSTS = ("episodes", "steps", "updates", "human_steps", "takeovers")
+"""Of a record's totals, those that the page shows as they are."""
 
 
 def write_report(store: Store, seeds: int) -> Path:
@@ -77,33 +82,35 @@ def write_report(store: Store, seeds: int) -> Path:
 def _page(results: Results, store: Store) -> Iterator[str]:
     judged, bars = list(judge(results)), list(judge_bars(results))
     yield from _introduction(results, judged, bars)
-    yield from _section("The paper's claims", f"{COMMAND} report")
-    yield from (
+    yield from _section(
+        "The paper's claims", "report",
         "A verdict is yes or no where a 95 % interval of the difference, paired by training seed, "
         "lies on one side of the bar; else it is undecided. What decides is the worst of the "
         "comparisons that a claim makes. Learning curves are judged twice: as the paper does, on "
         "training episodes in which the human helps, and by the policy alone on validation drives.",
-        "",
-    )
+    )  # fmt: skip
     yield from table(
         ("", "claim", "the paper", "what decides", "holds", "policy alone", "holds"),
-        (_claim_row(one) for one in judged),
-    )
+        (
+            (f"[{claim.source}](#{_anchor(claim.source)})", claim.text, claim.paper, found.ours,
+             found.holds, *((alone.ours, alone.holds) if alone else ("", "")))
+            for claim, found, alone in judged
+        ),
+    )  # fmt: skip
     yield from _time_lines(store.results / TIME_FILE)
-    yield from _section("This project's bars", f"{COMMAND} report")
-    yield from (
+    yield from _section(
+        "This project's bars", "report",
         "Of the policy alone: means of the seeds decide about shares and steps, 95 % intervals "
-        "about who is ahead.",
-        "",
-    )
+        "about which one is ahead.",
+    )  # fmt: skip
     yield from table(("bar", "measured", "met"), ((t, f.ours, f.holds) for t, f in bars))
     yield from _tests(results)
     for name, scenario in zip(PAPER_TABLES, SCENARIOS, strict=True):
         yield from _paper_table(results, name, scenario)
     yield from _costs(results)
     for name in FIGURES:
-        yield from _section(f"{name}: {EXPERIMENTS[name].title}", f"{COMMAND} {name}")
-        yield from (f"![{EXPERIMENTS[name].title}]({name}.png)", "")
+        title = EXPERIMENTS[name].title
+        yield from _section(f"{name}: {title}", name, f"![{title}]({name}.png)")
 
 
 def _introduction(
@@ -111,10 +118,7 @@ def _introduction(
 ) -> Iterator[str]:
     wanted = units_of(["all"], results.seeds)
     holds, met = Counter(one.found.holds for one in judged), Counter(f.holds for _, f in bars)
-    budgets = " and ".join(
-        f"{results.budget(scenario):,} in the {scenario.replace('_', ' ')}"
-        for scenario in SCENARIOS
-    )
+    budgets = " and ".join(f"{results.budget(name):,} in the {words(name)}" for name in SCENARIOS)
     yield from (
         "# The paper's experiments, run again",
         "",
@@ -132,41 +136,33 @@ def _introduction(
         "",
     )
     if results.stale:
-        yield from (
-            f"{len(results.stale)} records are of other settings than today's and left out.", ""
-        )  # fmt: skip
+        yield f"{len(results.stale)} records are of other settings than today's and left out."
+        yield ""
     yield from table(
         ("setting", "meaning", "algorithms"),
         (
-            (name, SETTINGS[name].meaning, ", ".join(name_of(Line(a)) for a in algorithms))
+            (name, SETTINGS[name].meaning, ", ".join(Line(a).name for a in algorithms))
             for _, name, algorithms in LINES
             if HUMAN_MODEL not in algorithms
         ),
     )
 
 
-def _claim_row(one: Judged) -> tuple[str, ...]:
-    claim, found, alone = one
-    link = f"[{claim.source}](#{_anchor(claim.source)})"
-    alone_cells = (alone.ours, alone.holds) if alone else ("", "")
-    return (link, claim.text, claim.paper, found.ours, found.holds, *alone_cells)
-
-
 def _anchor(source: str) -> str:
-    """Of the section of an experiment, as GitHub makes it."""
+    """The link to the section of an experiment, as GitHub makes it."""
     title = f"{source} {EXPERIMENTS[source].title}".lower().replace(",", "")
     return title.replace(" ", "-")
 
 
 def _time_lines(path: Path) -> Iterator[str]:
     """The paper's table of time efficiency beside ours, and what it says of them."""
-    yield from _section("Training time", f"{COMMAND} {TIME}")
     if not path.is_file():
-        yield from ("Not measured.", "")
+        yield from _section("Training time", TIME, "Not measured.")
         return
+    yield from _section("Training time", TIME)
     turns = _turns(path)
     yield from table(
-        ("seconds for 10,000 steps", *(name_of(Line(name)) for name in PAPER_S)),
+        ("seconds for 10,000 steps", *(Line(name).name for name in PAPER_S)),
         (
             ("the paper", *(f"{each:.0f}" for each in PAPER_S.values())),
             ("ours", *(f"{seconds(turns[name]):.0f}" for name in PAPER_S)),
@@ -175,11 +171,11 @@ def _time_lines(path: Path) -> Iterator[str]:
     found = ratio(turns["phil_td3"], turns["ia_td3"])
     value, low, high = (each - 1.0 for each in found[:3])
     holds = within(Estimate(value, low, high, found.size), SAME_LEVEL)
-    yield from (
+    yield (
         f'"Similar", says the paper of PHIL-TD3 and IA-TD3 (1.03 times): {found.text(3)} times, '
-        f"so within 5 %: {holds}.",
-        "",
+        f"so within 5 %: {holds}."
     )
+    yield ""
 
 
 def _turns(path: Path) -> dict[str, Turns]:
@@ -192,33 +188,32 @@ def _turns(path: Path) -> dict[str, Turns]:
 
 def _tests(results: Results) -> Iterator[str]:
     """Success of every policy in every scene."""
-    yield from _section("Test drives", f"{COMMAND} fig9 fig14 printed floor")
-    yield from ("Success in %, mean of the seeds, with its 95 % interval; in brackets that of the "
-                f"paper's {PAPER_TESTS} seeds alone.", "")  # fmt: skip
+    yield from _section(
+        "Test drives", "fig9 fig14 printed floor",
+        "Success in %, mean of the seeds, with its 95 % interval; in brackets that of the "
+        f"paper's {PAPER_TESTS} seeds alone.",
+    )  # fmt: skip
     rows = []
-    for _, setting, algorithms in LINES:
-        for line in (Line(algorithm, setting) for algorithm in algorithms):
-            cells = []
-            for scene in SCENES:
-                found = mean_estimate(results.tested(scene, line, SUCCESS).values())
-                paper = results.pooled(scene, line, SUCCESS, paper=True)
-                shown = f"{found.as_share()} ({100 * paper.mean():.0f})" if len(paper) else "–"
-                cells.append(shown)
-            if set(cells) != {"–"}:
-                rows.append((name_of(line), *cells))
+    for line in EVERY_LINE:
+        cells = []
+        for scene in SCENES:
+            found = mean_estimate(results.numbers(scene, line, SUCCESS).values())
+            paper = results.pooled(scene, line, SUCCESS, paper=True)
+            shown = f"{found.as_share()} ({100 * paper.mean():.0f})" if len(paper) else "–"
+            cells.append(shown)
+        if set(cells) != {"–"}:
+            rows.append((line.name, *cells))
     yield from table(("", *(scene.label for scene in SCENES)), rows)
 
 
 def _paper_table(results: Results, name: str, scenario: str) -> Iterator[str]:
     """A table of the paper with our numbers beside its own."""
-    title = EXPERIMENTS[name].title
-    yield from _section(f"{name}: {title}", f"{COMMAND} {name}")
-    yield from (
+    yield from _section(
+        f"{name}: {EXPERIMENTS[name].title}", name,
         "Surviving distance, m, mean and standard deviation over the drives with the paper's "
         f"{PAPER_TESTS} seeds, of all trainings: ours (the paper's). Distances end at the goal, at "
         "21 and 80 m; the paper counts what was driven beyond it.",
-        "",
-    )
+    )  # fmt: skip
     scenes = [scene for scene in PAPER_SCENES if scene.scenario == scenario]
     rows = []
     for algorithm, numbers in PAPER_TABLES[name].items():
@@ -227,51 +222,48 @@ def _paper_table(results: Results, name: str, scenario: str) -> Iterator[str]:
             ours = results.pooled(scene, Line(algorithm), DISTANCE, paper=True)
             shown = f"{ours.mean():.2f}±{ours.std():.2f}" if len(ours) else "–"
             cells.append(f"{shown} ({number})")
-        rows.append((name_of(Line(algorithm)), *cells))
+        rows.append((Line(algorithm).name, *cells))
     yield from table(("", *(scene.label for scene in scenes)), rows)
 
 
 def _costs(results: Results) -> Iterator[str]:
     """What each training cost, and where the policy alone ends."""
-    yield from _section("What the trainings cost", f"{COMMAND} all")
-    yield from ("Means of the seeds. Alone: validation drives of the policy without help.", "")
+    yield from _section(
+        "What the trainings cost", "all",
+        "Means of the seeds. Alone: validation drives of the policy without help.",
+    )  # fmt: skip
     rows = []
     for scenario in SCENARIOS:
-        for _, setting, algorithms in LINES:
-            for line in (Line(algorithm, setting) for algorithm in algorithms):
-                found = results.of(scenario, line)
-                if not found or not found[0].unit.trained:
-                    continue
-                totals = [result.record["totals"] for result in found]
-                ends = results.ends(scenario, line, ALONE, SUCCESS)
-                best = [each["validation"]["best"] for each in totals]
-                reached = steps_to(found, 0.9)
-                rows.append((
-                    scenario.replace("_", " "), name_of(line), str(len(found)),
-                    *(f"{np.mean([each[key] for each in totals]):,.0f}"
-                      for key in ("episodes", "steps", "updates", "human_steps", "takeovers")),
-                    f"{np.mean([sum(each['failures'].values()) for each in totals]):.0f}",
-                    f"{reached:,.0f}" if np.isfinite(reached) else "never",
-                    f"{100 * np.mean(best):.0f} %", f"{100 * np.mean(list(ends.values())):.0f} %",
-                ))  # fmt: skip
+        for line in EVERY_LINE:
+            found = results.of(scenario, line)
+            if not found or not found[0].unit.trained:
+                continue
+            totals = [result.record["totals"] for result in found]
+            costs = [f"{np.mean([each[key] for each in totals]):,.0f}" for key in COSTS]
+            failures = np.mean([sum(each["failures"].values()) for each in totals])
+            reached = steps_to(found, 0.9)
+            best = np.mean([each["validation"]["best"] for each in totals])
+            end = np.mean([*results.numbers(scenario, line, SUCCESS, ALONE).values()])
+            rows.append((
+                words(scenario), line.name, str(len(found)), *costs, f"{failures:.0f}",
+                f"{reached:,.0f}" if np.isfinite(reached) else "never",
+                f"{100 * best:.0f} %", f"{100 * end:.0f} %",
+            ))  # fmt: skip
     yield from table(
         ("", "", "seeds", "episodes", "steps", "updates", "human steps", "take-overs", "failures",
          "steps to 90 % alone", "best alone", "end alone"), rows)  # fmt: skip
-    floors = [
-        (scenario, result)
-        for scenario in SCENARIOS
-        for result in results.of(scenario, Line(CONSTANT))
-    ]
-    for scenario, result in floors:
-        tried = len(result.record["success_of"])
-        yield from (
-            f"Best constant action in the {scenario.replace('_', ' ')}: "
-            f"{result.record['action']:g}, the best of {tried} on validation drives.", ""
-        )  # fmt: skip
+    for scenario in SCENARIOS:
+        for result in results.of(scenario, Line(CONSTANT)):
+            action, tried = result.record["action"], len(result.record["success_of"])
+            best = f"{action:g}, the best of {tried} on validation drives."
+            yield from (f"Best constant action in the {words(scenario)}: {best}", "")
 
 
-def _section(title: str, command: str) -> Iterator[str]:
-    yield from (f"## {title}", "", f"`{command}`", "")
+def _section(title: str, names: str, text: str = "") -> Iterator[str]:
+    """A heading, the command that computes what is below it, and a paragraph."""
+    yield from (f"## {title}", "", f"`{COMMAND} {names}`", "")
+    if text:
+        yield from (text, "")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterator[str]:

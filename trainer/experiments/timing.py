@@ -13,8 +13,9 @@ import numpy as np
 
 from edge_runtime.files import make_directory
 from trainer.experiments.plan import FOUR, NORMAL, TIME, Unit, run_config, training_id
-from trainer.experiments.run import Store, one_thread
+from trainer.experiments.run import one_thread
 from trainer.experiments.statistics import RESAMPLES, Estimate, bootstrap
+from trainer.experiments.store import Store
 from trainer.training.run import TrainingRun
 from trainer.util import ProgressBar, about
 

@@ -68,8 +68,9 @@ class LearnerConfig:
     other way round: an actor should follow a critic that is ahead of it."""
     critic_learning_rate: float = 5e-4
     """Of the critics' optimiser. As in the authors' code, see ``actor_learning_rate``."""
-    learning_rate_decay: float = 0.996
-    """Factor on both learning rates, once an episode (table A5)."""
+    learning_rate_decay: float = 1.0
+    """Factor on both learning rates, once an episode (table A5: 0.996). By steps is
+    fairer: a policy that fails early has many short episodes."""
     learning_rate_final: float = 0.0
     """Share of both learning rates that is left at the end of the run; they fall to it linearly.
     The paper's is 1. With rates that stay high, the late policy swings about what it learned."""
@@ -98,9 +99,10 @@ class LearnerConfig:
     2016)."""
     exploration_final: float = 0.05
     """Least standard deviation of the exploration noise (table A5)."""
-    exploration_decay: float = 0.985
-    """Factor on the exploration's standard deviation, once an episode: 0.05 is reached after 119
-    episodes. Not in the paper."""
+    exploration_share: float = 0.5
+    """Share of the run in which the deviation falls linearly from the first to the least. By
+    steps, not by episodes: a policy that fails early has many short ones, and would stop exploring
+    before it has learned anything. The paper names no law."""
     exploration_bound: float = 1.0
     """Bound of the exploration noise (table A5: c)."""
     replay_capacity: int = 100_000
@@ -176,7 +178,7 @@ RANGES = {
     "exploration_initial": FROM_ZERO,
     "exploration_correlation": SHARE,
     "exploration_final": FROM_ZERO,
-    "exploration_decay": SHARE,
+    "exploration_share": ABOVE_ZERO,
     "exploration_bound": FROM_ZERO,
     "replay_capacity": (1, 10**9),
     "alpha": SHARE,
@@ -196,6 +198,7 @@ PRINTED_LEARNER = LearnerConfig(
     exploration_correlation=0.0,
     actor_learning_rate=5e-4,
     critic_learning_rate=2e-4,
+    learning_rate_decay=0.996,
     learning_rate_final=1.0,
     return_steps=1,
     tau=1e-3,

@@ -6,7 +6,6 @@ a transition points at three of them, so 100,000 transitions take 380 MB instead
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -64,16 +63,15 @@ class SumTree:
         return self.find(masses)
 
 
+FRAME_SHAPE = (45, 80)
 FRAMES_PER_TRANSITION = 1.05
 """Stored pictures for each transition: one, and one more at the start of each episode."""
+Lost = list[int]
+"""Slots of transitions that are forgotten because a new picture took the place of theirs."""
 
 
-AddPicture = Callable[[NDArray[np.uint8]], int]
-"""Stores a picture [45, 80]; gives its running number."""
-
-
-class Ledger:
-    """Running numbers of pictures and transitions, and the rings they are kept in.
+class RingIndex:
+    """Running numbers of pictures and transitions, the rings they are kept in, and the pictures.
 
     Args:
         capacity: transitions kept.
@@ -82,10 +80,10 @@ class Ledger:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.frame_slots = int(capacity * FRAMES_PER_TRANSITION) + 3
-        self.added = 0
-        self.frames_added = 0
+        self.pictures = np.empty((self.frame_slots, *FRAME_SHAPE), np.uint8)
         self.frame_ids = np.zeros((capacity, 3), np.int64)
         """The running numbers of each transition's three pictures, oldest first."""
+        self.added = self.frames_added = 0
         self.oldest = 0
         """Running number of the oldest transition that is not forgotten."""
         self._current: tuple[int, int] | None = None
@@ -99,50 +97,41 @@ class Ledger:
         return min(self.added, self.capacity)
 
     @property
-    def used_frames(self) -> int:
-        """Picture slots that hold a picture."""
-        return min(self.frames_added, self.frame_slots)
-
-    @property
     def alive(self) -> NDArray[np.int64]:
         """Slots of the transitions that are not forgotten, oldest first."""
         return np.arange(self.oldest, self.added, dtype=np.int64) % self.capacity
 
-    def start_episode(self, frames: NDArray[np.uint8], add_picture: AddPicture) -> None:
+    def start_episode(self, frames: NDArray[np.uint8]) -> Lost:
         """Take the first observation [2, 45, 80] of an episode; a picture seen twice once only."""
-        older = add_picture(frames[0])
-        newer = older if np.array_equal(frames[0], frames[1]) else add_picture(frames[1])
+        lost: Lost = []
+        older = newer = self._add_picture(frames[0], lost)
+        if not np.array_equal(frames[0], frames[1]):
+            newer = self._add_picture(frames[1], lost)
         self._current = (older, newer)
+        return lost
 
-    def check_started(self) -> None:
-        """Raise RuntimeError unless an episode has begun."""
+    def add(self, picture: NDArray[np.uint8]) -> tuple[int, Lost]:
+        """Number a transition that led to a picture; its slot.
+
+        Raises:
+            RuntimeError: no episode has begun.
+        """
         if self._current is None:
             raise RuntimeError("start_episode comes before add")
-
-    def add_picture(self) -> tuple[int, list[int]]:
-        """Number a new picture; it goes to that number modulo ``frame_slots``.
-
-        Returns:
-            The number, and the slots of transitions that are forgotten because this picture
-            takes the place of theirs.
-        """
-        number = self.frames_added
-        self.frames_added += 1
-        return number, list(self._forget(number - self.frame_slots))
-
-    def add_transition(self, newest: int) -> int:
-        """Number a transition that led to picture ``newest``; returns its slot."""
-        self.check_started()
-        assert self._current is not None
-        older, newer = self._current
+        lost: Lost = []
+        newest = self._add_picture(picture, lost)
         slot = self.added % self.capacity
-        self.frame_ids[slot] = older, newer, newest
+        self.frame_ids[slot] = *self._current, newest
         self.added += 1
         self.oldest = max(self.oldest, self.added - self.capacity)
-        self._current = (newer, newest)
-        return slot
+        self._current = (self._current[1], newest)
+        return slot, lost
 
-    def follows(self, slots: NDArray[np.int64], following: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def frames(self, slots: Indices, first: int) -> NDArray[np.uint8]:
+        """The two pictures from ``first`` on of each transition, [n, 2, 45, 80]."""
+        return self.pictures[self.frame_ids[slots, first : first + 2] % self.frame_slots]
+
+    def follows(self, slots: Indices, following: Indices) -> NDArray[np.bool_]:
         """Whether each transition begins with the picture that another ended with, [n].
 
         Pictures have running numbers, so no other episode's transition does, nor a forgotten one.
@@ -156,6 +145,7 @@ class Ledger:
             "frames_added": self.frames_added,
             "oldest": self.oldest,
             "frame_ids": self.frame_ids[: self.used],
+            "pictures": self.pictures[: self.frames_added],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -164,15 +154,21 @@ class Ledger:
         self.frames_added = state["frames_added"]
         self.oldest = state["oldest"]
         self.frame_ids[: self.used] = state["frame_ids"]
+        self.pictures[: self.frames_added] = state["pictures"]
         self._current = None
 
-    def _forget(self, lost_picture: int) -> Iterator[int]:
-        while len(self) and self.frame_ids[self.oldest % self.capacity, 0] <= lost_picture:
-            yield self.oldest % self.capacity
+    def _add_picture(self, picture: NDArray[np.uint8], lost: Lost) -> int:
+        """Store a picture; its running number. Forget the transitions that lose theirs by it."""
+        number = self.frames_added
+        self.frames_added += 1
+        self.pictures[number % self.frame_slots] = picture
+        gone = number - self.frame_slots
+        while len(self) and self.frame_ids[self.oldest % self.capacity, 0] <= gone:
+            lost.append(self.oldest % self.capacity)
             self.oldest += 1
+        return number
 
 
-FRAME_SHAPE = (45, 80)
 COLUMNS = (
     "actions", "rewards", "terminals", "human", "overruled", "penalised", "priorities"
 )  # fmt: skip
@@ -245,8 +241,7 @@ class ReplayBuffer:
     ) -> None:
         self.capacity, self.alpha = capacity, alpha
         self.steps, self.gamma, self.overruled_value = steps, gamma, overruled_value
-        self._ledger = Ledger(capacity)
-        self._pictures = np.empty((self._ledger.frame_slots, *FRAME_SHAPE), np.uint8)
+        self._ring = RingIndex(capacity)
         self._actions = np.zeros((capacity, action_size), np.float32)
         self._rewards = np.zeros(capacity, np.float32)
         self._terminals = np.zeros(capacity, np.float32)
@@ -257,27 +252,27 @@ class ReplayBuffer:
         self._trees = [SumTree(capacity) for _ in range(2 if separate else 1)]
 
     def __len__(self) -> int:
-        return len(self._ledger)
+        return len(self._ring)
 
     @property
     def added(self) -> int:
         """Transitions stored since the run began."""
-        return self._ledger.added
+        return self._ring.added
 
     @property
     def human_count(self) -> int:
         """How many of the kept transitions are the human's."""
-        return int(self._human[self._ledger.alive].sum())
+        return int(self._human[self._ring.alive].sum())
 
     def mean_priorities(self) -> tuple[float, float]:
         """Mean priority of the policy's and of the human's transitions (nan where none)."""
-        alive = self._ledger.alive
+        alive = self._ring.alive
         human, priorities = self._human[alive], self._priorities[alive]
         return _mean(priorities[~human]), _mean(priorities[human])
 
     def start_episode(self, frames: NDArray[np.uint8]) -> None:
         """Take the first observation [2, 45, 80] of an episode."""
-        self._ledger.start_episode(frames, self._add_picture)
+        self._forget(self._ring.start_episode(frames))
 
     def add(
         self,
@@ -300,9 +295,9 @@ class ReplayBuffer:
             overruled: the policy's action in its place, if so.
             penalised: whether that action is penalised.
         """
-        self._ledger.check_started()
-        priority = self._highest_priority()
-        slot = self._ledger.add_transition(self._add_picture(next_frames[1]))
+        priority = float(self._priorities[: self._ring.used].max()) if len(self) else 1.0
+        slot, lost = self._ring.add(next_frames[1])
+        self._forget(lost)
         self._actions[slot] = action
         self._rewards[slot] = reward
         self._terminals[slot] = terminal
@@ -339,23 +334,17 @@ class ReplayBuffer:
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on, without the unused part of the arrays."""
-        used, pictures = self._ledger.used, self._ledger.used_frames
-        return {
-            **self._ledger.state_dict(),
-            "pictures": self._pictures[:pictures],
-            **{name: getattr(self, f"_{name}")[:used] for name in COLUMNS},
-        }
+        columns = {name: getattr(self, f"_{name}")[: self._ring.used] for name in COLUMNS}
+        return {**self._ring.state_dict(), **columns}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave; the next episode begins with ``start_episode``."""
-        self._ledger.load_state_dict(state)
-        used, pictures = self._ledger.used, self._ledger.used_frames
-        self._pictures[:pictures] = state["pictures"]
+        self._ring.load_state_dict(state)
         for name in COLUMNS:
-            getattr(self, f"_{name}")[:used] = state[name]
+            getattr(self, f"_{name}")[: self._ring.used] = state[name]
         # What was here before must not be drawn any more.
         self._trees = [SumTree(self.capacity) for _ in self._trees]
-        alive = self._ledger.alive
+        alive = self._ring.alive
         if len(alive):
             self._set_weights(alive, self._priorities[alive] ** self.alpha)
 
@@ -363,10 +352,10 @@ class ReplayBuffer:
         returns = self._returns(indices)
         return Batch(
             indices=indices,
-            frames=self._pictures[self._places(indices, 0)],
+            frames=self._ring.frames(indices, 0),
             actions=self._actions[indices],
             rewards=returns.rewards,
-            next_frames=self._pictures[self._places(returns.lasts, 1)],
+            next_frames=self._ring.frames(returns.lasts, 1),
             terminals=returns.terminals,
             human=self._human[indices],
             probabilities=self._probabilities(indices),
@@ -374,10 +363,6 @@ class ReplayBuffer:
             overruled=self._overruled[indices],
             penalised=self._penalised[indices],
         )
-
-    def _places(self, indices: Indices, first: int) -> Indices:
-        """Where the two pictures from ``first`` on of each transition lie, [n, 2]."""
-        return self._ledger.frame_ids[indices, first : first + 2] % self._ledger.frame_slots
 
     def _returns(self, indices: Indices) -> _Returns:
         """The n-step returns, without their bootstrap, that begin with these transitions.
@@ -393,7 +378,7 @@ class ReplayBuffer:
         going = np.ones(len(indices), np.bool_)
         for step in range(1, self.steps):
             following = (lasts + 1) % self.capacity
-            going &= (terminals == 0.0) & self._ledger.follows(lasts, following)
+            going &= (terminals == 0.0) & self._ring.follows(lasts, following)
             if not going.any():
                 break
             discount = np.float32(self.gamma**step)
@@ -423,20 +408,11 @@ class ReplayBuffer:
         for tree, own in zip(self._trees, (~human, human), strict=True):
             tree[indices] = weights * own
 
-    def _highest_priority(self) -> float:
-        if len(self) == 0:
-            return 1.0
-        return float(self._priorities[: self._ledger.used].max())
-
-    def _add_picture(self, picture: NDArray[np.uint8]) -> int:
-        """Store a picture and return its running number; forget transitions that lose theirs."""
-        number, lost = self._ledger.add_picture()
-        self._pictures[number % self._ledger.frame_slots] = picture
-        for slot in lost:
-            # Not 0 ** alpha, which is one where alpha is zero.
-            self._priorities[slot] = 0.0
-            self._set_weights(np.array([slot]), np.zeros(1))
-        return number
+    def _forget(self, lost: Lost) -> None:
+        if lost:
+            # Weights of 0, not 0 ** alpha, which is 1 where alpha is 0.
+            self._priorities[lost] = 0.0
+            self._set_weights(np.array(lost), np.zeros(len(lost)))
 
 
 def _mean(values: NDArray[np.float64]) -> float:

@@ -33,7 +33,7 @@ from trainer.person.interface import HUMANS, Person, person_options
 from trainer.person.recording import DIRECTORY, DISCARDED, Recorder, steps_since, store_again
 from trainer.person.session import Sitting, SittingOver, WatchedEnv
 from trainer.training.config import RunConfig
-from trainer.training.delayed import Store, make_wheel, ticks_late
+from trainer.training.delayed import Store, behind, ticks_late
 from trainer.training.learning import Action, EpisodeLearning, Learning, LearningThread, Observation
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun, divergence_said
@@ -114,7 +114,7 @@ class PersonRun(TrainingRun):
         self.sitting = Sitting(person, recorder, self.env, speed=speed)
         self.guide = PersonGuide(self.sitting)
         self.kept_back = KeptBack(self.learning)
-        self.wheel = make_wheel(self.kept_back, self.env, self.network)
+        self.policy = behind(self.network, self.kept_back, self.env)
         self.watched = self.env = WatchedEnv(self.env, self.sitting)
 
     def train(

@@ -22,16 +22,15 @@ from trainer.bench import (
     QUICK,
     SB3,
     Row,
-    Updates,
     compare,
-    environment_figures,
+    figures,
     highway_drive,
-    learner_figures,
     median,
     our_drive,
     rows,
     take_turns,
     training_figures,
+    updates,
 )
 from trainer.bench_peers import HighwayPicture, check_varies, filled, gather, make_sb3_model
 from trainer.drivers import make_environment
@@ -42,6 +41,9 @@ from trainer.tests.test_commands import call
 TINY = replace(
     QUICK, batch_size=4, rounds=2, updates_per_round=1, steps_per_round=10, training_episodes=1
 )
+
+
+per_second = partial(figures, of=lambda time_s: 1.0 / time_s)
 
 
 def test_contenders_take_turns_and_none_is_always_first():
@@ -59,49 +61,32 @@ def test_contenders_take_turns_and_none_is_always_first():
     assert len(ticks) == 4
 
 
-def test_ratios_are_of_medians_and_of_rounds():
-    ours, peers = [[1.0, 2.0, 3.0], [10.0, 10.0, 10.0]], [[4.0, 4.0, 4.0], [30.0, 30.0, 30.0]]
-    assert median(ours) == 6.5
-    assert compare(ours, peers) == {"of_medians": 17.0 / 6.5, "median_of_rounds": 2.5}
-
-
-def test_a_slow_round_cancels_out_of_the_rounds_ratio():
-    ours, peers = [[1.0], [9.0], [1.0]], [[3.0], [27.0], [3.0]]
-    assert compare(ours, peers)["median_of_rounds"] == 3.0
-
-
-def test_learner_figures():
-    figures = learner_figures({OURS: [[20.0], [30.0]], SB3: [[100.0], [90.0]]})
-    assert figures["ms_per_update"] == 25.0
-    assert figures["updates_per_s"] == 40.0
-    assert figures["peers"] == {
-        SB3: {"ms_per_update": 95.0, "ratio": {"of_medians": 3.8, "median_of_rounds": 4.0}}
+@pytest.mark.parametrize(
+    ("ours", "peers", "of_medians", "of_rounds"),
+    [
+        ([[1.0, 2.0, 3.0], [10.0] * 3], [[4.0] * 3, [30.0] * 3], 17.0 / 6.5, 2.5),
+        # What slows a whole round down cancels out of the rounds' ratio.
+        ([[1.0], [9.0], [1.0]], [[3.0], [27.0], [3.0]], 3.0, 3.0),
+    ],
+)
+def test_ratios_are_of_medians_and_of_rounds(ours, peers, of_medians, of_rounds):
+    ratio = {"of_medians": of_medians, "median_of_rounds": of_rounds}
+    assert compare(ours, peers) == ratio
+    assert figures({OURS: ours, SB3: peers}, "ms") == {
+        "ms": median(ours),
+        "peers": {SB3: {"ms": median(peers), "ratio": ratio}},
     }
-
-
-def test_environment_figures():
-    figures = environment_figures({OURS: [[0.0005]], HIGHWAY: [[0.004]]})
-    assert figures["steps_per_s"] == 2000.0
-    assert figures["peers"][HIGHWAY]["steps_per_s"] == 250.0
-    assert figures["peers"][HIGHWAY]["ratio"]["of_medians"] == 8.0
+    assert per_second({OURS: ours}, "steps")["steps"] == 1.0 / median(ours)
 
 
 def test_training_figures_scale_to_10000_steps():
-    parts_s = {"environment": 0.1, "acting": 0.2, "storing": 0.3, "learning": 6.0, "waiting": 0.0}
+    parts_s = dict(zip(PARTS, (0.1, 0.2, 0.3, 6.0, 0.0), strict=True))
     named = {f"{name}_s": value for name, value in parts_s.items()}
-    episodes: list[Any] = [SimpleNamespace(steps=100, **named), SimpleNamespace(steps=300, **named)]
-    figures = training_figures(episodes, 16.0)
-    assert figures["steps"] == 400
-    assert figures["s_per_10k_steps"] == pytest.approx(
-        {
-            "total": 400.0,
-            "environment": 5.0,
-            "acting": 10.0,
-            "storing": 15.0,
-            "learning": 300.0,
-            "waiting": 0.0,
-        }
-    )
+    episodes: list[Any] = [SimpleNamespace(steps=steps, **named) for steps in (100, 300)]
+    found = training_figures(episodes, 16.0)
+    wanted = zip(("total", *PARTS), (400.0, 5.0, 10.0, 15.0, 300.0, 0.0), strict=True)
+    assert found["steps"] == 400
+    assert found["s_per_10k_steps"] == pytest.approx(dict(wanted))
 
 
 def test_an_update_draws_learns_and_sets_the_new_priorities():
@@ -116,7 +101,7 @@ def test_an_update_draws_learns_and_sets_the_new_priorities():
     recorder: Any = Recorder()
     experience = gather(50)
     buffer = filled(experience)
-    times_ms = Updates(recorder, buffer, batch_size=8).run(3)
+    times_ms = updates(recorder, buffer, batch_size=8, count=3)()
     assert len(times_ms) == 3
     assert [len(batch.indices) for batch in recorder.seen] == [8, 8, 8]
     drawn = np.concatenate([batch.indices for batch in recorder.seen])
@@ -128,9 +113,10 @@ def test_an_update_draws_learns_and_sets_the_new_priorities():
 def test_an_effective_precision_of_float32_is_measured_once(has, precision, monkeypatch):
     monkeypatch.setattr(bench, "TRANSITIONS", 20)
     monkeypatch.setattr(bench, "multiplies_bfloat16", lambda kind: has)
-    figures = bench.measure_learner(TINY, lambda done: None)
-    assert figures["precision"] == precision
-    assert (FLOAT32 in figures["peers"]) == has
+    found = bench.measure_learner(TINY, lambda done: None)
+    assert found["precision"] == precision
+    assert found["updates_per_s"] == 1e3 / found["ms_per_update"]
+    assert (FLOAT32 in found["peers"]) == has
 
 
 def test_the_whole_report_of_a_machine_without_the_peer(capsys, tmp_path, monkeypatch):
@@ -157,8 +143,8 @@ def test_the_whole_report_of_a_machine_without_the_peer(capsys, tmp_path, monkey
 
 
 def test_the_table_says_which_bars_are_missed():
-    learner = learner_figures({OURS: [[20.0]], SB3: [[90.0]]})
-    environment = {"left_turn": environment_figures({OURS: [[0.001]], HIGHWAY: [[0.009]]})}
+    learner = figures({OURS: [[20.0]], SB3: [[90.0]]}, "ms_per_update")
+    environment = {"left_turn": per_second({OURS: [[0.001]], HIGHWAY: [[0.009]]}, "steps_per_s")}
     seconds = dict.fromkeys(("total", *PARTS), 1.0)
     report = {
         "learner": {"batch_size": 128, **learner},

@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 
 from trainer.experiments.ray_runner import compute_parcel, keep, pack, run_on_ray
-from trainer.experiments.run import DONE, FAILED, FINISHED, STOPPED, Task, compute
+from trainer.experiments.run import Task, compute
+from trainer.experiments.store import DONE, FAILED, FINISHED, STOPPED
 from trainer.tests.experiments import UNIT, Soon, store_in, without_times
 
 UNITS = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]

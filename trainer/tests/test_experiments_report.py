@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,19 +12,9 @@ from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError
 from trainer.__main__ import main
 from trainer.experiments import judges
-from trainer.experiments.claims import BARS, CLAIMS, judge, judge_bars
+from trainer.experiments.claims import BARS, CLAIMS, HI, IA, PER, PHIL, judge, judge_bars
 from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, grid_of, load
-from trainer.experiments.judges import (
-    HI,
-    IA,
-    PER,
-    PHIL,
-    ahead,
-    first_reached,
-    level,
-    sooner,
-    sooner_by,
-)
+from trainer.experiments.judges import ahead, first_reached, level, sooner, sooner_by
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import table, write_report
 from trainer.experiments.statistics import (
@@ -116,20 +105,21 @@ class TestData:
 
 class TestJudges:
     def test_who_is_ahead_and_who_is_not(self, everything):
-        place: Any = {"places": ["left_turn"], "quantities": [SUCCESS]}
-        assert ahead(everything, ALONE, ours=[PHIL], others=[IA, HI, PER], **place).holds == "yes"
-        found = ahead(everything, ALONE, ours=[PER], others=[HI], **place)
+        def judged(judge, ours, *others):
+            return judge(["left_turn"], [ours], others, [SUCCESS])(everything, ALONE)
+
+        assert judged(ahead, PHIL, IA, HI, PER).holds == "yes"
+        found = judged(ahead, PER, HI)
         assert found.holds == "no"
         assert "vanilla TD3 over HI-TD3" in found.ours
-        assert level(everything, ALONE, ours=[PHIL], others=[PHIL], **place).holds == "yes"
-        assert level(everything, ALONE, ours=[PHIL], others=[PER], **place).holds == "no"
+        assert judged(level, PHIL, PHIL).holds == "yes"
+        assert judged(level, PHIL, PER).holds == "no"
 
     def test_missing_trainings_leave_it_open(self):
-        units = [unit for unit in units_of(["fig7"], SEEDS) if unit != UNIT]
-        results = results_of(units, SEEDS)
-        place: Any = {"places": ["left_turn"], "quantities": [SUCCESS]}
-        assert ahead(results, ALONE, ours=[PHIL], others=[PER], **place).holds == "undecided"
-        assert ahead(results, ALONE, ours=[PHIL], others=[IA], **place).holds == "yes"
+        results = results_of([unit for unit in units_of(["fig7"], SEEDS) if unit != UNIT], SEEDS)
+        for other, holds in ((PER, "undecided"), (IA, "yes")):
+            judge = ahead(["left_turn"], [PHIL], [other], [SUCCESS])
+            assert judge(results, ALONE).holds == holds
 
     def test_how_much_sooner(self):
         """Straight lines, so that the steps can be worked out by hand."""
@@ -147,16 +137,13 @@ class TestJudges:
         found, said = sooner_by(own, other, ALONE, SUCCESS, least=0.9)
         assert found.value == pytest.approx(6_000 / 1_800), "a lower bound"
         assert said == "1,800 against never steps"
-        rest: Any = {
-            "places": ["left_turn"],
-            "quantities": [SUCCESS],
-            "least": 0.9,
-            "by_mean": True,
-        }
-        bar = sooner(results, ALONE, ours=[PHIL], others=[PER], times=4.0, **rest)
-        assert bar.holds == "undecided"
-        assert sooner(results, ALONE, ours=[PHIL], others=[PER], times=3.0, **rest).holds == "yes"
-        assert sooner(results, ALONE, ours=[PER], others=[PHIL], times=1.0, **rest).holds == "no"
+        for ours, its, times, holds in (
+            (PHIL, PER, 4.0, "undecided"),
+            (PHIL, PER, 3.0, "yes"),
+            (PER, PHIL, 1.0, "no"),
+        ):
+            bar = sooner(["left_turn"], [ours], [its], [SUCCESS], times, least=0.9, by_mean=True)
+            assert bar(results, ALONE).holds == holds
 
     @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12), st.floats(0.0, 1.0))
     def test_a_level_is_reached_where_the_curve_crosses_it(self, values, least):

@@ -31,7 +31,8 @@ from trainer.experiments.plan import (
     unit_id,
     units_of,
 )
-from trainer.experiments.run import BUSY, FAILED, FINISHED, STOPPED, Task, compute, run_units
+from trainer.experiments.run import Task, compute, run_units
+from trainer.experiments.store import BEGUN, BUSY, DONE, FAILED, FINISHED, RUNNING, STOPPED
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
@@ -73,7 +74,7 @@ def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
     assert compute(Task(UNIT, store, stop_at_s=1.0)) == STOPPED, "time was over before it began"
     ends = [compute(Task(UNIT, store, stop_at_s=Soon(1e18))) for _ in range(2)]
     assert ends == [STOPPED, STOPPED]
-    assert store.states([UNIT])[UNIT] == running.BEGUN
+    assert store.states([UNIT])[UNIT] == BEGUN
     assert compute(Task(UNIT, store)) == FINISHED
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
@@ -107,7 +108,7 @@ def test_two_processes_share_one_file_of_records(tmp_path):
     ends = run_units([Task(unit, store) for unit in units], 2)
     assert ends == {FINISHED: 3}
     assert list(store.records("left_turn")) == sorted(units)
-    assert set(store.states(units).values()) == {running.DONE}
+    assert set(store.states(units).values()) == {DONE}
 
 
 def test_a_unit_that_another_process_has_is_left_to_it(straight, tmp_path, monkeypatch):
@@ -116,7 +117,7 @@ def test_a_unit_that_another_process_has_is_left_to_it(straight, tmp_path, monke
     with store.lock(UNIT) as mine:
         assert mine
         assert compute(Task(UNIT, store)) == BUSY
-        assert store.states([UNIT])[UNIT] == running.RUNNING
+        assert store.states([UNIT])[UNIT] == RUNNING
 
 
 def test_a_unit_that_is_done_is_not_trained_again(straight, tmp_path, monkeypatch):
@@ -163,53 +164,45 @@ def test_damaged_records_are_refused_in_one_line(straight, tmp_path, damage):
 
 
 class TestIds:
-    def test_what_decides_changes_the_id(self, tmp_path, monkeypatch):
-        store = store_in(tmp_path)
-        human = write_human(store)
-        ids = [unit_id(GUIDED, TINY, store.humans)]
-
-        def add(unit=GUIDED, plan=TINY):
-            ids.append(unit_id(unit, plan, store.humans))
-
-        for other in (UNIT, GUIDED._replace(seed=2), GUIDED._replace(setting="biased")):
-            add(other)
-        for change in ({"steps": {"left_turn": 300}}, {"evaluation_runs": 3}, {"test_runs": 4}):
-            add(plan=replace(TINY, **change))
-        add(plan=replace(TINY, learner={"tau": 0.5}))
-        monkeypatch.setitem(
-            ALGORITHMS, "phil_td3", replace(ALGORITHMS["phil_td3"], advantage_weight=2.0)
-        )
-        add()
-        monkeypatch.undo()
-        monkeypatch.setattr(planned, "behaviour", lambda *_: "another scene")
-        add()
-        monkeypatch.undo()
-        human.unlink()
-        write_human(store, seed=2)
-        add()
-        assert len(set(ids)) == len(ids)
-
-    def test_what_does_not_decide_keeps_it(self, tmp_path):
+    def test_what_decides_changes_the_id_and_nothing_else_does(self, tmp_path, monkeypatch):
         store, elsewhere = store_in(tmp_path), store_in(tmp_path / "elsewhere")
-        for each in (store, elsewhere):
-            write_human(each)
+        human = write_human(store)
+        write_human(elsewhere)
         first = unit_id(GUIDED, TINY, store.humans)
         assert first == unit_id(GUIDED, replace(TINY, checkpoint_every=7), store.humans)
         assert first == unit_id(GUIDED, TINY, elsewhere.humans)
-        human = unit_id(UNIT, TINY, tmp_path / "nowhere")
-        assert human == unit_id(UNIT, TINY, store.humans), "nobody guides it"
+        unguided = unit_id(UNIT, TINY, store.humans)
+        assert unguided == unit_id(UNIT, TINY, tmp_path / "nowhere"), "nobody guides it"
+        plans: list[dict] = [
+            {"steps": {"left_turn": 300}},
+            {"evaluation_runs": 3},
+            {"test_runs": 4},
+            {"learner": {"tau": 0.5}},
+        ]
+        others = (GUIDED._replace(seed=2), GUIDED._replace(setting="biased"))
+        ids = [first, unguided, *(unit_id(other, TINY, store.humans) for other in others)]
+        ids += [unit_id(GUIDED, replace(TINY, **change), store.humans) for change in plans]
+        with monkeypatch.context() as patch:
+            row = replace(ALGORITHMS["phil_td3"], advantage_weight=2.0)
+            patch.setitem(ALGORITHMS, "phil_td3", row)
+            ids.append(unit_id(GUIDED, TINY, store.humans))
+        with monkeypatch.context() as patch:
+            patch.setattr(planned, "behaviour", lambda *_: "another scene")
+            ids.append(unit_id(GUIDED, TINY, store.humans))
+        human.unlink()
+        write_human(store, seed=2)
+        ids.append(unit_id(GUIDED, TINY, store.humans))
+        assert len(set(ids)) == len(ids)
 
     def test_tests_do_not_name_the_training(self, tmp_path):
         more = replace(TINY, test_runs=9)
         assert training_id(UNIT, TINY, tmp_path) == training_id(UNIT, more, tmp_path)
 
     def test_a_scene_that_does_another_thing_is_another_scene(self):
-        assert planned.behaviour("left_turn", "nominal") == planned.behaviour("left_turn", "noise")
-        assert planned.behaviour("left_turn", "nominal") != planned.behaviour(
-            "left_turn", "variant"
-        )
-        printed = planned.behaviour("left_turn", "nominal", printed_reward=True)
-        assert planned.behaviour("left_turn", "nominal") != printed
+        nominal = planned.behaviour("left_turn", "nominal")
+        assert planned.behaviour("left_turn", "noise") == nominal
+        assert planned.behaviour("left_turn", "variant") != nominal
+        assert planned.behaviour("left_turn", "nominal", printed_reward=True) != nominal
 
     @given(st.permutations(["a", "b", "c"]))
     def test_the_order_of_values_does_not_matter(self, names):

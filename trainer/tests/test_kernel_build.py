@@ -105,15 +105,15 @@ def test_two_processes_may_build_at_once(tmp_path: Path) -> None:
 
 
 @needs_kernel
-def test_a_changed_header_is_built_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_changed_source_is_built_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    source, header = tmp_path / "answer.cpp", tmp_path / "answer.h"
-    source.write_text('#include "answer.h"\nextern "C" int answer() { return ANSWER; }\n')
-    header.write_text("#define ANSWER 6\n")
-    assert kernel._built(source).answer() == 6
-    header.write_text("#define ANSWER 7\n")
-    assert kernel._built(source).answer() == 7
+    source = tmp_path / "answer.cpp"
+
+    def answer(number: int) -> int:
+        source.write_text(f'extern "C" int answer() {{ return {number}; }}\n')
+        return int(kernel._built(source).answer())
+
+    assert [answer(6), answer(7)] == [6, 7]
     # What was built before is found again.
     monkeypatch.setattr(kernel, "_build", lambda *arguments: pytest.fail("built again"))
-    header.write_text("#define ANSWER 6\n")
-    assert kernel._built(source).answer() == 6
+    assert answer(6) == 6

@@ -9,11 +9,10 @@ from bridge.network import LatencySpec, parse_spec
 from trainer.drivers import make_environment
 from trainer.evaluate import drive_episode
 from trainer.training.delayed import (
-    DirectWheel,
-    RemoteDriver,
-    RemoteWheel,
+    DelayedPolicy,
+    DirectPolicy,
     VehicleEnd,
-    make_wheel,
+    behind,
     ticks_late,
 )
 
@@ -26,6 +25,17 @@ class Brightness:
 
     def act(self, observation):
         return np.array([observation[1].mean() / 128.0 - 1.0], np.float32)
+
+
+class Remote:
+    """A driver behind a network."""
+
+    def __init__(self, driver, env, spec, seed):
+        self.driver, self.end = driver, VehicleEnd(env, spec, seed)
+        self.reset = driver.reset
+
+    def act(self, observation):
+        return self.end.tick(observation, self.driver.act)
 
 
 class Kept:
@@ -70,17 +80,17 @@ def answer(observation):
     return np.array([number(observation) / 100.0], np.float32)
 
 
-def drive_wheel(spec, ticks, seed=0, terminated=False, human=()):
-    """Drive a wheel over numbered observations; the reward of tick n is n."""
+def drive_delayed(spec, ticks, seed=0, terminated=False, human=()):
+    """Drive over numbered observations; the reward of tick n is n."""
     kept: Any = Kept()
-    wheel = RemoteWheel(kept, Car(), parse_spec(spec))
-    wheel.start(frames(0), seed)
+    delayed = DelayedPolicy(kept, Car(), parse_spec(spec))
+    delayed.start(frames(0), seed)
     actions = []
     for tick in range(ticks):
-        actions.append(float(wheel.act(frames(tick), answer)[0]))
+        actions.append(float(delayed.act(frames(tick), answer)[0]))
         end = terminated and tick == ticks - 1
         action = np.array([0.9 if tick in human else actions[-1]], np.float32)
-        wheel.store(action, float(tick), frames(tick + 1), end, tick in human)
+        delayed.store(action, float(tick), frames(tick + 1), end, tick in human)
     return kept.rows, actions
 
 
@@ -90,7 +100,7 @@ def test_a_perfect_network_is_none_to_the_bit(scenario):
     policy = Brightness()
     for seed in (0, 1):
         bare = drive_episode(env, policy, seed)
-        remote = RemoteDriver(policy, env, LatencySpec(), seed)
+        remote = Remote(policy, env, LatencySpec(), seed)
         assert drive_episode(env, remote, seed) == bare
 
 
@@ -103,7 +113,7 @@ def test_a_delayed_driver_is_another_and_the_same_each_time():
 
 
 def test_a_reward_stands_beside_the_action_that_earned_it():
-    rows, actions = drive_wheel("100ms", 8, terminated=True)
+    rows, actions = drive_delayed("100ms", 8, terminated=True)
     # Round trip 2 ticks: hands off in ticks 0 and 1; tick n obeys the answer to n - 2.
     assert actions == pytest.approx([0, 0, 0, 0.01, 0.02, 0.03, 0.04, 0.05])
     wanted = [(n, pytest.approx(n / 100), n + 2.0, n + 1, n == 5, False) for n in range(6)]
@@ -111,14 +121,14 @@ def test_a_reward_stands_beside_the_action_that_earned_it():
 
 
 def test_a_humans_action_stands_beside_what_the_policy_would_have_had_to_answer():
-    rows, _ = drive_wheel("100ms", 8, human=(4,))
+    rows, _ = drive_delayed("100ms", 8, human=(4,))
     (row,) = [row for row in rows if row[5]]
     assert row == (2, pytest.approx(0.9), 4.0, 3, False, True)
 
 
 @pytest.mark.parametrize("spec", ["up.loss=30%", "60ms+-50ms", "down.loss=20%,delay=120ms"])
 def test_every_tick_is_stored_with_what_was_carried_out(spec):
-    rows, actions = drive_wheel(spec, 60, seed=1)
+    rows, actions = drive_delayed(spec, 60, seed=1)
     late = ticks_late(parse_spec(spec))
     assert [row[0] for row in rows] == list(range(60 - late))
     assert all(row[3] == row[0] + 1 for row in rows)
@@ -129,7 +139,11 @@ def test_every_tick_is_stored_with_what_was_carried_out(spec):
 
 def test_a_car_that_hears_nothing_brakes_by_itself():
     end = VehicleEnd(Car(), parse_spec("up.loss=100%"), seed=0)
-    assert [end.tick(frames(tick), answer).braking for tick in range(4)] == [0, 0, 1, 1]
+    braked = []
+    for tick in range(4):
+        end.tick(frames(tick), answer)
+        braked.append(end.braking)
+    assert braked == [False, False, True, True]
 
 
 @pytest.mark.parametrize(
@@ -139,11 +153,12 @@ def test_a_car_that_hears_nothing_brakes_by_itself():
 def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
     assert ticks_late(parse_spec(spec)) == ticks
     end = VehicleEnd(Car(), parse_spec(spec), seed=0)
-    held = [end.tick(frames(tick), answer).step for tick in range(8)]
-    assert held[-1] == 7 - ticks
+    for tick in range(8):
+        end.tick(frames(tick), answer)
+    assert end.answered_step == 7 - ticks
 
 
 def test_without_a_network_nothing_is_between():
     kept: Any = Kept()
-    assert isinstance(make_wheel(kept, Car(), LatencySpec()), DirectWheel)
-    assert isinstance(make_wheel(kept, Car(), parse_spec("1ms")), RemoteWheel)
+    assert type(behind(LatencySpec(), kept, Car())) is DirectPolicy
+    assert type(behind(parse_spec("1ms"), kept, Car())) is DelayedPolicy

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trainer.learner.replay import ReplayBuffer
+from trainer.learner.replay import ReplayBuffer, SumTree
 
 
 def frame(value: int) -> np.ndarray:
@@ -202,9 +202,9 @@ def test_with_alpha_zero_all_are_drawn_alike_and_the_forgotten_never():
     source = Source(buffer)
     for _ in range(60):
         source.episode(1)
-    buffer.update_priorities(buffer._ledger.alive[:3], np.array([0.5, 2.0, 9.0]))
+    buffer.update_priorities(buffer._ring.alive[:3], np.array([0.5, 2.0, 9.0]))
     batch = buffer.sample(1000, np.random.default_rng(0))
-    assert set(batch.indices) == set(buffer._ledger.alive)
+    assert set(batch.indices) == set(buffer._ring.alive)
     np.testing.assert_allclose(batch.probabilities, 1 / len(buffer))
 
 
@@ -244,8 +244,8 @@ def test_a_restored_buffer_draws_the_same():
 
 def test_a_hundred_thousand_transitions_fit_into_400_mb():
     buffer = ReplayBuffer(100_000)
-    size = sum(value.nbytes for value in vars(buffer).values() if isinstance(value, np.ndarray))
-    size += buffer._ledger.frame_ids.nbytes
+    parts = [*vars(buffer).values(), *vars(buffer._ring).values()]
+    size = sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
     assert size + buffer._trees[0]._nodes.nbytes < 400e6
 
 
@@ -287,3 +287,47 @@ def test_a_slot_that_changes_hands_leaves_the_other_buffer():
     source.episode(10)
     assert buffer.human_count == 0
     assert not buffer.sample(64, np.random.default_rng(0)).human.any()
+
+
+weights_lists = st.lists(st.floats(0, 100), min_size=1, max_size=70)
+
+
+@given(weights_lists, st.lists(st.tuples(st.integers(0, 69), st.floats(0, 100)), max_size=40))
+def test_sums_agree_with_a_plain_array(weights, changes):
+    tree, plain = SumTree(len(weights)), np.array(weights)
+    tree[np.arange(len(weights))] = plain
+    for index, weight in changes:
+        index %= len(weights)
+        tree[np.array([index])] = np.array([weight])
+        plain[index] = weight
+    assert tree.total == pytest.approx(plain.sum())
+    np.testing.assert_allclose(tree[np.arange(len(plain))], plain)
+
+
+@given(weights_lists, st.floats(0, 1, exclude_max=True))
+def test_find_inverts_the_cumulative_sum(weights, share):
+    plain = np.array(weights)
+    if plain.sum() < 1e-6:
+        return
+    tree = SumTree(len(plain))
+    tree[np.arange(len(plain))] = plain
+    (found,) = tree.find(np.array([share * tree.total]))
+    assert plain[found] > 0
+    cumulative = np.cumsum(plain)
+    below = cumulative[found - 1] if found else 0.0
+    tolerance = 1e-9 * tree.total
+    assert below - tolerance <= share * tree.total <= cumulative[found] + tolerance
+
+
+def test_of_an_index_named_twice_the_last_weight_counts():
+    tree = SumTree(4)
+    tree[np.array([2, 2])] = np.array([5.0, 1.0])
+    assert tree.total == 1.0
+
+
+def test_samples_are_in_proportion_to_the_weights():
+    tree = SumTree(5)
+    tree[np.arange(5)] = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    drawn = tree.sample(10_000, np.random.default_rng(0))
+    shares = np.bincount(drawn, minlength=5) / 10_000
+    np.testing.assert_allclose(shares, [0.0, 0.1, 0.2, 0.3, 0.4], atol=0.01)

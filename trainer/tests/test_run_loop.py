@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bridge.network import parse_spec
 from trainer.learner import equations
 from trainer.tests.scripted import CONFIG, HUMAN, LEARNER, POLICY, scripted_run
-from trainer.training.delayed import make_wheel
+from trainer.training.delayed import behind
 from trainer.training.run import WRONG_ACTIONS
 
 
@@ -104,19 +104,19 @@ def test_exploration_falls_to_its_floor(tmp_path, monkeypatch):
         lambda scale, bound, drawn: np.full(len(drawn), scale, np.float32),
     )
     learner = replace(
-        LEARNER, exploration_initial=0.5, exploration_decay=0.5, exploration_final=0.1
+        LEARNER, exploration_initial=0.5, exploration_share=0.4, exploration_final=0.1
     )
     run = scripted_run(tmp_path, replace(CONFIG, episodes=5, learner=learner))
     reported: list[float] = []
     run.train(lambda metrics: reported.append(metrics.exploration_std))
-    stds = [0.5, 0.25, 0.125, 0.1, 0.1]
+    stds = [0.5, 0.3, 0.1, 0.1, 0.1]
     assert reported == pytest.approx(stds)
     assert run.env.actions == pytest.approx([POLICY + std for std in stds])
 
 
 def test_a_human_at_the_wheel_does_not_drive_against_the_brake_of_a_silent_network(tmp_path):
     run = scripted_run(tmp_path, CONFIG, length=7, human_steps=(4, 5))
-    run.wheel = make_wheel(run.learning, run.env, parse_spec("up.loss=100%"))
+    run.policy = behind(parse_spec("up.loss=100%"), run.learning, run.env)
     run.train()
     assert run.env.braked == [False, False, True, False, False, True, True]
 

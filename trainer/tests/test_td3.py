@@ -193,33 +193,6 @@ def test_critic_gradients_do_not_leak_from_the_actors_loss():
     assert torch.equal(*steps)
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_every_algorithm_updates_and_its_priorities_follow_its_row(name):
-    row = ALGORITHMS[name]
-    learner, batch = TD3Learner(SMALL, row, seed=0), make_batch()
-    losses = learner.update(batch)
-    assert np.isfinite(losses[:4]).all()
-    assert (losses.cloning > 0) == row.behaviour_cloning
-    plain = replace(ALGORITHMS["ia_td3"], penalty=row.penalty)
-    td_only = TD3Learner(SMALL, plain, seed=0).update(batch).priorities
-    human = batch.human
-    np.testing.assert_allclose(losses.priorities[~human], td_only[~human], rtol=1e-5)
-    if row.advantage_weight:
-        bare = row.human_td_weight * (td_only[human] - 1e-3) + 1e-3
-        assert (losses.priorities[human] > bare).all()
-    else:
-        expected = row.human_td_weight * (td_only[human] - 1e-3) + 1e-3
-        np.testing.assert_allclose(losses.priorities[human], expected, rtol=1e-4)
-
-
-def test_a_batch_without_humans_and_one_of_humans_only():
-    for humans in (0, 12):
-        learner = TD3Learner(replace(SMALL, split_loss=True), PHIL, seed=0)
-        losses = learner.update(make_batch(humans=humans))
-        assert np.isfinite(losses[:4]).all()
-        assert np.isfinite(losses.priorities).all()
-
-
 def test_same_seed_same_weights_and_a_restored_learner_goes_on_alike():
     first, second = (TD3Learner(SMALL, PHIL, seed=7) for _ in range(2))
     for seed in range(3):

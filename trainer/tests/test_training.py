@@ -17,12 +17,12 @@ from bridge.report import COLLISION
 from edge_runtime.cli import INTERRUPTED
 from edge_runtime.util import UserError
 from trainer import seeds
-from trainer.commands.train import _quit as ask_to_quit
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import ReplayBuffer
 from trainer.plots import moving_average, write_learning_curve
 from trainer.training import validation
+from trainer.training.command import _quit as ask_to_quit
 from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
@@ -89,7 +89,10 @@ def test_the_same_seed_gives_the_same_weights(trained, tmp_path):
 
 def test_a_run_in_two_parts_ends_with_the_same_weights_and_metrics(trained, tmp_path):
     directory = tmp_path / "parts"
-    train(replace(TINY, episodes=2), directory)
+    directory.mkdir()
+    first = TrainingRun(TINY, directory)
+    first.train(lambda _: setattr(first, "quitting", True))
+    assert first.episode == 2
     resumed = train(TINY, directory, resume=True)
     assert torch.equal(actor_weights(trained), actor_weights(resumed))
     for ours, whole in zip(read_metrics(directory), read_metrics(trained.run_dir), strict=True):

@@ -93,44 +93,25 @@ def test_a_human_model_is_not_written_over(capsys, tmp_path):
     assert len(list(tmp_path.iterdir())) == 2
 
 
-class Work:
-    """Notes that it was asked to end."""
-
-    def __init__(self, over: bool = False) -> None:
-        self.over, self.asked = over, 0
-
-    def quit(self) -> bool:
-        self.asked += 1
-        return not self.over
-
-
 @pytest.mark.parametrize("number", SIGNALS)
-def test_the_first_signal_asks_to_stop(number):
-    work = Work()
-    with quit_on_signals(work.quit):
-        signal.raise_signal(number)
-        assert work.asked == 1
+@pytest.mark.parametrize("heeded", [True, False])
+def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number, heeded):
+    before, asked = [signal.getsignal(each) for each in SIGNALS], []
 
+    def ask():
+        asked.append(number)
+        return heeded
 
-def test_the_second_interrupt_is_one():
-    work = Work()
-    with quit_on_signals(work.quit):
-        signal.raise_signal(signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert work.asked == 1
-
-
-def test_when_the_work_is_over_the_first_interrupt_is_one():
-    with quit_on_signals(Work(over=True).quit), pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
-
-
-def test_afterwards_all_is_as_it_was():
-    before = [signal.getsignal(number) for number in SIGNALS]
-    with quit_on_signals(Work().quit):
-        assert [signal.getsignal(number) for number in SIGNALS] != before
-    assert [signal.getsignal(number) for number in SIGNALS] == before
+    with quit_on_signals(ask):
+        assert [signal.getsignal(each) for each in SIGNALS] != before
+        if heeded:
+            signal.raise_signal(number)
+            assert asked == [number]
+        if number == signal.SIGINT:
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(number)
+            assert asked == [number]
+    assert [signal.getsignal(each) for each in SIGNALS] == before
 
 
 @pytest.mark.parametrize("offset", [0.0, -1e-3, 1e-45, float("inf"), float("nan")])

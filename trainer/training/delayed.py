@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,22 +25,10 @@ from numpy.typing import NDArray
 from bridge.network import LatencySpec
 from bridge.virtual_link import COMMAND_WINDOW_S, ROUNDING_S, VirtualLink
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command
-from trainer.human.guide import Driver
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
 Policy = Callable[[Observation], Action]
-
-
-@dataclass(frozen=True)
-class Held:
-    """What the vehicle does in one tick."""
-
-    action: Action
-    step: int
-    """The tick whose state the obeyed command answers; -1 before the first command."""
-    braking: bool
-    """The vehicle brakes: no command has come for 2 T, or the command is a safe stop."""
 
 
 class VehicleEnd:
@@ -57,57 +44,44 @@ class VehicleEnd:
         self.env = env
         self._link: VirtualLink[Observation] = VirtualLink(spec, seed)
         self._step = 0
+        self.braking = False
+        """The vehicle brakes: no command has come for 2 T, or the command is a safe stop."""
 
-    def tick(self, observation: Observation, policy: Policy) -> Held:
+    @property
+    def answered_step(self) -> int:
+        """The tick whose state the obeyed command answers; -1 before the first command."""
+        return self._link.hold.newest_step
+
+    def tick(self, observation: Observation, policy: Policy) -> Action:
         """Send the tick's observation, let the policy answer all that arrive, and decide.
 
         The policy is asked for each fresh observation that reaches the edge within the tick: often
         one, but none or several where the network drops, delays or bundles them.
+
+        Returns:
+            What the vehicle does, float32 [action size].
         """
         self._link.send_state(self._step, observation)
         self._step += 1
         while arrival := self._link.next_at_edge():
             if not arrival.overtaken:
                 self._link.answer(arrival, _command(arrival.step, policy(arrival.message)))
-        return self._decide()
-
-    def release_brake(self) -> None:
-        """Until the next tick: whoever is in the car has taken over."""
-        self._press_brake(False)
-
-    def _decide(self) -> Held:
         decision = self._link.decide()
-        braking = bool(decision.brake_reason)
-        self._press_brake(braking)
-        if braking:
-            action = self.env.brake_action
+        self.press_brake(bool(decision.brake_reason))
+        if self.braking:
+            action: Action = self.env.brake_action
         elif decision.command is None:
             action = np.zeros(self.env.action_space.shape, np.float32)
         else:
             action = np.array(decision.command.action, np.float32)
-        return Held(action, self._link.hold.newest_step, braking)
+        return action
 
-    def _press_brake(self, pressed: bool) -> None:
-        """A scenario whose action only steers has a brake beside it."""
+    def press_brake(self, pressed: bool) -> None:
+        """Brake or not until the next tick: a scenario whose action only steers has a pedal."""
+        self.braking = pressed
         press = getattr(self.env, "press_brake", None)
         if press is not None:
             press(pressed)
-
-
-class RemoteDriver:
-    """A driver behind a network, for one episode that begins now."""
-
-    def __init__(self, driver: Driver, env: Any, spec: LatencySpec, seed: int) -> None:
-        self.driver = driver
-        self.vehicle_end = VehicleEnd(env, spec, seed)
-
-    def reset(self) -> None:
-        """Forget the last episode."""
-        self.driver.reset()
-
-    def act(self, observation: Observation) -> Action:
-        """What the vehicle does, float32 [action size]; once a control period."""
-        return self.vehicle_end.tick(observation, self.driver.act).action
 
 
 def _command(step: int, action: Action) -> Command:
@@ -125,7 +99,7 @@ def _command(step: int, action: Action) -> Command:
 
 
 class Store(Protocol):
-    """The part of a learner that a wheel needs."""
+    """What takes transitions: a learner, or a buffer before it."""
 
     def start_episode(self, observation: Observation) -> None:
         """Take an episode's first observation."""
@@ -143,61 +117,40 @@ class Store(Protocol):
         """Store a transition that led to ``observation``; arguments as ``ReplayBuffer.add``."""
 
 
-class Wheel(Protocol):
-    """What the training loop asks for: actions as the vehicle has them, and storing."""
+class DirectPolicy:
+    """A policy as the training loop has it, without a network: it acts on what is there.
+
+    Args:
+        store: where each tick goes as a transition.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
 
     def start(self, observation: Observation, seed: int) -> None:
-        """Begin an episode."""
+        """Begin an episode; a network's luck depends on the seed."""
+        self._store.start_episode(observation)
 
     def act(self, observation: Observation, policy: Policy) -> Action:
         """What the vehicle is told in the tick of this observation."""
-        ...
+        return policy(observation)
 
     def yield_to_human(self) -> None:
         """A human has taken over in this tick: only what they do moves the vehicle."""
 
     def store(
-        self,
-        action: Action,
-        reward: float,
-        observation: Observation,
-        terminated: bool,
-        human: bool,
-        overruled: Action | None = None,
-        penalised: bool = False,
-    ) -> None:
-        """Keep the tick that led to ``observation``; arguments as ``ReplayBuffer.add``."""
-
-
-class DirectWheel:
-    """No network: the policy acts on what is there."""
-
-    def __init__(self, learning: Store) -> None:
-        self._learning = learning
-
-    def start(self, observation: Observation, seed: int) -> None:
-        """Begin an episode."""
-        self._learning.start_episode(observation)
-
-    def act(self, observation: Observation, policy: Policy) -> Action:
-        """The policy's action."""
-        return policy(observation)
-
-    def yield_to_human(self) -> None:
-        """The policy's action is not carried out; nothing else holds the vehicle."""
-
-    def store(
         self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
     ) -> None:
-        """Every tick is a transition."""
-        self._learning.add(action, reward, observation, *rest, **guidance)
+        """Keep the tick that led to ``observation``; arguments as ``Store.add``."""
+        self._store.add(action, reward, observation, *rest, **guidance)
 
 
-class RemoteWheel:
+class DelayedPolicy(DirectPolicy):
     """The policy behind a network, in virtual time."""
 
-    def __init__(self, learning: Store, env: Any, spec: LatencySpec) -> None:
-        self._learning, self._env, self._spec = learning, env, spec
+    def __init__(self, store: Store, env: Any, spec: LatencySpec) -> None:
+        super().__init__(store)
+        self._env, self._spec = env, spec
         self._known: deque[Observation] = deque(maxlen=ticks_late(spec) + 1)
         """Observations of the ticks n - d to n."""
         self._storing = False
@@ -212,21 +165,20 @@ class RemoteWheel:
         """What the vehicle does: the newest command, or the brake."""
         self._known.append(observation)
         if not self._storing and len(self._known) == self._known.maxlen:
-            self._learning.start_episode(self._known[0])
+            self._store.start_episode(self._known[0])
             self._storing = True
-        return self._vehicle_end.tick(observation, policy).action
+        return self._vehicle_end.tick(observation, policy)
 
     def yield_to_human(self) -> None:
         """The vehicle lets go of the brake that it may have pressed for want of commands."""
-        self._vehicle_end.release_brake()
+        self._vehicle_end.press_brake(False)
 
     def store(
         self, action: Action, reward: float, observation: Observation, *rest: Any, **guidance: Any
     ) -> None:
         """Keep the tick; the first d of an episode answer to nothing the policy could know."""
         if self._storing:
-            following = [*self._known, observation][1]
-            self._learning.add(action, reward, following, *rest, **guidance)
+            super().store(action, reward, [*self._known, observation][1], *rest, **guidance)
 
 
 def ticks_late(spec: LatencySpec) -> int:
@@ -236,6 +188,6 @@ def ticks_late(spec: LatencySpec) -> int:
     return math.ceil(beyond_window_s / CONTROL_PERIOD_S)
 
 
-def make_wheel(learning: Store, env: Any, spec: LatencySpec) -> Wheel:
-    """The wheel for a network; ``none`` is no network."""
-    return DirectWheel(learning) if spec == LatencySpec() else RemoteWheel(learning, env, spec)
+def behind(spec: LatencySpec, store: Store, env: Any) -> DirectPolicy:
+    """The policy behind a network; ``none`` is no network."""
+    return DirectPolicy(store) if spec == LatencySpec() else DelayedPolicy(store, env, spec)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
@@ -23,7 +24,6 @@ from trainer.learner.config import Algorithm, LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
 from trainer.training.delayed import Store
-from trainer.util import as_arrays, as_tensors
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
@@ -35,20 +35,16 @@ class Learning(Store, Protocol):
     @property
     def added(self) -> int:
         """Transitions stored since the run began."""
-        ...
 
     @property
     def learner(self) -> TD3Learner:
         """The networks, as of the last finished update."""
-        ...
 
     def act(self, observation: Observation) -> Action:
         """The actor's action, float32 [action size]; not while updating."""
-        ...
 
     def act_together(self, observations: Observation, averaged: bool) -> Action:
         """The actor's actions, or the target actor's, [n, action size]; not while updating."""
-        ...
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
@@ -56,25 +52,17 @@ class Learning(Store, Protocol):
     def finish(self) -> float:
         """Wait until the update that was begun is done, if one was; the seconds waited.
 
-        Raises:
-            FloatingPointError: what it has learned is not finite; it may come out later, too.
+        FloatingPointError: what it has learned is not finite; it may come out later, too.
         """
-        ...
 
     def end_episode(self, progress: float) -> EpisodeLearning:
         """What was learned since the last call; learning rates fall.
 
-        Args:
-            progress: share of the run that is over, 0 to 1.
-
-        Raises:
-            FloatingPointError: it is not finite.
+        ``progress`` is the share of the run that is over. FloatingPointError: it is not finite.
         """
-        ...
 
     def state_dict(self) -> dict[str, Any]:
         """All that is needed to go on."""
-        ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""
@@ -98,29 +86,6 @@ class EpisodeLearning:
 
 
 NO_LOSSES = (math.nan,) * 4
-
-
-class LearningDriver:
-    """The policy that is being learned at the wheel, asked where it is learned.
-
-    Args:
-        learning: where.
-        averaged: whether the target actor drives, the running average of the one that learns.
-    """
-
-    def __init__(self, learning: Learning, averaged: bool) -> None:
-        self.learning, self.averaged = learning, averaged
-
-    def reset(self) -> None:
-        """Networks have no memory."""
-
-    def act(self, observation: Observation) -> Action:
-        """The action, float32 [action size]; not while an update is under way."""
-        return self.act_together(observation[None])[0]
-
-    def act_together(self, observations: Observation) -> Action:
-        """The same for observations [n, 2, 45, 80]: float32 [n, action size]."""
-        return self.learning.act_together(observations, self.averaged)
 
 
 class LearningThread:
@@ -246,14 +211,17 @@ class LearningThread:
         """All that is needed to go on."""
         return {
             "learner": self.learner.state_dict(),
-            "replay": as_tensors(self.replay.state_dict()),
+            "replay": {
+                name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+                for name, value in self.replay.state_dict().items()
+            },
             "drawing": self._random.bit_generator.state,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""
         self.learner.load_state_dict(state["learner"])
-        self.replay.load_state_dict(as_arrays(state["replay"]))
+        self.replay.load_state_dict(state["replay"])
         self._random.bit_generator.state = state["drawing"]
 
     def close(self) -> None:

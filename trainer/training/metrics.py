@@ -16,59 +16,8 @@ from torch.utils.tensorboard import SummaryWriter
 from bridge.report import GOAL
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer.training.learning import EpisodeLearning
 
-
-@dataclass
-class Tally:
-    """Sums over one training episode."""
-
-    rewards: float = 0.0
-    interventions: int = 0
-    human_steps: int = 0
-    steps: int = 0
-    environment_s: float = 0.0
-    acting_s: float = 0.0
-    storing_s: float = 0.0
-
-    def summary(
-        self,
-        episode: int,
-        total_steps: int,
-        updates: int,
-        exploration_std: float,
-        learned: EpisodeLearning,
-        info: dict[str, Any],
-    ) -> EpisodeMetrics:
-        """The episode's metrics; ``info`` is that of its last step."""
-        return EpisodeMetrics(
-            episode=episode,
-            total_steps=total_steps,
-            updates=updates,
-            steps=self.steps,
-            episode_return=float(self.rewards),
-            distance_m=float(info["distance_m"]),
-            outcome=info["outcome"],
-            interventions=self.interventions,
-            human_steps=self.human_steps,
-            exploration_std=exploration_std,
-            critic_loss=learned.critic_loss,
-            policy_loss=learned.policy_loss,
-            cloning_loss=learned.cloning_loss,
-            value=learned.value,
-            policy_priority=learned.policy_priority,
-            human_priority=learned.human_priority,
-            environment_s=self.environment_s,
-            acting_s=self.acting_s,
-            storing_s=self.storing_s,
-            learning_s=learned.learning_s,
-            waiting_s=learned.waiting_s,
-            validation_success=float("nan"),
-            validation_distance_m=float("nan"),
-            validation_reward=float("nan"),
-        )
-
-
+NAN = float("nan")
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
 ALWAYS = (
     "episode",
@@ -88,41 +37,41 @@ class EpisodeMetrics:
     """One training episode; a mean over its steps or updates where not said otherwise."""
 
     episode: int
-    total_steps: int
+    total_steps: int = 0
     """Environment steps since the run began."""
-    updates: int
+    updates: int = 0
     """Updates since the run began."""
-    steps: int
-    episode_return: float
+    steps: int = 0
+    episode_return: float = 0.0
     """Sum of the rewards, without the shaping of eq. 17."""
-    distance_m: float
+    distance_m: float = 0.0
     """Surviving distance."""
-    outcome: str
-    interventions: int
-    human_steps: int
-    exploration_std: float
-    critic_loss: float
-    policy_loss: float
-    cloning_loss: float
-    value: float
+    outcome: str = ""
+    interventions: int = 0
+    human_steps: int = 0
+    exploration_std: float = 0.0
+    critic_loss: float = NAN
+    policy_loss: float = NAN
+    cloning_loss: float = NAN
+    value: float = NAN
     """Mean Q_1 of the batches."""
-    policy_priority: float
+    policy_priority: float = NAN
     """Mean priority of the policy's transitions at the episode's end."""
-    human_priority: float
-    environment_s: float
+    human_priority: float = NAN
+    environment_s: float = 0.0
     """Time spent in the environment and with the human, while the learner updates."""
-    acting_s: float
+    acting_s: float = 0.0
     """Time of the policy's actions."""
-    storing_s: float
+    storing_s: float = 0.0
     """Time of drawing minibatches, storing steps and their new priorities."""
-    learning_s: float
+    learning_s: float = 0.0
     """Time of the updates themselves, beside the parts above."""
-    waiting_s: float
+    waiting_s: float = 0.0
     """How long the loop waited for an update after the environment's step was done."""
-    validation_success: float
+    validation_success: float = NAN
     """Success rate on the validation seeds (nan where the episode ended without one)."""
-    validation_distance_m: float
-    validation_reward: float
+    validation_distance_m: float = NAN
+    validation_reward: float = NAN
     """Mean of the episodes' sums of rewards: between equal success rates it decides which actor is
     kept."""
 

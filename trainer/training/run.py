@@ -23,13 +23,12 @@ from trainer.learner import equations
 from trainer.learner.config import ALGORITHMS, HUMANS_ACTION
 from trainer.learner.td3 import TD3Learner
 from trainer.training.config import BIASED, RunConfig
-from trainer.training.delayed import make_wheel
+from trainer.training.delayed import behind
 from trainer.training.learning import Action, Learning, LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
     MetricsWriter,
-    Tally,
     read_metrics,
     totals,
 )
@@ -112,7 +111,7 @@ class TrainingRun:
         )
         self.network = parse_spec(config.latency)
         self.validation = Validation(config, run_dir, self.learning, self.network)
-        self.wheel = make_wheel(self.learning, self.env, self.network)
+        self.policy = behind(self.network, self.learning, self.env)
         self.guide = self._make_guide()
         self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
         self.guidance = seeds.stream(config.seed, seeds.GUIDANCE)
@@ -232,32 +231,34 @@ class TrainingRun:
         return HumanGuide(driver, trigger)
 
     def _episode(self) -> EpisodeMetrics:
-        config, tally = self.config, Tally()
+        config, metrics = self.config, EpisodeMetrics(self.episode)
         seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
-        self.wheel.start(observation, seed)
+        self.policy.start(observation, seed)
         self._drawn = np.zeros(self.env.action_space.shape)
         guided = self.guide is not None and config.guided(self.episode, self.steps)
         if self.guide is not None:
             self.guide.reset()
         ended = False
         while not ended:
-            observation, ended, info = self._step(observation, guided, tally)
-        return tally.summary(
-            self.episode,
-            self.steps + tally.steps,
-            self.learning.learner.updates,
-            self._exploration_std(),
-            self.learning.end_episode(self.progress),
-            info,
+            observation, ended, info = self._step(observation, guided, metrics)
+        return replace(
+            metrics,
+            total_steps=self.steps + metrics.steps,
+            updates=self.learning.learner.updates,
+            episode_return=float(metrics.episode_return),
+            distance_m=float(info["distance_m"]),
+            outcome=info["outcome"],
+            exploration_std=self._exploration_std(),
+            **vars(self.learning.end_episode(self.progress)),
         )
 
     def _step(
-        self, observation: NDArray[np.uint8], guided: bool, tally: Tally
+        self, observation: NDArray[np.uint8], guided: bool, metrics: EpisodeMetrics
     ) -> tuple[NDArray[np.uint8], bool, dict[str, Any]]:
         """One control period: act, let the human take over and the car move; meanwhile, learn."""
         began_s = time.perf_counter()
-        policy_action = self.wheel.act(observation, self._explore)
+        policy_action = self.policy.act(observation, self._explore)
         acted_s = time.perf_counter()
         if self.learning.added >= self.config.learner.warmup_steps:
             self.learning.begin(self._beta())
@@ -267,12 +268,12 @@ class TrainingRun:
             intervention = self._spoil(self.guide.watch(observation, policy_action))
         human_action = None if intervention is None else intervention.action
         if intervention is not None:
-            self.wheel.yield_to_human()
+            self.policy.yield_to_human()
         action = equations.masked_action(policy_action, human_action)
         next_observation, reward, terminated, truncated, info = self.env.step(action)
         moved_s = time.perf_counter()
         waited_s = self.learning.finish()
-        self.wheel.store(
+        self.policy.store(
             action,
             self._shape(reward, intervention),
             next_observation,
@@ -282,13 +283,13 @@ class TrainingRun:
             penalised=self._penalises(intervention),
         )
         stored_s = time.perf_counter()
-        tally.steps += 1
-        tally.rewards += reward
-        tally.human_steps += intervention is not None
-        tally.interventions += intervention is not None and intervention.first
-        tally.acting_s += acted_s - began_s
-        tally.environment_s += moved_s - begun_s
-        tally.storing_s += begun_s - acted_s + stored_s - moved_s - waited_s
+        metrics.steps += 1
+        metrics.episode_return += reward
+        metrics.human_steps += intervention is not None
+        metrics.interventions += intervention is not None and intervention.first
+        metrics.acting_s += acted_s - began_s
+        metrics.environment_s += moved_s - begun_s
+        metrics.storing_s += begun_s - acted_s + stored_s - moved_s - waited_s
         if self.on_step is not None:
             speed_mps = float(info["speed_mps"])
             self.on_step(Seen(observation, policy_action, intervention, action, speed_mps))
@@ -319,7 +320,8 @@ class TrainingRun:
 
     def _exploration_std(self) -> float:
         c = self.config.learner
-        return max(c.exploration_final, c.exploration_initial * c.exploration_decay**self.episode)
+        left = max(0.0, 1.0 - self.progress / c.exploration_share)
+        return c.exploration_final + (c.exploration_initial - c.exploration_final) * left
 
     def _penalises(self, intervention: Intervention | None) -> bool:
         """Whether an intervention begins that the policy is to be penalised for (eq. 17)."""

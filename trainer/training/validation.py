@@ -11,12 +11,23 @@ import numpy as np
 from bridge.network import LatencySpec
 from bridge.report import GOAL, EpisodeResult
 from trainer import seeds
-from trainer.drivers import BEST_FILE, make_environment
+from trainer.drivers import BEST_FILE, NetworkDriver, make_environment
 from trainer.evaluate import NO_NETWORK, drive_episodes, drive_together
 from trainer.training.config import RunConfig
-from trainer.training.learning import Learning, LearningDriver
+from trainer.training.learning import Action, Learning, Observation
 from trainer.training.metrics import EpisodeMetrics
 from trainer.util import save_torch
+
+
+class LearningDriver(NetworkDriver):
+    """The policy that is being learned, or its running average, asked where it is learned."""
+
+    def __init__(self, learning: Learning, averaged: bool) -> None:
+        self.learning, self.averaged = learning, averaged
+
+    def act_together(self, observations: Observation) -> Action:
+        """Actions float32 [n, action size] for observations [n, 2, 45, 80]."""
+        return self.learning.act_together(observations, self.averaged)
 
 
 class Validation:

@@ -96,15 +96,12 @@ def test_power_on_by_hand():
     assert first.last(0x221) == bytes(8)
 
 
-def test_the_documented_start_moves_it_at_the_golden_speed():
-    bench = enabled(SLOW_AHEAD)
+@pytest.mark.parametrize("frame", [SLOW_AHEAD, TURNED])
+def test_the_documented_start_moves_it_by_the_golden_frames(frame):
+    bench = enabled(frame)
     assert bench.last(0x211)[1] == 1
     assert bench.last(0x211)[6] == 0
-    assert bench.last(0x221) == bytes.fromhex("00 96 00 00 00 00 00 00")
-
-
-def test_the_golden_angle_turns_the_inner_wheel():
-    assert enabled(TURNED).last(0x221) == bytes.fromhex("00 00 00 00 00 00 00 C8")
+    assert bench.last(0x221) == frame[1]
 
 
 @pytest.mark.parametrize(
@@ -216,22 +213,14 @@ def test_undervoltage_is_the_batterys_and_its_motors_say_so():
         assert data[5] & 1
 
 
-def test_the_emergency_stop_gives_control_back_when_it_is_released():
+@pytest.mark.parametrize(("name", "byte", "shown"), [("estop", 0, 1), ("remote", 1, 2)])
+def test_a_person_outranks_the_bus_and_gives_control_back(name, byte, shown):
     bench = enabled(FAST_AHEAD)
-    bench.switch("estop")
-    assert bench.run(1.0, FAST_AHEAD).hunter.body.stands
-    assert bench.last(0x211)[0] == 1
-    bench.switch("estop", on=False)
-    assert not bench.run(1.0, FAST_AHEAD).hunter.body.stands
-
-
-def test_the_remote_outranks_the_bus_and_gives_it_back():
-    bench = enabled(FAST_AHEAD)
-    bench.switch("remote")
+    bench.switch(name)
     bench.send(CAN_MODE)
     assert bench.run(1.0, FAST_AHEAD).hunter.body.stands
-    assert mode(bench) == 2
-    bench.switch("remote", on=False)
+    assert bench.last(0x211)[byte] == shown
+    bench.switch(name, on=False)
     assert not bench.run(1.0, FAST_AHEAD).hunter.body.stands
 
 

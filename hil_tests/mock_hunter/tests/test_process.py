@@ -1,6 +1,5 @@
 """The mock on a bus: inside one process on `virtual`, and as a process of its own."""
 
-import io
 import sys
 import threading
 import time
@@ -15,7 +14,7 @@ from hil_tests.__main__ import main
 from hil_tests.faults.rig import ChassisProcess, free_bus
 from hil_tests.mock_hunter.body import MODELS
 from hil_tests.mock_hunter.hunter import MockHunter
-from hil_tests.mock_hunter.process import Orders, Server, parse_switch
+from hil_tests.mock_hunter.process import Server, parse_switch, read_orders
 from hil_tests.processes import wait_until
 
 PATIENCE_S = 5.0
@@ -125,15 +124,9 @@ def test_orders_that_are_none_are_refused(line):
 
 
 def test_orders_come_in_turn_and_bad_ones_are_told():
-    told: list[str] = []
-    orders = Orders(io.StringIO("remote on\nmeteor on\nremote off\n"), told.append)
     found: list[tuple[str, bool]] = []
-
-    def both():
-        found.extend(orders.newest())
-        return len(found) == 2
-
-    wait_until(both, "two orders")
+    told: list[str] = []
+    read_orders(["remote on\n", "meteor on\n", "remote off\n"], found.append, told.append)
     assert found == [("remote", True), ("remote", False)]
     assert len(told) == 1
 

@@ -60,10 +60,8 @@ def load(name: str) -> ctypes.CDLL | None:
 def _built(source: Path) -> ctypes.CDLL:
     """The library of this source, compiler and processor: from the cache, or built now."""
     compiler = _compiler()
-    # Every header beside it, included or not: none can be forgotten.
-    code = [file.read_bytes() for file in (source, *sorted(source.parent.glob("*.h")))]
-    settings = "\0".join([*compiler, *_FLAGS, _OPENMP, _processor()]).encode()
-    key = b"\0".join([settings, *code])
+    settings = "\0".join([*compiler, *_FLAGS, _OPENMP, _processor(), ""]).encode()
+    key = settings + source.read_bytes()
     library = _cache() / f"{source.stem}-{hashlib.sha256(key).hexdigest()[:16]}.so"
     if not library.exists():
         _build(compiler, source, library)
@@ -78,31 +76,18 @@ def _build(compiler: list[str], source: Path, library: Path) -> None:
         # A compiler without OpenMP still gives a kernel of one thread.
         for openmp in ([_OPENMP], []):
             command = [*compiler, *_FLAGS, *openmp, "-o", str(target), str(source)]
-            failure = _failure(command)
-            if failure is None:
+            try:
+                done = subprocess.run(
+                    command, capture_output=True, text=True, errors="replace",
+                    timeout=_TIMEOUT_S, check=False,
+                )  # fmt: skip
+            except (OSError, subprocess.TimeoutExpired) as error:
+                raise _BuildError(f"{command[0]} cannot be run: {error}") from error
+            if done.returncode == 0:
                 os.replace(target, library)
                 return
-    raise _BuildError(failure)
-
-
-def _failure(command: list[str]) -> str | None:
-    """Run the compiler; the first line of its complaint, or None if it had none."""
-    try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=_TIMEOUT_S,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        return f"{command[0]} cannot be run: {error}"
-    if done.returncode == 0:
-        return None
-    lines = done.stderr.splitlines()
-    worst = next((line for line in lines if "error" in line), f"status {done.returncode}")
-    return f"{command[0]} failed: {worst}"
+    errors = (line for line in done.stderr.splitlines() if "error" in line)
+    raise _BuildError(f"{command[0]} failed: {next(errors, f'status {done.returncode}')}")
 
 
 def _compiler() -> list[str]:
@@ -186,22 +171,17 @@ def _served(frames: Tensor, parameters: tuple[Tensor, ...]) -> bool:
     """Whether the kernel can do it."""
     if torch.compiler.is_compiling() or torch.jit.is_tracing() or torch.onnx.is_in_onnx_export():
         return False
-    shapes: tuple[tuple[int, ...], ...] = (
+    shapes = (
         (_FILTERS1, frames.shape[1], _SIDE, _SIDE),
         (_FILTERS1,),
         (_FILTERS2, _FILTERS1, _SIDE, _SIDE),
         (_FILTERS2,),
     )
+    found = [(each.dtype, each.device.type, tuple(each.shape)) for each in parameters]
     return (
-        frames.dtype == torch.uint8
-        and frames.device.type == "cpu"
+        (frames.dtype, frames.device.type) == (torch.uint8, "cpu")
         and frames.shape[1:] in ((1, *_FRAME), (2, *_FRAME))
-        and all(
-            parameter.dtype == torch.float32
-            and parameter.device.type == "cpu"
-            and parameter.shape == shape
-            for parameter, shape in zip(parameters, shapes, strict=True)
-        )
+        and found == [(torch.float32, "cpu", shape) for shape in shapes]
         and _library() is not None
     )
 

@@ -3,17 +3,484 @@
 //   frames [n, 45, 80] -> 6x6 convolution,  6 filters -> 2x2 max pooling, ReLU -> [6, 20, 37]
 //                      -> 6x6 convolution, 16 filters -> 2x2 max pooling, ReLU -> [16, 7, 16]
 //
-// How is told in trunk_forward.h and trunk_backward.h.
-//
 // Images are independent tasks; gradients are summed in chunks of fixed size and then in order, so
 // that no result depends on the number of threads.
 
+#include <algorithm>
+#include <cstddef>
 #include <cstdint>
+#include <cstring>
+#include <memory>
 #include <type_traits>
+#include <vector>
 
-#include "trunk_backward.h"
-#include "trunk_forward.h"
-#include "trunk_layers.h"
+#if defined(__AVX512BF16__)
+#include <immintrin.h>
+#endif
+
+namespace {
+
+// Vectors, and the sizes of the networks' two layers.
+
+#if defined(__AVX512F__)
+constexpr int LANES = 16, REGISTERS = 32;
+#elif defined(__AVX__)
+constexpr int LANES = 8, REGISTERS = 16;
+#elif defined(__aarch64__)
+constexpr int LANES = 4, REGISTERS = 32;
+#else
+constexpr int LANES = 4, REGISTERS = 16;
+#endif
+typedef float Vector __attribute__((vector_size(4 * LANES)));
+typedef int32_t Integers __attribute__((vector_size(4 * LANES)));
+typedef uint8_t Bytes __attribute__((vector_size(LANES)));
+// The same at an address that need not be aligned.
+typedef float LooseVector __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
+typedef uint8_t LooseBytes __attribute__((vector_size(LANES), aligned(1), may_alias));
+
+inline Vector load(const float* from) { return *reinterpret_cast<const LooseVector*>(from); }
+inline void store(float* to, Vector value) { *reinterpret_cast<LooseVector*>(to) = value; }
+
+#if defined(__AVX512BF16__)
+typedef uint32_t Pair;  // of bfloat16: the even channel in the lower half
+inline uint32_t bfloat16(float value) {
+    uint32_t bits;
+    std::memcpy(&bits, &value, sizeof bits);
+    return (bits + 0x7fff + (bits >> 16 & 1)) >> 16;  // to nearest, ties to even
+}
+inline void pack(const float (&channels)[2], Pair* to) {
+    *to = bfloat16(channels[0]) | bfloat16(channels[1]) << 16;
+}
+inline Vector add_product(Vector sum, Pair weight, const Pair* plane) {
+    return _mm512_dpbf16_ps(sum, (__m512bh)_mm512_loadu_si512(plane),
+                            (__m512bh)_mm512_set1_epi32(weight));
+}
+#else
+typedef float Pair;
+#endif
+inline void pack(const float (&channel)[1], float* to) { *to = channel[0]; }
+inline Vector add_product(Vector sum, float weight, const float* plane) {
+    return sum + weight * load(plane);
+}
+
+constexpr int vectors(int floats) { return (floats + LANES - 1) / LANES; }
+
+constexpr int SIDE = 6;                // of a filter
+constexpr int PRODUCTS = 9, TAPS = 9;  // see below
+constexpr int WIDE = REGISTERS / 16;   // vectors of positions computed together
+constexpr uint8_t OFF = 4;             // in the place of a winner (0..3): ReLU is off
+
+// A layer: its image, and the pooled outputs that are used, ROWS x COLUMNS. They are numbered along
+// rows of PITCH and computed up to SIZE, so that no loop has a remainder. The surplus is not used.
+template <int CHANNELS_, int IMAGE_PITCH_, int IMAGE_SIZE_, int FILTERS_, int GROUP_, int ROWS_,
+          int COLUMNS_>
+struct Layer {
+    static constexpr int CHANNELS = CHANNELS_, IMAGE_PITCH = IMAGE_PITCH_, IMAGE_SIZE = IMAGE_SIZE_;
+    static constexpr int FILTERS = FILTERS_, GROUP = GROUP_;  // GROUP filters computed together
+    static constexpr int ROWS = ROWS_, COLUMNS = COLUMNS_, PITCH = COLUMNS + 2;
+    static constexpr int SIZE = (ROWS * PITCH + 63) / 64 * 64, OUTPUTS = FILTERS * SIZE;
+    static constexpr int PLANE = SIZE + 2 * PITCH + 2, PLANES = PRODUCTS * CHANNELS * PLANE;
+    // A single channel has nothing to be paired with.
+    template <typename Cell>
+    using Fitting = std::conditional_t<CHANNELS % 2 == 0, Cell, float>;
+    template <typename Cell>
+    static constexpr int PACKED = std::is_same_v<Cell, float> ? 1 : 2;  // channels in a cell
+    template <typename Cell>
+    static constexpr int STACKS = CHANNELS / PACKED<Cell>;
+    // Backward, channels are innermost; 6 are padded to 8, so that every second pixel is aligned.
+    static constexpr int CELL = CHANNELS <= 2 ? CHANNELS : (CHANNELS + 7) / 8 * 8;
+    static constexpr int WINDOW = SIDE * CELL;  // a row of a window
+    static constexpr int PADDED_WINDOW = vectors(WINDOW) * LANES;
+    static constexpr int LAST_WINDOW = (2 * ROWS - 1) * IMAGE_PITCH + 2 * COLUMNS - 1;
+    static_assert((LAST_WINDOW + (SIDE - 1) * IMAGE_PITCH) * CELL + PADDED_WINDOW <=
+                      IMAGE_SIZE * CELL,
+                  "whole vectors must not leave the image");
+};
+// The second layer uses 19 of the first one's 20 rows.
+template <int FRAMES>
+using FirstLayer = Layer<FRAMES, 80, 45 * 80, 6, 6, 19, 37>;
+using Second = Layer<6, FirstLayer<1>::PITCH, FirstLayer<1>::SIZE, 16, 8, 7, 16>;
+constexpr int POOLED = Second::ROWS * Second::COLUMNS, FEATURES = Second::FILTERS * POOLED;
+
+// Frames to features.
+//
+// Pooling needs the four outputs of a 2x2 block together, and neighbours share inputs. In one
+// dimension: split the filter h into its even taps h0 and odd taps h1, and let x0, x1 and x2 be the
+// inputs from 2p, 2p + 1 and 2p + 2 on, every second one. Three convolutions replace four:
+//
+//   y(2p)     = h0*x0 + h1*x1 = m0 + m1      m0 = h0*(x0 - x1)
+//   y(2p + 1) = h0*x1 + h1*x2 = m1 + m2      m1 = (h0 + h1)*x1      m2 = h1*(x2 - x1)
+//
+// In two dimensions that is 9 convolutions of 3x3 taps in place of 16, so 44% of the
+// multiplications are saved, and equal inputs still give exactly equal outputs. The 9 pictures to
+// convolve are called planes below, the 9 results products.
+//
+// In reduced precision two channels' planes, and their weights, are rounded to bfloat16 and lie side
+// by side in 32 bits, a pair: one instruction multiplies and adds both, in single precision. Where
+// the processor has no such instruction, reduced precision is single precision.
+
+// The 9 planes of the channels that share a cell: x0 - x1, x1 and x2 - x1 in both directions.
+template <class L, typename Cell, typename Pixel>
+void make_planes(const Pixel* image, int channel_stride, Cell* planes) {
+    constexpr int PACKED = L::template PACKED<Cell>, STRIDE = L::template STACKS<Cell> * L::PLANE;
+    constexpr int WIDTH = 2 * L::PITCH + 1;
+    for (int row = 0; row < L::ROWS + 2; ++row) {
+        float down[3][PACKED][WIDTH];
+        for (int channel = 0; channel < PACKED; ++channel) {
+            const Pixel* x = image + channel * channel_stride + 2 * row * L::IMAGE_PITCH;
+            for (int i = 0; i < WIDTH; ++i) {
+                const float x1 = x[i + L::IMAGE_PITCH];
+                down[0][channel][i] = x[i] - x1;
+                down[1][channel][i] = x1;
+                down[2][channel][i] = x[i + 2 * L::IMAGE_PITCH] - x1;
+            }
+        }
+        for (int part = 0; part < 3; ++part) {
+            Cell* out = planes + 3 * part * STRIDE + row * L::PITCH;
+            for (int i = 0; i < L::PITCH; ++i) {
+                float left[PACKED], middle[PACKED], right[PACKED];
+                for (int channel = 0; channel < PACKED; ++channel) {
+                    const float* x = down[part][channel] + 2 * i;
+                    left[channel] = x[0] - x[1];
+                    middle[channel] = x[1];
+                    right[channel] = x[2] - x[1];
+                }
+                pack(left, out + i), pack(middle, out + STRIDE + i);
+                pack(right, out + 2 * STRIDE + i);
+            }
+        }
+    }
+}
+
+template <class L, typename Cell, typename Pixel>
+void make_all_planes(const Pixel* image, int channel_stride, Cell* planes) {
+    for (int stack = 0; stack < L::template STACKS<Cell>; ++stack, planes += L::PLANE)
+        make_planes<L>(image + stack * L::template PACKED<Cell> * channel_stride, channel_stride,
+                       planes);
+}
+
+// The 9 weights of a filter's tap: h0, h0 + h1 and h1 in both directions.
+template <class L>
+void split_tap(const float* corner, float scale, float products[PRODUCTS]) {
+    float parts[3][3];
+    for (int down = 0; down < 3; down += 2) {
+        const float* at = corner + down / 2 * SIDE * L::CHANNELS;
+        parts[down][0] = at[0] * scale, parts[down][2] = at[L::CHANNELS] * scale;
+        parts[down][1] = parts[down][0] + parts[down][2];
+    }
+    for (int right = 0; right < 3; ++right) parts[1][right] = parts[0][right] + parts[2][right];
+    std::copy_n(&parts[0][0], PRODUCTS, products);
+}
+
+// Weights [filter][6][6][channel] to [product][stack of channels][tap][filter].
+template <class L, typename Cell>
+std::vector<Cell> split_weights(const float* weights, float scale) {
+    constexpr int PACKED = L::template PACKED<Cell>, STACKS = L::template STACKS<Cell>;
+    std::vector<Cell> split(PRODUCTS * STACKS * TAPS * L::FILTERS);
+    for (int filter = 0; filter < L::FILTERS; ++filter)
+        for (int stack = 0; stack < STACKS; ++stack)
+            for (int tap = 0; tap < TAPS; ++tap) {
+                const int row = filter * SIDE * SIDE + tap / 3 * 2 * SIDE + tap % 3 * 2;
+                float products[PACKED][PRODUCTS];
+                for (int i = 0; i < PACKED; ++i)
+                    split_tap<L>(weights + row * L::CHANNELS + stack * PACKED + i, scale,
+                                 products[i]);
+                for (int product = 0; product < PRODUCTS; ++product) {
+                    float channels[PACKED];
+                    for (int i = 0; i < PACKED; ++i) channels[i] = products[i][product];
+                    pack(channels, &split[((product * STACKS + stack) * TAPS + tap) * L::FILTERS +
+                                          filter]);
+                }
+            }
+    return split;
+}
+
+// Adds up blocks of 2x2 outputs from their products, which lie ``stride`` apart, and pools them. As
+// in torch, the first of equals wins.
+inline void pool(const float* products, int stride, float bias, float* output, uint8_t* winner) {
+    Vector down[2][3];
+    for (int right = 0; right < 3; ++right) {
+        const Vector middle = load(products + (3 + right) * stride);
+        down[0][right] = load(products + right * stride) + middle;
+        down[1][right] = middle + load(products + (6 + right) * stride);
+    }
+    Vector best = down[0][0] + down[0][1];
+    Integers place = {};
+    for (int next = 1; next < 4; ++next) {
+        const Vector value = down[next / 2][next % 2] + down[next / 2][next % 2 + 1];
+        const Integers wins = value > best;
+        best = wins ? value : best;
+        place = wins ? Integers{} + next : place;
+    }
+    best += bias;
+    const Integers on = best > Vector{};
+    store(output, best < Vector{} ? Vector{} : best);  // not the mask: NaN should stay NaN
+    *reinterpret_cast<LooseBytes*>(winner) =
+        __builtin_convertvector(on ? place : Integers{} + OFF, Bytes);
+}
+
+// One product at WIDE vectors of positions for GROUP filters, with all sums in registers.
+template <class L, typename Cell>
+void multiply(const Cell* planes, const Cell* weights, float products[L::GROUP][WIDE * LANES]) {
+    Vector sums[L::GROUP][WIDE] = {};
+    for (int stack = 0; stack < L::template STACKS<Cell>; ++stack, planes += L::PLANE)
+        for (int tap = 0; tap < TAPS; ++tap, weights += L::FILTERS)
+            for (int filter = 0; filter < L::GROUP; ++filter)
+                for (int i = 0; i < WIDE; ++i)
+                    sums[filter][i] =
+                        add_product(sums[filter][i], weights[filter],
+                                    planes + tap / 3 * L::PITCH + tap % 3 + i * LANES);
+    for (int filter = 0; filter < L::GROUP; ++filter)
+        for (int i = 0; i < WIDE; ++i) store(&products[filter][i * LANES], sums[filter][i]);
+}
+
+// Planes [product][stack][PLANE] to outputs and winners [filter][SIZE].
+template <class L, typename Cell>
+void convolve(const Cell* planes, const Cell* weights, const float* bias, float* outputs,
+              uint8_t* winners) {
+    constexpr int TILE = WIDE * LANES, STACKS = L::template STACKS<Cell>;
+    float products[PRODUCTS][L::GROUP][TILE];
+    for (int tile = 0; tile < L::SIZE; tile += TILE)
+        for (int group = 0; group < L::FILTERS; group += L::GROUP) {
+            for (int product = 0; product < PRODUCTS; ++product)
+                multiply<L>(planes + product * STACKS * L::PLANE + tile,
+                            weights + product * STACKS * TAPS * L::FILTERS + group,
+                            products[product]);
+            for (int filter = 0; filter < L::GROUP; ++filter)
+                for (int i = 0; i < TILE; i += LANES) {
+                    const int at = (group + filter) * L::SIZE + tile + i;
+                    pool(&products[0][filter][i], L::GROUP * TILE, bias[group + filter],
+                         outputs + at, winners + at);
+                }
+        }
+}
+
+// What a thread needs for one image. It starts as zeros: unused positions may hold anything, but
+// reading them should not meet slow denormal numbers.
+template <int FRAMES, typename Cell>
+struct ForwardScratch {
+    using First = FirstLayer<FRAMES>;
+    typename First::template Fitting<Cell> planes1[First::PLANES];
+    Cell planes2[Second::PLANES];
+    float hidden[First::OUTPUTS], outputs[Second::OUTPUTS];
+    uint8_t winners1[First::OUTPUTS], winners2[Second::OUTPUTS];
+};
+
+template <int FRAMES, typename Cell>
+void forward(const uint8_t* frames, int64_t image_stride, int64_t images, const float* weights1,
+             const float* bias1, const float* weights2, const float* bias2, float* features,
+             float* hidden, uint8_t* winners1, uint8_t* winners2, int threads) {
+    using First = FirstLayer<FRAMES>;
+    using Cell1 = typename First::template Fitting<Cell>;
+    const auto split1 = split_weights<First, Cell1>(weights1, 1.0f / 255.0f);
+    const auto split2 = split_weights<Second, Cell>(weights2, 1.0f);
+#pragma omp parallel num_threads(threads) if (images > 1)
+    {
+        const auto scratch = std::make_unique<ForwardScratch<FRAMES, Cell>>();
+#pragma omp for schedule(dynamic)
+        for (int64_t image = 0; image < images; ++image) {
+            float* between = hidden ? hidden + image * First::OUTPUTS : scratch->hidden;
+            uint8_t* won1 = hidden ? winners1 + image * First::OUTPUTS : scratch->winners1;
+            uint8_t* won2 = hidden ? winners2 + image * Second::OUTPUTS : scratch->winners2;
+            make_all_planes<First>(frames + image * image_stride, First::IMAGE_SIZE,
+                                   scratch->planes1);
+            convolve<First>(scratch->planes1, split1.data(), bias1, between, won1);
+            make_all_planes<Second>(between, First::SIZE, scratch->planes2);
+            convolve<Second>(scratch->planes2, split2.data(), bias2, scratch->outputs, won2);
+            for (int row = 0; row < Second::FILTERS * Second::ROWS; ++row)
+                std::copy_n(scratch->outputs + row / Second::ROWS * Second::SIZE +
+                                row % Second::ROWS * Second::PITCH,
+                            Second::COLUMNS, features + image * FEATURES + row * Second::COLUMNS);
+        }
+    }
+}
+
+// The gradients of features to those of the weights.
+//
+// A pooled output passes its gradient to one position of four, the winner, and to none where ReLU is
+// off. What remains is a list of spikes: a gradient, and where the winner's window starts. The
+// gradients of weights and inputs are sums over these lists.
+
+// The gradient of a pooled output that has one, and where its winner's window starts.
+struct Spike {
+    float gradient;
+    int start;
+};
+
+// Lists a filter's spikes; ``start`` counts numbers of an image whose channels are innermost.
+template <class L>
+int list_spikes(const float* gradients, int row_stride, int stride, const uint8_t* winners,
+                Spike* spikes) {
+    constexpr int RIGHT = L::CELL, DOWN = L::IMAGE_PITCH * RIGHT;
+    constexpr int SHIFT[] = {0, RIGHT, DOWN, DOWN + RIGHT, 0};
+    int count = 0;
+    for (int row = 0; row < L::ROWS; ++row)
+        for (int column = 0; column < L::COLUMNS; ++column) {
+            const uint8_t winner = winners[row * L::PITCH + column];
+            // Always written and kept only if it counts: no branch to mispredict.
+            spikes[count] = {gradients[row * row_stride + column * stride],
+                             2 * row * DOWN + 2 * column * RIGHT + SHIFT[winner]};
+            count += winner != OFF;
+        }
+    return count;
+}
+
+// Rows of a window that fit into the registers together.
+template <class L>
+constexpr int rows_together() {
+    constexpr int WIDTH = vectors(L::WINDOW);
+    return 6 * WIDTH + 4 < REGISTERS ? 6 : 2 * WIDTH + 4 < REGISTERS ? 2 : 1;
+}
+
+// weights += sum of gradient * window.
+template <class L>
+void add_windows(const Spike* spikes, int count, const float* image, float* weights) {
+    constexpr int TOGETHER = rows_together<L>(), WIDTH = vectors(L::WINDOW);
+    for (int top = 0; top < SIDE; top += TOGETHER, weights += TOGETHER * L::PADDED_WINDOW) {
+        Vector sums[TOGETHER][WIDTH] = {};
+        for (int i = 0; i < count; ++i) {
+            const float* window = image + spikes[i].start + top * L::IMAGE_PITCH * L::CELL;
+            for (int row = 0; row < TOGETHER; ++row, window += L::IMAGE_PITCH * L::CELL)
+                for (int j = 0; j < WIDTH; ++j)
+                    sums[row][j] += spikes[i].gradient * load(window + j * LANES);
+        }
+        for (int row = 0; row < TOGETHER; ++row)
+            for (int j = 0; j < WIDTH; ++j) {
+                float* to = weights + row * L::PADDED_WINDOW + j * LANES;
+                store(to, load(to) + sums[row][j]);
+            }
+    }
+}
+
+// window += gradient * weights, for each spike. The padding adds zeros to what follows the window.
+template <class L>
+void spread_spikes(const Spike* spikes, int count, const float* weights, float* image) {
+    constexpr int TOGETHER = rows_together<L>(), WIDTH = vectors(L::WINDOW);
+    for (int top = 0; top < SIDE; top += TOGETHER, weights += TOGETHER * L::PADDED_WINDOW) {
+        Vector filter[TOGETHER][WIDTH];
+        for (int row = 0; row < TOGETHER; ++row)
+            for (int j = 0; j < WIDTH; ++j)
+                filter[row][j] = load(weights + row * L::PADDED_WINDOW + j * LANES);
+        for (int i = 0; i < count; ++i) {
+            float* window = image + spikes[i].start + top * L::IMAGE_PITCH * L::CELL;
+            for (int row = 0; row < TOGETHER; ++row, window += L::IMAGE_PITCH * L::CELL)
+                for (int j = 0; j < WIDTH; ++j)
+                    store(window + j * LANES,
+                          load(window + j * LANES) + spikes[i].gradient * filter[row][j]);
+        }
+    }
+}
+
+// [CHANNELS][IMAGE_SIZE] to [IMAGE_SIZE][CELL]; what pads a cell is left alone.
+template <class L, typename Number>
+void interleave(const Number* planar, float* interleaved) {
+    for (int i = 0; i < L::IMAGE_SIZE; ++i)
+        for (int channel = 0; channel < L::CHANNELS; ++channel)
+            interleaved[i * L::CELL + channel] = planar[channel * L::IMAGE_SIZE + i];
+}
+
+// Gradients of a layer's parameters.
+template <class L>
+struct Gradients {
+    float weights[L::FILTERS][SIDE][L::PADDED_WINDOW], bias[L::FILTERS];
+
+    void add(const Gradients& other) {
+        const float* from = &other.weights[0][0][0];
+        float* to = &weights[0][0][0];
+        for (size_t i = 0; i < sizeof(weights) / sizeof(float); ++i) to[i] += from[i];
+        for (int filter = 0; filter < L::FILTERS; ++filter) bias[filter] += other.bias[filter];
+    }
+
+    void write(float scale, float* to_weights, float* to_bias) const {
+        for (int row = 0; row < L::FILTERS * SIDE; ++row)
+            for (int i = 0; i < SIDE * L::CHANNELS; ++i)
+                *to_weights++ =
+                    weights[row / SIDE][row % SIDE][i / L::CHANNELS * L::CELL + i % L::CHANNELS] *
+                    scale;
+        std::copy_n(bias, L::FILTERS, to_bias);
+    }
+};
+
+template <int FRAMES>
+struct Sums {
+    Gradients<FirstLayer<FRAMES>> first;
+    Gradients<Second> second;
+};
+
+// What a thread needs for one image; channels are innermost.
+template <int FRAMES>
+struct BackwardScratch {
+    using First = FirstLayer<FRAMES>;
+    alignas(64) float image[First::IMAGE_SIZE * First::CELL];
+    alignas(64) float hidden[First::SIZE * Second::CELL];
+    alignas(64) float hidden_gradients[First::SIZE * Second::CELL];
+    Spike spikes[First::SIZE];  // of one filter at a time
+};
+
+template <int FRAMES>
+void backward_image(const float* weights2, const uint8_t* winners1, const uint8_t* winners2,
+                    const float* gradients, BackwardScratch<FRAMES>& scratch, Sums<FRAMES>& sums) {
+    using First = FirstLayer<FRAMES>;
+    Spike* spikes = scratch.spikes;
+    const auto sum = [spikes](int count) {
+        float total = 0;
+        for (int i = 0; i < count; ++i) total += spikes[i].gradient;
+        return total;
+    };
+    std::fill_n(scratch.hidden_gradients, First::SIZE * Second::CELL, 0.0f);
+    for (int filter = 0; filter < Second::FILTERS; ++filter) {
+        const int count = list_spikes<Second>(gradients + filter * POOLED, Second::COLUMNS, 1,
+                                              winners2 + filter * Second::SIZE, spikes);
+        add_windows<Second>(spikes, count, scratch.hidden, sums.second.weights[filter][0]);
+        spread_spikes<Second>(spikes, count, weights2 + filter * SIDE * Second::PADDED_WINDOW,
+                              scratch.hidden_gradients);
+        sums.second.bias[filter] += sum(count);
+    }
+    for (int filter = 0; filter < First::FILTERS; ++filter) {
+        const int count = list_spikes<First>(
+            scratch.hidden_gradients + filter, First::PITCH * Second::CELL, Second::CELL,
+            winners1 + filter * First::SIZE, spikes);
+        add_windows<First>(spikes, count, scratch.image, sums.first.weights[filter][0]);
+        sums.first.bias[filter] += sum(count);
+    }
+}
+
+constexpr int64_t CHUNK = 8;  // images that share their sums
+
+template <int FRAMES>
+void backward(const uint8_t* frames, int64_t image_stride, int64_t images, const float* weights2,
+              const float* hidden, const uint8_t* winners1, const uint8_t* winners2,
+              const float* gradients, float* to_weights1, float* to_bias1, float* to_weights2,
+              float* to_bias2, int threads) {
+    using First = FirstLayer<FRAMES>;
+    std::vector<float> padded2(Second::FILTERS * SIDE * Second::PADDED_WINDOW);
+    for (int pixel = 0; pixel < Second::FILTERS * SIDE * SIDE; ++pixel)
+        std::copy_n(weights2 + pixel * Second::CHANNELS, Second::CHANNELS,
+                    &padded2[pixel / SIDE * Second::PADDED_WINDOW + pixel % SIDE * Second::CELL]);
+    std::vector<Sums<FRAMES>> sums((images + CHUNK - 1) / CHUNK);
+#pragma omp parallel num_threads(threads) if (images > CHUNK)
+    {
+        const auto scratch = std::make_unique<BackwardScratch<FRAMES>>();
+#pragma omp for schedule(dynamic)
+        for (int64_t first = 0; first < images; first += CHUNK)
+            for (int64_t image = first; image < std::min(images, first + CHUNK); ++image) {
+                interleave<First>(frames + image * image_stride, scratch->image);
+                interleave<Second>(hidden + image * First::OUTPUTS, scratch->hidden);
+                backward_image<FRAMES>(padded2.data(), winners1 + image * First::OUTPUTS,
+                                       winners2 + image * Second::OUTPUTS,
+                                       gradients + image * FEATURES, *scratch, sums[first / CHUNK]);
+            }
+    }
+    Sums<FRAMES> total = {};
+    for (const Sums<FRAMES>& part : sums) {
+        total.first.add(part.first);
+        total.second.add(part.second);
+    }
+    total.first.write(1.0f / 255.0f, to_weights1, to_bias1);
+    total.second.write(1.0f, to_weights2, to_bias2);
+}
+
+}  // namespace
 
 // Frames are [images][channels][45][80] with ``image_stride`` bytes between images and 1 or 2
 // channels; weights and their gradients are [filter][6][6][channel]. What a backward pass will need

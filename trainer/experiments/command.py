@@ -8,10 +8,9 @@ import time
 from pathlib import Path
 
 from edge_runtime.cli import examples, not_negative, whole_number
-from edge_runtime.files import make_directory, write_atomic
+from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.evaluate import cores
-from trainer.experiments import run as running
 from trainer.experiments.plan import (
     DEFAULT_SEEDS,
     EXPERIMENTS,
@@ -24,7 +23,8 @@ from trainer.experiments.plan import (
 )
 from trainer.experiments.ray_runner import run_on_ray
 from trainer.experiments.report import write_report
-from trainer.experiments.run import FAILED, FINISHED, Store, Task, say
+from trainer.experiments.run import Task, run_units, say
+from trainer.experiments.store import DONE, FAILED, FINISHED, Store
 from trainer.experiments.timing import TIME_FILE, measure
 from trainer.options import add_time_limit, deadline_s
 
@@ -40,7 +40,8 @@ MOST_SEEDS = 1000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
+    what = parser.add_argument_group("what is computed")
+    what.add_argument(
         "names",
         nargs="+",
         metavar="NAME",
@@ -49,49 +50,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"training time; {STATUS}: what is done, running and missing; {REPORT}: draw the figures "
         "and judge the claims from what is done",
     )
-    parser.add_argument(
+    what.add_argument(
         "--seeds",
         type=whole_number(1, MOST_SEEDS),
         default=DEFAULT_SEEDS,
         help="trainings of each algorithm in each setting",
     )
-    parser.add_argument(
+    what.add_argument(
+        "--scenario", choices=SCENARIOS, help="compute in this one only (default: in both)"
+    )
+    what.add_argument(
+        "--quick",
+        action="store_true",
+        help="a few steps of everything, kept in RUNS/quick: a look whose numbers mean nothing",
+    )
+    how = parser.add_argument_group("how it is computed")
+    how.add_argument(
         "--jobs",
         type=not_negative,
         default=0,
         metavar="N",
         help="processes of one thread each; 0: one a core",
     )
-    parser.add_argument(
-        "--scenario", choices=SCENARIOS, help="compute in this one only (default: in both)"
-    )
-    parser.add_argument(
+    how.add_argument(
         "--ray",
         metavar="ADDRESS",
         help="compute on a Ray cluster instead of this machine: HOST:PORT, auto or local",
     )
     add_time_limit(
-        parser,
+        how,
         "begin nothing after this time, and stop what runs at its next checkpoint, five "
         "episodes apart; the same command goes on from there",
     )
-    parser.add_argument(
-        "--results", default="results/paper", metavar="DIR", help="records, figures and report"
-    )
-    parser.add_argument(
-        "--runs", default="runs/paper", metavar="DIR", help="checkpoints and actors"
-    )
-    parser.add_argument(
-        "--humans",
-        default="results/humans/paper",
-        metavar="DIR",
-        help="holds the human model of each scenario: DIR/left_turn, DIR/congestion",
-    )
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="a few steps of everything, kept in RUNS/quick: a look whose numbers mean nothing",
-    )
+    where = parser.add_argument_group("where it is kept")
+    for option, default, text in (
+        ("--results", "results/paper", "records, figures and report"),
+        ("--runs", "runs/paper", "checkpoints and actors"),
+        ("--humans", "results/humans/paper",
+         "holds the human model of each scenario: DIR/left_turn, DIR/congestion"),
+    ):  # fmt: skip
+        where.add_argument(option, default=default, metavar="DIR", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -99,50 +97,43 @@ def run(arguments: argparse.Namespace) -> int:
     names = list(dict.fromkeys(arguments.names))
     if len(names) > 1 and {STATUS, REPORT} & set(names):
         raise UserError(f"{STATUS} and {REPORT} stand alone")
-    store = _store(arguments)
+    results, runs, humans = map(Path, (arguments.results, arguments.runs, arguments.humans))
+    store = Store(PLAN, results, runs, humans)
+    if arguments.quick:
+        store = Store(QUICK, runs / "quick" / "results", runs / "quick", humans)
     if names == [STATUS]:
-        print("\n".join(running.status_lines(store, arguments.seeds)))
+        print("\n".join(store.status_lines(arguments.seeds)))
         return 0
     if names == [REPORT]:
         print(f"wrote {write_report(store, arguments.seeds)}")
         return 0
-    status = 0
-    if set(names) != {TIME}:
-        status = _compute(arguments, store, [name for name in names if name != TIME])
+    computed = [name for name in names if name != TIME]
+    status = _compute(arguments, store, computed) if computed else 0
     if TIME in names:
-        make_directory(store.results)
         measured = json.dumps(measure(store))
         write_atomic(store.results / TIME_FILE, f"{measured}\n".encode())
     return status
 
 
-def _store(arguments: argparse.Namespace) -> Store:
-    results, runs, humans = map(Path, (arguments.results, arguments.runs, arguments.humans))
-    if arguments.quick:
-        return Store(QUICK, runs / "quick" / "results", runs / "quick", humans)
-    return Store(PLAN, results, runs, humans)
-
-
 def _compute(arguments: argparse.Namespace, store: Store, names: list[str]) -> int:
     wanted = units_of(names, arguments.seeds, arguments.scenario)
-    if names and not wanted:
+    if not wanted:
         raise UserError(f"{', '.join(names)}: nothing to compute in {arguments.scenario}")
-    possible = [unit for unit in wanted if not obstacle(unit, store.humans)]
+    obstacles = {unit: obstacle(unit, store.humans) for unit in wanted}
+    possible = [unit for unit in wanted if not obstacles[unit]]
     if len(possible) < len(wanted):
-        missing = {str(obstacle(unit, store.humans)) for unit in wanted} - {"None"}
-        say(f"{len(wanted) - len(possible)} units left out: {'; '.join(sorted(missing))}")
+        missing = sorted({text for text in obstacles.values() if text})
+        say(f"{len(wanted) - len(possible)} units left out: {'; '.join(missing)}")
+    states = store.states(possible)
     # The clock that the processes have, too.
     stop_at_s = deadline_s(arguments, time.time)
-    states = store.states(possible)
-    left = [Task(unit, store, stop_at_s) for unit in possible if states[unit] != running.DONE]
+    left = [Task(unit, store, stop_at_s) for unit in possible if states[unit] != DONE]
     if left and arguments.ray:
         ends = run_on_ray(left, arguments.ray)
     else:
-        ends = running.run_units(left, arguments.jobs or cores())
-    said = ", ".join(f"{count} {end}" for end, count in ends.items())
-    print(
-        f"{len(possible) - len(left)} of {len(wanted)} units were done{f', {said}' if said else ''}"
-    )
+        ends = run_units(left, arguments.jobs or cores())
+    said = "".join(f", {count} {end}" for end, count in ends.items())
+    print(f"{len(possible) - len(left)} of {len(wanted)} units were done{said}")
     if ends[FINISHED] < len(left):
         print("the same command goes on")
     return 1 if ends[FAILED] else 0

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import math
 import os
 import sys
 import textwrap
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
 from functools import partial
@@ -94,8 +95,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "defaults and meanings",
     )
     add_latency(what, "the network between policy and vehicle, also in validation")
-    who = parser.add_argument_group("who guides")
-    who.add_argument(
+    guide = parser.add_argument_group("the human")
+    guide.add_argument(
         "--human",
         default=DEFAULTS.human,
         metavar=f"expert|HUMAN_DIR|{'|'.join(HUMANS)}",
@@ -122,44 +123,45 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.device == "cuda" and not torch.cuda.is_available():
         raise UserError("no CUDA device is available; use --device cpu")
     set_threads(arguments.threads)
-    _check_human(arguments.human)
-    config = _config(arguments)
+    human = arguments.human
+    if human != DEFAULTS.human and human not in HUMANS and not Path(human).exists():
+        known = ", ".join([DEFAULTS.human, *HUMANS])
+        raise UserError(f"--human {human} is none of {known}, nor a human model's directory")
+    given = {name: getattr(arguments, name) for name in (*OPTIONS, *EXTENT)}
+    given["human"] = PERSON if human in HUMANS else human
+    given["latency"] = str(parse_spec(arguments.latency))
+    config = replace(PRESETS[arguments.preset], **given)
+    for assignment in arguments.set:
+        config = with_setting(config, assignment)
     run_dir = Path(arguments.out)
     with claimed(run_dir):
         check_directory(run_dir, config, arguments.resume)
         return _train(arguments, config, run_dir)
 
 
-def _check_human(human: str) -> None:
-    if human != DEFAULTS.human and human not in HUMANS and not Path(human).exists():
-        words = ", ".join([DEFAULTS.human, *HUMANS])
-        raise UserError(f"--human {human} is none of {words}, nor a human model's directory")
-
-
-def _config(arguments: argparse.Namespace) -> RunConfig:
-    given = {name: getattr(arguments, name) for name in (*OPTIONS, *EXTENT)}
-    given["human"] = PERSON if arguments.human in HUMANS else arguments.human
-    given["latency"] = str(parse_spec(arguments.latency))
-    config = replace(PRESETS[arguments.preset], **given)
-    for assignment in arguments.set:
-        config = with_setting(config, assignment)
-    return config
-
-
 def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> int:
     sink = _sink(arguments.rerun)
     with _training(arguments, config, run_dir) as training:
         end_s = deadline_s(arguments)
+        extent = (
+            (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
+        )
         with (
-            ProgressBar("training", *_extent(training)) as bar,
+            ProgressBar("training", *extent) as bar,
             _watched(training, sink) as watch,
             # The last: behind the first signal is what a viewer makes of them.
             quit_on_signals(partial(_quit, training)),
         ):
-            report = _Reporter(bar, bool(config.steps))
+            recent: deque[EpisodeMetrics] = deque(maxlen=20)
+            validation = "-"
 
             def on_episode(metrics: EpisodeMetrics) -> None:
-                report(metrics)
+                nonlocal validation
+                recent.append(metrics)
+                if not math.isnan(metrics.validation_success):
+                    validation = f"{metrics.validation_success:.2f}"
+                figures = {**_means(recent), "validation": validation}
+                bar.advance(figures, metrics.steps if config.steps else 1)
                 watch(metrics)
 
             training.train(on_episode, end_s)
@@ -170,6 +172,16 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def _means(episodes: Collection[EpisodeMetrics]) -> dict[str, str]:
+    """What the progress bar shows of the last episodes."""
+    count = len(episodes)
+    return {
+        "return": f"{sum(m.episode_return for m in episodes) / count:.1f}",
+        "distance": f"{sum(m.distance_m for m in episodes) / count:.1f} m",
+        "success": f"{sum(m.outcome == GOAL for m in episodes) / count:.2f}",
+    }
 
 
 @contextmanager
@@ -208,19 +220,11 @@ def _watched(training: TrainingRun, sink: Any) -> Iterator[Callable[[EpisodeMetr
         yield on_episode
 
 
-def _extent(training: TrainingRun) -> tuple[int, int]:
-    """What the progress bar counts to, and from: steps where they are limited, else episodes."""
-    config = training.config
-    if config.steps:
-        return config.steps, training.steps
-    return config.episodes, training.episode
-
-
 def _quit(training: TrainingRun) -> bool:
     heeded = training.quit()
     if training.quitting:
-        # Not print: a signal may come in the midst of one, which takes no other. And whoever read
-        # it, as `tee`, may have had the same ^C.
+        # Not print: a signal may come in the midst of one, which takes no other. And the reader,
+        # such as `tee`, may have had the same ^C.
         with suppress(OSError):
             os.write(_STDERR, _ENDING)
     return heeded
@@ -238,35 +242,6 @@ def _summary(run_dir: Path) -> str:
         counted(sum(found["failures"].values()), "failure"),
     ]
     return ", ".join(parts)
-
-
-class _Reporter:
-    """Feeds the progress bar from the episodes' metrics: means over the last twenty.
-
-    Args:
-        bar: the progress bar.
-        by_steps: whether it counts environment steps.
-    """
-
-    def __init__(self, bar: ProgressBar, by_steps: bool) -> None:
-        self.bar, self.by_steps = bar, by_steps
-        self.recent: deque[EpisodeMetrics] = deque(maxlen=20)
-        self.validation = "-"
-
-    def __call__(self, metrics: EpisodeMetrics) -> None:
-        self.recent.append(metrics)
-        if metrics.validation_success == metrics.validation_success:
-            self.validation = f"{metrics.validation_success:.2f}"
-        count = len(self.recent)
-        self.bar.advance(
-            {
-                "return": f"{sum(m.episode_return for m in self.recent) / count:.1f}",
-                "distance": f"{sum(m.distance_m for m in self.recent) / count:.1f} m",
-                "success": f"{sum(m.outcome == GOAL for m in self.recent) / count:.2f}",
-                "validation": self.validation,
-            },
-            metrics.steps if self.by_steps else 1,
-        )
 
 
 class _Set(argparse.Action):
@@ -336,15 +311,15 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
 
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
-    saved = _flat(read_json(path, "run config"))
-    wanted = _flat(config.as_dict())
+    saved, wanted = _flat(read_json(path, "run config")), _flat(config.as_dict())
     if not all(isinstance(saved.get(name), int) for name in EXTENT):
         raise UserError(f"run config {path} does not say how many episodes and steps")
-    changed = [
-        f"{_given(name, saved)} (now {_value(name, wanted)})"
-        for name in wanted
-        if name not in EXTENT and (name not in saved or saved[name] != wanted[name])
-    ]
+    changed = []
+    for name in wanted:
+        if name not in EXTENT and (name not in saved or saved[name] != wanted[name]):
+            option = f"--{name} " if name in OPTIONS else f"--set {name}="
+            before = f"{option}{_typed(name, saved)}" if name in saved else f"no {name}"
+            changed.append(f"{before} (now {_typed(name, wanted)})")
     if changed:
         raise UserError(f"{run_dir} was trained with {', '.join(changed)}: repeat what it had")
     for name in EXTENT:
@@ -359,16 +334,6 @@ def _flat(values: dict[str, Any]) -> dict[str, Any]:
     return {**own, **learner} if isinstance(learner, dict) else own
 
 
-def _given(name: str, values: dict[str, Any]) -> str:
-    """A setting as it is typed."""
-    if name not in values:
-        return f"no {name}"
-    if name in OPTIONS:
-        return f"--{name} {_value(name, values)}"
-    return f"--set {name}={_value(name, values)}"
-
-
-def _value(name: str, values: dict[str, Any]) -> str:
-    value = values[name]
+def _typed(name: str, values: dict[str, Any]) -> str:
     # A run may go on with another device of the person's.
-    return "|".join(HUMANS) if (name, value) == ("human", PERSON) else str(value)
+    return "|".join(HUMANS) if (name, values[name]) == ("human", PERSON) else str(values[name])

@@ -1,0 +1,90 @@
+"""Bad input is one line and exit status 2 for every command, and nothing is written."""
+
+from __future__ import annotations
+
+import shlex
+
+import pytest
+
+from bridge.tests.harness import LEFT_TURN, TOY, bridge_status
+from edge_runtime.link_probe import free_endpoint
+
+ROWS = [
+    ("simulate --env phil/Nowhere-v0", "Nowhere"),
+    ("simulate --env no_such_module:X-v0", "no_such_module"),
+    ("simulate --env CartPole-v1", "uint8"),
+    ("simulate --env bridge.tests.broken_module:X-v0", "RuntimeError: two"),
+    ("simulate --env TOY --condition variant", "scene"),
+    ("simulate --env congestion --condition foggy", "foggy"),
+    ("simulate --env ::", "module:id"),
+    ("simulate --env TOY --latency fast", "latency"),
+    ("simulate --env TOY --episodes 0", "at least 1"),
+    ("simulate --env TOY --vehicle-id a/b", "vehicle id"),
+    ("simulate --env TOY --listen here", "endpoint"),
+    ("simulate --env TOY --connect here", "endpoint"),
+    ("simulate --env TOY --connect FREE --wait-edge-s 0", "nobody answers"),
+    ("simulate --env TOY --connect FREE --listen FREE", "not allowed"),
+    ("simulate --env TOY --out /dev/null/r.json", "Not a directory"),
+    ("simulate --env TOY --clock sundial", "sundial"),
+    ("simulate --env TOY --loop vehicle", "--loop vehicle needs --clock realtime"),
+    ("relay --listen tcp/127.0.0.1:7001", "--connect"),
+    ("relay --listen here --connect tcp/127.0.0.1:7001", "endpoint"),
+    ("relay --listen tcp/127.0.0.1:7001 --connect tcp/127.0.0.1:7001", "circle"),
+    ("relay --listen tls/127.0.0.1:7001 --connect tcp/127.0.0.1:7002", "plain text only"),
+    ("relay --listen tcp/127.0.0.1:7001 --connect quic/127.0.0.1:7002", "plain text only"),
+    ("relay --listen tcp/127.0.0.1:7001 --connect udp/127.0.0.1:7001 --latency 5", "latency"),
+    ("router --listen FREE --config router.json5", "goes with no other option"),
+    ("record --out there.mcap", "exists"),
+    ("record --out /dev/null/a.mcap", "Not a directory"),
+    ("record --out a.mcap --vehicle-id a/b", "vehicle id"),
+    ("record --out a.mcap --connect here", "endpoint"),
+    ("record --out a.mcap --connect FREE --wait-s 0", "nobody"),
+    ("repair none.mcap", "No such file"),
+    ("repair there.mcap", "no MCAP recording"),
+    ("replay LEFT_TURN --policy none.onnx", "does not exist"),
+    ("replay LEFT_TURN --policy none.onnx --tls certs/viewer", "--tls is for a link"),
+    ("replay LEFT_TURN --listen FREE --config edge.toml", "--config is for --policy"),
+    ("replay LEFT_TURN", "--policy"),
+    ("replay LEFT_TURN --policy a.onnx --connect FREE", "not allowed"),
+    ("replay LEFT_TURN --listen here", "endpoint"),
+    ("replay LEFT_TURN --listen FREE --wait-edge-s 0", "python -m edge_runtime run"),
+    ("replay LEFT_TURN --policy a.onnx --tolerance -1", "tolerance"),
+    ("replay LEFT_TURN --policy a.onnx --out /dev/null/r.json", "Not a directory"),
+    ("replay missing.mcap --policy p.onnx", "No such file"),
+    ("replay there.mcap --policy p.onnx", "no MCAP recording"),
+    ("ros2 --connect FREE --ros2-listen FREE --wait-s 0", "nobody answers"),
+    ("ros2 --connect FREE --vehicle-id a/b", "vehicle id"),
+    ("ros2 --connect FREE --namespace 9/x", "namespace '9/x'"),
+    ("ros2 --connect FREE --namespace ''", "empty value after --namespace"),
+    ("ros2 --connect FREE --ros2-listen tls/127.0.0.1:7448", "plain text"),
+    ("ros2 --connect FREE --ros2-listen nowhere", "endpoint 'nowhere'"),
+    ("ros2 --connect FREE --ros2-listen tcp/a:1 --ros2-connect tcp/a:1", "not allowed with"),
+    ("ros2 --connect FREE --max-rate-hz 0", "is not a rate"),
+    ("ros2 --connect FREE --max-rate-hz nan", "is not a rate"),
+    ("ros2 --connect FREE --out /dev/null/a.json", "Not a directory"),
+    ("ros2 --connect FREE --tls nowhere", "plain text despite --tls"),
+    ("view --connect FREE --save never.rrd --wait-s 0", "nobody answers"),
+    ("view --connect FREE", "no display"),
+    ("view --save /dev/null/a.rrd", "Not a directory"),
+    ("view --connect FREE --save a.rrd --vehicle-id a/b", "vehicle id"),
+    ("view --save a.rrd --serve", "not allowed with"),
+    ("view --save a.mcap", "called F.rrd"),
+    ("view none.mcap --save a.rrd", "cannot be read"),
+    ("view LEFT_TURN --vehicle-id other --save a.rrd", "holds no vehicle other"),
+    ("view there.mcap --save a.rrd", "no MCAP recording"),
+]
+
+
+@pytest.mark.parametrize(("command", "part"), ROWS)
+def test_bad_input_is_one_line_and_status_2(command, part, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (tmp_path / "there.mcap").write_bytes(b"mine")
+    words = {"TOY": lambda: TOY, "FREE": free_endpoint, "LEFT_TURN": lambda: str(LEFT_TURN)}
+    arguments = [words[word]() if word in words else word for word in shlex.split(command)]
+    assert bridge_status(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert part in line
+    assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]
+    assert (tmp_path / "there.mcap").read_bytes() == b"mine"
