@@ -46,7 +46,6 @@ MOMENTS = {"left_turn": ("8", "3.4"), "congestion": ("3", "5.0")}
 FILM_POLICY, FILM_SEED = "constant:0.3", "40"
 """Always the same throttle, and a drive in which it would meet a car, once: the guide brakes, hands
 the wheel back when the car stands, and the next gap is wide enough."""
-RUNS = Path("results/units/left_turn/phil_td3/normal")
 SHIPPED = Path("results/latency/left_turn/shipped.json")
 LOADED_S, DRAWN_S = 20.0, 5.0
 """Until some 10 MB are in the viewer, and until it has drawn them, in software."""
@@ -144,12 +143,6 @@ def _frames(scenario: str, seed: int, time_s: float) -> np.ndarray:
     for _ in range(round(time_s / env.config.control_period_s)):
         observation, *_ = env.step(driver.act(observation))
     return np.asarray(observation)
-
-
-def learning_curve(out: Path, _work: Path) -> None:
-    """Three seeds of PHIL-TD3 in the left turn."""
-    run_dirs = sorted(str(path) for path in RUNS.glob("seed_*"))
-    run_command("trainer", "plot", *run_dirs, "--out", str(out))
 
 
 def success_against_latency(out: Path, work: Path) -> None:
@@ -349,7 +342,6 @@ PICTURES: dict[str, Make] = {
     "cockpit.png": lambda out, _work: run_command(
         "trainer.person.tests.browser", "--picture", str(out)
     ),
-    "learning_curve.png": learning_curve,
     "success_against_latency.png": success_against_latency,
     "loop.png": loop,
     "rerun.png": rerun_loop,

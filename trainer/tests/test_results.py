@@ -1,19 +1,15 @@
-"""What is kept under ``results/`` lies where it says that it belongs."""
+"""What is kept under ``results/paper`` lies where it says that it belongs."""
 
 import json
 from pathlib import Path
 
-UNITS = Path(__file__).parents[2] / "results" / "units"
+import pytest
+
+PAPER = Path(__file__).parents[2] / "results" / "paper"
 
 
-def place_of(config: Path) -> Path:
-    about = json.loads(config.read_text())
-    unit = about["unit"]
-    names = [unit[name] for name in ("scenario", "algorithm", "setting")]
-    return UNITS.joinpath(*names, f"seed_{unit['seed']}-{about['id']}")
-
-
-def test_each_unit_lies_in_its_own_directory():
-    configs = sorted(UNITS.rglob("config.json"))
-    assert configs
-    assert [str(path) for path in configs if path.parent != place_of(path)] == []
+@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
+def test_each_record_lies_in_its_scenarios_file_once(scenario):
+    records = list(map(json.loads, (PAPER / f"{scenario}.jsonl").read_text().splitlines()))
+    assert {record["unit"]["scenario"] for record in records} == {scenario}
+    assert len({record["id"] for record in records}) == len(records)
