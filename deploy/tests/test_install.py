@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import platform
@@ -58,11 +59,16 @@ def test_install_upgrade_back_and_away(board: Board):
     board.runs_a_process()
     with Simulator(board.workshop.endpoint) as simulator:
 
-        def drives(step: int) -> float:
+        def drives(episode: int) -> float:
+            """The running release's answer: states go out until one comes."""
             simulator.alive.clear()
-            command = ask_until_answered(simulator, step)
-            assert command.mode == "drive"
-            return round(command.action[0], 3)
+            for step in range(200):
+                with contextlib.suppress(queue.Empty):
+                    state = make_state(step, session=f"s-{episode}", episode=episode, final=True)
+                    command = simulator.ask(state, timeout_s=0.1)
+                    assert command.mode == "drive"
+                    return round(command.action[0], 3)
+            raise AssertionError("nobody answers")
 
         done = board.install(one.path, "process")
         assert (done.returncode, done.stderr) == (0, "")
@@ -77,17 +83,6 @@ def test_install_upgrade_back_and_away(board: Board):
     assert board.status()["current"] == one.manifest.version
     assert board.run("uninstall").returncode == 0
     assert not board.root.exists()
-
-
-def ask_until_answered(simulator: Simulator, episode: int):
-    """The running release's answer: states go out until one comes."""
-    for step in range(200):
-        state = make_state(step, session=f"simulator-{episode}", episode=episode, final=True)
-        try:
-            return simulator.ask(state, timeout_s=0.1)
-        except queue.Empty:
-            continue
-    raise AssertionError("nobody answers")
 
 
 class Listener:

@@ -108,26 +108,24 @@ def test_an_installer_that_refuses_is_told_and_cleaned_up(far, board, workshop, 
     assert [p.name for p in board.root.iterdir()] == ["trusted.pub"]
 
 
-def test_a_host_that_is_not_there_ends_it_at_once(far, board, workshop, capfd):
-    assert push(board, workshop, "nowhere", workshop.make(0.1).path) == 2
-    assert "ssh does not reach the board" in capfd.readouterr().err
-    assert len((far / "log").read_text().splitlines()) == 1
-
-
-def test_a_copy_that_fails_leaves_nothing_behind(far, board, workshop, monkeypatch, capfd):
+@pytest.mark.parametrize(
+    ("host", "machine", "says", "lines"),
+    [
+        ("nowhere", HERE.machine, "ssh does not reach the board", 1),
+        ("board", "riscv64", "the bundle is for riscv64", 1),
+        ("full", HERE.machine, "scp ended with status 1", 6),
+    ],
+)
+def test_a_push_that_fails_ends_at_once_and_leaves_nothing_behind(
+    far, board, workshop, monkeypatch, capfd, host, machine, says, lines
+):
     """What has come so far may hold the vehicle's private key."""
-    made = workshop.make(0.1)
+    made = make_bundle(workshop.inputs(), HERE._replace(machine=machine), far / "bundles")
     monkeypatch.chdir(made.path.parent)
-    assert push(board, workshop, "full", made.path.name) == 2
-    assert "scp ended with status 1" in capfd.readouterr().err
+    assert push(board, workshop, host, made.path.name) == 2
+    assert says in capfd.readouterr().err
+    assert len((far / "log").read_text().splitlines()) == lines
     assert list((far / "home").iterdir()) == []
-    assert not board.root.exists()
-
-
-def test_a_board_of_another_kind_is_not_touched(far, board, workshop, capfd, tmp_path):
-    made = make_bundle(workshop.inputs(), HERE._replace(machine="riscv64"), tmp_path / "b")
-    assert push(board, workshop, "board", made.path) == 2
-    assert "the bundle is for riscv64" in capfd.readouterr().err
     assert not board.root.exists()
 
 
