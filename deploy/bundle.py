@@ -26,7 +26,7 @@ import edge_runtime
 from deploy.certs import DEFAULT_KEY, write_private
 from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
-from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, find_target, gather, lock_path
+from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, gather, lock_path
 from edge_runtime.cli import examples
 from edge_runtime.config import NONE, Config, load_config
 from edge_runtime.files import check_writable, write_atomic
@@ -91,17 +91,11 @@ class Made(NamedTuple):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "--target", metavar="|".join(TARGETS), required=True, help="the board's kind"
-    )
+    parser.add_argument("--target", choices=TARGETS, required=True, help="the board's kind")
     add = functools.partial(parser.add_argument, metavar="FILE")
     add("--policy", required=True, help="signed policy file")
     add("--config", help="settings of `edge_runtime run`: connect, vehicle, ... (TOML)")
-    add(
-        "--public-key",
-        default=str(DEFAULT_PUBLIC_KEY),
-        help="of whoever signed the policy",
-    )
+    add("--public-key", default=str(DEFAULT_PUBLIC_KEY), help="of whoever signed the policy")
     add("--key", default=DEFAULT_KEY, help="private key that signs the bundle")
     add = functools.partial(parser.add_argument, metavar="DIR")
     add("--tls", help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01")
@@ -111,7 +105,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Make a bundle and print its size and contents."""
-    target, out = find_target(arguments.target), Path(arguments.out)
+    target, out = TARGETS[arguments.target], Path(arguments.out)
     inputs = Inputs(
         policy=Path(arguments.policy),
         public_key=Path(arguments.public_key),

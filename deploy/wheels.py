@@ -56,13 +56,6 @@ class Pin(NamedTuple):
     sha256: str
 
 
-def find_target(name: str) -> Target:
-    """The row of a name. Raises UserError with the known ones."""
-    if name not in TARGETS:
-        raise UserError(f"target {name!r} is not known; choose from {', '.join(TARGETS)}")
-    return TARGETS[name]
-
-
 def lock_path(target: Target) -> Path:
     """The file that names every wheel of a target by version and hash."""
     return LOCKS / f"bundle-{target.name}.txt"
@@ -148,8 +141,8 @@ def main(argv: list[str]) -> int:
         description=__doc__,
         epilog=examples("python -m deploy.wheels jetpack5"),
     )
-    parser.add_argument("target", metavar="|".join(TARGETS))
-    target = find_target(parser.parse_args(argv).target)
+    parser.add_argument("target", choices=TARGETS)
+    target = TARGETS[parser.parse_args(argv).target]
     path = lock_path(target)
     lines = []
     for line in read_bytes(path, "lock").decode().splitlines():
