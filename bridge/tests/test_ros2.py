@@ -326,6 +326,18 @@ def test_a_sigterm_ends_it_with_its_counts(tmp_path):
     assert read(out)["rejected"]["feedback_malformed"] >= 1
 
 
+def test_a_sigterm_is_an_interrupt_before_the_session_opens(monkeypatch):
+    handlers = []
+
+    def no_session(*_):
+        handlers.append(signal.getsignal(signal.SIGTERM))
+        raise UserError("none")
+
+    monkeypatch.setattr("bridge.ros2.open_ros2_session", no_session)
+    assert bridge_status(["ros2"]) == 2
+    assert signal.SIG_DFL not in handlers
+
+
 def test_a_busy_ros_2_port_names_the_option_to_change(capsys):
     busy = free_endpoint()
     session = open_session(listen=busy, mode="router")
