@@ -30,8 +30,8 @@ from edge_runtime.transport import open_session
 from hil_tests.bench_floor import STEP_BYTES
 from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
-from hil_tests.report import table
 from hil_tests.sweep import simulate
+from trainer.experiments.report import table
 from trainer.util import processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
@@ -362,7 +362,7 @@ def lockstep(policy: list[str], episodes: int) -> dict[str, Any]:
     endpoint = free_endpoint()
     with tempfile.TemporaryDirectory() as folder, start_edge(policy, endpoint):
         report = simulate(
-            endpoint, OURS, Path(folder) / "lock.json", _LOCKSTEP_LIMIT_S,
+            endpoint, Path(folder) / "lock.json", _LOCKSTEP_LIMIT_S, "--vehicle-id", OURS,
             "--env", SCENARIO, "--clock", "lockstep", "--episodes", str(episodes),
         )  # fmt: skip
     simulated_s = sum(row["time_s"] for row in report["per_episode"])
