@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import zenoh
@@ -32,7 +31,7 @@ from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 from hil_tests.sweep import simulate
 from trainer.experiments.report import table
-from trainer.util import processor_model, source_revision
+from trainer.util import ProgressBar, processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
 SCENARIO = "left_turn"
@@ -94,8 +93,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     with ExitStack() as stack:
         session = open_session(listen=endpoint, mode="router")
         stack.callback(session.close)
-        ours = Ours(session)
-        stack.callback(ours.close)
+        ours = stack.enter_context(Ours(session))
         starts_s: list[float] = []
         while len(starts_s) < STARTS:
             begun_s = time.perf_counter()
@@ -103,13 +101,11 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             starts_s.append(ours.rouse() - begun_s)
             if len(starts_s) < STARTS:
                 edge.end()
-        _tell(f"{STARTS} starts")
         words = (arguments.policy, endpoint, FLOOR, str(ours.reply_bytes))
         bare = stack.enter_context(Process("hil_tests.bench_floor", *words))
         bare.wait_for_line("ready")
-        floor = Contender(session, FLOOR)
-        floor.padding = bytes(len(ours.prepare()[1]) - wire.FRAMES_BYTES - STEP_BYTES)
-        stack.callback(floor.close)
+        state_bytes = len(ours.prepare()[1])
+        floor = stack.enter_context(Contender(session, FLOOR, state_bytes))
         for contender in (ours, floor):
             contender.rouse()
             for _ in range(WARM_UP):
@@ -129,14 +125,9 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             "floor_memory_mb": floor_memory,
         },
         "modes": dict(ours.modes),
-        "state_bytes": len(ours.prepare()[1]),
+        "state_bytes": state_bytes,
         "lockstep": lockstep(policy, arguments.episodes),
     }
-
-
-def _tell(done: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r{done:<40}", end="", file=sys.stderr, flush=True)
 
 
 class Contender:
@@ -145,15 +136,14 @@ class Contender:
     This one speaks to the bare process: the step, the frames, and padding to the size of a state.
     """
 
-    padding = b""
-
-    def __init__(self, session: zenoh.Session, vehicle_id: str) -> None:
+    def __init__(self, session: zenoh.Session, vehicle_id: str, state_bytes: int = 0) -> None:
         self.arrivals: dict[int, float] = {}
         self.vehicle_id = vehicle_id
         draw = np.random.default_rng(0).integers
         shape = (PICTURES, *wire.FRAMES_SHAPE)
         self.pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]
         self.step = 0
+        self._padding = bytes(max(0, state_bytes - wire.FRAMES_BYTES - STEP_BYTES))
         self._publisher = session.declare_publisher(
             wire.key(vehicle_id, "state"), congestion_control=zenoh.CongestionControl.DROP
         )
@@ -164,7 +154,7 @@ class Contender:
 
     def payload(self, frames: bytes) -> bytes:
         """The state of the present step."""
-        return self.step.to_bytes(STEP_BYTES, "big") + frames + self.padding
+        return self.step.to_bytes(STEP_BYTES, "big") + frames + self._padding
 
     def step_of(self, payload: bytes) -> int:
         """Which step an answer is to."""
@@ -204,8 +194,10 @@ class Contender:
             time.sleep(0.0001)
         return self.arrivals[step] - begun_s
 
-    def close(self) -> None:
-        """Undeclare."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._subscriber.undeclare()
         self._publisher.undeclare()
 
@@ -218,9 +210,8 @@ class Ours(Contender):
     """Speaks to `edge_runtime run`: real states, real commands. A block is an episode."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self.reply_bytes = 0
+        self.reply_bytes = self._episode = 0
         self.modes: Counter[str] = Counter()
-        self._episode = 0
         super().__init__(session, OURS)
 
     def end_block(self) -> None:
@@ -231,9 +222,8 @@ class Ours(Contender):
 
     def payload(self, frames: bytes, final: bool = False) -> bytes:
         """A state as a simulator sends it."""
-        episode = self._episode
-        state = make_state(self.step, session="bench", episode=episode, frames=frames, final=final)
-        return wire.encode(state)
+        what = {"session": "bench", "episode": self._episode, "frames": frames, "final": final}
+        return wire.encode(make_state(self.step, **what))
 
     def step_of(self, payload: bytes) -> int:
         """From a command, which is also counted by its mode."""
@@ -252,20 +242,19 @@ def start_edge(policy: list[str], endpoint: str) -> Process:
 def alternate(ours: Ours, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
     """Blocks in turn, who begins a pair ends the next; one pair is not counted."""
     times: dict[str, list[np.ndarray]] = {OURS: [], FLOOR: []}
-    for number in range(blocks + 1):
-        for contender in (ours, floor) if number % 2 else (floor, ours):
-            block = block_ms(contender, count)
-            if number:
-                times[contender.vehicle_id].append(block)
-        _tell(f"block {number} of {blocks}")
-    mine, theirs = times[OURS], times[FLOOR]
-    named = {"ours": mine, "floor": theirs}
+    with ProgressBar("pairs of blocks", blocks + 1) as bar:
+        for number in range(blocks + 1):
+            for contender in (ours, floor) if number % 2 else (floor, ours):
+                block = block_ms(contender, count)
+                if number:
+                    times[contender.vehicle_id].append(block)
+            bar.advance({})
     return {
         "period_ms": PERIOD_S * 1e3,
         "blocks": blocks,
         "states_per_block": count,
-        "unanswered": {name: blocks * count - sum(map(len, some)) for name, some in named.items()},
-        "latency_ms": compare(mine, theirs),
+        "unanswered": {name: blocks * count - sum(map(len, some)) for name, some in times.items()},
+        "latency_ms": compare(times[OURS], times[FLOOR]),
     }
 
 
@@ -304,23 +293,18 @@ def compare(
     if not ours or len(ours) != len(floor):
         raise ValueError(f"{len(ours)} blocks of ours beside {len(floor)} of the floor")
 
-    def quantiles(blocks: Sequence[np.ndarray], draw: Sequence[int] | np.ndarray) -> np.ndarray:
-        found = np.percentile(np.concatenate([blocks[index] for index in draw]), QUANTILES)
-        return np.asarray(found)
+    def quantiles(draw: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Of ours and of the floor, [2, quantiles]."""
+        both = (np.concatenate([blocks[index] for index in draw]) for blocks in (ours, floor))
+        return np.array([np.percentile(times, QUANTILES) for times in both])
 
     draws = np.random.default_rng(seed).integers(0, len(ours), (RESAMPLES, len(ours)))
-    resampled = np.array([quantiles(ours, draw) / quantiles(floor, draw) for draw in draws])
-    low, high = np.percentile(resampled, INTERVAL, axis=0)
-    mine, theirs = (quantiles(blocks, range(len(ours))) for blocks in (ours, floor))
-    columns = zip(QUANTILES, mine, theirs, mine / theirs, low, high, strict=True)
+    resampled = np.array([mine / theirs for mine, theirs in map(quantiles, draws)])
+    intervals = np.percentile(resampled, INTERVAL, axis=0).T.tolist()
+    found = zip(QUANTILES, *quantiles(range(len(ours))).tolist(), intervals, strict=True)
     return {
-        f"p{quantile}": {
-            "ours": float(own),
-            "floor": float(bare),
-            "ratio": float(ratio),
-            "interval": [float(least), float(most)],
-        }
-        for quantile, own, bare, ratio, least, most in columns
+        f"p{quantile}": {"ours": own, "floor": bare, "ratio": own / bare, "interval": interval}
+        for quantile, own, bare, interval in found
     }
 
 
@@ -328,11 +312,10 @@ def memory_mb(process: Process, contender: Contender, steps: int) -> dict[str, A
     """Resident memory at the start and after each tenth of ``steps`` answers, one by one."""
     contender.arrivals.clear()
     samples, latencies_s = [process.resident_mb()], []
-    for part in range(1, MEMORY_SAMPLES + 1):
+    for _ in range(MEMORY_SAMPLES):
         latencies_s += [contender.ask() for _ in range(steps // MEMORY_SAMPLES)]
         contender.arrivals.clear()
         samples.append(process.resident_mb())
-        _tell(f"{part * steps // MEMORY_SAMPLES:,} of {steps:,} steps")
     return {
         "steps": steps,
         "start": samples[0],
@@ -366,13 +349,11 @@ def lockstep(policy: list[str], episodes: int) -> dict[str, Any]:
             "--env", SCENARIO, "--clock", "lockstep", "--episodes", str(episodes),
         )  # fmt: skip
     simulated_s = sum(row["time_s"] for row in report["per_episode"])
-    times = report["times_real_time"]
     return {
         "scenario": SCENARIO,
         "episodes": episodes,
         "simulated_s": simulated_s,
-        "wall_s": simulated_s / times,
-        "times_real_time": times,
+        "times_real_time": report["times_real_time"],
     }
 
 

@@ -17,7 +17,6 @@ from typing import Any
 
 from bridge.environments import CONDITIONS, NOMINAL
 from edge_runtime.cli import (
-    ArgumentParser,
     Command,
     add_public_key,
     examples,
@@ -77,7 +76,7 @@ SHOWN_WRONG = 5
 
 
 def _add_shared(
-    parser: ArgumentParser, parts: Sequence[str], runs: int, of_what: str, target: float
+    parser: argparse.ArgumentParser, parts: Sequence[str], runs: int, of_what: str, target: float
 ) -> None:
     parser.add_argument(
         "--out",
@@ -107,7 +106,7 @@ def _several(text: str) -> int:
     return count
 
 
-def _add_campaign_arguments(parser: ArgumentParser) -> None:
+def _add_campaign_arguments(parser: argparse.ArgumentParser) -> None:
     runs_help = "episodes of each row, the same seeds"
     _add_shared(parser, ("latency", "faults"), 100, runs_help, 0.98)
     parser.add_argument(
@@ -208,7 +207,7 @@ def run_latency(
     return {**latency, "figures": write_figures(out, latency)}
 
 
-def _add_vehicle_arguments(parser: ArgumentParser) -> None:
+def _add_vehicle_arguments(parser: argparse.ArgumentParser) -> None:
     runs_help = "episodes of each loop and of each lag"
     _add_shared(parser, ("compare", "sweep"), 50, runs_help, 0.95)
     rigs = "simulators in real time side by side, each with a vehicle of its own"

@@ -270,7 +270,8 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
 
 
 def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeypatch):
-    edges, limits_s = [], chain((0.1,), repeat(120.0))
+    edges: list[str] = []
+    limits_s = chain((0.1,), repeat(120.0))
     start, wait = sweep.BackgroundCommand.__init__, sweep.BackgroundCommand.wait
 
     def note(self, *words, **options):
