@@ -222,8 +222,9 @@ class Ours(Contender):
 
     def payload(self, frames: bytes, final: bool = False) -> bytes:
         """A state as a simulator sends it."""
-        what = {"session": "bench", "episode": self._episode, "frames": frames, "final": final}
-        return wire.encode(make_state(self.step, **what))
+        episode = self._episode
+        state = make_state(self.step, session="bench", episode=episode, frames=frames, final=final)
+        return wire.encode(state)
 
     def step_of(self, payload: bytes) -> int:
         """From a command, which is also counted by its mode."""

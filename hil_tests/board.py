@@ -33,7 +33,7 @@ from edge_runtime.cli import examples, positive, sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
-from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand, wait_until
+from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 
 Keep = Callable[[dict[str, Any]], None]
 """Given a report, for JSON, each time when it has grown."""
@@ -425,8 +425,8 @@ def _drive(certificates: Path, port: int) -> dict[str, Any]:
         "--listen", f"tls/127.0.0.1:{port}", "--vehicle-id", VEHICLE, "--wait-edge-s", "120",
         "--tls", str(certificates / f"simulator-{VEHICLE}"), "--out", str(out),
     ]  # fmt: skip
-    with BackgroundCommand(*words, quiet=True) as simulator:
-        simulator.wait(_EPISODE_LIMIT_S)
+    with Process(*words) as simulator:
+        simulator.succeed(_EPISODE_LIMIT_S)
     report = json.loads(out.read_text())
     kept = ("success_rate", "answered_states", "latency_ms", "safe_stops", "rejected", "policy_id")
     return {name: report[name] for name in kept} | {"outcome": report["per_episode"][0]["outcome"]}

@@ -32,7 +32,7 @@ from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.processes import (
     POLICY,
     PUBLIC_KEY,
-    BackgroundCommand,
+    Process,
     headless_viewer,
     operator,
     run_command,
@@ -207,16 +207,16 @@ def recorded_drive(work: Path) -> Path:
     trust = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
     with ExitStack() as stack:
         edge = ("edge_runtime", "run", *trust, *common, "--vehicle", "mock")
-        stack.enter_context(BackgroundCommand(*edge, ready="ready"))
+        stack.enter_context(Process(*edge, ready="ready", shown=True))
         record = ("bridge", "record", "--out", str(out), *common, "--wait-s", "30")
-        recorder = stack.enter_context(BackgroundCommand(*record))
+        recorder = stack.enter_context(Process(*record, shown=True))
         stack.enter_context(operator(endpoint, VEHICLE_ID))
         run_command(
             "bridge", "simulate", "--env", "left_turn", "--clock", "realtime",
             "--latency", LATENCY, "--episodes", EPISODES, "--seed", SEED,
             "--listen", endpoint, "--vehicle-id", VEHICLE_ID,
         )  # fmt: skip
-        recorder.wait(RECORDER_LIMIT_S)
+        recorder.succeed(RECORDER_LIMIT_S)
     return out
 
 

@@ -18,7 +18,7 @@ from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_bytes
-from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand, run_command, wait_until
+from hil_tests.processes import POLICY, PUBLIC_KEY, Process, run_command, wait_until
 
 LEFT_TURN = Path("hil_tests/recordings/left_turn.mcap")
 EPISODES = 4
@@ -60,23 +60,23 @@ def _record(out: Path, trust: tuple[str, ...]) -> None:
     endpoint = free_endpoint()
     simulate = ("bridge", "simulate", "--env", "left_turn", "--listen", endpoint)
     record = ("bridge", "record", "--out", str(out), "--connect", endpoint)
-    first = BackgroundCommand(*simulate, "--episodes", str(EPISODES), quiet=True)
+    first = Process(*simulate, "--episodes", str(EPISODES))
     wait = ("--wait-s", "30", "--linger-s", "30")
-    with first, BackgroundCommand(*record, *wait, quiet=True) as recorder:
+    with first, Process(*record, *wait) as recorder:
         _wait_for_simulators(out, 1)
         run = ("edge_runtime", "run", *trust, "--connect", endpoint)
-        with BackgroundCommand(*run, ready="ready"):
-            first.wait(PATIENCE_S)
+        with Process(*run, ready="ready", shown=True):
+            first.succeed(PATIENCE_S)
             realtime = ("--seed", str(EPISODES), "--clock", "realtime")
-            with BackgroundCommand(*simulate, *realtime, quiet=True) as second:
+            with Process(*simulate, *realtime) as second:
                 _wait_for_simulators(out, 2)
                 time.sleep(DRIVEN_BEFORE_S)
                 second.send(signal.SIGSTOP)
                 time.sleep(STOPPED_S)
                 second.send(signal.SIGCONT)
-                second.wait(PATIENCE_S)
+                second.succeed(PATIENCE_S)
         recorder.send(signal.SIGTERM)
-        recorder.wait(PATIENCE_S)
+        recorder.succeed(PATIENCE_S)
 
 
 def _wait_for_simulators(out: Path, count: int) -> None:

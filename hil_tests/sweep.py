@@ -25,8 +25,8 @@ from edge_runtime.util import UserError, read_json
 from hil_tests.faults.rig import free_bus
 from hil_tests.mock_hunter.body import make_parameters
 from hil_tests.processes import (
-    BackgroundCommand,
     CommandTimeoutError,
+    Process,
     in_parallel,
     operator,
     trusting,
@@ -325,12 +325,12 @@ def run_rig(task: Task, part: Part, limit_s: float, *options: str, hunter: bool 
             bus, config = free_bus(), Path(folder) / "edge.toml"
             settings = [f"--set={name}={value}" for name, value in task.changes.items()]
             mock = ("hil_tests", "mock_hunter", "--bus", bus, *settings)
-            stack.enter_context(BackgroundCommand(*mock, ready="ready", quiet=True))
+            stack.enter_context(Process(*mock, ready="ready"))
             config.write_text(f'bus = "{bus}"\n')
             vehicle = ("--vehicle", "hunter", "--config", str(config))
         edge = ("edge_runtime", "run", *trusting(task.policy, task.public_key), *vehicle)
         where = ("--connect", endpoint, *common)
-        stack.enter_context(BackgroundCommand(*edge, *where, ready="ready", quiet=True))
+        stack.enter_context(Process(*edge, *where, ready="ready"))
         if hunter:
             stack.enter_context(operator(endpoint, VEHICLE_ID))
         return simulate(
@@ -351,8 +351,8 @@ def simulate(endpoint: str, out: Path, limit_s: float, *options: str) -> dict[st
     words = ("bridge", "simulate", *options)
     began_s = time.monotonic()
     here = ("--listen", endpoint, "--out", str(out))
-    with BackgroundCommand(*words, *here, quiet=True) as simulator:
-        simulator.wait(limit_s)
+    with Process(*words, *here) as simulator:
+        simulator.succeed(limit_s)
     wall_s = round(time.monotonic() - began_s, 3)
     command = f"python -m {shlex.join(words)}"
     return {**read_json(out, "report"), "command": command, "wall_s": wall_s}

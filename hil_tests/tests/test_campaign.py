@@ -272,16 +272,14 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
 def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeypatch):
     edges: list[str] = []
     limits_s = chain((0.1,), repeat(120.0))
-    start, wait = sweep.BackgroundCommand.__init__, sweep.BackgroundCommand.wait
+    start, wait = sweep.Process.__init__, sweep.Process.wait
 
     def note(self, *words, **options):
         edges.extend(words[:1] if words[0] == "edge_runtime" else ())
         start(self, *words, **options)
 
-    monkeypatch.setattr(sweep.BackgroundCommand, "__init__", note)
-    monkeypatch.setattr(
-        sweep.BackgroundCommand, "wait", lambda self, _limit_s: wait(self, next(limits_s))
-    )
+    monkeypatch.setattr(sweep.Process, "__init__", note)
+    monkeypatch.setattr(sweep.Process, "wait", lambda self, _limit_s: wait(self, next(limits_s)))
     task = Task(POLICY, "any", "left_turn", "nominal", 1, 1)
     (found,) = sweep.drive_network(task, Part("none", 1, 1))
     assert len(found["episodes"]) == 1

@@ -20,7 +20,7 @@ from edge_runtime.cli import run_cli
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.tests.policies import write_policy as write_toy_policy
-from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand
+from hil_tests.processes import POLICY, PUBLIC_KEY, Process
 from hil_tests.recording import LEFT_TURN
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.evaluate import drive_episodes
@@ -122,7 +122,7 @@ def test_a_killed_runtime_stops_the_car_and_a_new_one_drives_on(policy, tmp_path
 def test_a_mock_vehicle_drives_along_and_latency_is_really_there(policy, tmp_path):
     endpoint, out = free_endpoint(), tmp_path / "late.json"
     arguments = ("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
-    with BackgroundCommand("edge_runtime", "run", *arguments, "--vehicle", "mock", ready="ready"):
+    with Process("edge_runtime", "run", *arguments, "--vehicle", "mock", ready="ready"):
         options = ("--episodes", "2", "--clock", "lockstep", "--latency", "50ms+-10ms")
         with start_simulate(endpoint, out, "left_turn", *options) as simulator:
             assert simulator.wait(120) == 0, simulator.errors

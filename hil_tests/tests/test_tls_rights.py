@@ -20,7 +20,7 @@ from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, run_command
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.util import UserError
-from hil_tests.processes import BackgroundCommand
+from hil_tests.processes import Process
 from hil_tests.tests.tls_parties import SETTLE_S, Intruder, listener, make_certificates, session
 
 STRANGERS = ("edge-hunter02", "simulator-hunter02", "operator-hunter02", "viewer")
@@ -197,7 +197,7 @@ def test_a_vehicle_at_a_router_hears_only_its_own(parties, tmp_path, rights, hea
     endpoint, found = free_endpoint("tls"), []
     path = router_file(endpoint, parties, tmp_path / "r.json5", rights)
     with (
-        BackgroundCommand("bridge", "router", "--config", path, ready="ready"),
+        Process("bridge", "router", "--config", path, ready="ready"),
         contextlib.ExitStack() as opened,
     ):
         edge, *simulators = (
