@@ -26,7 +26,6 @@ from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.policy import load_policy
 from edge_runtime.transport import open_session
-from hil_tests.bench_floor import STEP_BYTES
 from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 from hil_tests.sweep import simulate
@@ -91,9 +90,8 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     policy = ["--policy", arguments.policy, "--public-key", arguments.public_key]
     endpoint = free_endpoint()
     with ExitStack() as stack:
-        session = open_session(listen=endpoint, mode="router")
-        stack.callback(session.close)
-        ours = stack.enter_context(Ours(session))
+        session = stack.enter_context(open_session(listen=endpoint, mode="router"))
+        ours, floor = (stack.enter_context(Contender(session, name)) for name in (OURS, FLOOR))
         starts_s: list[float] = []
         while len(starts_s) < STARTS:
             begun_s = time.perf_counter()
@@ -101,16 +99,13 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             starts_s.append(ours.rouse() - begun_s)
             if len(starts_s) < STARTS:
                 edge.end()
-        words = (arguments.policy, endpoint, FLOOR, str(ours.reply_bytes))
-        bare = stack.enter_context(Process("hil_tests.bench_floor", *words))
-        bare.wait_for_line("ready")
-        state_bytes = len(ours.prepare()[1])
-        floor = stack.enter_context(Contender(session, FLOOR, state_bytes))
+        words = ("hil_tests.bench_floor", arguments.policy, endpoint, FLOOR)
+        bare = stack.enter_context(Process(*words, ready="ready"))
         for contender in (ours, floor):
             contender.rouse()
             for _ in range(WARM_UP):
                 contender.ask()
-        ours.end_block()
+            contender.end_block()
         latency = alternate(ours, floor, arguments.blocks, arguments.states)
         idle = idle_load(edge.pid)
         memory = memory_mb(edge, ours, arguments.steps)
@@ -125,25 +120,25 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             "floor_memory_mb": floor_memory,
         },
         "modes": dict(ours.modes),
-        "state_bytes": state_bytes,
+        "state_bytes": len(ours.prepare()[1]),
         "lockstep": lockstep(policy, arguments.episodes),
     }
 
 
 class Contender:
-    """Sends states to a process; ``arrivals`` holds when the answer to each step came.
+    """Sends states to a process. A block of them is an episode.
 
-    This one speaks to the bare process: the step, the frames, and padding to the size of a state.
+    ``arrivals`` holds when the answer to each step came, ``modes`` how many answers had each mode.
     """
 
-    def __init__(self, session: zenoh.Session, vehicle_id: str, state_bytes: int = 0) -> None:
-        self.arrivals: dict[int, float] = {}
+    def __init__(self, session: zenoh.Session, vehicle_id: str) -> None:
         self.vehicle_id = vehicle_id
+        self.arrivals: dict[int, float] = {}
+        self.modes: Counter[str] = Counter()
         draw = np.random.default_rng(0).integers
         shape = (PICTURES, *wire.FRAMES_SHAPE)
-        self.pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]
-        self.step = 0
-        self._padding = bytes(max(0, state_bytes - wire.FRAMES_BYTES - STEP_BYTES))
+        self._pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]
+        self._step = self._episode = 0
         self._publisher = session.declare_publisher(
             wire.key(vehicle_id, "state"), congestion_control=zenoh.CongestionControl.DROP
         )
@@ -152,21 +147,19 @@ class Contender:
             wire.key(vehicle_id, "command"), self._on_command
         )
 
-    def payload(self, frames: bytes) -> bytes:
-        """The state of the present step."""
-        return self.step.to_bytes(STEP_BYTES, "big") + frames + self._padding
-
-    def step_of(self, payload: bytes) -> int:
-        """Which step an answer is to."""
-        return int.from_bytes(payload[:STEP_BYTES], "big")
+    def prepare(self, final: bool = False) -> tuple[int, bytes]:
+        """The next step and its state."""
+        self._step += 1
+        frames = self._pictures[self._step % PICTURES]
+        state = make_state(
+            self._step, session="bench", episode=self._episode, frames=frames, final=final
+        )
+        return self._step, wire.encode(state)
 
     def end_block(self) -> None:
-        """After the last state of a block."""
-
-    def prepare(self) -> tuple[int, bytes]:
-        """The next step and its payload."""
-        self.step += 1
-        return self.step, self.payload(self.pictures[self.step % PICTURES])
+        """A final state: the edge runtime stands by while the other process works."""
+        self.put(self.prepare(final=True)[1])
+        self._episode += 1
 
     def rouse(self) -> float:
         """Send states until the first answer, and say when that came (perf_counter).
@@ -203,36 +196,10 @@ class Contender:
 
     def _on_command(self, sample: zenoh.Sample) -> None:
         arrived_s = time.perf_counter()
-        self.arrivals.setdefault(self.step_of(bytes(sample.payload)), arrived_s)
-
-
-class Ours(Contender):
-    """Speaks to `edge_runtime run`: real states, real commands. A block is an episode."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self.reply_bytes = self._episode = 0
-        self.modes: Counter[str] = Counter()
-        super().__init__(session, OURS)
-
-    def end_block(self) -> None:
-        """A final state: it stands by while the other one works."""
-        self.step += 1
-        self.put(self.payload(self.pictures[0], final=True))
-        self._episode += 1
-
-    def payload(self, frames: bytes, final: bool = False) -> bytes:
-        """A state as a simulator sends it."""
-        episode = self._episode
-        state = make_state(self.step, session="bench", episode=episode, frames=frames, final=final)
-        return wire.encode(state)
-
-    def step_of(self, payload: bytes) -> int:
-        """From a command, which is also counted by its mode."""
-        command = wire.decode_command(payload)
+        command = wire.decode_command(bytes(sample.payload))
         assert isinstance(command, wire.Command), command
-        self.reply_bytes = len(payload)
         self.modes[command.mode] += 1
-        return command.step
+        self.arrivals.setdefault(command.step, arrived_s)
 
 
 def start_edge(policy: list[str], endpoint: str) -> Process:
@@ -240,7 +207,7 @@ def start_edge(policy: list[str], endpoint: str) -> Process:
     return Process("edge_runtime", "run", *policy, "--connect", endpoint, "--vehicle-id", OURS)
 
 
-def alternate(ours: Ours, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
+def alternate(ours: Contender, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
     """Blocks in turn, who begins a pair ends the next; one pair is not counted."""
     times: dict[str, list[np.ndarray]] = {OURS: [], FLOOR: []}
     with ProgressBar("pairs of blocks", blocks + 1) as bar:
