@@ -44,7 +44,7 @@ HEARD = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
 """What is kept of the CAN bus: all commands, the chassis's state, its speed."""
 _INSIDE = "hil_tests.faults.inside"
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
-_TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(\w+)")
+_TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) .*motion=(\w+)")
 _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
 _REARM_EVERY_S = 2.0
@@ -366,7 +366,6 @@ class Truth(NamedTuple):
 
     since_s: float
     control: str
-    condition: str
     moves: bool
 
 
@@ -408,8 +407,8 @@ class ChassisProcess:
 
     def _on_line(self, seen_s: float, line: str) -> None:
         if told := _TOLD.match(line):
-            since_s, control, condition, motion = told.groups()
-            self.truth.append(Truth(float(since_s), control, condition, motion == "moves"))
+            since_s, control, motion = told.groups()
+            self.truth.append(Truth(float(since_s), control, motion == "moves"))
         if switched := _SWITCHED.match(line):
             applied_s, name, word = switched.groups()
             self.switched.append((float(applied_s), name, word))

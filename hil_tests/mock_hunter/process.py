@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Any
 
 import can
 
@@ -62,7 +61,7 @@ class Server:
         later: Sequence[tuple[float, str]] = (),
     ) -> None:
         self.orders: queue.SimpleQueue[Switch] = queue.SimpleQueue()
-        """Switches to obey next, from any thread."""
+        """Faults to switch next, from any thread."""
         self._hunter, self._bus, self._tell = hunter, bus, tell
         self._later = sorted(later)
         self._ending = threading.Event()
@@ -126,18 +125,9 @@ def _is_plain(message: can.Message) -> bool:
     return not any(odd)
 
 
-class _AfterFault(argparse.Action):
-    """``--after-s`` belongs to the ``--fault`` before it."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
-        if not namespace.fault or namespace.fault[-1][0]:
-            parser.error("--after-s follows a --fault")
-        namespace.fault[-1] = (values, namespace.fault[-1][1])
-
-
 EXAMPLE = examples(
     "python -m hil_tests mock_hunter",
-    "python -m hil_tests mock_hunter --bus socketcan:vcan0 --fault link_steer --after-s 20",
+    "python -m hil_tests mock_hunter --bus socketcan:vcan0 --fault link_steer@20",
 )
 
 
@@ -157,10 +147,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--set", action="append", metavar="NAME=VALUE", help="a parameter's value")
     parser.add_argument(
-        "--fault", action="append", type=_fault, metavar="NAME", help="from the start"
-    )
-    parser.add_argument(
-        "--after-s", action=_AfterFault, type=seconds, metavar="S", help="that fault comes later"
+        "--fault", action="append", type=_fault, metavar="NAME[@S]", help="from the start, or later"
     )
 
 
@@ -197,7 +184,8 @@ def _check_reachable(text: str) -> BusName:
 
 
 def _fault(text: str) -> tuple[float, str]:
+    name, at, after_s = text.partition("@")
     try:
-        return 0.0, check_fault(text)
+        return seconds(after_s) if at else 0.0, check_fault(name)
     except UserError as error:
         raise argparse.ArgumentTypeError(str(error)) from None

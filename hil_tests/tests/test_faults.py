@@ -222,7 +222,7 @@ def test_the_speed_of_a_frame_has_a_sign():
 
 def moved_between(truth, begin_s, end_s):
     chassis = ChassisProcess.__new__(ChassisProcess)
-    chassis.truth = [Truth(since_s, "can", "ok", moves) for since_s, moves in truth]
+    chassis.truth = [Truth(since_s, "can", moves) for since_s, moves in truth]
     return chassis.moved_between(begin_s, end_s)
 
 

@@ -99,7 +99,7 @@ def test_a_bus_that_takes_nothing_is_said_once():
 def test_as_a_process_it_obeys_switches_and_ends_on_a_signal(monkeypatch):
     monkeypatch.setenv("PYTHONIOENCODING", "utf-8:strict")  # as in a desktop's locale
     name = free_bus()
-    chassis = ChassisProcess(name, "--fault", "estop", "--after-s", "0.3")
+    chassis = ChassisProcess(name, "--fault", "estop@0.3")
     bus = open_bus(parse_bus(name))
     try:
         assert status_after(bus, lambda data: data[0] == 1)  # the fault of the command line
@@ -137,8 +137,7 @@ def test_orders_come_in_turn_and_bad_ones_are_told():
         (["--bus", "can0"], "is no CAN bus"),
         (["--bus", "udp_multicast:10.1.2.3"], "is no IPv4 multicast group"),
         (["--fault", "meteor"], "no fault 'meteor'; choose from silent"),
-        (["--after-s", "3"], "--after-s follows a --fault"),
-        (["--fault", "silent", "--after-s", "-1"], "not a finite number of seconds"),
+        (["--fault", "silent@-1"], "not a finite number of seconds"),
         (["--set", "wings=2"], "no parameter 'wings'"),
         (["--set", "track_m"], "use NAME=VALUE"),
         (["--model", "hunter-3"], "invalid choice"),
