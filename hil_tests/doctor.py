@@ -284,11 +284,9 @@ def _can_over_udp() -> str:
     import can
 
     from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+    from hil_tests.faults.rig import free_bus
 
-    with socket.socket(type=socket.SOCK_DGRAM) as probe:
-        probe.bind((LOOPBACK, 0))
-        number = probe.getsockname()[1]
-    name = parse_bus(f"udp_multicast:239.74.163.9:{number}")
+    name = parse_bus(free_bus())
     with open_bus(name) as sender, open_bus(name) as receiver:
         sender.send(can.Message(arbitration_id=0x111, data=b"doctor", is_extended_id=False))
         heard = receiver.recv(ARRIVAL_S)

@@ -12,7 +12,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,15 +25,13 @@ from bridge.rerun.wire_view import Timeline
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.files import check_writable, make_directory, write_atomic
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
 from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.processes import (
     POLICY,
     PUBLIC_KEY,
-    Process,
+    drive_shown,
     headless_viewer,
-    operator,
     run_command,
 )
 from hil_tests.report import write_figures, write_png
@@ -56,7 +53,6 @@ VEHICLE_ID = "pictures"
 LATENCY = "50ms+-10ms,outage=0.4s@3s"
 EPISODES, SEED = "2", "8"
 LOOP_TIME_S = 8.0
-RECORDER_LIMIT_S = 30.0
 PARTS = {
     "uplink": "#2878e6",
     "inference and queue": "#3caa5a",
@@ -202,21 +198,9 @@ def recorded_drive(work: Path) -> Path:
     out = work / "drive.mcap"
     if out.exists():
         return out
-    endpoint = free_endpoint()
-    common = ("--connect", endpoint, "--vehicle-id", VEHICLE_ID)
     trust = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
-    with ExitStack() as stack:
-        edge = ("edge_runtime", "run", *trust, *common, "--vehicle", "mock")
-        stack.enter_context(Process(*edge, ready="ready", shown=True))
-        record = ("bridge", "record", "--out", str(out), *common, "--wait-s", "30")
-        recorder = stack.enter_context(Process(*record, shown=True))
-        stack.enter_context(operator(endpoint, VEHICLE_ID))
-        run_command(
-            "bridge", "simulate", "--env", "left_turn", "--clock", "realtime",
-            "--latency", LATENCY, "--episodes", EPISODES, "--seed", SEED,
-            "--listen", endpoint, "--vehicle-id", VEHICLE_ID,
-        )  # fmt: skip
-        recorder.succeed(RECORDER_LIMIT_S)
+    simulate = ("--clock", "realtime", "--latency", LATENCY, "--episodes", EPISODES, "--seed", SEED)
+    drive_shown(VEHICLE_ID, trust, simulate, ("record", "--out", str(out), "--wait-s", "30"))
     return out
 
 

@@ -236,6 +236,37 @@ def run_command(*arguments: str) -> None:
         raise UserError(f"python -m {arguments[0]} {arguments[1]} ended with status {status}")
 
 
+def drive_shown(
+    vehicle_id: str,
+    trust: Sequence[str],
+    simulate: Sequence[str],
+    listener: Sequence[str] = (),
+) -> None:
+    """Drive the left turn with a mock vehicle and an operator, by commands as a person types them.
+
+    Args:
+        vehicle_id: whose keys on the wire.
+        trust: the edge runtime's options for its policy.
+        simulate: further options of ``bridge simulate``.
+        listener: a further command of the bridge, which listens and ends after the drive.
+
+    Raises:
+        UserError: one of them failed.
+    """
+    endpoint = free_endpoint()
+    common = ("--connect", endpoint, "--vehicle-id", vehicle_id)
+    with contextlib.ExitStack() as stack:
+        edge = ("edge_runtime", "run", *trust, *common, "--vehicle", "mock")
+        stack.enter_context(Process(*edge, ready="ready", shown=True))
+        beside = Process("bridge", *listener, *common, shown=True) if listener else None
+        stack.enter_context(beside or contextlib.nullcontext())
+        stack.enter_context(operator(endpoint, vehicle_id))
+        where = ("--listen", endpoint, "--vehicle-id", vehicle_id)
+        run_command("bridge", "simulate", "--env", "left_turn", *simulate, *where)
+        if beside is not None:
+            beside.succeed()
+
+
 def end_children() -> None:
     """Ask every process that this one has started to end, whichever thread waits for it."""
     for children in Path("/proc/self/task").glob("*/children"):
