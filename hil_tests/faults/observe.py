@@ -51,13 +51,6 @@ class ModeSeen(NamedTuple):
     reason: str
 
 
-class BrakeSeen(NamedTuple):
-    """The simulated vehicle's brake, pressed or released."""
-
-    seen_s: float
-    pressed: bool
-
-
 @dataclass
 class Timeline:
     """Events in order of arrival. Threads only append; a reader sees whole entries."""
