@@ -116,12 +116,9 @@ def test_packages_are_asked_for(monkeypatch, tmp_path):
     assert "(locked: 0.0.1)" in examine(BY_NAME["locked versions"]).detail
 
 
-def test_an_old_python_is_missing(monkeypatch):
+def test_an_old_python_is_missing_and_the_can_bus_carries_a_frame(monkeypatch):
     monkeypatch.setattr(doctor, "OLDEST", (99, 0))
     assert not examine(BY_NAME["Python"]).ok
-
-
-def test_the_can_bus_between_processes_carries_a_frame():
     said = examine(BY_NAME["CAN over UDP"]).detail
     assert said == "a frame went through UDP multicast on loopback"
 
