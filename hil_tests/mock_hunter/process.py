@@ -31,23 +31,16 @@ Switch = tuple[str, bool]
 _WORDS = {"on": True, "off": False}
 
 
-def parse_switch(line: str) -> Switch:
-    """``NAME on`` or ``NAME off``. Raises UserError for anything else."""
-    name, _, word = line.strip().partition(" ")
-    if word not in _WORDS:
-        raise UserError(f"{line.strip()!r} is no order: use NAME on, or NAME off")
-    return check_fault(name), _WORDS[word]
-
-
 def read_orders(
     lines: Iterable[str], obey: Callable[[Switch], None], complain: Callable[[str], None]
 ) -> None:
-    """Read lines to their end, in a thread of its own so that nobody waits for them."""
+    """Read ``NAME on`` or ``NAME off``, line by line, in a thread so that nobody waits for them."""
     for line in lines:
-        try:
-            obey(parse_switch(line))
-        except UserError as error:
-            complain(f"error: {error}")
+        name, _, word = line.strip().partition(" ")
+        if name in FAULTS and word in _WORDS:
+            obey((name, _WORDS[word]))
+        else:
+            complain(f"error: {line.strip()!r} is no order: use NAME on, or NAME off")
 
 
 class Server:
