@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 
 import can
@@ -51,12 +51,10 @@ class Server:
         hunter: MockHunter,
         bus: can.BusABC,
         tell: Callable[[str], None] = lambda line: None,
-        later: Sequence[tuple[float, str]] = (),
     ) -> None:
         self.orders: queue.SimpleQueue[Switch] = queue.SimpleQueue()
         """Faults to switch next, from any thread."""
         self._hunter, self._bus, self._tell = hunter, bus, tell
-        self._later = sorted(later)
         self._ending = threading.Event()
         self._said = ""
         self._fails = False
@@ -67,11 +65,7 @@ class Server:
 
     def run(self) -> None:
         """Obey and report."""
-        begun_s = time.monotonic()
         while not self._ending.is_set():
-            now_s = time.monotonic()
-            while self._later and now_s - begun_s >= self._later[0][0]:
-                self._switch(self._later.pop(0)[1], True)
             while not self.orders.empty():
                 self._switch(*self.orders.get())
             for frame in self._hunter.due(time.monotonic()):
@@ -150,7 +144,15 @@ def run(arguments: argparse.Namespace) -> int:
     bus, tell = open_bus(_check_reachable(arguments.bus)), partial(print, flush=True)
     try:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
-        server = Server(hunter, bus, tell, arguments.fault or ())
+        server = Server(hunter, bus, tell)
+        for after_s, name in arguments.fault or ():
+            switch = partial(server.orders.put, (name, True))
+            if after_s:
+                later = threading.Timer(after_s, switch)
+                later.daemon = True
+                later.start()
+            else:
+                switch()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: server.stop())
         if isinstance(sys.stdin, io.TextIOWrapper):
