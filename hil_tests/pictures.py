@@ -24,7 +24,7 @@ from bridge.recording import Recording, read_heard
 from bridge.rerun.wire_view import Timeline
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.files import check_writable, make_directory, write_atomic
+from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError, read_json
 from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.processes import (
@@ -75,11 +75,6 @@ def add_arguments(parser: ArgumentParser) -> None:
         "names", metavar="NAME", nargs="*", help=f"of {', '.join(PICTURES)} (default: all)"
     )
     parser.add_argument("--out", metavar="DIR", default="docs", help="where they go")
-    parser.add_argument(
-        "--work",
-        metavar="DIR",
-        help="keep what is made on the way (default: thrown away)",
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -96,11 +91,9 @@ def run(arguments: argparse.Namespace) -> int:
     for name in names:
         check_writable(out / name)
     with tempfile.TemporaryDirectory(prefix="phil-pictures-") as folder:
-        work = Path(arguments.work or folder)
-        make_directory(work)
         for name in names:
             try:
-                PICTURES[name](out / name, work)
+                PICTURES[name](out / name, Path(folder))
             except UserError as error:
                 status = SOME_MISSING
                 print(f"{name}: not made: {error}", file=sys.stderr)
