@@ -74,7 +74,7 @@ MS = Measure({"ms": 1.0, "us": 1e-3, "s": 1e3}, most=60_000.0)
 SECONDS = Measure({"s": 1.0, "ms": 1e-3, "us": 1e-6}, most=MAX_TIME_S)
 PERCENT = Measure({"%": 1.0}, most=100.0)
 COUNT = Measure({"": 1.0}, least=1.0, most=1e6)
-RATE = Measure({"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}, 1e-3, 1e9)
+RATE = Measure({"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}, math.ulp(0.0), 1e9)
 
 
 @dataclass(frozen=True)

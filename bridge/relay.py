@@ -266,15 +266,17 @@ class RelayTraffic:
             counts["lost"] += not arrivals
             counts["duplicated"] += len(arrivals) > 1
         if is_final:
-            self._come_out(name, payload, now_s)
+            self._come_out(name, payload)
             return
         for arrival_s in arrivals:
             due_s = start_s + arrival_s
             line.push(due_s, partial(self._come_out, name, payload, due_s))
 
-    def _come_out(self, name: str, payload: bytes, due_s: float) -> None:
+    def _come_out(self, name: str, payload: bytes, due_s: float | None = None) -> None:
+        """Deliver it; ``due_s`` is when its timer was to run, None where it passes at once."""
         with self._lock:
-            self._lags_s.append(time.monotonic() - due_s)
+            if due_s is not None:
+                self._lags_s.append(time.monotonic() - due_s)
             self._counts[name]["delivered"] += 1
         self._deliver[name](payload)
 

@@ -116,10 +116,11 @@ def run(arguments: Any) -> int:
         check_ros2_endpoint(endpoint)
     namespace = arguments.namespace or namespace_of(vehicle_id)
     check_ros_name(namespace, "namespace")
-    session = open_ros2_session(arguments.ros2_listen, arguments.ros2_connect)
     with (
-        contextlib.closing(session),
         sigterm_as_interrupt(),
+        contextlib.closing(
+            open_ros2_session(arguments.ros2_listen, arguments.ros2_connect)
+        ) as session,
         open_listener(connect, vehicle_id, arguments.wait_s, tls) as listener,
         open_node(session, namespace) as node,
     ):

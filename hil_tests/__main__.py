@@ -13,13 +13,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
     "pictures": ("hil_tests.pictures", "every picture of the READMEs"),
-    "campaign": ("hil_tests.campaign", "every fault, every latency row, one report"),
+    "campaign": ("hil_tests.campaign:CAMPAIGN", "every fault, every latency row, one report"),
     "mock_hunter": (
         "hil_tests.mock_hunter.process",
         "a Hunter on a CAN bus, with a switch for each fault",
     ),
     "vehicle": (
-        "hil_tests.vehicle",
+        "hil_tests.campaign:VEHICLES",
         "policy in the loop against vehicle in the loop, and the lag it may have",
     ),
     "bench": ("hil_tests.bench_loop", "the loop against the least that could answer"),

@@ -1,7 +1,7 @@
 """``python -m hil_tests.bench_floor``: the least that could answer a state.
 
-A Zenoh callback, onnxruntime on the frames, and a put of a reply of the size that it is told:
-no validation, no watchdog, no limits. What the edge runtime costs is measured against this.
+A Zenoh callback, onnxruntime on the frames, and a put of a command: no validation, no watchdog, no
+limits. What the edge runtime costs is measured against this.
 """
 
 from __future__ import annotations
@@ -10,45 +10,48 @@ import signal
 import sys
 import threading
 
+import msgspec
 import numpy as np
 import onnxruntime
 import zenoh
 
 from edge_runtime.transport import open_session
-from edge_runtime.wire import FRAMES_BYTES, FRAMES_SHAPE, key
-
-STEP_BYTES = 8
+from edge_runtime.wire import DRIVE, FRAMES_SHAPE, Command, State, encode, key
 
 
-def main(policy: str, connect: str, vehicle_id: str, reply_bytes: int) -> None:
-    """Answer until SIGTERM. A payload is the step, the frames, and padding."""
+def main(policy: str, connect: str, vehicle_id: str) -> None:
+    """Answer until SIGTERM."""
     end = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: end.set())
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     network = onnxruntime.InferenceSession(policy, options, providers=["CPUExecutionProvider"])
-    session = open_session(connect=connect, mode="peer")
-    publisher = session.declare_publisher(
-        key(vehicle_id, "command"),
-        congestion_control=zenoh.CongestionControl.DROP,
-        priority=zenoh.Priority.REAL_TIME,
-        express=True,
-    )
-    padding = bytes(reply_bytes - STEP_BYTES)
+    decode = msgspec.msgpack.Decoder(State).decode
 
     def on_state(sample: zenoh.Sample) -> None:
-        payload = bytes(sample.payload)
-        frames = np.frombuffer(payload, np.uint8, FRAMES_BYTES, STEP_BYTES)
-        network.run(["action"], {"frames": frames.reshape(1, *FRAMES_SHAPE)})
-        publisher.put(payload[:STEP_BYTES] + padding)
+        state = decode(bytes(sample.payload))
+        frames = np.frombuffer(state.frames, np.uint8).reshape(1, *FRAMES_SHAPE)
+        (actions,) = network.run(["action"], {"frames": frames})
+        command = Command(
+            session=state.session, episode=state.episode, step=state.step, mode=DRIVE,
+            action=actions[0].tolist(), policy_id="0" * 64, received_ns=state.sent_ns,
+            inference_ns=0, sent_ns=state.sent_ns,
+        )  # fmt: skip
+        publisher.put(encode(command))
 
-    subscriber = session.declare_subscriber(key(vehicle_id, "state"), on_state)
-    print("ready", flush=True)
-    end.wait()
-    subscriber.undeclare()
-    publisher.undeclare()
-    session.close()
+    with (
+        open_session(connect=connect, mode="peer") as session,
+        session.declare_publisher(
+            key(vehicle_id, "command"),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        ) as publisher,
+        session.declare_subscriber(key(vehicle_id, "state"), on_state),
+    ):
+        print("ready", flush=True)
+        end.wait()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]))
+    main(*sys.argv[1:])

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import zenoh
@@ -27,12 +26,11 @@ from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.policy import load_policy
 from edge_runtime.transport import open_session
-from hil_tests.bench_floor import STEP_BYTES
 from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
-from hil_tests.report import table
 from hil_tests.sweep import simulate
-from trainer.util import processor_model, source_revision
+from trainer.experiments.report import table
+from trainer.util import ProgressBar, processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
 SCENARIO = "left_turn"
@@ -92,10 +90,8 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     policy = ["--policy", arguments.policy, "--public-key", arguments.public_key]
     endpoint = free_endpoint()
     with ExitStack() as stack:
-        session = open_session(listen=endpoint, mode="router")
-        stack.callback(session.close)
-        ours = Ours(session)
-        stack.callback(ours.close)
+        session = stack.enter_context(open_session(listen=endpoint, mode="router"))
+        ours, floor = (stack.enter_context(Contender(session, name)) for name in (OURS, FLOOR))
         starts_s: list[float] = []
         while len(starts_s) < STARTS:
             begun_s = time.perf_counter()
@@ -103,18 +99,13 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             starts_s.append(ours.rouse() - begun_s)
             if len(starts_s) < STARTS:
                 edge.end()
-        _tell(f"{STARTS} starts")
-        words = (arguments.policy, endpoint, FLOOR, str(ours.reply_bytes))
-        bare = stack.enter_context(Process("hil_tests.bench_floor", *words))
-        bare.wait_for_line("ready")
-        floor = Contender(session, FLOOR)
-        floor.padding = bytes(len(ours.prepare()[1]) - wire.FRAMES_BYTES - STEP_BYTES)
-        stack.callback(floor.close)
+        words = ("hil_tests.bench_floor", arguments.policy, endpoint, FLOOR)
+        bare = stack.enter_context(Process(*words, ready="ready"))
         for contender in (ours, floor):
             contender.rouse()
             for _ in range(WARM_UP):
                 contender.ask()
-        ours.end_block()
+            contender.end_block()
         latency = alternate(ours, floor, arguments.blocks, arguments.states)
         idle = idle_load(edge.pid)
         memory = memory_mb(edge, ours, arguments.steps)
@@ -134,26 +125,20 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _tell(done: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r{done:<40}", end="", file=sys.stderr, flush=True)
-
-
 class Contender:
-    """Sends states to a process; ``arrivals`` holds when the answer to each step came.
+    """Sends states to a process. A block of them is an episode.
 
-    This one speaks to the bare process: the step, the frames, and padding to the size of a state.
+    ``arrivals`` holds when the answer to each step came, ``modes`` how many answers had each mode.
     """
 
-    padding = b""
-
     def __init__(self, session: zenoh.Session, vehicle_id: str) -> None:
-        self.arrivals: dict[int, float] = {}
         self.vehicle_id = vehicle_id
+        self.arrivals: dict[int, float] = {}
+        self.modes: Counter[str] = Counter()
         draw = np.random.default_rng(0).integers
         shape = (PICTURES, *wire.FRAMES_SHAPE)
-        self.pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]
-        self.step = 0
+        self._pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]
+        self._step = self._episode = 0
         self._publisher = session.declare_publisher(
             wire.key(vehicle_id, "state"), congestion_control=zenoh.CongestionControl.DROP
         )
@@ -162,21 +147,19 @@ class Contender:
             wire.key(vehicle_id, "command"), self._on_command
         )
 
-    def payload(self, frames: bytes) -> bytes:
-        """The state of the present step."""
-        return self.step.to_bytes(STEP_BYTES, "big") + frames + self.padding
-
-    def step_of(self, payload: bytes) -> int:
-        """Which step an answer is to."""
-        return int.from_bytes(payload[:STEP_BYTES], "big")
+    def prepare(self, final: bool = False) -> tuple[int, bytes]:
+        """The next step and its state."""
+        self._step += 1
+        frames = self._pictures[self._step % PICTURES]
+        state = make_state(
+            self._step, session="bench", episode=self._episode, frames=frames, final=final
+        )
+        return self._step, wire.encode(state)
 
     def end_block(self) -> None:
-        """After the last state of a block."""
-
-    def prepare(self) -> tuple[int, bytes]:
-        """The next step and its payload."""
-        self.step += 1
-        return self.step, self.payload(self.pictures[self.step % PICTURES])
+        """A final state: the edge runtime stands by while the other process works."""
+        self.put(self.prepare(final=True)[1])
+        self._episode += 1
 
     def rouse(self) -> float:
         """Send states until the first answer, and say when that came (perf_counter).
@@ -204,44 +187,19 @@ class Contender:
             time.sleep(0.0001)
         return self.arrivals[step] - begun_s
 
-    def close(self) -> None:
-        """Undeclare."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._subscriber.undeclare()
         self._publisher.undeclare()
 
     def _on_command(self, sample: zenoh.Sample) -> None:
         arrived_s = time.perf_counter()
-        self.arrivals.setdefault(self.step_of(bytes(sample.payload)), arrived_s)
-
-
-class Ours(Contender):
-    """Speaks to `edge_runtime run`: real states, real commands. A block is an episode."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self.reply_bytes = 0
-        self.modes: Counter[str] = Counter()
-        self._episode = 0
-        super().__init__(session, OURS)
-
-    def end_block(self) -> None:
-        """A final state: it stands by while the other one works."""
-        self.step += 1
-        self.put(self.payload(self.pictures[0], final=True))
-        self._episode += 1
-
-    def payload(self, frames: bytes, final: bool = False) -> bytes:
-        """A state as a simulator sends it."""
-        episode = self._episode
-        state = make_state(self.step, session="bench", episode=episode, frames=frames, final=final)
-        return wire.encode(state)
-
-    def step_of(self, payload: bytes) -> int:
-        """From a command, which is also counted by its mode."""
-        command = wire.decode_command(payload)
+        command = wire.decode_command(bytes(sample.payload))
         assert isinstance(command, wire.Command), command
-        self.reply_bytes = len(payload)
         self.modes[command.mode] += 1
-        return command.step
+        self.arrivals.setdefault(command.step, arrived_s)
 
 
 def start_edge(policy: list[str], endpoint: str) -> Process:
@@ -249,23 +207,22 @@ def start_edge(policy: list[str], endpoint: str) -> Process:
     return Process("edge_runtime", "run", *policy, "--connect", endpoint, "--vehicle-id", OURS)
 
 
-def alternate(ours: Ours, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
+def alternate(ours: Contender, floor: Contender, blocks: int, count: int) -> dict[str, Any]:
     """Blocks in turn, who begins a pair ends the next; one pair is not counted."""
     times: dict[str, list[np.ndarray]] = {OURS: [], FLOOR: []}
-    for number in range(blocks + 1):
-        for contender in (ours, floor) if number % 2 else (floor, ours):
-            block = block_ms(contender, count)
-            if number:
-                times[contender.vehicle_id].append(block)
-        _tell(f"block {number} of {blocks}")
-    mine, theirs = times[OURS], times[FLOOR]
-    named = {"ours": mine, "floor": theirs}
+    with ProgressBar("pairs of blocks", blocks + 1) as bar:
+        for number in range(blocks + 1):
+            for contender in (ours, floor) if number % 2 else (floor, ours):
+                block = block_ms(contender, count)
+                if number:
+                    times[contender.vehicle_id].append(block)
+            bar.advance({})
     return {
         "period_ms": PERIOD_S * 1e3,
         "blocks": blocks,
         "states_per_block": count,
-        "unanswered": {name: blocks * count - sum(map(len, some)) for name, some in named.items()},
-        "latency_ms": compare(mine, theirs),
+        "unanswered": {name: blocks * count - sum(map(len, some)) for name, some in times.items()},
+        "latency_ms": compare(times[OURS], times[FLOOR]),
     }
 
 
@@ -304,23 +261,18 @@ def compare(
     if not ours or len(ours) != len(floor):
         raise ValueError(f"{len(ours)} blocks of ours beside {len(floor)} of the floor")
 
-    def quantiles(blocks: Sequence[np.ndarray], draw: Sequence[int] | np.ndarray) -> np.ndarray:
-        found = np.percentile(np.concatenate([blocks[index] for index in draw]), QUANTILES)
-        return np.asarray(found)
+    def quantiles(draw: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Of ours and of the floor, [2, quantiles]."""
+        both = (np.concatenate([blocks[index] for index in draw]) for blocks in (ours, floor))
+        return np.array([np.percentile(times, QUANTILES) for times in both])
 
     draws = np.random.default_rng(seed).integers(0, len(ours), (RESAMPLES, len(ours)))
-    resampled = np.array([quantiles(ours, draw) / quantiles(floor, draw) for draw in draws])
-    low, high = np.percentile(resampled, INTERVAL, axis=0)
-    mine, theirs = (quantiles(blocks, range(len(ours))) for blocks in (ours, floor))
-    columns = zip(QUANTILES, mine, theirs, mine / theirs, low, high, strict=True)
+    resampled = np.array([mine / theirs for mine, theirs in map(quantiles, draws)])
+    intervals = np.percentile(resampled, INTERVAL, axis=0).T.tolist()
+    found = zip(QUANTILES, *quantiles(range(len(ours))).tolist(), intervals, strict=True)
     return {
-        f"p{quantile}": {
-            "ours": float(own),
-            "floor": float(bare),
-            "ratio": float(ratio),
-            "interval": [float(least), float(most)],
-        }
-        for quantile, own, bare, ratio, least, most in columns
+        f"p{quantile}": {"ours": own, "floor": bare, "ratio": own / bare, "interval": interval}
+        for quantile, own, bare, interval in found
     }
 
 
@@ -328,11 +280,10 @@ def memory_mb(process: Process, contender: Contender, steps: int) -> dict[str, A
     """Resident memory at the start and after each tenth of ``steps`` answers, one by one."""
     contender.arrivals.clear()
     samples, latencies_s = [process.resident_mb()], []
-    for part in range(1, MEMORY_SAMPLES + 1):
+    for _ in range(MEMORY_SAMPLES):
         latencies_s += [contender.ask() for _ in range(steps // MEMORY_SAMPLES)]
         contender.arrivals.clear()
         samples.append(process.resident_mb())
-        _tell(f"{part * steps // MEMORY_SAMPLES:,} of {steps:,} steps")
     return {
         "steps": steps,
         "start": samples[0],
@@ -362,17 +313,15 @@ def lockstep(policy: list[str], episodes: int) -> dict[str, Any]:
     endpoint = free_endpoint()
     with tempfile.TemporaryDirectory() as folder, start_edge(policy, endpoint):
         report = simulate(
-            endpoint, OURS, Path(folder) / "lock.json", _LOCKSTEP_LIMIT_S,
+            endpoint, Path(folder) / "lock.json", _LOCKSTEP_LIMIT_S, "--vehicle-id", OURS,
             "--env", SCENARIO, "--clock", "lockstep", "--episodes", str(episodes),
         )  # fmt: skip
     simulated_s = sum(row["time_s"] for row in report["per_episode"])
-    times = report["times_real_time"]
     return {
         "scenario": SCENARIO,
         "episodes": episodes,
         "simulated_s": simulated_s,
-        "wall_s": simulated_s / times,
-        "times_real_time": times,
+        "times_real_time": report["times_real_time"],
     }
 
 

@@ -33,7 +33,7 @@ from edge_runtime.cli import examples, positive, sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
-from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand, wait_until
+from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 
 Keep = Callable[[dict[str, Any]], None]
 """Given a report, for JSON, each time when it has grown."""
@@ -109,23 +109,15 @@ exec setpriv --pdeathsig KILL qemu-system-aarch64 -machine virt -cpu cortex-a72 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "--boards",
-        nargs="+",
-        choices=BOARDS,
-        default=list(BOARDS),
-        help="an emulated aarch64 computer with systemd; Python 3.8 without systemd",
-    )
-    parser.add_argument(
-        "--cuts", metavar="N", type=positive, default=8, help="power cuts of the emulated one"
-    )
-    parser.add_argument(
-        "--cache", metavar="DIR", default=DEFAULT_CACHE, help="keeps the emulated one's disk"
-    )
-    parser.add_argument(
-        "--wheels", metavar="DIR", default=DEFAULT_FOLDER, help="keeps the bundles' wheels"
-    )
-    parser.add_argument("--out", metavar="R.json", help="write the reports to this file")
+    boards = "an emulated aarch64 computer with systemd; Python 3.8 without systemd"
+    parser.add_argument("--boards", nargs="+", choices=BOARDS, default=list(BOARDS), help=boards)
+    for name, metavar, kind, default, text in (
+        ("--cuts", "N", positive, 8, "power cuts of the emulated one"),
+        ("--cache", "DIR", Path, Path(DEFAULT_CACHE), "keeps the emulated one's disk"),
+        ("--wheels", "DIR", Path, Path(DEFAULT_FOLDER), "keeps the bundles' wheels"),
+        ("--out", "R.json", str, None, "write the reports to this file"),
+    ):
+        parser.add_argument(name, metavar=metavar, type=kind, default=default, help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -152,12 +144,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def prove(board: str, cache: str, wheels: str, cuts: int, keep: Keep) -> None:
+def prove(board: str, cache: Path, wheels: Path, cuts: int, keep: Keep) -> None:
     """Prove one of BOARDS."""
     if board == "aarch64":
-        prove_aarch64(Path(cache), Path(wheels), cuts, keep)
+        prove_aarch64(cache, wheels, cuts, keep)
     else:
-        keep(prove_python38(Path(wheels)))
+        keep(prove_python38(wheels))
 
 
 def why_not(board: str) -> str:
@@ -284,18 +276,18 @@ class Board:
         finally:
             os.environ["PATH"] = before
 
+    def send(self, bundle: Path) -> None:
+        """Copy a bundle and its signature there."""
+        self.copy(bundle, Path(f"{bundle}.sig"))
+
     def install(self, bundle: Path) -> subprocess.CompletedProcess[str]:
         """Install a bundle that was sent there."""
         return self.run(f"{INSTALL} install {bundle.name}")
 
-    def upgrade(self, bundle: Path) -> None:
-        """Install one that must be taken. UserError with the installer's line."""
-        if (done := self.install(bundle)).returncode != 0:
+    def must(self, command: str) -> None:
+        """An installer's command that must succeed. UserError with its line."""
+        if (done := self.run(f"{INSTALL} {command}")).returncode != 0:
             raise UserError(f"on the board: {done.stderr.strip()}")
-
-    def send(self, bundle: Path) -> None:
-        """Copy a bundle and its signature there."""
-        self.copy(bundle, Path(f"{bundle}.sig"))
 
     def status(self) -> dict[str, Any]:
         """What the installed release says of itself. UserError where it is not whole."""
@@ -425,8 +417,8 @@ def _drive(certificates: Path, port: int) -> dict[str, Any]:
         "--listen", f"tls/127.0.0.1:{port}", "--vehicle-id", VEHICLE, "--wait-edge-s", "120",
         "--tls", str(certificates / f"simulator-{VEHICLE}"), "--out", str(out),
     ]  # fmt: skip
-    with BackgroundCommand(*words, quiet=True) as simulator:
-        simulator.wait(_EPISODE_LIMIT_S)
+    with Process(*words) as simulator:
+        simulator.succeed(_EPISODE_LIMIT_S)
     report = json.loads(out.read_text())
     kept = ("success_rate", "answered_states", "latency_ms", "safe_stops", "rejected", "policy_id")
     return {name: report[name] for name in kept} | {"outcome": report["per_episode"][0]["outcome"]}
@@ -461,10 +453,9 @@ def _hang(board: Board) -> float:
 def _upgrade_and_back(board: Board, light: Path) -> bool:
     """Whether an upgrade became current, and a roll-back the release before."""
     before = board.current()
-    board.upgrade(light)
+    board.must(f"install {light.name}")
     upgraded = board.current()
-    if (done := board.run(f"{INSTALL} rollback")).returncode != 0:
-        raise UserError(f"on the board: {done.stderr.strip()}")
+    board.must("rollback")
     return upgraded != before and board.current() == before
 
 
@@ -500,7 +491,7 @@ def _cut(board: Board, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]
     """
     choice = random.Random(1)
     begun_s = time.monotonic()
-    board.upgrade(lights[0])
+    board.must(f"install {lights[0].name}")
     whole_s = time.monotonic() - begun_s
     said_last: Counter[str] = Counter()
     current: Counter[str] = Counter()
@@ -521,7 +512,7 @@ def _cut(board: Board, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]
             then = board.current()
             current["the old one" if then == before else "the new one"] += 1
             board.wait_until_active()
-            board.upgrade(bundle)
+            board.must(f"install {bundle.name}")
             if board.current() == before:
                 raise UserError("the same command does not complete it")
         except (UserError, TimeoutError) as error:

@@ -1,102 +1,151 @@
-"""``python -m hil_tests campaign``: every fault, every network of the axes, one report.
+"""``python -m hil_tests campaign`` and ``vehicle``: reports of many drives.
 
-The unit of work is a chunk: some episodes of one network through a real edge runtime, in virtual
-time, kept on disk. Each worker has an edge runtime process and an endpoint of its own.
+The first does every fault, and drives every network of the axes through real edge runtimes. The
+second says what the actuators of a vehicle cost and what they may cost: `compare` drives the same
+seeds in real time, once with the policy in the loop and once with a mock Hunter; `sweep` drives
+every lag of a table in virtual time.
 """
 
 from __future__ import annotations
 
 import argparse
-import queue
-import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+import shlex
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
-from edge_runtime.link_probe import free_endpoint
-from edge_runtime.util import UserError, read_json
+from bridge.environments import CONDITIONS, NOMINAL
+from edge_runtime.cli import (
+    Command,
+    add_public_key,
+    examples,
+    not_negative,
+    positive,
+    share,
+    sigterm_as_interrupt,
+)
+from edge_runtime.policy import load_policy
+from edge_runtime.util import UserError
 from hil_tests.faults.run import choose_rows, run_faults
-from hil_tests.processes import BackgroundCommand, CommandTimeoutError, in_parallel, trusting
+from hil_tests.mock_hunter.body import make_parameters, read_changes
 from hil_tests.report import (
     check_report,
+    comparison_verdict,
+    lag_sentence,
+    render_comparison,
     render_faults,
     render_latency,
+    render_sweep,
     write_figures,
+    write_lag_figures,
     write_report,
 )
 from hil_tests.sweep import (
+    LAG_AXES,
+    LAGS,
+    LOOPS,
+    MODEL,
     NETWORK_AXES,
+    POLICY,
+    VEHICLE,
     Axis,
-    KeptResults,
+    Lag,
+    Part,
     Task,
-    add_sweep_arguments,
     budget,
+    cost,
+    drive_all,
+    drive_lag,
+    drive_network,
+    lag_budget,
     make_row,
-    simulate,
-    task_of,
-    this_command,
-    turns,
+    run_rig,
     worth_keeping,
 )
 from trainer.evaluate import cores
+from trainer.options import add_scenario
 from trainer.util import ProgressBar
 
-PARTS = ("latency", "faults")
-VEHICLE_ID = "campaign01"
-CHUNK_EPISODES = 50
-CHUNK_LIMIT_S = 900.0
-ATTEMPTS = 6
-FORMAT = 2
-"""Raise it where the same specification begins to mean another drive: kept chunks become void."""
+PART_EPISODES, LOOP_EPISODES = 50, 5
+"""Of a network, in virtual time; of a loop, in real time: short, so that all rigs end at about the
+same time."""
+LONGEST_EPISODE_S = 60.0
+"""With the wait for a stand before it; the scenarios time out after 30 s."""
 SHOWN_WRONG = 5
-EXAMPLE = examples(
-    "python -m hil_tests campaign --only latency --runs 100 --out runs/latency.json",
-    "python -m hil_tests campaign --only faults --rows 'hunter_*' --tries 100 --out runs/f.json",
-)
 
 
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
-    add_sweep_arguments(parser, PARTS, 100, "episodes of each row, the same seeds", 0.98)
+def _add_shared(
+    parser: argparse.ArgumentParser, parts: Sequence[str], runs: int, of_what: str, target: float
+) -> None:
+    parser.add_argument(
+        "--out",
+        required=True,
+        metavar="R.json",
+        help="the report; R.md, pictures and R_rows/ (what is done already) go beside it",
+    )
+    default = "policy file (default: results/policies/SCENARIO.onnx)"
+    parser.add_argument("--policy", metavar="P.onnx", help=default)
+    add_public_key(parser)
+    add_scenario(parser)
+    parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
+    parser.add_argument("--only", choices=parts, help="one part (default: both)")
+    for name, kind, value, text in (
+        ("--runs", _several, runs, of_what),
+        ("--seed", not_negative, 0, "of the first episode"),
+        ("--target", share, target, "success that is asked for"),
+        ("--jobs", not_negative, 0, "drives or faults side by side; 0: one a core"),
+    ):
+        parser.add_argument(name, type=kind, default=value, help=text)
+
+
+def _several(text: str) -> int:
+    count = positive(text)
+    if count < 2:
+        raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
+    return count
+
+
+def _add_campaign_arguments(parser: argparse.ArgumentParser) -> None:
+    runs_help = "episodes of each row, the same seeds"
+    _add_shared(parser, ("latency", "faults"), 100, runs_help, 0.98)
     parser.add_argument(
         "--rows",
         metavar="NAME,...",
         help=f"only these latency axes ({', '.join(axis.name for axis in NETWORK_AXES)}) and "
         "faults, by name or pattern (hunter_*)",
     )
-    parser.add_argument(
-        "--against",
-        action="append",
-        default=[],
-        metavar="NAME=R.json",
-        help="show another campaign's curves and budget beside",
-    )
     parser.add_argument("--tries", type=positive, default=10, help="of each fault")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _run_campaign(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where a fault was not met as it should be."""
     out = Path(arguments.out)
     check_report(out)
-    arguments.jobs = arguments.jobs or cores()
     axes, faults = _choose(arguments)
-    others = dict(_other(text) for text in arguments.against)
-    report: dict[str, Any] = {"command": this_command()}
+    jobs = arguments.jobs or cores()
+    report: dict[str, Any] = {"command": _this_command()}
     name = Path(arguments.policy or f"{arguments.scenario}.onnx").name
-    text = [f"# Campaign: {name}, {arguments.scenario}", "", f"`{this_command()}`", ""]
+    text = [f"# Campaign: {name}, {arguments.scenario}", "", f"`{_this_command()}`", ""]
     if axes:
-        with sigterm_as_interrupt():  # Whoever ends a campaign ends its processes.
-            latency = _run_latency(arguments, axes, out.with_name(f"{out.stem}_rows"))
-        figures = write_figures(out, latency, others)
-        report["latency"] = {**latency, "figures": figures}
-        text += ["## Latency", "", render_latency(latency, figures, others)]
+        report["latency"] = latency = run_latency(
+            _task(arguments), axes, arguments.target, jobs, out
+        )
+        text += ["## Latency", "", render_latency(latency)]
+        print(latency["budget"]["sentence"])
     if faults is not None:
-        report["faults"] = _run_faults(arguments, faults)
-        text += ["## Faults", "", render_faults(report["faults"])]
+        with ProgressBar("faults", arguments.tries * len(choose_rows(faults or None))) as bar:
+            report["faults"] = found = run_faults(
+                arguments.tries, faults or None, arguments.policy and Path(arguments.policy),
+                lambda row: bar.advance({"row": row}), jobs, arguments.public_key,
+            )  # fmt: skip
+        text += ["## Faults", "", render_faults(found)]
+        for row in found["rows"]:
+            for kind in ("wrong", "unsafe", "crashes"):
+                for what in row[kind][:SHOWN_WRONG]:
+                    print(f"{row['name']}: {kind}: {what}")
+        print("Every fault was met." if found["passed"] else "Not every fault was met.")
     write_report(out, report, text)
-    _conclude(out, report)
     return 0 if faults is None or report["faults"]["passed"] else 1
 
 
@@ -117,164 +166,158 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[Axis], list[str] | None
     return axes, None if without_faults else faults
 
 
-def _run_faults(arguments: argparse.Namespace, names: list[str]) -> dict[str, Any]:
-    policy = Path(arguments.policy) if arguments.policy else None
-    with ProgressBar("faults", arguments.tries * len(choose_rows(names or None))) as bar:
-        return run_faults(
-            arguments.tries, names or None, policy, lambda row: bar.advance({"row": row}),
-            arguments.jobs, arguments.public_key,
-        )  # fmt: skip
+def _task(arguments: argparse.Namespace, changes: dict[str, float] | None = None) -> Task:
+    """UserError where the policy does not load.
+
+    The edge runtime checks signatures where it matters; here the loop is measured.
+    """
+    policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
+    loaded = load_policy(str(policy), arguments.public_key, allow_unsigned=True)
+    return Task(
+        policy, loaded.policy_id, arguments.scenario, arguments.condition, arguments.seed,
+        arguments.runs, arguments.public_key, changes or {},
+    )  # fmt: skip
 
 
-def _other(text: str) -> tuple[str, dict[str, Any]]:
-    name, equals, path = text.partition("=")
-    if not equals:
-        raise UserError(f"--against {text}: write NAME=R.json")
-    try:
-        latency: dict[str, Any] = read_json(path, "report")["latency"]
-        budget_part = latency["budget"]
-        sentence = budget_part["sentence"].removeprefix(Path(latency["policy"]).stem)
-        budget_part["sentence"] = name + sentence
-        latency["rows"]
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is no report of a latency campaign with its budget") from None
-    return name, latency
+def _this_command() -> str:
+    return "python -m hil_tests " + shlex.join(sys.argv[1:])
 
 
-def _conclude(out: Path, report: dict[str, Any]) -> None:
-    if "latency" in report:
-        print(report["latency"]["budget"]["sentence"])
-    if faults := report.get("faults"):
-        for row in faults["rows"]:
-            for kind in ("wrong", "unsafe", "crashes"):
-                for what in row[kind][:SHOWN_WRONG]:
-                    print(f"{row['name']}: {kind}: {what}")
-        print("Every fault was met." if faults["passed"] else "Not every fault was met.")
-    print(f"{out} and {out.with_suffix('.md')}")
+def _rows_beside(out: Path) -> Path:
+    return out.with_name(f"{out.stem}_rows")
 
 
-class Chunk(NamedTuple):
-    """Episodes with the seeds ``first_seed``, ``first_seed + 1``, ...: the same for every row."""
-
-    spec: str
-    first_seed: int
-    episodes: int
-
-
-def _run_latency(arguments: argparse.Namespace, axes: Sequence[Axis], keep: Path) -> dict[str, Any]:
-    """Sweep the axes; the part ``latency`` of the report. What is kept is not driven again."""
-    task = task_of(arguments)
-    deciding = {"format": FORMAT, "policy": task.policy_id, "clock": "lockstep"}
-    store = KeptResults(keep, task, deciding)
-    every_turn = turns(task.seed, task.runs, CHUNK_EPISODES)
-    specs = dict.fromkeys(spec for axis in axes for spec in axis.specs)
-    chunks = {spec: [Chunk(spec, *turn) for turn in every_turn] for spec in specs}
-    found = store.complete(
-        "latency",
-        [chunk for some in chunks.values() for chunk in some],
-        Chunk._asdict,
-        lambda missing, on_done: drive_chunks(task, missing, arguments.jobs, on_done),
-        lambda chunk, _: {"of": chunk.spec},
-    )
-    rows = {
-        spec: make_row(spec, [part for chunk in some for part in found[chunk]["parts"]])
-        for spec, some in chunks.items()
-    }
+def run_latency(
+    task: Task, axes: Sequence[Axis], target: float, jobs: int, out: Path
+) -> dict[str, Any]:
+    """Drive every network of the axes; the report's part ``latency``."""
+    specs = list(dict.fromkeys(spec for axis in axes for spec in axis.specs))
+    with sigterm_as_interrupt():  # Whoever ends a campaign ends its processes.
+        found = drive_all(task, specs, PART_EPISODES, drive_network, jobs, _rows_beside(out))
+    rows = {spec: make_row(spec, parts) for spec, parts in found.items()}
     driven_s, wall_s = (sum(row[name] for row in rows.values()) for name in ("driven_s", "wall_s"))
-    return {
+    latency = {
         **task.facts(),
         "clock": "lockstep",
         "axes": [axis.as_dict() for axis in axes],
         "rows": rows,
-        "budget": budget(axes, rows, arguments.target, task.policy.stem),
+        "budget": budget(axes, rows, target, task.policy.stem),
         "faster_than_real_time": driven_s / wall_s,
+    }
+    return {**latency, "figures": write_figures(out, latency)}
+
+
+def _add_vehicle_arguments(parser: argparse.ArgumentParser) -> None:
+    runs_help = "episodes of each loop and of each lag"
+    _add_shared(parser, ("compare", "sweep"), 50, runs_help, 0.95)
+    rigs = "simulators in real time side by side, each with a vehicle of its own"
+    parser.add_argument("--rigs", type=positive, default=4, metavar="N", help=rigs)
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a parameter of the mock Hunter, as in python -m hil_tests mock_hunter",
+    )
+    parser.add_argument(
+        "--lags",
+        type=_lags,
+        default=LAGS,
+        metavar="DEAD+CONSTANT,...",
+        help="only these points of the sweep, in ms, as in 50+100,200+300 (default: a table)",
+    )
+
+
+def _lags(text: str) -> list[Lag]:
+    lags = []
+    for point in text.split(","):
+        dead, _, constant = point.partition("+")
+        if not (dead.isdecimal() and constant.isdecimal() and int(constant) > 0):
+            raise argparse.ArgumentTypeError(
+                f"{point!r} is no lag: write DEAD+CONSTANT in ms, as in 50+100"
+            )
+        lags.append(Lag(int(dead), int(constant)))
+    return list(dict.fromkeys(lags))
+
+
+def _run_vehicle(arguments: argparse.Namespace) -> int:
+    """Run the parts; 0, or 1 where the vehicle in the loop is below the target."""
+    out, target, holds = Path(arguments.out), arguments.target, True
+    check_report(out)
+    task = _task(arguments, read_changes(arguments.set))
+    make_parameters(MODEL, task.changes)  # refuses what the mock does not know
+    report: dict[str, Any] = {"command": _this_command(), "policy_id": task.policy_id}
+    title = f"# Vehicle in the loop: {task.policy.name}, {arguments.scenario}"
+    text = [title, "", f"`{_this_command()}`"]
+    if arguments.only != "sweep":
+        report["comparison"] = found = run_comparison(task, target, arguments.rigs, out)
+        text += ["", "## In real time", "", render_comparison(found)]
+        print(comparison_verdict(found))
+        holds = found["holds"]
+    if arguments.only != "compare":
+        jobs = arguments.jobs or cores()
+        report["sweep"] = found = run_sweep(task, arguments.lags, target, jobs, out)
+        text += ["", "## Lag, in virtual time", "", render_sweep(found)]
+        print(lag_sentence(found))
+    write_report(out, report, text)
+    return 0 if holds else 1
+
+
+def drive_loop(task: Task, part: Part) -> list[dict[str, Any]]:
+    """Drive a part in real time from a stand, with or without a mock Hunter in the loop."""
+    options = ("--clock", "realtime", "--loop", part.point, "--standing")
+    limit_s = LONGEST_EPISODE_S * (1 + part.runs)
+    report = run_rig(task, part, limit_s, *options, hunter=part.point == VEHICLE)
+    return [worth_keeping(report)]
+
+
+def run_comparison(task: Task, target: float, rigs: int, out: Path) -> dict[str, Any]:
+    """Drive both loops, ``rigs`` at a time; the report's part ``comparison``."""
+    with sigterm_as_interrupt():
+        found = drive_all(task, LOOPS, LOOP_EPISODES, drive_loop, rigs, _rows_beside(out))
+    rows = {loop: make_row(loop, parts) for loop, parts in found.items()}
+    return {
+        **task.facts(),
+        "mock": task.changes,
+        "rows": rows,
+        "cost": cost(rows[POLICY]["per_episode"], rows[VEHICLE]["per_episode"]),
+        "target_success": target,
+        "holds": rows[VEHICLE]["success"]["value"] >= target,
     }
 
 
-def drive_chunks(
-    task: Task,
-    chunks: Sequence[Chunk],
-    jobs: int,
-    on_chunk: Callable[[Chunk, dict[str, Any]], None],
-) -> None:
-    """Drive all chunks, ``jobs`` at a time.
-
-    Raises:
-        UserError: a command failed, or the machine stood still again and again.
-    """
-    idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
-
-    def work(chunk: Chunk) -> dict[str, Any]:
-        worker = idle.get()
-        try:
-            return worker.drive(chunk)
-        finally:
-            idle.put(worker)
-
-    with ExitStack() as stack:
-        directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="phil-campaign-"))
-        for number in range(min(jobs, len(chunks))):
-            worker = Worker(task, Path(directory) / f"{number}.json")
-            stack.callback(worker.close)
-            idle.put(worker)
-        in_parallel(work, chunks, jobs, on_chunk)
+def run_sweep(
+    task: Task, lags: Sequence[Lag], target: float, jobs: int, out: Path
+) -> dict[str, Any]:
+    """Drive every lag, ``jobs`` at a time; the report's part ``sweep``."""
+    with sigterm_as_interrupt():
+        found = drive_all(task, lags, task.runs, drive_lag, jobs, _rows_beside(out), processes=True)
+    rows = {lag.spec: row for lag, (row,) in found.items()}
+    axes = [axis for axis in LAG_AXES if set(axis.specs) <= set(rows)]
+    sweep = {
+        **task.facts(),
+        "mock": task.changes,
+        "axes": [axis.as_dict() for axis in axes],
+        "rows": rows,
+        "budget": budget(axes, rows, target, task.policy.stem) if axes else None,
+        "lag_budget": lag_budget(list(rows.values()), target),
+    }
+    return {**sweep, "figures": write_lag_figures(out, sweep)}
 
 
-class Worker:
-    """One edge runtime that stays, and one simulator after another."""
-
-    def __init__(self, task: Task, out: Path) -> None:
-        self._task, self._out = task, out
-        self.start_edge()
-
-    def start_edge(self) -> None:
-        """Start the edge runtime, on an endpoint of its own."""
-        task = self._task
-        self._endpoint = free_endpoint()
-        self.edge = BackgroundCommand(
-            "edge_runtime", "run", *trusting(task.policy, task.public_key),
-            "--connect", self._endpoint, "--vehicle-id", VEHICLE_ID, ready="ready", quiet=True,
-        )  # fmt: skip
-
-    def drive(self, chunk: Chunk) -> dict[str, Any]:
-        """Drive a chunk undisturbed by the machine; what the campaign keeps of it."""
-        try:
-            parts = self._undisturbed(chunk, ATTEMPTS)
-        except UserError as error:
-            # Nobody listens between two chunks: any process of the machine may take the port. And
-            # lock-step crawls beside an edge runtime that has lost its wire: each step waits.
-            if not isinstance(error, CommandTimeoutError) and "is in use" not in str(error):
-                raise
-            self.close()
-            self.start_edge()
-            parts = self._undisturbed(chunk, ATTEMPTS)
-        return {"parts": [worth_keeping(part) for part in parts]}
-
-    def close(self) -> None:
-        """End the edge runtime."""
-        self.edge.end()
-
-    def _undisturbed(self, chunk: Chunk, attempts: int) -> list[dict[str, Any]]:
-        """Drive a chunk, and a disturbed one again in halves: the good half is done then.
-
-        The edge runtime lives in wall time: where it gets no processor for 2 T it rightly stops,
-        and virtual time knows nothing of that.
-        """
-        spec, first_seed, episodes = chunk
-        report: dict[str, Any] = simulate(
-            self._endpoint, VEHICLE_ID, self._out, CHUNK_LIMIT_S,
-            "--env", self._task.scenario, "--condition", self._task.condition,
-            "--episodes", str(episodes), "--seed", str(first_seed),
-            "--clock", "lockstep", "--latency", spec,
-        )  # fmt: skip
-        if not report["wall_clock_stalls"]:
-            return [report]
-        if attempts == 1:
-            raise UserError(
-                f"{spec}: the edge runtime gets too little processor time for a drive "
-                "without a pause; use fewer --jobs (rows that are done are kept)"
-            )
-        if episodes == 1:
-            return self._undisturbed(chunk, attempts - 1)
-        halves = [Chunk(spec, *turn) for turn in turns(first_seed, episodes, (episodes + 1) // 2)]
-        return [report for half in halves for report in self._undisturbed(half, attempts)]
+CAMPAIGN = Command(
+    examples(
+        "python -m hil_tests campaign --only latency --runs 100 --out runs/latency.json",
+        "python -m hil_tests campaign --only faults --rows 'hunter_*' --out runs/faults.json",
+    ),
+    _add_campaign_arguments,
+    _run_campaign,
+)
+VEHICLES = Command(
+    examples(
+        "python -m hil_tests vehicle --out runs/vehicle.json",
+        "python -m hil_tests vehicle --only sweep --lags 50+100,200+300 --out runs/lags.json",
+    ),
+    _add_vehicle_arguments,
+    _run_vehicle,
+)

@@ -6,7 +6,6 @@ import argparse
 import shutil
 import sys
 import time
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from edge_runtime.cli import ArgumentParser, examples, not_negative, positive, positive_number
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
-from hil_tests.processes import BackgroundCommand, operator, run_command
+from hil_tests.processes import drive_shown, run_command
 
 MARKER = ".phil-demo"
 """Says that a directory is a demo's, so that the demo may replace what is in it."""
@@ -172,7 +170,8 @@ class Demo:
         """A few episodes in real time, recorded for rerun by a listener on the wire."""
         heading("7  In real time, recorded for rerun")
         report = self.directory / "realtime.json"
-        self._simulate(min(RECORDED_RUNS, self.runs), "realtime", LATENCY, report, self.recording)
+        view = ("view", "--save", str(self.recording))
+        self._simulate(min(RECORDED_RUNS, self.runs), "realtime", LATENCY, report, *view)
 
     def show(self) -> bool:
         """The table, where everything is, and whether the policy drives as well as it should."""
@@ -188,37 +187,14 @@ class Demo:
         return good
 
     def _simulate(
-        self,
-        episodes: int,
-        clock: str,
-        latency: str,
-        report: Path,
-        recording: Path | None = None,
+        self, episodes: int, clock: str, latency: str, report: Path, *listener: str
     ) -> None:
-        """Drive over Zenoh: edge runtime, simulator, operator, and a viewer that records."""
-        endpoint = free_endpoint()
-        common = ("--connect", endpoint, "--vehicle-id", VEHICLE)
-        with ExitStack() as stack:
-            stack.enter_context(
-                BackgroundCommand(
-                    "edge_runtime", "run", "--policy", str(self.policy),
-                    "--public-key", str(self.public_key), *common, "--vehicle", "mock",
-                    ready="ready",
-                )
-            )  # fmt: skip
-            viewer = None
-            if recording is not None:
-                viewer = stack.enter_context(
-                    BackgroundCommand("bridge", "view", "--save", str(recording), *common)
-                )
-            stack.enter_context(operator(endpoint, VEHICLE))
-            run_command(
-                "bridge", "simulate", "--env", "left_turn", "--episodes", str(episodes),
-                "--clock", clock, "--latency", latency, "--listen", endpoint,
-                "--vehicle-id", VEHICLE, "--seed", str(FIRST_SEED), "--out", str(report),
-            )  # fmt: skip
-            if viewer is not None:
-                viewer.wait(timeout_s=20.0)
+        trust = ("--policy", str(self.policy), "--public-key", str(self.public_key))
+        simulate = (
+            "--episodes", str(episodes), "--clock", clock, "--latency", latency,
+            "--seed", str(FIRST_SEED), "--out", str(report),
+        )  # fmt: skip
+        drive_shown(VEHICLE, trust, simulate, listener)
 
 
 def heading(text: str) -> None:
@@ -226,25 +202,19 @@ def heading(text: str) -> None:
     Console().print(f"\n[bold]{text}[/bold]")
 
 
-COLUMNS = ("drive", "success", "distance, m", "p50, ms", "p99, ms", "safe stops")
-
-
 def drives_table(reports: dict[str, dict[str, Any]]) -> Table:
     """A row for each report, under its name."""
     table = Table(title="Left turn, the same seeds; latency from state sent to command received")
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column == COLUMNS[0] else "right")
+    table.add_column("drive")
+    for column in ("success", "distance, m", "p50, ms", "p99, ms", "safe stops"):
+        table.add_column(column, justify="right")
     for name, report in reports.items():
-        table.add_row(name, *_cells(report))
+        distance, latency = report["surviving_distance_m"], report.get("latency_ms")
+        table.add_row(
+            name,
+            f"{report['success_rate']:.0%}",
+            f"{distance['mean']:.2f} ± {distance['std']:.2f}",
+            *(f"{latency[name]:.1f}" if latency else "-" for name in ("p50", "p99")),
+            str(report.get("safe_stops", "-")),
+        )
     return table
-
-
-def _cells(report: dict[str, Any]) -> list[str]:
-    distance, latency = report["surviving_distance_m"], report.get("latency_ms")
-    return [
-        f"{report['success_rate']:.0%}",
-        f"{distance['mean']:.2f} ± {distance['std']:.2f}",
-        f"{latency['p50']:.1f}" if latency else "-",
-        f"{latency['p99']:.1f}" if latency else "-",
-        str(report.get("safe_stops", "-")),
-    ]

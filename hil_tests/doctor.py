@@ -8,8 +8,6 @@ imported up here; heavy libraries are tried in a process of their own.
 from __future__ import annotations
 
 import argparse
-import contextlib
-import json
 import os
 import platform
 import re
@@ -82,11 +80,7 @@ if not sticks:
     sys.exit("SDL sees no game controller")
 print(", ".join(f"{stick.get_name()} ({stick.get_numaxes()} axes)" for stick in sticks))
 """
-EXAMPLE = examples(
-    "python -m hil_tests doctor",
-    "python -m hil_tests doctor --only basics vehicle",
-    "python -m hil_tests doctor --json",
-)
+EXAMPLE = examples("python -m hil_tests doctor --only basics vehicle")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -94,7 +88,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--only", metavar="GROUP", nargs="+", default=GROUPS, help=f"of {', '.join(GROUPS)}"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -110,16 +103,11 @@ def run(arguments: argparse.Namespace) -> int:
     for check in CHECKS:
         if check.group not in arguments.only:
             continue
-        finding = examine(check)
-        if not arguments.json:
-            if not found or found[-1].group != finding.group:
-                print(f"\n{finding.group}")
-            print(lines(finding), flush=True)
-        found.append(finding)
-    if arguments.json:
-        print(json.dumps({"basics": basics_work(found), "checks": [f._asdict() for f in found]}))
-    else:
-        print("\n" + summary(found))
+        if not found or check.group != found[-1].check.group:
+            print(f"\n{check.group}")
+        found.append(examine(check))
+        print(lines(found[-1]), flush=True)
+    print(f"\n{summary(found)}")
     return 0 if basics_work(found) else NOT_READY
 
 
@@ -142,13 +130,11 @@ class Check(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """A check that was made."""
+    """A check that was made: whether it is there, what was found, and how to get it."""
 
-    group: str
-    name: str
+    check: Check
     ok: bool
     detail: str
-    without: str
     remedy: str
 
 
@@ -164,40 +150,38 @@ def examine(check: Check) -> Finding:
     # A broken library may raise anything at all, and the checks after it are still wanted.
     except Exception as error:
         detail = f"{type(error).__name__}: {error}"
-    text = " ".join(detail.split())
-    return Finding(check.group, check.name, ok, text, check.without, remedy)
+    return Finding(check, ok, " ".join(detail.split()), remedy)
 
 
 def basics_work(found: list[Finding]) -> bool:
     """Whether nothing basic is missing."""
-    return all(finding.ok for finding in found if finding.group == BASICS)
+    return all(finding.ok for finding in found if finding.check.group == BASICS)
 
 
 def lines(finding: Finding) -> str:
     """A line where it is there; what it is for and how to get it where it is not."""
-    said = f"{finding.name}: {finding.detail}"
+    said = f"{finding.check.name}: {finding.detail}"
     if finding.ok:
         return f"  ok       {said}"
-    indent = "\n" + 11 * " "
-    return f"  missing  {said}{indent}without it: {finding.without}{indent}get it: {finding.remedy}"
+    needs = (f"without it: {finding.check.without}", f"get it: {finding.remedy}")
+    return ("\n" + 11 * " ").join((f"  missing  {said}", *needs))
 
 
 def summary(found: list[Finding]) -> str:
     """The last line."""
-    missing = [finding for finding in found if not finding.ok]
+    missing = [finding.check for finding in found if not finding.ok]
     if not basics_work(found):
-        names = ", ".join(finding.name for finding in missing if finding.group == BASICS)
+        names = ", ".join(check.name for check in missing if check.group == BASICS)
         return f"The basics do not work here: {names}."
-    basics = "The basics work. " if any(finding.group == BASICS for finding in found) else ""
-    if missing:
-        names = ", ".join(finding.name for finding in missing)
-        return f"{basics}Missing{' besides' if basics else ''}: {names}."
-    return f"{basics}Nothing is missing."
+    basics = "The basics work. " if any(one.check.group == BASICS for one in found) else ""
+    if not missing:
+        return f"{basics}Nothing is missing."
+    names = ", ".join(check.name for check in missing)
+    return f"{basics}Missing{' besides' if basics else ''}: {names}."
 
 
 def _python() -> str:
-    number = tuple(map(int, platform.python_version_tuple()[:2]))
-    if number < OLDEST:
+    if sys.version_info[:2] < OLDEST:
         raise MissingError(f"this is Python {platform.python_version()}")
     return f"{platform.python_version()}, {sys.executable}"
 
@@ -240,13 +224,11 @@ def _loopback() -> str:
 
     came = threading.Event()
     endpoint = free_endpoint()
-    with contextlib.ExitStack() as stack:
-        router = open_session(listen=endpoint, mode="router")
-        stack.callback(router.close)
-        client = open_session(connect=endpoint, mode="client")
-        stack.callback(client.close)
-        subscriber = router.declare_subscriber("phil/doctor", lambda _: came.set())
-        stack.callback(subscriber.undeclare)
+    with (
+        open_session(listen=endpoint, mode="router") as router,
+        open_session(connect=endpoint, mode="client") as client,
+        router.declare_subscriber("phil/doctor", lambda _: came.set()),
+    ):
         client.put("phil/doctor", b"doctor")
         if not came.wait(ARRIVAL_S):
             raise MissingError(f"no message within {ARRIVAL_S:.0f} s over {endpoint}")
@@ -302,11 +284,9 @@ def _can_over_udp() -> str:
     import can
 
     from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+    from hil_tests.faults.rig import free_bus
 
-    with socket.socket(type=socket.SOCK_DGRAM) as probe:
-        probe.bind((LOOPBACK, 0))
-        number = probe.getsockname()[1]
-    name = parse_bus(f"udp_multicast:239.74.163.9:{number}")
+    name = parse_bus(free_bus())
     with open_bus(name) as sender, open_bus(name) as receiver:
         sender.send(can.Message(arbitration_id=0x111, data=b"doctor", is_extended_id=False))
         heard = receiver.recv(ARRIVAL_S)
@@ -422,8 +402,8 @@ CHECKS = (
           "end who listens there, or give --listen and --connect another port"),
     Check("ports", "7448", partial(port, 7448), "no `bridge ros2` without options",
           "end who listens there, or give --ros2-listen another port"),
-    Check("ports", "9876", partial(port, 9876), "no --serve, no --spawn", "end the other rerun"),
-    Check("ports", "9090", partial(port, 9090), "no --serve", "end the other rerun"),
+    *(Check("ports", str(number), partial(port, number), "no --serve, no --spawn",
+            "end the other rerun") for number in (9876, 9090)),
     Check("vehicle", "CAN over UDP", _can_over_udp, "no `hil_tests mock_hunter` without options",
           "a route for multicast on loopback: `ip route add 239.0.0.0/8 dev lo`"),
     Check("vehicle", "CAN interface", _can_interface,

@@ -12,7 +12,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,16 +24,14 @@ from bridge.recording import Recording, read_heard
 from bridge.rerun.wire_view import Timeline
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples
-from edge_runtime.files import check_writable, make_directory, write_atomic
-from edge_runtime.link_probe import free_endpoint
+from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError, read_json
 from edge_runtime.wire import CONTROL_PERIOD_S
 from hil_tests.processes import (
     POLICY,
     PUBLIC_KEY,
-    BackgroundCommand,
+    drive_shown,
     headless_viewer,
-    operator,
     run_command,
 )
 from hil_tests.report import write_figures, write_png
@@ -55,7 +52,6 @@ VEHICLE_ID = "pictures"
 LATENCY = "50ms+-10ms,outage=0.4s@3s"
 EPISODES, SEED = "2", "8"
 LOOP_TIME_S = 8.0
-RECORDER_LIMIT_S = 30.0
 PARTS = {
     "uplink": "#2878e6",
     "inference and queue": "#3caa5a",
@@ -78,11 +74,6 @@ def add_arguments(parser: ArgumentParser) -> None:
         "names", metavar="NAME", nargs="*", help=f"of {', '.join(PICTURES)} (default: all)"
     )
     parser.add_argument("--out", metavar="DIR", default="docs", help="where they go")
-    parser.add_argument(
-        "--work",
-        metavar="DIR",
-        help="keep what is made on the way (default: thrown away)",
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -99,11 +90,9 @@ def run(arguments: argparse.Namespace) -> int:
     for name in names:
         check_writable(out / name)
     with tempfile.TemporaryDirectory(prefix="phil-pictures-") as folder:
-        work = Path(arguments.work or folder)
-        make_directory(work)
         for name in names:
             try:
-                PICTURES[name](out / name, work)
+                PICTURES[name](out / name, Path(folder))
             except UserError as error:
                 status = SOME_MISSING
                 print(f"{name}: not made: {error}", file=sys.stderr)
@@ -195,21 +184,9 @@ def recorded_drive(work: Path) -> Path:
     out = work / "drive.mcap"
     if out.exists():
         return out
-    endpoint = free_endpoint()
-    common = ("--connect", endpoint, "--vehicle-id", VEHICLE_ID)
     trust = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
-    with ExitStack() as stack:
-        edge = ("edge_runtime", "run", *trust, *common, "--vehicle", "mock")
-        stack.enter_context(BackgroundCommand(*edge, ready="ready"))
-        record = ("bridge", "record", "--out", str(out), *common, "--wait-s", "30")
-        recorder = stack.enter_context(BackgroundCommand(*record))
-        stack.enter_context(operator(endpoint, VEHICLE_ID))
-        run_command(
-            "bridge", "simulate", "--env", "left_turn", "--clock", "realtime",
-            "--latency", LATENCY, "--episodes", EPISODES, "--seed", SEED,
-            "--listen", endpoint, "--vehicle-id", VEHICLE_ID,
-        )  # fmt: skip
-        recorder.wait(RECORDER_LIMIT_S)
+    simulate = ("--clock", "realtime", "--latency", LATENCY, "--episodes", EPISODES, "--seed", SEED)
+    drive_shown(VEHICLE_ID, trust, simulate, ("record", "--out", str(out), "--wait-s", "30"))
     return out
 
 

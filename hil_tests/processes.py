@@ -1,7 +1,7 @@
 """The repository's own commands as processes, the operator beside a drive, rerun's viewer.
 
-`run_command` is what a person types; `BackgroundCommand` runs beside us and says why it failed;
-`Process` stamps every line that it prints, for who measures or disturbs it.
+`run_command` is what a person types; `Process` runs beside us, says why it failed, and stamps every
+line that it prints.
 """
 
 from __future__ import annotations
@@ -41,27 +41,37 @@ _LAST_WORDS_S = 1.0
 _CRASH_MARKS = ("Traceback (most recent call last)", "panicked at", "Fatal Python error")
 
 
-class CommandTimeoutError(UserError):
+class CommandTimeoutError(UserError, TimeoutError):
     """A command had not ended when its time was over."""
 
 
 class Process:
-    """``python -m ARGUMENTS``; ``lines`` are stdout and stderr with their monotonic times.
+    """``python -m ARGUMENTS`` beside us; ``lines`` are its output with their monotonic times.
 
     Args:
         arguments: the module and its arguments.
+        ready: text of its output that says it has started; None: no wait.
+        shown: print the command.
         environment: variables beside ours.
         told: it reads its standard input, and `tell` writes there.
         on_line: called with the time and text of each line, in a thread.
+
+    Raises:
+        UserError: it ended, or said nothing for too long, before it was ready.
     """
 
     def __init__(
         self,
         *arguments: str,
+        ready: str | None = None,
+        shown: bool = False,
         environment: Mapping[str, str] | None = None,
         told: bool = False,
         on_line: Callable[[float, str], None] = lambda seen_s, line: None,
     ) -> None:
+        if shown:
+            print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
+        self.name = " ".join(arguments[:2])
         self.lines: list[tuple[float, str]] = []
         self._ended_by_us = False
         self._on_line = on_line
@@ -76,6 +86,14 @@ class Process:
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+        if ready is not None:
+            try:
+                wait_until(lambda: self.has_ended or self._when(ready), self.name)
+            except TimeoutError:
+                self.end()
+            if self.has_ended:
+                self._gone(None)
+                raise self._failure()
 
     @property
     def pid(self) -> int:
@@ -119,8 +137,17 @@ class Process:
             return -signal.SIGKILL
 
     def wait(self, timeout_s: float = PATIENCE_S) -> int:
-        """The exit status, once it has ended by itself; subprocess.TimeoutExpired."""
-        return self._gone(timeout_s)
+        """The exit status, once it has ended by itself; CommandTimeoutError."""
+        try:
+            return self._gone(timeout_s)
+        except subprocess.TimeoutExpired:
+            said = f"python -m {self.name} did not end within {timeout_s:g} s"
+            raise CommandTimeoutError(said) from None
+
+    def succeed(self, timeout_s: float = PATIENCE_S) -> None:
+        """Wait until it has ended by itself; UserError with its last line where it failed."""
+        if self.wait(timeout_s):
+            raise self._failure()
 
     def crashed(self) -> bool:
         """Whether it ended on its own, or said what a crash says."""
@@ -148,61 +175,17 @@ class Process:
     def _when(self, text: str) -> float | None:
         return next((seen_s for seen_s, line in self.lines if text in line), None)
 
+    def _failure(self) -> UserError:
+        said = [line for _, line in self.lines if line.strip()]
+        last = said[-1].strip() if said else "it said nothing"
+        return UserError(f"python -m {self.name}: {last}")
+
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             seen_s = time.monotonic()
             self.lines.append((seen_s, line.rstrip()))
             self._on_line(seen_s, line)
-
-
-class BackgroundCommand(Process):
-    """A process whose failure is a UserError with its last line.
-
-    Args:
-        arguments: the module and its arguments.
-        ready: text of its output that says it has started; None: no wait.
-        quiet: do not print the command.
-
-    Raises:
-        UserError: it ended, or said nothing for too long, before it was ready.
-    """
-
-    def __init__(self, *arguments: str, ready: str | None = None, quiet: bool = False) -> None:
-        if not quiet:
-            print(f"\n$ python -m {shlex.join(arguments)} &", flush=True)
-        self.name = " ".join(arguments[:2])
-        super().__init__(*arguments)
-        if ready is None:
-            return
-        try:
-            wait_until(lambda: self.has_ended or self._when(ready), self.name)
-        except TimeoutError:
-            self.end()
-        if self.has_ended:
-            self._gone(None)
-            raise self._failure()
-
-    def wait(self, timeout_s: float = PATIENCE_S) -> int:
-        """Wait until it has ended by itself, with status 0.
-
-        Raises:
-            CommandTimeoutError: it has not ended.
-            UserError: it failed.
-        """
-        try:
-            status = self._gone(timeout_s)
-        except subprocess.TimeoutExpired:
-            said = f"python -m {self.name} did not end within {timeout_s:g} s"
-            raise CommandTimeoutError(said) from None
-        if status:
-            raise self._failure()
-        return status
-
-    def _failure(self) -> UserError:
-        said = [line for _, line in self.lines if line.strip()]
-        last = said[-1].strip() if said else "it said nothing"
-        return UserError(f"python -m {self.name}: {last}")
 
 
 @contextlib.contextmanager
@@ -251,6 +234,37 @@ def run_command(*arguments: str) -> None:
         raise
     if status:
         raise UserError(f"python -m {arguments[0]} {arguments[1]} ended with status {status}")
+
+
+def drive_shown(
+    vehicle_id: str,
+    trust: Sequence[str],
+    simulate: Sequence[str],
+    listener: Sequence[str] = (),
+) -> None:
+    """Drive the left turn with a mock vehicle and an operator, by commands as a person types them.
+
+    Args:
+        vehicle_id: whose keys on the wire.
+        trust: the edge runtime's options for its policy.
+        simulate: further options of ``bridge simulate``.
+        listener: a further command of the bridge, which listens and ends after the drive.
+
+    Raises:
+        UserError: one of them failed.
+    """
+    endpoint = free_endpoint()
+    common = ("--connect", endpoint, "--vehicle-id", vehicle_id)
+    with contextlib.ExitStack() as stack:
+        edge = ("edge_runtime", "run", *trust, *common, "--vehicle", "mock")
+        stack.enter_context(Process(*edge, ready="ready", shown=True))
+        beside = Process("bridge", *listener, *common, shown=True) if listener else None
+        stack.enter_context(beside or contextlib.nullcontext())
+        stack.enter_context(operator(endpoint, vehicle_id))
+        where = ("--listen", endpoint, "--vehicle-id", vehicle_id)
+        run_command("bridge", "simulate", "--env", "left_turn", *simulate, *where)
+        if beside is not None:
+            beside.succeed()
 
 
 def end_children() -> None:

@@ -18,9 +18,10 @@ from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_bytes
-from hil_tests.processes import POLICY, PUBLIC_KEY, BackgroundCommand, run_command, wait_until
+from hil_tests.processes import POLICY, PUBLIC_KEY, Process, run_command, wait_until
 
 LEFT_TURN = Path("hil_tests/recordings/left_turn.mcap")
+TRUST = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
 EPISODES = 4
 MAX_BYTES = 300_000
 DRIVEN_BEFORE_S = 2.0
@@ -31,10 +32,6 @@ EXAMPLE = examples("python -m hil_tests recording --out runs/left_turn.mcap")
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--policy", metavar="POLICY.onnx", default=str(POLICY), help="who drives")
-    parser.add_argument(
-        "--public-key", metavar="FILE", default=str(PUBLIC_KEY), help="Ed25519 public key, PEM"
-    )
     parser.add_argument("--out", metavar="F.mcap", default=str(LEFT_TURN), help="where it is kept")
 
 
@@ -42,11 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Make the recording anew; the old one stays where anything goes wrong."""
     out = Path(arguments.out)
     check_writable(out)
-    trust = ("--policy", arguments.policy, "--public-key", arguments.public_key)
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "drive.mcap"
-        _record(made, trust)
-        run_command("bridge", "replay", str(made), *trust)
+        _record(made)
+        run_command("bridge", "replay", str(made), *TRUST)
         data = read_bytes(made, "recording")
         if len(data) > MAX_BYTES:
             raise UserError(f"the recording has {len(data)} bytes, more than {MAX_BYTES}")
@@ -55,28 +51,28 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _record(out: Path, trust: tuple[str, ...]) -> None:
+def _record(out: Path) -> None:
     """The runtime starts last, so that the drive begins once the recorder listens."""
     endpoint = free_endpoint()
     simulate = ("bridge", "simulate", "--env", "left_turn", "--listen", endpoint)
     record = ("bridge", "record", "--out", str(out), "--connect", endpoint)
-    first = BackgroundCommand(*simulate, "--episodes", str(EPISODES), quiet=True)
+    first = Process(*simulate, "--episodes", str(EPISODES))
     wait = ("--wait-s", "30", "--linger-s", "30")
-    with first, BackgroundCommand(*record, *wait, quiet=True) as recorder:
+    with first, Process(*record, *wait) as recorder:
         _wait_for_simulators(out, 1)
-        run = ("edge_runtime", "run", *trust, "--connect", endpoint)
-        with BackgroundCommand(*run, ready="ready"):
-            first.wait(PATIENCE_S)
+        run = ("edge_runtime", "run", *TRUST, "--connect", endpoint)
+        with Process(*run, ready="ready", shown=True):
+            first.succeed(PATIENCE_S)
             realtime = ("--seed", str(EPISODES), "--clock", "realtime")
-            with BackgroundCommand(*simulate, *realtime, quiet=True) as second:
+            with Process(*simulate, *realtime) as second:
                 _wait_for_simulators(out, 2)
                 time.sleep(DRIVEN_BEFORE_S)
                 second.send(signal.SIGSTOP)
                 time.sleep(STOPPED_S)
                 second.send(signal.SIGCONT)
-                second.wait(PATIENCE_S)
+                second.succeed(PATIENCE_S)
         recorder.send(signal.SIGTERM)
-        recorder.wait(PATIENCE_S)
+        recorder.succeed(PATIENCE_S)
 
 
 def _wait_for_simulators(out: Path, count: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
 from hil_tests.sweep import LOOPS, VEHICLE
+from trainer.experiments.report import table
 
 Found = Mapping[str, Any]
 """A part of a report's JSON."""
-MARKDOWN = ".md"
 FIGURES = {
     "success": ("success", "success", "Wilson's 95 % interval"),
     "distance": ("surviving_distance_m", "surviving distance, m", "Student's 95 % interval"),
@@ -28,17 +28,18 @@ COLUMNS = 3
 
 def check_report(out: Path) -> None:
     """Raise UserError now, before the long work, if `write_report` would fail after it."""
-    if out.suffix == MARKDOWN:
+    if out.suffix == ".md":
         raise UserError(f"--out {out} is for the JSON; the Markdown is written beside it")
     check_writable(out)
-    check_writable(out.with_suffix(MARKDOWN))
+    check_writable(out.with_suffix(".md"))
 
 
 def write_report(out: Path, report: Found, lines: Sequence[str]) -> None:
-    """Write ``out`` and, with its ``lines``, the Markdown beside it."""
+    """Write ``out`` and, with its ``lines``, the Markdown beside it; say where."""
     write_json_out(out, report)
-    text = "\n".join(lines).rstrip() + "\n"
-    write_atomic(out.with_suffix(MARKDOWN), text.encode())
+    markdown = out.with_suffix(".md")
+    write_atomic(markdown, ("\n".join(lines).rstrip() + "\n").encode())
+    print(f"{out} and {markdown}")
 
 
 def render_faults(report: Found) -> str:
@@ -49,15 +50,15 @@ def render_faults(report: Found) -> str:
     for row in report["rows"]:
         tries = str(row["tries"]) + (f" (+{row['disturbed']} again)" if row["disturbed"] else "")
         times = (
-            _spread(row["reaction_ms"]), _number(row["reaction_limit_ms"], 0),
-            _spread(row["recovery_ms"]), _number(row["recovery_limit_ms"], 0),
+            _numbers(row["reaction_ms"], 0), _number(row["reaction_limit_ms"], 0),
+            _numbers(row["recovery_ms"], 0), _number(row["recovery_limit_ms"], 0),
         )  # fmt: skip
         rows.append((row["done"], row["expected"], tries, *times, fault_verdict(row)))
     end = (
         f"{report['crashes']} crashes and {report['unsafe_commands']} unsafe commands "
         "over the whole campaign."
     )
-    return "\n".join([*table(head, rows), "", end])
+    return "\n".join([*table(head, rows), end])
 
 
 def fault_verdict(row: Found) -> str:
@@ -73,46 +74,59 @@ def fault_verdict(row: Found) -> str:
     return "MISSED: " + ", ".join(faults) if faults else met
 
 
-def render_latency(latency: Found, figures: Mapping[str, str], others: Mapping[str, Found]) -> str:
-    """Sentences of the budgets, pictures, and a table for each axis."""
-    sentences = [part["budget"]["sentence"] for part in (latency, *others.values())]
-    speed = f"{latency['faster_than_real_time']:.1f} times real time in each worker"
+Cells = Mapping[str, Callable[[Found], str]]
+"""What is said of something, and how it is read."""
+_OF_A_ROW: Cells = {
+    "episodes": lambda row: str(row["episodes"]),
+    "success (95 %)": lambda row: share(row["success"]),
+    "collisions": lambda row: f"{row['collision_rate']:.0%}",
+    "surviving distance, m (95 %)": lambda row: _interval(row["surviving_distance_m"]),
+    "time, s": lambda row: f"{row['episode_time_s']:.2f}",
+    "latency p50 / p99, ms": lambda row: _numbers(row["latency_ms"], 1),
+    "safe stops an episode": lambda row: f"{row['safe_stops_per_episode']:.2f}",
+    "ticks without a new command": lambda row: f"{row['ticks_without_new_command']:.0%}",
+}
+_OF_A_VEHICLE: Cells = {
+    "speed error rmse / max, m/s of the vehicle": lambda vehicle: _numbers(
+        vehicle["speed_error_mps"], 3
+    ),
+    "action error rmse / max": lambda vehicle: ", ".join(
+        f"{name} {_numbers(error, 2)}" for name, error in vehicle["action_error"].items()
+    ),
+    "actuator lag, ms": lambda vehicle: ", ".join(
+        f"{name} {_number(lag, 0)}" for name, lag in vehicle["lag_ms"].items()
+    ),
+    "feedback age p50 / p99, ms": lambda vehicle: _numbers(vehicle["feedback_age_ms"], 1),
+    "metres of the vehicle for one of the scenario": lambda vehicle: _number(vehicle["scale"], 3),
+}
+
+
+def render_latency(latency: Found) -> str:
+    """The budget's sentence, pictures, and a table for each axis."""
     lines = [
-        *(f"{sentence}\n" for sentence in sentences),
+        latency["budget"]["sentence"],
+        "",
         "A limit is the largest tested value up to which, at every tested value, the share of "
         f"successes over {latency['runs']} episodes (the same seeds in every row) is at the "
-        f"target; nothing is interpolated. Clock: {latency['clock']}, {speed}, the start of each "
-        "simulator included.",
+        f"target; nothing is interpolated. Clock: {latency['clock']}, "
+        f"{latency['faster_than_real_time']:.1f} times real time in each worker, the start of "
+        "each simulator included.",
         "",
-        *(f"![{name}]({path})\n" for name, path in figures.items()),
+        *_pictures(latency),
     ]
     for axis in latency["axes"]:
+        points = zip(axis["values"], axis["specs"], strict=True)
+        rows = []
+        for value, spec in points:
+            cells = (tell(latency["rows"][spec]) for tell in _OF_A_ROW.values())
+            rows.append((f"{value:g} {axis['unit']}", *cells))
         title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
-        lines += [title, "", *_latency_table(axis, latency["rows"]), ""]
+        lines += [title, "", *table(("value", *_OF_A_ROW), rows)]
     return "\n".join(lines)
 
 
-def _latency_table(axis: Found, rows: Found) -> list[str]:
-    head = ("value", "success", "95 %", "surviving distance, m", "collisions",
-            "safe stops an episode", "ticks without a new command",
-            "latency p50 / p99, ms")  # fmt: skip
-    cells = []
-    for value, spec in zip(axis["values"], axis["specs"], strict=True):
-        row = rows[spec]
-        success = row["success"]
-        cells.append(
-            (
-                f"{value:g} {axis['unit']}",
-                f"{success['value']:.0%}",
-                f"{success['low']:.0%} to {success['high']:.0%}",
-                _interval(row["surviving_distance_m"], 2),
-                f"{row['collision_rate']:.0%}",
-                f"{row['safe_stops_per_episode']:.2f}",
-                f"{row['ticks_without_new_command']:.0%}",
-                _pair(row["latency_ms"], 0, ("p50", "p99")),
-            )
-        )
-    return table(head, cells)
+def _pictures(part: Found) -> list[str]:
+    return [f"![{name}]({path})\n" for name, path in part["figures"].items()]
 
 
 def comparison_verdict(comparison: Found) -> str:
@@ -130,7 +144,7 @@ def render_comparison(comparison: Found) -> str:
     """The verdict, a column for each loop, and what the vehicle was like."""
     loops = [comparison["rows"][loop] for loop in LOOPS]
     longer = comparison["cost"]
-    rows = [(name, *(tell(row) for row in loops)) for name, tell in _OF_A_LOOP.items()]
+    rows = [(name, *(tell(row) for row in loops)) for name, tell in _OF_A_ROW.items()]
     for name, tell in _OF_A_VEHICLE.items():
         of_each = (row["vehicle"] for row in loops)
         rows.append((name, *("-" if each is None else tell(each) for each in of_each)))
@@ -139,38 +153,11 @@ def render_comparison(comparison: Found) -> str:
             comparison_verdict(comparison),
             "",
             f"Where both reach the goal ({longer['seeds']} seeds), the drive takes "
-            f"{_interval(longer['longer_s'], 2)} s longer with the vehicle.",
+            f"{_interval(longer['longer_s'])} s longer with the vehicle.",
             "",
             *table(("", "policy in the loop", "vehicle in the loop"), rows),
         ]
     )
-
-
-_OF_A_LOOP: dict[str, Callable[[Found], str]] = {
-    "episodes": lambda row: str(row["episodes"]),
-    "success (95 %)": lambda row: share(row["success"]),
-    "collisions": lambda row: f"{row['collision_rate']:.0%}",
-    "surviving distance, m (95 %)": lambda row: _interval(row["surviving_distance_m"], 2),
-    "time, s": lambda row: f"{row['episode_time_s']:.2f}",
-    "latency p50 / p99, ms": lambda row: _pair(row["latency_ms"], 1, ("p50", "p99")),
-    "safe stops an episode": lambda row: f"{row['safe_stops_per_episode']:.2f}",
-}
-_OF_A_VEHICLE: dict[str, Callable[[Found], str]] = {
-    "speed error rmse / max, m/s of the vehicle": lambda vehicle: _pair(
-        vehicle["speed_error_mps"], 3, ("rmse", "max")
-    ),
-    "action error rmse / max": lambda vehicle: ", ".join(
-        f"{name} {_pair(error, 2, ('rmse', 'max'))}"
-        for name, error in vehicle["action_error"].items()
-    ),
-    "actuator lag, ms": lambda vehicle: ", ".join(
-        f"{name} {_number(lag, 0)}" for name, lag in vehicle["lag_ms"].items()
-    ),
-    "feedback age p50 / p99, ms": lambda vehicle: _pair(
-        vehicle["feedback_age_ms"], 1, ("p50", "p99")
-    ),
-    "metres of the vehicle for one of the scenario": lambda vehicle: _number(vehicle["scale"], 3),
-}
 
 
 def lag_sentence(sweep: Found) -> str:
@@ -188,21 +175,23 @@ def lag_sentence(sweep: Found) -> str:
     )
 
 
-def render_sweep(sweep: Found, figures: Mapping[str, str]) -> str:
+def render_sweep(sweep: Found) -> str:
     """The sentences, the pictures, and the table: success, measured lag, stops of the driver."""
     points = {(row["constant_ms"], row["dead_ms"]): row for row in sweep["rows"].values()}
     constants, deads = (sorted({point[way] for point in points}) for way in (0, 1))
-    sentences = [lag_sentence(sweep)]
-    if sweep["budget"]:
-        sentences.append(sweep["budget"]["sentence"])
-    rows = [
-        (str(constant), *(_point(points.get((constant, dead))) for dead in deads))
-        for constant in constants
-    ]
+
+    def cell(row: Found | None) -> str:
+        if row is None:
+            return "-"
+        star = "*" if row["stops"] else ""
+        return f"{row['success']['value']:.0%}{star} ({_number(row['lag_ms'], 0)})"
+
+    rows = [[constant, *(cell(points.get((constant, d))) for d in deads)] for constant in constants]
     return "\n".join(
         [
-            *(f"{sentence}\n" for sentence in sentences),
-            *(f"![{name}]({path})\n" for name, path in figures.items()),
+            f"{lag_sentence(sweep)}\n",
+            *([f"{sweep['budget']['sentence']}\n"] if sweep["budget"] else []),
+            *_pictures(sweep),
             f"Success of {sweep['runs']} episodes, and in brackets the lag of the speed that the "
             "drives showed, ms; a star where the driver stopped the vehicle, which did not follow:",
             "",
@@ -211,26 +200,13 @@ def render_sweep(sweep: Found, figures: Mapping[str, str]) -> str:
     )
 
 
-def _point(row: Found | None) -> str:
-    if row is None:
-        return "-"
-    star = "*" if row["stops"] else ""
-    return f"{row['success']['value']:.0%}{star} ({_number(row['lag_ms'], 0)})"
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """The lines of a table in Markdown."""
-    lines = ["| " + " | ".join(cells) + " |" for cells in (head, *rows)]
-    return [lines[0], "|---" * len(head) + "|", *lines[1:]]
-
-
 def share(estimate: Mapping[str, float]) -> str:
     """As in "95 % (83 to 99)"."""
     return f"{estimate['value']:.0%} ({estimate['low']:.0%} to {estimate['high']:.0%})"
 
 
-def _interval(estimate: Mapping[str, float], digits: int) -> str:
-    value, low, high = (f"{estimate[name]:.{digits}f}" for name in ("value", "low", "high"))
+def _interval(estimate: Mapping[str, float]) -> str:
+    value, low, high = (f"{estimate[name]:.2f}" for name in ("value", "low", "high"))
     return f"{value} ({low} to {high})"
 
 
@@ -238,33 +214,25 @@ def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _pair(found: Mapping[str, float | None], digits: int, names: Sequence[str]) -> str:
-    return " / ".join(_number(found[name], digits) for name in names)
+def _numbers(found: Mapping[str, float | None] | None, digits: int) -> str:
+    return " / ".join(_number(value, digits) for value in found.values()) if found else "-"
 
 
-def _spread(spread: Mapping[str, float] | None) -> str:
-    return "-" if spread is None else _pair(spread, 0, ("min", "median", "max"))
-
-
-def write_figures(
-    out: Path, swept: Found, others: Mapping[str, Found] | None = None
-) -> dict[str, str]:
+def write_figures(out: Path, swept: Found) -> dict[str, str]:
     """Write a PNG of success and one of surviving distance beside ``out``: a panel for each axis.
 
     Args:
         out: the report's path; the pictures' names begin with its stem.
-        swept: the report's part of this policy.
-        others: parts of other reports by the name to show them under.
+        swept: a part of a report with axes.
 
     Returns:
         The files' names by figure.
     """
-    parts = {Path(swept["policy"]).stem: swept, **(others or {})}
     names = {}
-    for figure_name, (field, label, band) in FIGURES.items():
-        path = out.with_name(f"{out.stem}_{figure_name}.png")
-        write_png(path, _draw_axes(parts, swept, field, label, band))
-        names[figure_name] = path.name
+    for name, (field, label, band) in FIGURES.items():
+        path = out.with_name(f"{out.stem}_{name}.png")
+        write_png(path, _draw_axes(swept, field, label, band))
+        names[name] = path.name
     return names
 
 
@@ -282,16 +250,17 @@ def write_png(path: Path, figure: Figure) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-def _draw_axes(
-    parts: Mapping[str, Found], swept: Found, field: str, label: str, band: str
-) -> Figure:
-    axes = swept["axes"]
+def _draw_axes(swept: Found, field: str, label: str, band: str) -> Figure:
+    axes, name = swept["axes"], Path(swept["policy"]).stem
     rows, columns = math.ceil(len(axes) / COLUMNS), min(COLUMNS, len(axes))
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten().tolist()
     for panel, axis in zip(panels, axes, strict=False):
-        for number, (name, part) in enumerate(parts.items()):
-            _draw_curve(panel, axis, part["rows"], field, name, f"C{number}")
+        values = axis["values"]
+        estimates = [swept["rows"][spec][field] for spec in axis["specs"]]
+        panel.plot(values, [each["value"] for each in estimates], "o-", ms=3.5, label=name)
+        low, high = ([each[end] for each in estimates] for end in ("low", "high"))
+        panel.fill_between(values, low, high, alpha=0.2, linewidth=0)
         panel.set_xlabel(f"{axis['title']}, {axis['unit']}", fontsize=9)
         panel.grid(alpha=0.3)
         if field == "success":
@@ -310,22 +279,9 @@ def _draw_axes(
     return figure
 
 
-def _draw_curve(panel: Any, axis: Found, rows: Found, field: str, name: str, colour: str) -> None:
-    points = [
-        (value, rows[spec][field])
-        for value, spec in zip(axis["values"], axis["specs"], strict=True)
-        if spec in rows
-    ]
-    values = [value for value, _ in points]
-    panel.plot(values, [e["value"] for _, e in points], "o-", ms=3.5, color=colour, label=name)
-    low, high = ([e[end] for _, e in points] for end in ("low", "high"))
-    panel.fill_between(values, low, high, color=colour, alpha=0.2, linewidth=0)
-
-
 def _draw_lags(sweep: Found) -> Figure:
     rows = sweep["rows"].values()
-    dead = sorted({row["dead_ms"] for row in rows})
-    constant = sorted({row["constant_ms"] for row in rows})
+    dead, constant = (sorted({row[name] for row in rows}) for name in ("dead_ms", "constant_ms"))
     success = np.full((len(constant), len(dead)), np.nan)
     for row in rows:
         place = constant.index(row["constant_ms"]), dead.index(row["dead_ms"])
@@ -336,15 +292,11 @@ def _draw_lags(sweep: Found) -> Figure:
     panel = figure.subplots()
     image = panel.imshow(success, origin="lower", aspect="auto", vmin=0.5, vmax=1, cmap="RdYlGn")
     for (y, x), value in np.ndenumerate(success):
-        if np.isnan(value):
-            continue  # not asked for
-        panel.text(
-            x, y, f"{value:.0%}", ha="center", va="center", fontsize=8,
-            weight="bold" if value >= target else "normal",
-            color="white" if abs(value - 0.75) > 0.18 else "black",  # dark at both ends
-        )  # fmt: skip
-    panel.set_xticks(range(len(dead)), [str(value) for value in dead])
-    panel.set_yticks(range(len(constant)), [str(value) for value in constant])
+        if not np.isnan(value):  # else it was not asked for
+            weight = "bold" if value >= target else "normal"
+            panel.text(x, y, f"{value:.0%}", ha="center", va="center", fontsize=8, weight=weight)
+    panel.set_xticks(range(len(dead)), map(str, dead))
+    panel.set_yticks(range(len(constant)), map(str, constant))
     panel.set_xlabel("dead time of the actuator, ms")
     panel.set_ylabel("its time constant, ms")
     panel.set_title(

@@ -1,41 +1,50 @@
-"""What both campaigns share: axes as data, rows of episodes, the budget's sentence, kept results.
+"""What both campaigns share: axes as data, parts driven side by side and kept, rows, the budget.
 
-A campaign drives the points of some axes, each with the same seeds, and says up to which value of
-each the policy holds a share of successes. `campaign.py` does so for the network, `vehicle.py` for
-the lag of a vehicle's actuators.
+A campaign drives points (networks, loops, lags of the actuators), each with the same seeds, and
+says up to which value of each axis the policy holds a share of successes.
 """
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import statistics
-import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-from bridge.environments import CONDITIONS, NOMINAL
-from bridge.network import parse_spec
 from bridge.report import COLLISION, GOAL
-from edge_runtime.cli import ArgumentParser, add_public_key, not_negative, positive, share
 from edge_runtime.files import make_directory, write_json
-from edge_runtime.policy import load_policy
+from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
-from hil_tests.processes import BackgroundCommand
-from trainer.drivers import make_environment
+from hil_tests.faults.rig import free_bus
+from hil_tests.mock_hunter.body import make_parameters
+from hil_tests.processes import (
+    CommandTimeoutError,
+    Process,
+    in_parallel,
+    operator,
+    trusting,
+)
+from hil_tests.virtual_drive import Driven, VirtualDrive
+from trainer.drivers import OnnxDriver, make_environment
 from trainer.experiments.plan import digest
 from trainer.experiments.statistics import Estimate, mean_estimate, success_estimate
-from trainer.options import add_scenario
 from trainer.util import ProgressBar
-
-Item = TypeVar("Item")
 
 LOOPS = POLICY, VEHICLE = ("policy", "vehicle")
 """What may be in the loop."""
+VEHICLE_ID = "campaign01"
+MODEL = "hunter-2.0"
+PART_LIMIT_S = 900.0
+ATTEMPTS = 6
+FORMAT = 3
+"""Raise it where the same part begins to mean another drive: kept results become void."""
 
 
 @dataclass(frozen=True)
@@ -48,16 +57,15 @@ class Axis:
     values: tuple[float, ...]
     """Ascending."""
     pattern: str
-    """The specification of a point; ``{}`` is the value."""
+    """The specification of a point, which is its name in the report; ``{}`` is the value."""
     base: str
     """The specification at value 0, and what the line is measured on."""
     limit: str
     """How the budget's sentence names the limit; ``{}`` is the value with its unit."""
-    canonical: Callable[[str], str] = lambda text: str(parse_spec(text))
 
     def spec(self, value: float) -> str:
-        """The specification at a value, in canonical form: the point's name in the report."""
-        return self.canonical(self.pattern.format(f"{value:g}") if value else self.base)
+        """The specification at a value."""
+        return self.pattern.format(f"{value:g}") if value else self.base
 
     @property
     def specs(self) -> list[str]:
@@ -96,7 +104,7 @@ steps of 50 ms, and on to where nobody drives."""
 
 
 class Lag(NamedTuple):
-    """A lag of the vehicle's actuators."""
+    """A lag of the vehicle's actuators: a dead time and a time constant of the speed."""
 
     dead_ms: int
     constant_ms: int
@@ -105,13 +113,6 @@ class Lag(NamedTuple):
     def spec(self) -> str:
         """Its name in the report."""
         return f"dead={self.dead_ms}ms,constant={self.constant_ms}ms"
-
-    def changes(self) -> dict[str, float]:
-        """The mock's parameters."""
-        return {
-            "dead_time_s": self.dead_ms / 1e3,
-            "speed_time_constant_s": self.constant_ms / 1e3,
-        }
 
 
 DEAD_TIMES_MS = (0, 50, 100, 200, 300, 400, 500, 600, 800)
@@ -123,16 +124,19 @@ LAG_AXES = (
     Axis("dead_time", f"dead time, with a time constant of {LINE_CONSTANT_MS} ms", "ms",
          DEAD_TIMES_MS, f"dead={{}}ms,constant={LINE_CONSTANT_MS}ms",
          Lag(DEAD_TIMES_MS[0], LINE_CONSTANT_MS).spec,
-         f"{{}} of dead time (time constant {LINE_CONSTANT_MS} ms)", str),
+         f"{{}} of dead time (time constant {LINE_CONSTANT_MS} ms)"),
     Axis("time_constant", f"time constant, with a dead time of {LINE_DEAD_MS} ms", "ms",
          TIME_CONSTANTS_MS, f"dead={LINE_DEAD_MS}ms,constant={{}}ms",
          Lag(LINE_DEAD_MS, TIME_CONSTANTS_MS[0]).spec,
-         f"{{}} of time constant (dead time {LINE_DEAD_MS} ms)", str),
+         f"{{}} of time constant (dead time {LINE_DEAD_MS} ms)"),
 )  # fmt: skip
 """Two lines through the table LAGS."""
 
+Rows = Mapping[str, Mapping[str, Any]]
+"""The report's rows by their specification."""
 
-def limit_of(axis: Axis, rows: Mapping[str, Mapping[str, Any]], target: float) -> float | None:
+
+def limit_of(axis: Axis, rows: Rows, target: float) -> float | None:
     """The largest tested value up to which success is at the target at every tested value.
 
     Success is the share of the row's episodes (the point estimate), and nothing is interpolated.
@@ -146,9 +150,7 @@ def limit_of(axis: Axis, rows: Mapping[str, Mapping[str, Any]], target: float) -
     return limit
 
 
-def budget(
-    axes: Sequence[Axis], rows: Mapping[str, Mapping[str, Any]], target: float, name: str
-) -> dict[str, Any]:
+def budget(axes: Sequence[Axis], rows: Rows, target: float, name: str) -> dict[str, Any]:
     """Each axis's limit, whether it is only the end of what was tested, and the sentence."""
     limits = {axis.name: limit_of(axis, rows, target) for axis in axes}
     open_ended = {axis.name: limits[axis.name] == axis.values[-1] for axis in axes}
@@ -156,7 +158,7 @@ def budget(
         "target_success": target,
         "limits": limits,
         "up_to_the_largest_tested": open_ended,
-        "sentence": _sentence(axes, limits, open_ended, target, name),
+        "sentence": _sentence(axes, limits, open_ended, f"{target:.0%} success", name),
     }
 
 
@@ -164,14 +166,14 @@ def _sentence(
     axes: Sequence[Axis],
     limits: Mapping[str, float | None],
     open_ended: Mapping[str, bool],
-    target: float,
+    goal: str,
     name: str,
 ) -> str:
     parts, missed = [], []
     for axis in axes:
         limit = limits[axis.name]
         if limit is None and axis.base == NO_NETWORK:
-            return f"{name} is below {target:.0%} success even on a perfect network."
+            return f"{name} is below {goal} even on a perfect network."
         if limit is None:
             missed.append(f"on {axis.base} alone it is below that, so no {axis.name} has a budget")
             continue
@@ -180,54 +182,27 @@ def _sentence(
     if not parts:
         return f"{name}: " + "; ".join(missed) + "."
     listed = ", ".join(parts[:-1]) + (" and " if parts[:-1] else "") + parts[-1]
-    held = f"{name} holds at least {target:.0%} success up to {listed}, one at a time"
-    return "; ".join([held, *missed]) + "."
+    return "; ".join([f"{name} holds at least {goal} up to {listed}, one at a time", *missed]) + "."
 
 
-def make_row(spec: str, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Join what was driven over the wire under one specification, each part `worth_keeping`.
+def lag_budget(rows: Sequence[Mapping[str, Any]], target: float) -> dict[str, Any]:
+    """Up to which sum of dead time and time constant every tested point holds the target.
 
-    Latencies are from state sent to command received: the median of the parts' p50 and the
-    largest p99.
+    ``sum_ms`` is None where the least does not; ``measured_ms`` is the same by the lag that the
+    drives showed (points where it could not be told are left out).
     """
-    episodes = [episode for part in parts for episode in part["episodes"]]
-    outcomes = Counter(episode["outcome"] for episode in episodes)
-    count = len(episodes)
-    heard = [part["latency_ms"] for part in parts if part["latency_ms"]["p50"] is not None]
-    steps = sum(episode["steps"] for episode in episodes)
+
+    def limit(points: Sequence[tuple[float, Mapping[str, Any]]]) -> float | None:
+        failing = [size for size, row in points if row["success"]["value"] < target]
+        first = min(failing, default=float("inf"))
+        return max((size for size, _ in points if size < first), default=None)
+
     return {
-        "spec": spec,
-        "episodes": count,
-        **summary(episodes),
-        "collision_rate": outcomes[COLLISION] / count,
-        "safe_stops_per_episode": sum(part["safe_stops"] for part in parts) / count,
-        "ticks_without_new_command": sum(part["deadline_misses"] for part in parts) / steps,
-        "latency_ms": {
-            "p50": statistics.median(latency["p50"] for latency in heard) if heard else None,
-            "p99": max(latency["p99"] for latency in heard) if heard else None,
-        },
-        "rejected": dict(sum((Counter(part["rejected"]) for part in parts), Counter())),
-        "driven_s": sum(episode["time_s"] for episode in episodes),
-        "wall_s": sum(part["wall_s"] for part in parts),
-        "command": parts[0]["command"],
-        "per_episode": episodes,
+        "target_success": target,
+        "sum_ms": limit([(row["dead_ms"] + row["constant_ms"], row) for row in rows]),
+        "measured_ms": limit([(row["lag_ms"], row) for row in rows if row["lag_ms"] is not None]),
+        "all_hold": all(row["success"]["value"] >= target for row in rows),
     }
-
-
-def summary(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How episodes ended: success with Wilson's interval, distance with Student's, of 95 %."""
-    outcomes = Counter(episode["outcome"] for episode in episodes)
-    return {
-        "success": interval(success_estimate(outcomes[GOAL], len(episodes))),
-        "outcomes": dict(outcomes),
-        "surviving_distance_m": interval(mean_estimate([e["distance_m"] for e in episodes])),
-        "episode_time_s": statistics.fmean(episode["time_s"] for episode in episodes),
-    }
-
-
-def interval(estimate: Estimate) -> dict[str, float]:
-    """As it stands in a report."""
-    return {"value": estimate.value, "low": estimate.low, "high": estimate.high}
 
 
 class Task(NamedTuple):
@@ -248,132 +223,124 @@ class Task(NamedTuple):
         return {"policy": str(self.policy), **{name: getattr(self, name) for name in names}}
 
 
-def task_of(arguments: argparse.Namespace) -> Task:
-    """The task that is asked for; UserError where its policy does not load.
+class Part(NamedTuple):
+    """Episodes of one point with the seeds ``seed``, ``seed + 1``, ...: the same for every point.
 
-    The edge runtime checks signatures where it matters; here the loop is measured.
+    ``point`` is a network, one of LOOPS or a `Lag`.
     """
-    policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
-    loaded = load_policy(str(policy), arguments.public_key, allow_unsigned=True)
-    return Task(
-        policy, loaded.policy_id, arguments.scenario, arguments.condition, arguments.seed,
-        arguments.runs, arguments.public_key,
-    )  # fmt: skip
+
+    point: Any
+    seed: int
+    runs: int
+
+    def split(self, size: int) -> list[Part]:
+        """Parts of that many episodes at most, which cover each seed once."""
+        return [
+            Part(self.point, self.seed + done, min(size, self.runs - done))
+            for done in range(0, self.runs, size)
+        ]
 
 
-def turns(seed: int, runs: int, size: int) -> list[tuple[int, int]]:
-    """First seed and number of episodes of turns that cover each seed once."""
-    return [(seed + done, min(size, runs - done)) for done in range(0, runs, size)]
+Drive = Callable[[Task, Part], list[dict[str, Any]]]
+"""Drives a part; its results, for JSON."""
 
 
-class KeptResults:
-    """A file for each result, named by a hash of all that decides it.
+def drive_all(
+    task: Task,
+    points: Sequence[Any],
+    size: int,
+    drive: Drive,
+    jobs: int,
+    keep: Path,
+    processes: bool = False,
+) -> dict[Any, list[dict[str, Any]]]:
+    """Drive the task's episodes at every point, ``jobs`` parts at a time; the results by point.
 
     Args:
-        directory: where; it is made.
-        task: whose scenario and condition, with the environment's settings, decide, too.
-        deciding: what else all results have in common.
+        task: what all drives have in common.
+        points: in any order.
+        size: episodes of a part, at most.
+        drive: what is called with a part that is not kept.
+        jobs: parts side by side.
+        keep: directory of a file for each part, named by a hash of all that decides it.
+        processes: call ``drive`` in processes, not in threads.
 
     Raises:
-        UserError: there can be no such directory.
+        UserError: there can be no such directory, a kept result is no JSON, or a drive failed.
     """
+    config = make_environment(task.scenario, task.condition).config
+    deciding = {
+        "format": FORMAT, "drive": drive.__name__, "policy": task.policy_id,
+        "scenario": task.scenario, "condition": task.condition, "environment": asdict(config),
+        "changes": task.changes,
+    }  # fmt: skip
+    make_directory(keep)
+    parts = [one for point in points for one in Part(point, task.seed, task.runs).split(size)]
+    paths = {one: keep / f"{digest({**deciding, **one._asdict()})}.json" for one in parts}
+    found = {one: _read_kept(path) for one, path in paths.items() if path.is_file()}
+    with ProgressBar("parts", len(parts), len(found)) as bar:
 
-    def __init__(self, directory: Path, task: Task, deciding: Mapping[str, Any]) -> None:
-        config = make_environment(task.scenario, task.condition).config
-        shared = {"scenario": task.scenario, "condition": task.condition}
-        self._deciding = {**deciding, **shared, "environment": asdict(config)}
-        self._directory = directory
-        make_directory(directory)
+        def on_done(one: Part, results: list[dict[str, Any]]) -> None:
+            found[one] = results
+            write_json(paths[one], results)
+            bar.advance({"of": getattr(one.point, "spec", one.point)})
 
-    def complete(
-        self,
-        what: str,
-        items: Sequence[Item],
-        name: Callable[[Item], Mapping[str, Any]],
-        drive: Callable[[list[Item], Callable[[Item, dict[str, Any]], None]], None],
-        figures: Callable[[Item, dict[str, Any]], dict[str, str]],
-    ) -> dict[Item, dict[str, Any]]:
-        """The result of each item: those that are kept, and those that ``drive`` adds now.
-
-        Args:
-            what: is counted by the progress bar.
-            items: in any order.
-            name: an item's part of what decides its result.
-            drive: called with the missing items, and with what is to be called with each result.
-            figures: shown beside the bar after each.
-
-        Raises:
-            UserError: a kept result is no JSON.
-        """
-        paths = {item: self._path(name(item)) for item in items}
-        found = {item: _read_kept(path) for item, path in paths.items() if path.is_file()}
-        missing = [item for item in items if item not in found]
-        with ProgressBar(what, len(items), len(found)) as bar:
-
-            def on_done(item: Item, result: dict[str, Any]) -> None:
-                found[item] = result
-                write_json(paths[item], result)
-                bar.advance(figures(item, result))
-
-            if missing:
-                drive(missing, on_done)
-        return found
-
-    def _path(self, one: Mapping[str, Any]) -> Path:
-        return self._directory / f"{digest({**self._deciding, **one})}.json"
+        missing = [one for one in parts if one not in found]
+        in_parallel(partial(drive, task), missing, jobs, on_done, processes)
+    return {
+        point: [result for one in parts if one.point == point for result in found[one]]
+        for point in points
+    }
 
 
-def _read_kept(path: Path) -> dict[str, Any]:
+def _read_kept(path: Path) -> list[dict[str, Any]]:
     try:
-        result: dict[str, Any] = read_json(path, "kept result")
+        results: list[dict[str, Any]] = read_json(path, "kept result")
     except UserError as error:
         raise UserError(f"{error}; remove it") from None
-    return result
+    return results
 
 
-def add_sweep_arguments(
-    parser: ArgumentParser, parts: Sequence[str], runs: int, runs_help: str, target: float
-) -> None:
-    """The options that both campaigns have."""
-    parser.add_argument(
-        "--out",
-        required=True,
-        metavar="R.json",
-        help="the report; R.md, pictures and R_rows/ (what is done already) go beside it",
-    )
-    default = "policy file (default: results/policies/SCENARIO.onnx)"
-    parser.add_argument("--policy", metavar="P.onnx", help=default)
-    add_public_key(parser)
-    add_scenario(parser)
-    parser.add_argument("--condition", choices=CONDITIONS, default=NOMINAL, help="scene")
-    parser.add_argument("--only", choices=parts, help="one part (default: both)")
-    for name, kind, value, text in (
-        ("--runs", _several, runs, runs_help),
-        ("--seed", not_negative, 0, "of the first episode"),
-        ("--target", share, target, "success that is asked for"),
-        (
-            "--jobs",
-            not_negative,
-            0,
-            "drives or faults side by side; 0: one a core",
-        ),
-    ):
-        parser.add_argument(name, type=kind, default=value, help=text)
+def run_rig(task: Task, part: Part, limit_s: float, *options: str, hunter: bool = False) -> Any:
+    """Drive a part through processes of its own, which end with it.
+
+    Args:
+        task: what is driven.
+        part: the seeds.
+        limit_s: the simulator's time.
+        options: further ones of ``bridge simulate``.
+        hunter: put a mock Hunter on a CAN bus into the loop, and an operator beside it.
+
+    Returns:
+        The simulator's report, with its command.
+
+    Raises:
+        UserError: a command failed, or did not end (CommandTimeoutError).
+    """
+    endpoint = free_endpoint()
+    common = ("--vehicle-id", VEHICLE_ID)
+    with tempfile.TemporaryDirectory(prefix="phil-rig-") as folder, ExitStack() as stack:
+        vehicle: tuple[str, ...] = ()
+        if hunter:
+            bus, config = free_bus(), Path(folder) / "edge.toml"
+            settings = [f"--set={name}={value}" for name, value in task.changes.items()]
+            mock = ("hil_tests", "mock_hunter", "--bus", bus, *settings)
+            stack.enter_context(Process(*mock, ready="ready"))
+            config.write_text(f'bus = "{bus}"\n')
+            vehicle = ("--vehicle", "hunter", "--config", str(config))
+        edge = ("edge_runtime", "run", *trusting(task.policy, task.public_key), *vehicle)
+        where = ("--connect", endpoint, *common)
+        stack.enter_context(Process(*edge, *where, ready="ready"))
+        if hunter:
+            stack.enter_context(operator(endpoint, VEHICLE_ID))
+        return simulate(
+            endpoint, Path(folder) / "report.json", limit_s, *common, "--env", task.scenario,
+            "--condition", task.condition, "--episodes", str(part.runs), "--seed", str(part.seed),
+            *options,
+        )  # fmt: skip
 
 
-def _several(text: str) -> int:
-    count = positive(text)
-    if count < 2:
-        raise argparse.ArgumentTypeError(f"{text} is too few: 2 or more have an interval")
-    return count
-
-
-def this_command() -> str:
-    """The command line that makes a report, to stand in it."""
-    return "python -m hil_tests " + shlex.join(sys.argv[1:])
-
-
-def simulate(endpoint: str, vehicle_id: str, out: Path, limit_s: float, *words: str) -> Any:
+def simulate(endpoint: str, out: Path, limit_s: float, *options: str) -> dict[str, Any]:
     """Run ``bridge simulate`` beside an edge runtime; its report, with the command.
 
     ``wall_s`` of the report includes the simulator's start.
@@ -381,19 +348,192 @@ def simulate(endpoint: str, vehicle_id: str, out: Path, limit_s: float, *words: 
     Raises:
         UserError: it failed, or did not end (CommandTimeoutError).
     """
-    arguments = ("bridge", "simulate", *words)
-    here = ("--listen", endpoint, "--vehicle-id", vehicle_id, "--out", str(out))
+    words = ("bridge", "simulate", *options)
     began_s = time.monotonic()
-    with BackgroundCommand(*arguments, *here, quiet=True) as simulator:
-        simulator.wait(limit_s)
+    here = ("--listen", endpoint, "--out", str(out))
+    with Process(*words, *here) as simulator:
+        simulator.succeed(limit_s)
     wall_s = round(time.monotonic() - began_s, 3)
-    command = f"python -m {shlex.join(arguments)}"
+    command = f"python -m {shlex.join(words)}"
     return {**read_json(out, "report"), "command": command, "wall_s": wall_s}
 
 
+def drive_network(task: Task, part: Part, attempts: int = ATTEMPTS) -> list[dict[str, Any]]:
+    """Drive a part in lock-step behind its network, and a disturbed one again in halves.
+
+    The edge runtime lives in wall time: where it gets no processor for 2 T it rightly stops, and
+    virtual time knows nothing of that.
+    """
+    try:
+        network = ("--clock", "lockstep", "--latency", part.point)
+        report = run_rig(task, part, PART_LIMIT_S, *network)
+    except UserError as error:
+        # Any process of the machine may take the port before we do. And lock-step crawls beside an
+        # edge runtime that has lost its wire: each step waits.
+        passing = isinstance(error, CommandTimeoutError) or "is in use" in str(error)
+        if not passing or attempts == 1:
+            raise
+        return drive_network(task, part, attempts // 2)
+    if not report["wall_clock_stalls"]:
+        return [worth_keeping(report)]
+    if attempts == 1:
+        raise UserError(
+            f"{part.point}: the edge runtime gets too little processor time for a drive "
+            "without a pause; use fewer --jobs (rows that are done are kept)"
+        )
+    if part.runs == 1:
+        return drive_network(task, part, attempts - 1)
+    halves = part.split((part.runs + 1) // 2)
+    return [found for half in halves for found in drive_network(task, half, attempts)]
+
+
+def drive_lag(task: Task, part: Part) -> list[dict[str, Any]]:
+    """Drive a part with a lag of the actuators in virtual time; its one row."""
+    lag: Lag = part.point
+    env, driver = _cockpit(task.policy, task.scenario, task.condition, task.public_key)
+    times = {"dead_time_s": lag.dead_ms / 1e3, "speed_time_constant_s": lag.constant_ms / 1e3}
+    virtual = VirtualDrive(env, driver, make_parameters(MODEL, {**task.changes, **times}))
+    driven = [virtual.episode(part.seed + number) for number in range(part.runs)]
+    return [lag_row(lag, driven, virtual.tracking.report(virtual.action_names))]
+
+
+@cache
+def _cockpit(
+    policy: Path, scenario: str, condition: str, public_key: str | None
+) -> tuple[Any, OnnxDriver]:
+    return make_environment(scenario, condition), OnnxDriver(policy, public_key)
+
+
+def lag_row(lag: Lag, driven: Sequence[Driven], tracking: Mapping[str, Any]) -> dict[str, Any]:
+    """What a point amounts to."""
+    return {
+        "spec": lag.spec,
+        "dead_ms": lag.dead_ms,
+        "constant_ms": lag.constant_ms,
+        **summary([episode._asdict() for episode in driven]),
+        "stops": sum(episode.stops for episode in driven),
+        "lag_ms": tracking["lag_ms"]["speed"],
+        "speed_error_mps": tracking["speed_error_mps"],
+    }
+
+
 def worth_keeping(report: Mapping[str, Any]) -> dict[str, Any]:
-    """What a campaign keeps of such a report."""
-    names = ("command", "wall_s", "latency_ms", "deadline_misses", "safe_stops", "rejected")
+    """What a campaign keeps of a simulator's report."""
+    names = ("command", "wall_s", "latency_ms", "deadline_misses", "safe_stops", "rejected",
+             "tick_overruns", "vehicle")  # fmt: skip
     of_each = ("seed", "outcome", "distance_m", "time_s", "steps")
-    episodes = [{name: row[name] for name in of_each} for row in report["per_episode"]]
-    return {**{name: report[name] for name in names}, "episodes": episodes}
+    reasons = Counter(event["reason"] for event in report["safe_stop_events"])
+    return {
+        **{name: report[name] for name in names},
+        "safe_stop_reasons": dict(reasons),
+        "episodes": [{name: row[name] for name in of_each} for row in report["per_episode"]],
+    }
+
+
+def make_row(spec: str, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Join what was driven over the wire at one point, each part `worth_keeping`.
+
+    Latencies are from state sent to command received: the median of the parts' p50 and the
+    largest p99.
+    """
+    episodes = [episode for part in parts for episode in part["episodes"]]
+    outcomes = Counter(episode["outcome"] for episode in episodes)
+    count = len(episodes)
+    steps = sum(episode["steps"] for episode in episodes)
+    vehicles = [part["vehicle"] for part in parts if part["vehicle"] is not None]
+    return {
+        "spec": spec,
+        "episodes": count,
+        **summary(episodes),
+        "collision_rate": outcomes[COLLISION] / count,
+        "safe_stops_per_episode": sum(part["safe_stops"] for part in parts) / count,
+        "safe_stop_reasons": _counted(parts, "safe_stop_reasons"),
+        "ticks_without_new_command": sum(part["deadline_misses"] for part in parts) / steps,
+        "tick_overruns": sum(part["tick_overruns"] for part in parts),
+        "latency_ms": _p50_p99([part["latency_ms"] for part in parts]),
+        "rejected": _counted(parts, "rejected"),
+        "driven_s": sum(episode["time_s"] for episode in episodes),
+        "wall_s": sum(part["wall_s"] for part in parts),
+        "command": parts[0]["command"],
+        "vehicle": join_vehicles(vehicles) if vehicles else None,
+        "per_episode": episodes,
+    }
+
+
+def join_vehicles(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """One report of a vehicle for several: errors pooled, lags and ages the median of the parts.
+
+    The largest stands for ``max`` and ``p99``.
+    """
+    first = parts[0]
+    return {
+        "name": first["name"],
+        "scale": first["scale"],
+        "samples": sum(part["samples"] for part in parts),
+        "speed_error_mps": _pool([(part["samples"], part["speed_error_mps"]) for part in parts]),
+        "action_error": {
+            name: _pool([(part["samples"], part["action_error"][name]) for part in parts])
+            for name in first["action_error"]
+        },
+        "lag_ms": {
+            name: _of_told(statistics.median, [part["lag_ms"][name] for part in parts])
+            for name in first["lag_ms"]
+        },
+        "feedback_age_ms": _p50_p99([part["feedback_age_ms"] for part in parts]),
+        "faults": _counted(parts, "faults"),
+        "moving_starts": sum(part["moving_starts"] for part in parts),
+    }
+
+
+def _pool(errors: Sequence[tuple[int, Mapping[str, float]]]) -> dict[str, float | None]:
+    told = [(samples, error) for samples, error in errors if error["rmse"] is not None]
+    if not told:
+        return {"rmse": None, "max": None}
+    squares = sum(samples * error["rmse"] ** 2 for samples, error in told)
+    rmse = (squares / sum(samples for samples, _ in told)) ** 0.5
+    return {"rmse": rmse, "max": max(error["max"] for _, error in told)}
+
+
+def _p50_p99(times: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
+    return {
+        "p50": _of_told(statistics.median, [each["p50"] for each in times]),
+        "p99": _of_told(max, [each["p99"] for each in times]),
+    }
+
+
+def _of_told(join: Callable[[list[float]], float], values: Sequence[float | None]) -> float | None:
+    told = [value for value in values if value is not None]
+    return join(told) if told else None
+
+
+def _counted(parts: Sequence[Mapping[str, Any]], name: str) -> dict[str, int]:
+    return dict(sum((Counter(part[name]) for part in parts), Counter()))
+
+
+def summary(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How episodes ended: success with Wilson's interval, distance with Student's, of 95 %."""
+    outcomes = Counter(episode["outcome"] for episode in episodes)
+    return {
+        "success": interval(success_estimate(outcomes[GOAL], len(episodes))),
+        "outcomes": dict(outcomes),
+        "surviving_distance_m": interval(mean_estimate([e["distance_m"] for e in episodes])),
+        "episode_time_s": statistics.fmean(episode["time_s"] for episode in episodes),
+    }
+
+
+def cost(
+    policy: Sequence[Mapping[str, Any]], vehicle: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """What the actuators cost in time, by seed, where both loops reach the goal; 95 % interval."""
+    times = {row["seed"]: row["time_s"] for row in policy if row["outcome"] == GOAL}
+    longer = [
+        row["time_s"] - times[row["seed"]]
+        for row in vehicle
+        if row["outcome"] == GOAL and row["seed"] in times
+    ]
+    return {"seeds": len(longer), "longer_s": interval(mean_estimate(longer))}
+
+
+def interval(estimate: Estimate) -> dict[str, float]:
+    """As it stands in a report."""
+    return {"value": estimate.value, "low": estimate.low, "high": estimate.high}

@@ -72,7 +72,7 @@ class VirtualDrive:
             self._command(hunter, step, self._driver.act(observation).tolist(), info["speed_mps"])
             newest = None
             for now_ms, report in hunter.run(PERIOD_MS):
-                newest = _feedback(step, self.action_names, report, now_ms)
+                newest = self._feedback(step, report, now_ms)
                 self.tracking.feedback(newest)
             if hunter.core.state is not State.STOPPED:
                 stopped_ms = math.inf
@@ -80,9 +80,11 @@ class VirtualDrive:
                 stops, stopped_ms = stops + 1, hunter.now_ms
             elif hunter.now_ms - stopped_ms >= REARM_MS:
                 hunter.core.enable(hunter.now_ms / 1e3)
-            observation, _, terminated, truncated, info = self._env.step(
-                self._apply(self._env, _decision(newest))
+            heard = VehicleDecision(
+                command=None, fresh=True, brake_reason="", undriven_s=0.0, feedback=newest
             )
+            action = self._apply(self._env, heard)
+            observation, _, terminated, truncated, info = self._env.step(action)
             step, ended = step + 1, terminated or truncated
         self.tracking.end()
         time_s = step * CONTROL_PERIOD_S
@@ -95,6 +97,16 @@ class VirtualDrive:
                 session=SESSION, episode=0, step=step, mode=DRIVE, action=action, policy_id="",
                 received_ns=0, inference_ns=0, sent_ns=hunter.now_ms * 10**6,
             )
+        )  # fmt: skip
+
+    def _feedback(self, step: int, report: VehicleReport, now_ms: int) -> Feedback:
+        """As `edge_runtime/vehicles/base.py` makes it."""
+        return Feedback(
+            vehicle=NAME, session=SESSION, episode=0, step=step, mode=DRIVE,
+            action=[report.action.get(name, 0.0) for name in self.action_names],
+            speed_mps=report.speed_mps, self_braking=report.self_braking, faults=report.faults,
+            sent_ns=now_ms * 10**6, scenario_speed_mps=report.scenario_speed_mps,
+            commanded_speed_mps=report.commanded_speed_mps,
         )  # fmt: skip
 
 
@@ -143,20 +155,3 @@ class VirtualHunter:
                 reports.append((now_ms, self.core.report(now_s)))
         self.now_ms += duration_ms
         return reports
-
-
-def _feedback(step: int, names: list[str], report: VehicleReport, now_ms: int) -> Feedback:
-    """As `edge_runtime/vehicles/base.py` makes it."""
-    return Feedback(
-        vehicle=NAME, session=SESSION, episode=0, step=step, mode=DRIVE,
-        action=[report.action.get(name, 0.0) for name in names], speed_mps=report.speed_mps,
-        self_braking=report.self_braking, faults=report.faults, sent_ns=now_ms * 10**6,
-        scenario_speed_mps=report.scenario_speed_mps,
-        commanded_speed_mps=report.commanded_speed_mps,
-    )  # fmt: skip
-
-
-def _decision(feedback: Feedback | None) -> VehicleDecision:
-    return VehicleDecision(
-        command=None, fresh=True, brake_reason="", undriven_s=0.0, feedback=feedback
-    )

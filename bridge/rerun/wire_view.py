@@ -373,16 +373,13 @@ class Timeline:
     """
 
     def __init__(self) -> None:
-        self.now = Moment(0, 0, 0)
         self._starts: dict[int, int] = {}
         self._end_step = 0
 
     def place(self, episode: int, step: int) -> Moment:
-        """Return the moment of a step and move ``now`` there if that is forward."""
+        """Return the moment of a step."""
         # A viewer that comes late begins at zero as well: its first step is the first it saw.
         start = self._starts.setdefault(episode, self._end_step)
         moment = Moment(episode, step, start + step)
         self._end_step = max(self._end_step, moment.total_step + 1)
-        if moment.total_step > self.now.total_step:
-            self.now = moment
         return moment

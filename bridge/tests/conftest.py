@@ -1,6 +1,21 @@
-"""Property tests compute; on a busy machine they are given the time."""
+"""Property tests compute; on a busy machine they are given the time. How a refusal looks."""
 
+import pytest
 from hypothesis import settings
+
+from bridge.tests.harness import bridge_status
 
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
+
+
+@pytest.fixture
+def refusal(capsys):
+    """Run ``python -m bridge`` with arguments that it refuses; return its only line."""
+
+    def refused(*arguments):
+        assert bridge_status([str(argument) for argument in arguments]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line
+
+    return refused

@@ -91,6 +91,14 @@ def wait_until_driving_steadily(log: Path, steady_s: float = 0.4) -> None:
     wait_until(steady, "a steady drive")
 
 
+def refused(run: BridgeProcess, out: Path, *parts: str) -> None:
+    """Assert that it ends with status 2 and one line, which holds the parts, and writes nothing."""
+    assert run.wait() == 2
+    (line,) = run.errors.splitlines()
+    assert all(part in line for part in parts), line
+    assert not out.exists()
+
+
 def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
     """Write a test policy file."""
     path = folder / f"{kind}{value:g}.onnx"

@@ -13,6 +13,7 @@ from bridge.tests.harness import (
     TOY,
     BridgeProcess,
     make_command,
+    refused,
     start_edge,
     start_simulate,
     wait_until_driving,
@@ -123,13 +124,6 @@ def heard_commands(endpoint):
         subscriber = session.declare_subscriber("phil/hunter01/command", hear)
         yield heard
         subscriber.undeclare()
-
-
-def refused(run, out, *parts):
-    assert run.wait() == 2
-    (line,) = run.errors.splitlines()
-    assert all(part in line for part in parts), line
-    assert not out.exists()
 
 
 @pytest.mark.parametrize("clock", ["lockstep", "realtime"])

@@ -82,6 +82,7 @@ def test_delay_jitter_and_loss(text, up, down):
         ("order=kept,duplicate=3%", {"order": "kept", "duplicate_percent": 3}),
         ("rate=1Mbit/s,queue=50ms", {"rate_kbps": 1000, "queue_ms": 50}),
         ("rate=800bit/s", {"rate_kbps": 0.8}),
+        ("rate=0.5bit/s", {"rate_kbps": 0.0005}),
         ("outage=500ms@2s", {"outages": (Outage(0.5, 2.0),)}),
         ("outage=0.5s/10s", {"outages": (Outage(0.5, 10.0, 10.0),)}),
         ("outage=0.5s/10s@0s", {"outages": (Outage(0.5, 0.0, 10.0),)}),

@@ -63,6 +63,7 @@ def test_the_final_state_passes_a_dead_link_and_what_was_before_it_is_forgotten(
         rig.traffic.take("state", final := encode(make_state(1, final=True)))
         time.sleep(0.1)
     assert [payload for _, payload, _ in rig.came] == [final]
+    assert rig.traffic.report()["timer_lag_ms"]["max"] == 0.0  # No timer has run.
 
 
 def test_outages_begin_to_count_with_the_first_state():

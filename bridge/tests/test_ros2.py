@@ -31,7 +31,6 @@ from bridge.tests import harness
 from bridge.tests.harness import (
     SLOW_TOY,
     BridgeProcess,
-    bridge_status,
     make_policy,
     read,
     start_edge,
@@ -326,11 +325,22 @@ def test_a_sigterm_ends_it_with_its_counts(tmp_path):
     assert read(out)["rejected"]["feedback_malformed"] >= 1
 
 
-def test_a_busy_ros_2_port_names_the_option_to_change(capsys):
+def test_a_sigterm_is_an_interrupt_before_the_session_opens(monkeypatch, refusal):
+    handlers = []
+
+    def no_session(*_):
+        handlers.append(signal.getsignal(signal.SIGTERM))
+        raise UserError("none")
+
+    monkeypatch.setattr("bridge.ros2.open_ros2_session", no_session)
+    assert "none" in refusal("ros2")
+    assert signal.SIG_DFL not in handlers
+
+
+def test_a_busy_ros_2_port_names_the_option_to_change(refusal):
     busy = free_endpoint()
     session = open_session(listen=busy, mode="router")
-    assert bridge_status(["ros2", "--connect", free_endpoint(), "--ros2-listen", busy]) == 2
+    line = refusal("ros2", "--connect", free_endpoint(), "--ros2-listen", busy)
     session.close()
-    (line,) = capsys.readouterr().err.splitlines()
     assert "is in use" in line
     assert "--ros2-listen" in line

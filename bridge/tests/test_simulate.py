@@ -15,10 +15,10 @@ from bridge.tests.harness import (
     SLOW_TOY,
     TOY,
     BridgeProcess,
-    bridge_status,
     drive_in_process,
     make_policy,
     read,
+    refused,
     simulate,
     simulate_undisturbed,
     start_edge,
@@ -122,15 +122,10 @@ def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path, clock):
     assert row["actions"][resumed] == pytest.approx([0.2])
 
 
-def test_two_simulators_cannot_share_a_port(tmp_path, capsys):
+def test_two_simulators_cannot_share_a_port(tmp_path, refusal):
     endpoint, out = free_endpoint(), tmp_path / "never.json"
-    first = open_session(listen=endpoint, mode="router")
-    try:
-        arguments = ["simulate", "--env", TOY, "--listen", endpoint, "--out", str(out)]
-        assert bridge_status(arguments) == 2
-    finally:
-        first.close()
-    (line,) = capsys.readouterr().err.splitlines()
+    with contextlib.closing(open_session(listen=endpoint, mode="router")):
+        line = refusal("simulate", "--env", TOY, "--listen", endpoint, "--out", out)
     assert "in use" in line
     assert not out.exists()
 
@@ -138,19 +133,14 @@ def test_two_simulators_cannot_share_a_port(tmp_path, capsys):
 def test_nobody_comes_and_one_line_says_what_to_start(tmp_path):
     out = tmp_path / "never.json"
     with start_simulate(free_endpoint(), out, TOY, "--wait-edge-s", "0.3") as run:
-        assert run.wait() == 2
-    assert "python -m edge_runtime run" in run.errors
-    assert len(run.errors.splitlines()) == 1
-    assert not out.exists()
+        refused(run, out, "python -m edge_runtime run")
 
 
 def test_a_number_that_is_not_finite_is_one_line_and_status_2(tmp_path):
     policy, endpoint, out = make_policy(tmp_path), free_endpoint(), tmp_path / "never.json"
     env = "bridge.tests.toy:BridgeToyNan-v0"
     with start_edge(endpoint, policy), start_simulate(endpoint, out, env) as run:
-        assert run.wait() == 2
-    assert "reward is nan" in run.errors
-    assert len(run.errors.splitlines()) == 1
+        refused(run, out, "reward is nan")
 
 
 def test_what_the_edge_rejects_is_in_the_report(tmp_path):

@@ -19,22 +19,14 @@ from bridge.recording import Recording
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP, State, decode_state
 from hil_tests.faults.inside import VEHICLE
 from hil_tests.faults.rig import Rig, address
-from hil_tests.faults.row import (
-    GAP,
-    Try,
-    drives_on,
-    drove_on,
-    fault,
-    sleep_until,
-)
+from hil_tests.faults.row import GAP, Try, drives_on, fault, sleep_until
 from hil_tests.processes import Process, wait_until
 
-STOPPED_S = CUT_S = STEPPED_S = 1.0
+LASTS_S = 1.0
 STALLED_S = 0.6
 """Shorter than Zenoh's lease, so that the connection lives and brings all that it held at once."""
 BRIGHT_S = 0.5
 STARVED_S = 2.0
-FAULTY_S = 1.0
 SETTLED_S = 0.5
 """So long the drive is steady first: a vehicle may lag behind what it was asked before."""
 FULL_AT_BYTES = 60_000
@@ -45,16 +37,14 @@ _CANNOT_WRITE = 1
 """Exit status of a recorder that cannot write."""
 _FEWEST_STATES = 5
 _EXPECT_OWN = "simulator brakes by itself: no_command"
-_EXPECT_EDGE = "edge sends safe_stop: no_fresh_state"
 _EXPECT_BOTH = "both ends stop, each by itself"
 _TO_BRAKE = "last drive command to the simulator's brake"
-_TO_STOP = "last state at the probe to safe_stop on the wire"
 _THROUGH_LINK = "last state through the link to safe_stop in the edge's log"
 
 
-@fault("SIGKILL to the edge runtime; a new one", _EXPECT_OWN, _TO_BRAKE)
+@fault(_EXPECT_OWN, _TO_BRAKE)
 def edge_killed(rig: Rig, number: int) -> Try:
-    """The simulator brakes by itself; a new edge runtime drives on."""
+    """SIGKILL to the edge runtime; a new one."""
     begin_s = time.monotonic()
     rig.edge.kill()
     reaction_s = rig.own_brake_s(begin_s) - rig.last_drive_s()
@@ -63,22 +53,23 @@ def edge_killed(rig: Rig, number: int) -> Try:
     return Try(reaction_s, rig.recovered_after_s(ended_s), "no_command")
 
 
-@fault("edge runtime stopped for 1 s and continued", _EXPECT_OWN, _TO_BRAKE, flows=True)
+@fault(_EXPECT_OWN, _TO_BRAKE, flows=True)
 def edge_stopped(rig: Rig, number: int) -> Try:
-    """SIGSTOP: the simulator brakes by itself; what piled up is not driven on."""
+    """Edge runtime stopped for 1 s and continued."""
     begin_s = time.monotonic()
     rig.edge.send(signal.SIGSTOP)
     reaction_s = rig.own_brake_s(begin_s) - rig.last_drive_s()
-    sleep_until(begin_s + STOPPED_S)
+    sleep_until(begin_s + LASTS_S)
     ended_s = time.monotonic()
     rig.edge.send(signal.SIGCONT)
     recovered_s = rig.recovered_after_s(ended_s)
+    # What piled up meanwhile is not driven on.
     return Try(reaction_s, recovered_s, "no_command", wrong=rig.must_stop_first(ended_s))
 
 
-@fault("SIGKILL to the simulator; a new one", _EXPECT_EDGE, _TO_STOP)
+@fault("edge sends safe_stop: no_fresh_state", "last state at the probe to safe_stop on the wire")
 def simulator_killed(rig: Rig, number: int) -> Try:
-    """The edge runtime's safe stop; a new simulator has a new session."""
+    """SIGKILL to the simulator; a new one."""
     begin_s = time.monotonic()
     rig.simulator.kill()
     stop = rig.stop_command(begin_s)
@@ -90,15 +81,15 @@ def simulator_killed(rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
-@fault("TCP cut for 1 s and restored", _EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
+@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
 def link_cut(rig: Rig, number: int) -> Try:
-    """Every connection broken and refused for a second: both ends stop, each by itself."""
+    """TCP cut for 1 s and restored."""
     begin_s, drive_s = time.monotonic(), rig.last_drive_s()
     rig.link.cut()
     last_s = rig.link.last_state_s
     stop = rig.logged_stop(begin_s)
     brake_s = rig.own_brake_s(begin_s) - max(drive_s, rig.last_drive_s())
-    sleep_until(begin_s + CUT_S)
+    sleep_until(begin_s + LASTS_S)
     ended_s = time.monotonic()
     rig.link.restore()
     recovered_s = rig.recovered_after_s(ended_s)
@@ -106,9 +97,9 @@ def link_cut(rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, recovered_s, stop.reason, figures=figures)
 
 
-@fault("TCP held for 0.6 s, then all at once", _EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
+@fault(_EXPECT_BOTH, _THROUGH_LINK, rig={"between": "link"})
 def link_stalled(rig: Rig, number: int) -> Try:
-    """The link holds everything for a while, then brings it all at once."""
+    """TCP held for 0.6 s, then all at once."""
     begin_s = time.monotonic()
     rig.link.stall()
     stop = rig.logged_stop(begin_s)
@@ -121,11 +112,11 @@ def link_stalled(rig: Rig, number: int) -> Try:
 
 
 @fault(
-    "SIGKILL to the router; a new one", _EXPECT_BOTH,
-    "last state at the router to safe_stop in the edge's log", rig={"between": "router"},
+    _EXPECT_BOTH, "last state at the router to safe_stop in the edge's log",
+    rig={"between": "router"},
 )  # fmt: skip
 def router_restarted(rig: Rig, number: int) -> Try:
-    """The router between the ends is gone, and a new one comes on the same port."""
+    """SIGKILL to the router; a new one."""
     begin_s = time.monotonic()
     rig.router.kill()
     stop = rig.logged_stop(begin_s)
@@ -135,25 +126,31 @@ def router_restarted(rig: Rig, number: int) -> Try:
     return Try(reaction_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
-@drives_on("edge's wall clock 1 h ahead and back", "drives on", by_arrival=True)
+@drives_on(by_arrival=True)
 def clock_stepped_edge(rig: Rig, number: int) -> Try:
-    """The edge runtime's wall clock jumps an hour ahead, then back."""
-    return _stepped(rig, rig.edge, number)
+    """Edge's wall clock 1 h ahead and back."""
+    return _stepped(rig.edge, number)
 
 
-@drives_on("simulator's wall clock 1 h ahead and back", "drives on")
+@drives_on()
 def clock_stepped_simulator(rig: Rig, number: int) -> Try:
-    """The simulator's wall clock jumps an hour ahead, then back."""
-    return _stepped(rig, rig.simulator, number)
+    """Simulator's wall clock 1 h ahead and back."""
+    return _stepped(rig.simulator, number)
+
+
+def _stepped(process: Process, number: int) -> Try:
+    process.send(signal.SIGUSR1 if number % 2 == 0 else signal.SIGUSR2)
+    time.sleep(LASTS_S)
+    return Try()
 
 
 @fault(
-    "inference of about 2.5 T for 0.5 s", "edge sends safe_stop: inference_too_long",
+    "edge sends safe_stop: inference_too_long",
     "last answered state at the probe to safe_stop on the wire",
     policy="slow", flows=True, alone=True,
 )  # fmt: skip
 def slow_inference(rig: Rig, number: int) -> Try:
-    """Frames on which the policy takes longer than T; the last good state is the one before."""
+    """Inference of about 2.5 T for 0.5 s."""
     begin_s = time.monotonic()
     rig.bright(True)
     try:
@@ -166,9 +163,9 @@ def slow_inference(rig: Rig, number: int) -> Try:
     return Try(stop.seen_s - last_s, rig.recovered_after_s(ended_s), stop.reason)
 
 
-@fault("two spinning processes for each core, 2 s", "drives on or safe_stop", GAP, alone=True)
+@fault("drives on or safe_stop", GAP, alone=True)
 def cpu_starved(rig: Rig, number: int) -> Try:
-    """The spinning processes have the same priority as all others."""
+    """Two spinning processes for each core, 2 s."""
     spinners = [
         multiprocessing.get_context("spawn").Process(target=_spin, daemon=True)
         for _ in range(2 * (os.cpu_count() or 1))
@@ -186,6 +183,11 @@ def cpu_starved(rig: Rig, number: int) -> Try:
     return Try(rig.longest_gap(begin_s, ended_s), recovered_s, figures={"safe stops": stops})
 
 
+def _spin() -> None:
+    while True:
+        pass
+
+
 def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     """Stops for the fault, stays stopped when it is over, and drives again once re-armed."""
     time.sleep(SETTLED_S)
@@ -196,10 +198,10 @@ def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
     # What another says after the switch is no good any more.
     end_s = stop.seen_s if word == "silent" else begin_s
     last_s = max(s for s in rig.timeline.feedback_s if s < end_s)
-    sleep_until(begin_s + FAULTY_S)
+    sleep_until(begin_s + LASTS_S)
     said = any(f"vehicle_{word}" in line for seen_s, line in rig.edge.lines if seen_s > begin_s)
     rig.switch(VEHICLE, None)
-    time.sleep(FAULTY_S)
+    time.sleep(LASTS_S)
     drove = [c for c in rig.timeline.commands if c.seen_s > stop.seen_s and c.mode == DRIVE]
     wrong = ["drove before it was re-armed"] if drove else []
     wrong += [] if said else [f"the log does not say vehicle_{word}"]
@@ -216,57 +218,51 @@ for _word, _done in (
     ("lying", "vehicle reports a speed that cannot be"),
 ):
     fault(
-        _done, "edge sends safe_stop: vehicle_fault; stays until re-armed",
-        "last good feedback at the probe to safe_stop on the wire", name=f"vehicle_{_word}",
-        rig={"vehicle": "mock"}, policy="steady", flows=True,
+        "edge sends safe_stop: vehicle_fault; stays until re-armed",
+        "last good feedback at the probe to safe_stop on the wire",
+        name=f"vehicle_{_word}", done=_done, rig={"vehicle": "mock"}, policy="steady", flows=True,
     )(partial(_vehicle_is, _word))  # fmt: skip
 
 
-@drives_on(
-    "disk full while recording", "recorder says so and ends; the recording is readable; drives on"
-)
+@drives_on("recorder says so and ends; the recording is readable; drives on")
 def disk_full(rig: Rig, number: int) -> Try:
-    """No file may grow beyond a limit: the same failing write as on a full disk."""
+    """Disk full while recording."""
     path, recorder = _start_recorder(rig, number)
-    begin_s = time.monotonic()
+    # No file may grow beyond a limit: the same failing write as on a full disk.
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FULL_AT_BYTES, FULL_AT_BYTES))
     status = recorder.wait()
-    end_s = time.monotonic()
     wrong = _too_few(states_in(path))
     if status != _CANNOT_WRITE:
         wrong.append(f"status {status}: {recorder.lines[-1:]}")
     if not any("error: recording" in line for _, line in recorder.lines):
         wrong.append(f"it does not say so: {recorder.lines[-1:]}")
-    return drove_on(rig, begin_s, end_s, wrong=wrong)
+    return Try(wrong=wrong)
 
 
-@drives_on("SIGKILL to the recorder", "at most 1 s of the recording is lost; drives on")
+@drives_on("at most 1 s of the recording is lost; drives on")
 def recorder_killed(rig: Rig, number: int) -> Try:
-    """In the middle of a recording: at most the last second is lost."""
+    """SIGKILL to the recorder."""
     path, recorder = _start_recorder(rig, number)
-    begin_s = time.monotonic()
     time.sleep(RECORDED_S)
     sent = len(rig.timeline.states)
     recorder.kill()
-    end_s = time.monotonic()
     states, places = states_in(path), list(rig.timeline.states)
     last = (states[-1].session, states[-1].episode, states[-1].step) if states else None
     lost = sent - 1 - places.index(last) if last in places else sent
     lost_s = max(0, lost) * CONTROL_PERIOD_S
     wrong = _too_few(states)
     wrong += [f"{lost_s:.1f} s lost"] if lost_s > MOST_LOST_S + CONTROL_PERIOD_S / 2 else []
-    return drove_on(rig, begin_s, end_s, wrong=wrong, figures={"lost, s": lost_s})
+    return Try(wrong=wrong, figures={"lost, s": lost_s})
 
 
 def states_in(path: Path) -> list[State]:
     """The states that can be read from a recording, whole or torn."""
-    found = []
-    for stored in Recording(path).messages():
-        if stored.channel.topic.endswith("/state") and stored.channel.message_encoding == "msgpack":
-            state = decode_state(stored.message.data)
-            if isinstance(state, State):
-                found.append(state)
-    return found
+    stored = (
+        decode_state(each.message.data)
+        for each in Recording(path).messages()
+        if each.channel.topic.endswith("/state") and each.channel.message_encoding == "msgpack"
+    )
+    return [state for state in stored if isinstance(state, State)]
 
 
 def _too_few(states: list[State]) -> list[str]:
@@ -287,16 +283,3 @@ def _listens_s(endpoint: str) -> float | None:
     except OSError:
         return None
     return time.monotonic()
-
-
-def _spin() -> None:
-    """Keep a core busy."""
-    while True:
-        pass
-
-
-def _stepped(rig: Rig, process: Process, number: int) -> Try:
-    begin_s = time.monotonic()
-    process.send(signal.SIGUSR1 if number % 2 == 0 else signal.SIGUSR2)
-    time.sleep(STEPPED_S)
-    return drove_on(rig, begin_s, time.monotonic())

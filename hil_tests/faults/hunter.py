@@ -191,7 +191,7 @@ _hunter = partial(
 
 for _expect in _EXPECTS:
     _hunter(
-        f"Hunter: {FAULTS[_expect.name]}",
+        done=f"Hunter: {FAULTS[_expect.name]}",
         name=f"hunter_{_expect.name}",
         measured="last frame in time on the bus to set-point 0"
         if _expect.name in _NO_FRAME_TO_SHOW_IT
@@ -201,7 +201,7 @@ for _expect in _EXPECTS:
     )(partial(at_fault, _expect))
 
 _hunter(
-    f"Hunter: {FAULTS['stuck']}",
+    done=f"Hunter: {FAULTS['stuck']}",
     name="hunter_stuck",
     measured="first set-point that it does not follow to set-point 0",
     reaction_limit_s=FOLLOWS_S + DEVIATES_S + REACTION_LIMIT_S,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
 
 import msgspec
 import numpy as np
@@ -17,25 +16,18 @@ from edge_runtime.wire import (
     DRIVE,
     Command,
     Feedback,
-    Health,
+    Message,
     Rejection,
-    State,
     encode,
 )
 from hil_tests.faults.rig import Rig, make_state
-from hil_tests.faults.row import (
-    GAP,
-    Try,
-    drives_on,
-    drove_on,
-    fault,
-)
+from hil_tests.faults.row import GAP, Try, drives_on, drove_on, fault
 from hil_tests.processes import wait_until
 
 FLOOD_PER_S, FLOOD_S = 10_000, 2.0
 BAD_STATE_ROUNDS = 50
 SECOND_S = 2.0
-OVERSIZED_BYTES = 10_000_000
+OVERSIZED, OVERSIZED_BYTES = 5, 10_000_000
 COUNT, PER_S = 10_000, 2_500
 """Of garbage, and its pace: enough to hurt, little enough that the drive goes on beside it."""
 _FOREIGN = "garbage"
@@ -43,50 +35,37 @@ _FOREIGN = "garbage"
 _HOUR_NS = 3600 * 1_000_000_000
 _LONGEST_RANDOM, _SPLICED = 512, 64
 
-counted = partial(drives_on, expected="drives on; each rejected and counted by reason")
-counted_at_its_end = partial(counted, flows=False, new_rig_each_try=True)
-"""The simulator's counts are read in its report, for which the drive has to end."""
+_COUNTED = "drives on; each rejected and counted by reason"
 
 
-@counted(
-    "truncated, wrong schema, NaN, old, repeated, reordered, future states", rig={"sender": True}
-)
+@drives_on(_COUNTED, counted="edge", rig={"sender": True})
 def bad_states(rig: Rig, number: int) -> Try:
-    """Each kind of bad state between the good ones of the same simulator."""
-    before, begin_s = rig.edge_counts(), time.monotonic()
-    wanted: Counter[str] = Counter()
+    """Truncated, wrong schema, NaN, old, repeated, reordered, future states."""
+    sent: Counter[str] = Counter()
     for _ in range(BAD_STATE_ROUNDS):
         with rig.sender.lock:
             for reason, payload in _bad_of(rig.sender.step):
                 rig.probe.put("state", payload)
-                wanted[reason] += 1
-            _send_reordered(rig, wanted)
+                sent[reason] += 1
+            _send_reordered(rig, sent)
         time.sleep(CONTROL_PERIOD_S / 2)
-    end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
+    return Try(rejected=sent)
 
 
-@counted("states of 10 MB")
+@drives_on(_COUNTED, counted="edge")
 def oversized(rig: Rig, number: int) -> Try:
-    """Five times; the memory must not grow by them."""
-    payload = bytes(OVERSIZED_BYTES)
-    before, begin_s = rig.edge_counts(), time.monotonic()
-    memory_mb = rig.edge.resident_mb()
-    for _ in range(5):
+    """States of 10 MB."""
+    payload, memory_mb = bytes(OVERSIZED_BYTES), rig.edge.resident_mb()
+    for _ in range(OVERSIZED):
         rig.probe.put("state", payload)
         time.sleep(CONTROL_PERIOD_S)
-    end_s = time.monotonic()
-    found = rig.edge_counts() - before
     figures = {"memory grown, MB": rig.edge.resident_mb() - memory_mb}
-    return drove_on(rig, begin_s, end_s, Counter(oversized=5), found, figures=figures)
+    return Try(rejected={"oversized": OVERSIZED}, figures=figures)
 
 
-@fault(
-    f"{FLOOD_PER_S:,} states a second for {FLOOD_S:g} s", "answers the newest, or stops", GAP,
-    rig={"sender": True}, alone=True,
-)  # fmt: skip
+@fault("answers the newest, or stops", GAP, rig={"sender": True}, alone=True)
 def flood(rig: Rig, number: int) -> Try:
-    """Valid states of one simulator at a hundred times the rate and more."""
+    """10,000 states a second for 2 s."""
     rig.sender.running.clear()
     memory_mb, begin_s = rig.edge.resident_mb(), time.monotonic()
     sent = 0
@@ -105,26 +84,21 @@ def flood(rig: Rig, number: int) -> Try:
     return Try(rig.longest_gap(begin_s, end_s), recovered_s, figures=figures)
 
 
-@counted("a second simulator with the same id")
+@drives_on(_COUNTED, counted="edge")
 def second_simulator(rig: Rig, number: int) -> Try:
-    """States of another session on the same key, as a second simulator sends them."""
-    before, begin_s = rig.edge_counts(), time.monotonic()
-    wanted: Counter[str] = Counter()
-    for step in range(round(SECOND_S / CONTROL_PERIOD_S)):
+    """A second simulator with the same id."""
+    steps = round(SECOND_S / CONTROL_PERIOD_S)
+    for step in range(steps):
         # Where the first one is silent for 2 T it may be answered: it is no garbage.
         rig.timeline.states[("second", number, step)] = time.monotonic()
         rig.probe.put("state", encode(make_state(step, session="second", episode=number)))
-        wanted["foreign_session"] += 1
         time.sleep(CONTROL_PERIOD_S)
-    end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
+    return Try(rejected={"foreign_session": steps})
 
 
-@counted_at_its_end(
-    "a second edge runtime with the same id", expected="second one refuses; drives on"
-)
+@fault("second one refuses; drives on", GAP, recovery_limit_s=None, new_rig_each_try=True)
 def second_edge(rig: Rig, number: int) -> Try:
-    """A second edge runtime with the same id gives way; the first answer to a state counts."""
+    """A second edge runtime with the same id."""
     second = rig.start_edge()
     begin_s = time.monotonic()
     status = second.wait()
@@ -132,72 +106,78 @@ def second_edge(rig: Rig, number: int) -> Try:
     rig.end_drive()
     # By drives alone: its last safe stop is obeyed beside the other's drive, which is safe.
     answers = Counter(c.place for c in rig.timeline.commands if c.mode == DRIVE)
-    wanted = Counter(stale=sum(count - 1 for count in answers.values()))
+    stale = {"stale": sum(count - 1 for count in answers.values())}
     ended = f"the second one ended with status {status}: {second.lines[-1:]}"
-    wrong = [] if status == BAD_INPUT else [ended]
-    return drove_on(rig, begin_s, end_s, wanted, rig.simulator_counts(), wrong=wrong)
+    done = Try(rejected=stale, wrong=[] if status == BAD_INPUT else [ended])
+    return drove_on(rig, begin_s, end_s, done, rig.simulator_counts())
 
 
-@counted(f"{COUNT:,} random and mutated states")
+@drives_on(_COUNTED, counted="edge")
 def garbage_states(rig: Rig, number: int) -> Try:
-    """On the state's key; the edge runtime counts each by reason."""
-    payloads = list(mutated(encode(make_state(1, session=_FOREIGN)), COUNT, number))
-    wanted = Counter(_reason(wire.decode_state(payload)) for payload in payloads)
-    before = rig.edge_counts()
-    begin_s = time.monotonic()
-    _put_all(rig, "state", payloads)
-    end_s = time.monotonic()
-    return drove_on(rig, begin_s, end_s, wanted, rig.edge_counts() - before)
+    """10,000 random and mutated states."""
+    return _put_garbage(rig, "state", make_state(1, session=_FOREIGN), number)
 
 
-@counted_at_its_end(f"{COUNT:,} random and mutated commands; future, old, wrong size")
+@drives_on(_COUNTED, counted="simulator")
 def garbage_commands(rig: Rig, number: int) -> Try:
-    """On the command's key, and commands of other times; the simulator counts them."""
-    payloads = list(mutated(encode(_command(rig, session=_FOREIGN)), COUNT, number))
-    wanted = Counter(_reason(wire.decode_command(payload)) for payload in payloads)
-    begin_s = time.monotonic()
-    _put_all(rig, "command", payloads)
+    """10,000 random and mutated commands; future, old, wrong size."""
+    done = _put_garbage(rig, "command", _command(rig, session=_FOREIGN), number)
     others = {
         "unknown_step": _command(rig, ahead=1000),
         "stale": _command(rig, ahead=-3),
         "action_size": _command(rig, action=[0.1, 0.2]),
     }
-    for reason, command in others.items():
+    for command in others.values():
         rig.probe.put("command", encode(command))
-        wanted[reason] += 1
-    end_s = time.monotonic()
-    # Its own answers are in order, so that every rejection is one of these.
-    rig.end_drive()
-    return drove_on(rig, begin_s, end_s, wanted, rig.simulator_counts())
+    # The edge's own answers are in order, so that every rejection is one of these.
+    return Try(rejected=Counter(done.rejected) + Counter(others.keys()))
 
 
-@counted(f"{COUNT:,} random and mutated feedback messages", expected="drives on")
+@drives_on()
 def garbage_feedback(rig: Rig, number: int) -> Try:
-    """On the feedback's key: nobody drives by it, and nobody minds."""
+    """10,000 random and mutated feedback messages."""
     feedback = Feedback(
         vehicle="mock", session=_FOREIGN, episode=0, step=0, mode="drive", action=[0.1],
         speed_mps=1.0, self_braking=False, faults=[], sent_ns=time.time_ns(),
     )  # fmt: skip
-    begin_s = time.monotonic()
-    _put_all(rig, "feedback", mutated(encode(feedback), COUNT, number))
-    return drove_on(rig, begin_s, time.monotonic())
+    _put_garbage(rig, "feedback", feedback, number)
+    return Try()
 
 
-@counted_at_its_end(f"{COUNT:,} random and mutated health messages")
+@fault(_COUNTED, GAP, recovery_limit_s=None, new_rig_each_try=True)
 def garbage_health(rig: Rig, number: int) -> Try:
-    """On the health's key, which the simulator reads for its report, and counts."""
+    """10,000 random and mutated health messages."""
     wait_until(lambda: rig.probe.health, "a health message")
-    valid: Health = rig.probe.health[-1]
-    payloads = list(mutated(encode(valid), COUNT, number))
-    decoded = [wire.decode_health(payload) for payload in payloads]
-    wanted = Counter(f"health_{m.reason.value}" for m in decoded if isinstance(m, Rejection))
     begin_s = time.monotonic()
-    _put_all(rig, "health", payloads)
+    done = _put_garbage(rig, "health", rig.probe.health[-1], number)
     end_s = time.monotonic()
     rig.end_drive()
-    counts = rig.simulator_counts()
-    unread = Counter({name: n for name, n in counts.items() if name.startswith("health_")})
-    return drove_on(rig, begin_s, end_s, wanted, unread)
+    unread = {n: c for n, c in rig.simulator_counts().items() if n.startswith("health_")}
+    return drove_on(rig, begin_s, end_s, done, Counter(unread))
+
+
+def _put_garbage(rig: Rig, topic: str, valid: Message, seed: int) -> Try:
+    """Send COUNT mutations of a message; what is valid still belongs to a foreign session."""
+    decode, prefix, legal = _READ[topic]
+    sent: Counter[str] = Counter()
+    begin_s = time.monotonic()
+    for number, payload in enumerate(mutated(encode(valid), COUNT, seed)):
+        rig.probe.put(topic, payload)
+        found = decode(payload)
+        sent[f"{prefix}{found.reason.value}" if isinstance(found, Rejection) else legal] += 1
+        if number % 25 == 0:
+            time.sleep(max(0.0, begin_s + number / PER_S - time.monotonic()))
+    del sent[""]
+    return Try(rejected=sent)
+
+
+_READ: dict[str, tuple[Callable[[bytes], object], str, str]] = {
+    "state": (wire.decode_state, "", "foreign_session"),
+    "command": (wire.decode_command, "", "foreign_session"),
+    "feedback": (wire.decode_feedback, "", ""),
+    "health": (wire.decode_health, "health_", ""),
+}
+"""Topic -> how it is read, the prefix of a reason in the report, and how what is valid counts."""
 
 
 def _bad_of(step: int) -> Iterable[tuple[str, bytes]]:
@@ -214,44 +194,24 @@ def _bad_of(step: int) -> Iterable[tuple[str, bytes]]:
     # From another time of day is no reason: the next one is good whatever its clock says.
 
 
-def _send_reordered(rig: Rig, wanted: Counter[str]) -> None:
+def _send_reordered(rig: Rig, sent: Counter[str]) -> None:
     """Two states that have overtaken one another, and one that says it comes from the future."""
     rig.sender.step += 3
     step = rig.sender.step
     rig.sender.send(make_state(step - 1))
     rig.probe.put("state", encode(make_state(step - 2)))
-    wanted["stale"] += 1
+    sent["stale"] += 1
     rig.sender.send(make_state(step, sent_ns=time.time_ns() + _HOUR_NS))
 
 
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
     """A drive command to the newest state, or to one ``ahead`` of it."""
-    newest = rig.timeline.commands[-1]
-    session, episode, step = newest.place
-    fields: dict = {
-        "session": session,
-        "episode": episode,
-        "step": max(0, step + ahead),
-        "mode": "drive",
-        "action": [0.1],
-        "policy_id": "0" * 64,
-        "received_ns": time.time_ns(),
-        "inference_ns": 1,
-        "sent_ns": time.time_ns(),
-    }
-    return Command(**{**fields, **changes})
-
-
-def _reason(message: State | Command | Rejection) -> str:
-    return message.reason.value if isinstance(message, Rejection) else "foreign_session"
-
-
-def _put_all(rig: Rig, topic: str, payloads: Iterable[bytes]) -> None:
-    begin_s = time.monotonic()
-    for sent, payload in enumerate(payloads):
-        rig.probe.put(topic, payload)
-        if sent % 25 == 0:
-            time.sleep(max(0.0, begin_s + sent / PER_S - time.monotonic()))
+    session, episode, step = rig.timeline.commands[-1].place
+    command = Command(
+        session=session, episode=episode, step=max(0, step + ahead), mode="drive", action=[0.1],
+        policy_id="0" * 64, received_ns=time.time_ns(), inference_ns=1, sent_ns=time.time_ns(),
+    )  # fmt: skip
+    return msgspec.structs.replace(command, **changes)
 
 
 def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:

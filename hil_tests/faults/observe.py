@@ -6,9 +6,7 @@ probe, of the edge runtime's log and of the simulated vehicle can be taken from 
 
 from __future__ import annotations
 
-import contextlib
 import statistics
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -51,13 +49,6 @@ class ModeSeen(NamedTuple):
     seen_s: float
     mode: str
     reason: str
-
-
-class BrakeSeen(NamedTuple):
-    """The simulated vehicle's brake, pressed or released."""
-
-    seen_s: float
-    pressed: bool
 
 
 @dataclass
@@ -214,7 +205,7 @@ class Heard(NamedTuple):
     data: bytes
 
 
-class CanMonitor:
+class CanMonitor(can.Listener):
     """Hears all frames of a CAN bus in a thread, and keeps those of the identifiers asked for."""
 
     def __init__(self, bus: str, can_ids: tuple[int, ...]) -> None:
@@ -223,9 +214,7 @@ class CanMonitor:
         """Frames that are not the Hunter's: nobody should send any."""
         self._can_ids = frozenset(can_ids)
         self._bus = open_bus(parse_bus(bus))
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._listen, daemon=True)
-        self._thread.start()
+        self._notifier = can.Notifier(self._bus, [self], timeout=_POLL_S)
 
     def of(self, can_id: int, since_s: float = float("-inf")) -> list[Heard]:
         """The frames of an identifier since a moment, in order."""
@@ -233,22 +222,18 @@ class CanMonitor:
 
     def close(self) -> None:
         """End the thread, then close the bus."""
-        self._ending.set()
-        self._thread.join()
+        self._notifier.stop()
         self._bus.shutdown()
 
-    def _listen(self) -> None:
-        while not self._ending.is_set():
-            with contextlib.suppress(can.CanError):
-                message = self._bus.recv(_POLL_S)
-                if message is not None:
-                    self._note(message)
-
-    def _note(self, message: can.Message) -> None:
+    def on_message_received(self, msg: can.Message) -> None:
+        """Called by the notifier."""
         # The stamp is the kernel's, by the wall clock: how late this thread runs does not count.
-        seen_s = message.timestamp + time.monotonic() - time.time()
-        heard = Heard(seen_s, message.arbitration_id, bytes(message.data))
+        seen_s = msg.timestamp + time.monotonic() - time.time()
+        heard = Heard(seen_s, msg.arbitration_id, bytes(msg.data))
         if heard.can_id in self._can_ids:
             self.heard.append(heard)
-        if heard.can_id not in FRAMES or message.is_extended_id:
+        if heard.can_id not in FRAMES or msg.is_extended_id:
             self.strange.append(heard)
+
+    def on_error(self, exc: Exception) -> None:
+        """What a socket cannot unpack is no frame."""

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar, cast
 
+import msgspec
 import numpy as np
 
 from edge_runtime.commands import ask
@@ -27,7 +28,6 @@ from edge_runtime.vehicles.hunter import bus as multicast
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, FRAMES_SHAPE, SAFE_STOP, State, encode
 from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
 from hil_tests.faults.observe import (
-    BrakeSeen,
     CanMonitor,
     CommandSeen,
     ModeSeen,
@@ -44,7 +44,7 @@ HEARD = (0x111, 0x131, 0x421, 0x441, 0x211, 0x221)
 """What is kept of the CAN bus: all commands, the chassis's state, its speed."""
 _INSIDE = "hil_tests.faults.inside"
 _MODE = re.compile(r"\bmode\b.*\bnow\W+(\w+)(?:.*\breason\W+(\w+))?")
-_TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) condition=(\w+).* motion=(\w+)")
+_TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) .*motion=(\w+)")
 _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
 _REARM_EVERY_S = 2.0
@@ -165,10 +165,10 @@ class Rig:
 
         wait_until(driving, "a steady drive", timeout_s)
 
-    def brakes(self) -> list[BrakeSeen]:
-        """What the simulated vehicle's brake did so far."""
+    def brakes(self) -> list[tuple[float, bool]]:
+        """When the simulated vehicle's brake was pressed (True) or released so far."""
         lines = (self.directory / BRAKES).read_text().splitlines()
-        return [BrakeSeen(float(a), b == "1") for a, b in (line.split() for line in lines)]
+        return [(float(a), b == "1") for a, b in (line.split() for line in lines)]
 
     def switch(self, name: str, word: str | None) -> None:
         """Write a word into one of the files that the faulty ends look at; None removes it."""
@@ -216,9 +216,10 @@ class Rig:
 
     def own_brake_s(self, since_s: float) -> float:
         """When the simulated vehicle's brake went on after ``since_s``."""
-        return _await_first(
-            self.brakes, lambda b: b.pressed and b.seen_s > since_s, "the simulator's own brake"
-        ).seen_s
+        pressed = _await_first(
+            self.brakes, lambda b: b[1] and b[0] > since_s, "the simulator's own brake"
+        )
+        return pressed[0]
 
     def stop_command(self, since_s: float) -> CommandSeen:
         """The first safe_stop command after ``since_s``."""
@@ -253,7 +254,7 @@ class Rig:
 
     def longest_gap(self, begin_s: float, end_s: float) -> float:
         """The longest time without a command at the probe, s."""
-        return longest_gap_s((c.seen_s for c in list(self.timeline.commands)), begin_s, end_s)
+        return longest_gap_s([c.seen_s for c in self.timeline.commands], begin_s, end_s)
 
     def edge_counts(self) -> Counter[str]:
         """The edge's rejections by reason, by a health message sent after all sent so far."""
@@ -287,18 +288,16 @@ class Rig:
         steady = len(recent) >= _SETTLED_COMMANDS and {c.mode for c in recent} == {"drive"}
         brakes = self.brakes()
         fresh = now_s - self.last_drive_s() < _SETTLED_S
-        return steady and fresh and not (brakes and brakes[-1].pressed)
+        return steady and fresh and not (brakes and brakes[-1][1])
 
     def _start(self, name: str, *arguments: str) -> Process:
-        on_line = self._on_edge_line if name == "edge" else lambda seen_s, line: None
+        def on_line(seen_s: float, line: str) -> None:
+            if name == "edge" and (found := _MODE.search(line)):
+                self.timeline.modes.append(ModeSeen(seen_s, found[1], found[2] or ""))
+
         process = Process(*arguments, environment={DIRECTORY: str(self.directory)}, on_line=on_line)
         self._processes.append((name, process))
         return process
-
-    def _on_edge_line(self, seen_s: float, line: str) -> None:
-        if found := _MODE.search(line):
-            mode, reason = found.group(1), found.group(2) or ""
-            self.timeline.modes.append(ModeSeen(seen_s, mode, reason))
 
 
 def _await_first(events: Callable[[], list[E]], wanted: Callable[[E], bool], what: str) -> E:
@@ -345,20 +344,14 @@ class Sender:
                 self.send_next()
 
 
-def make_state(step: int, seed: int = 0, **changes: object) -> State:
+def make_state(step: int, **changes: object) -> State:
     """A valid state with a picture of noise below half brightness."""
-    generator = np.random.default_rng((seed, step))
-    fields: dict = {
-        "session": SESSION,
-        "episode": 0,
-        "step": step,
-        "sim_time_s": round(step * CONTROL_PERIOD_S, 6),
-        "sent_ns": time.time_ns(),
-        "frames": generator.integers(0, 120, FRAMES_SHAPE, dtype=np.uint8).tobytes(),
-        "speed_mps": 3.0,
-        "final": False,
-    }
-    return State(**{**fields, **changes})
+    noise = np.random.default_rng(step).integers(0, 120, FRAMES_SHAPE, dtype=np.uint8)
+    state = State(
+        session=SESSION, episode=0, step=step, sim_time_s=round(step * CONTROL_PERIOD_S, 6),
+        sent_ns=time.time_ns(), frames=noise.tobytes(), speed_mps=3.0, final=False,
+    )  # fmt: skip
+    return msgspec.structs.replace(state, **changes)
 
 
 class Truth(NamedTuple):
@@ -366,7 +359,6 @@ class Truth(NamedTuple):
 
     since_s: float
     control: str
-    condition: str
     moves: bool
 
 
@@ -408,8 +400,8 @@ class ChassisProcess:
 
     def _on_line(self, seen_s: float, line: str) -> None:
         if told := _TOLD.match(line):
-            since_s, control, condition, motion = told.groups()
-            self.truth.append(Truth(float(since_s), control, condition, motion == "moves"))
+            since_s, control, motion = told.groups()
+            self.truth.append(Truth(float(since_s), control, motion == "moves"))
         if switched := _SWITCHED.match(line):
             applied_s, name, word = switched.groups()
             self.switched.append((float(applied_s), name, word))

@@ -1,8 +1,8 @@
 """A row of the fault table.
 
 A new row is a function that takes a driving rig and the number of its try, does the fault once,
-undoes it, and returns a `Try`; `fault` above it puts it into ROWS. The modules with rows are named
-in `run.py`.
+undoes it, and returns a `Try`; its docstring says what is done. `fault` or `drives_on` above it
+puts it into ROWS. The modules with rows are named in `run.py`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -77,19 +76,63 @@ ROWS: list[Row] = []
 
 
 def fault(
-    done: str, expected: str, measured: str, name: str = "", **options: Any
+    expected: str, measured: str, name: str = "", done: str = "", **options: Any
 ) -> Callable[[DoFault], DoFault]:
-    """Put a function into the table, by its own name; ``options`` are those of `Row`."""
+    """Put a function into the table.
+
+    Its own name and its docstring stand there, or ``name`` and ``done`` where several rows share
+    it; ``options`` are those of `Row`.
+    """
 
     def add(run: DoFault) -> DoFault:
-        ROWS.append(Row(name or run.__name__, done, expected, measured, run, **options))
+        said = done or " ".join((run.__doc__ or "").split()).rstrip(".")
+        ROWS.append(Row(name or run.__name__, said, expected, measured, run, **options))
         return run
 
     return add
 
 
-drives_on = partial(fault, measured=GAP, recovery_limit_s=None, flows=True)
-"""A fault through which the drive goes on."""
+def drives_on(
+    expected: str = "drives on", counted: Literal["", "edge", "simulator"] = "", **options: Any
+) -> Callable[[DoFault], DoFault]:
+    """As `fault`, for one through which the drive goes on.
+
+    The function returns what else is to be judged; ``rejected`` are the messages that it sent to be
+    rejected. Who ``counted`` them must have counted just these. The simulator's counts stand in its
+    report, for which the drive has to end.
+    """
+    if counted == "simulator":
+        options = {"flows": False, "new_rig_each_try": True, **options}
+
+    def add(do: DoFault) -> DoFault:
+        def run(rig: Rig, number: int) -> Try:
+            before = rig.edge_counts() if counted == "edge" else Counter()
+            begin_s = time.monotonic()
+            done = do(rig, number)
+            end_s = time.monotonic()
+            found = Counter(done.rejected)
+            if counted == "edge":
+                found = rig.edge_counts() - before
+            if counted == "simulator":
+                rig.end_drive()
+                found = rig.simulator_counts()
+            return drove_on(rig, begin_s, end_s, done, found)
+
+        run.__doc__, run.__name__ = do.__doc__, do.__name__
+        through: dict[str, Any] = {"recovery_limit_s": None, "flows": True, **options}
+        return fault(expected, GAP, **through)(run)
+
+    return add
+
+
+def drove_on(rig: Rig, begin_s: float, end_s: float, done: Try, counted: Counter[str]) -> Try:
+    """Judge a try through which the drive was to go on, and what was counted in it."""
+    wanted = Counter(done.rejected)
+    wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
+    # Safe stops come as steadily as drives: the gaps alone would not tell.
+    wrong += [*stops_between(rig.timeline.commands, begin_s, end_s), *done.wrong]
+    gap_s = rig.longest_gap(begin_s, end_s)
+    return replace(done, reaction_s=gap_s, rejected=dict(counted), wrong=wrong)
 
 
 def at_any_phase(number: int) -> None:
@@ -100,23 +143,3 @@ def at_any_phase(number: int) -> None:
 def sleep_until(time_s: float) -> None:
     """Sleep until a moment of the monotonic clock."""
     time.sleep(max(0.0, time_s - time.monotonic()))
-
-
-def drove_on(
-    rig: Rig,
-    begin_s: float,
-    end_s: float,
-    wanted: Counter[str] | None = None,
-    counted: Counter[str] | None = None,
-    **more: Any,
-) -> Try:
-    """The try of a row in which nothing was to happen between two moments, but perhaps counting.
-
-    ``wanted`` messages had to be rejected, by reason, and ``counted`` ones were; ``more`` are
-    further fields of the `Try`.
-    """
-    wanted, counted = wanted or Counter(), counted or Counter()
-    wrong = [] if counted == wanted else [f"counted {dict(counted)}, sent {dict(wanted)}"]
-    # Safe stops come as steadily as drives: the gaps alone would not tell.
-    wrong += [*stops_between(rig.timeline.commands, begin_s, end_s), *more.pop("wrong", [])]
-    return Try(rig.longest_gap(begin_s, end_s), rejected=dict(counted), wrong=wrong, **more)

@@ -121,13 +121,13 @@ def choose_rows(names: Sequence[str] | None) -> list[Row]:
     Raises:
         UserError: a name that the table does not hold, or a pattern that fits none.
     """
-    if names is None:
-        return list(ROWS)
     known = [row.name for row in ROWS]
-    for name in names:
-        if not fnmatch.filter(known, name):
+    chosen: set[str] = set()
+    for name in ["*"] if names is None else names:
+        if not (found := fnmatch.filter(known, name)):
             raise UserError(f"no fault {name!r}; choose from {', '.join(known)}")
-    return [row for row in ROWS if any(fnmatch.fnmatch(row.name, name) for name in names)]
+        chosen.update(found)
+    return [row for row in ROWS if row.name in chosen]
 
 
 def run_row(row: Row, trust: Sequence[str], work: Path, tries: int, on_try: OnTry) -> Outcome:
@@ -177,17 +177,10 @@ def report_row(row: Row, outcome: Outcome) -> dict[str, Any]:
     recoveries = [t.recovery_s for t in outcome.tries if t.recovery_s is not None]
     late = _over(reactions, row.reaction_limit_s), _over(recoveries, row.recovery_limit_s)
     wrong = [*outcome.failures, *(text for t in outcome.tries for text in t.wrong)]
-    rejected: Counter[str] = Counter()
-    figures: dict[str, float] = {}
-    for one in outcome.tries:
-        rejected.update(one.rejected)
-        for name, value in one.figures.items():
-            figures[name] = max(value, figures.get(name, value))
+    names = {name for t in outcome.tries for name in t.figures}
+    figures = {n: max(t.figures[n] for t in outcome.tries if n in t.figures) for n in names}
     return {
-        "name": row.name,
-        "done": row.done,
-        "expected": row.expected,
-        "measured": row.measured,
+        **{name: getattr(row, name) for name in ("name", "done", "expected", "measured")},
         "tries": len(outcome.tries) + len(outcome.failures),
         "disturbed": outcome.disturbed,
         "reaction_ms": spread_ms(reactions),
@@ -197,7 +190,7 @@ def report_row(row: Row, outcome: Outcome) -> dict[str, Any]:
         "recovery_limit_ms": _ms(row.recovery_limit_s),
         "recoveries_late": late[1],
         "reasons": dict(Counter(t.reason for t in outcome.tries if t.reason)),
-        "rejected": dict(rejected),
+        "rejected": dict(sum((Counter(t.rejected) for t in outcome.tries), Counter())),
         "figures": figures,
         "notes": [text for t in outcome.tries for text in t.notes],
         "wrong": wrong,

@@ -79,11 +79,8 @@ def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> P
     """A model's row with some numbers replaced.
 
     Raises:
-        UserError: an unknown model or name, or a number that is not positive (a dead time may
-            be 0).
+        UserError: an unknown name, or a number that is not positive (a dead time may be 0).
     """
-    if model not in MODELS:
-        raise UserError(f"no model {model!r}; choose from {', '.join(MODELS)}")
     for name, value in (changes or {}).items():
         if name not in SOURCES:
             raise UserError(f"no parameter {name!r}; choose from {', '.join(SOURCES)}")
@@ -181,7 +178,8 @@ class Battery:
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self._fraction = 1.0
-        self._current_a = parameters.idle_a
+        self.amperes = parameters.idle_a
+        """Drawn from it now."""
         self._before_empty: float | None = None
 
     @property
@@ -189,12 +187,7 @@ class Battery:
         """At its terminals, now."""
         p = self._parameters
         open_v = p.empty_v + (p.full_v - p.empty_v) * self._fraction
-        return open_v - p.resistance_ohm * self._current_a
-
-    @property
-    def amperes(self) -> float:
-        """Drawn from it now."""
-        return self._current_a
+        return open_v - p.resistance_ohm * self.amperes
 
     @property
     def too_low(self) -> bool:
@@ -205,8 +198,8 @@ class Battery:
         """Draw what this motion takes; braking gives nothing back."""
         p = self._parameters
         drive_a = p.drive_a_per_mps * abs(speed_mps)
-        self._current_a = p.idle_a + drive_a + p.drive_a_per_mps2 * max(0.0, acceleration_mps2)
-        used = self._current_a * step_s / p.capacity_as
+        self.amperes = p.idle_a + drive_a + p.drive_a_per_mps2 * max(0.0, acceleration_mps2)
+        used = self.amperes * step_s / p.capacity_as
         self._fraction = max(0.0, self._fraction - used)
 
     def empty(self, on: bool) -> None:

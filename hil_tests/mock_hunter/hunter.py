@@ -71,7 +71,8 @@ class MockHunter:
         self._under_way: deque[tuple[float, Setpoint]] = deque()
         self._setpoint = Setpoint()
         self._tick = 0
-        self._reported: Reported | None = None  # the newest
+        self._fast: list[Wire] = []
+        self._slow: list[Wire] = []
         self._outgoing: deque[tuple[float, Wire]] = deque()
 
     def describe(self) -> str:
@@ -164,20 +165,61 @@ class MockHunter:
         return advance(self.body, self._setpoint, step_s, self._parameters)
 
     def _report(self, now_s: float) -> None:
-        if self._reported is None or "frozen" not in self.faults:
-            self._reported = Reported(
-                self.chassis, self.body, self.battery.volts, self.battery.amperes,
-                self._tick // SLOW_EVERY, "lying" in self.faults,
-            )  # fmt: skip
-        frames = fast_frames(self._reported, self._parameters)
-        if self._tick % SLOW_EVERY == 0:
-            frames += slow_frames(self._reported, self._parameters, self._profile)
+        with_slow = self._tick % SLOW_EVERY == 0
+        if "frozen" not in self.faults or not self._slow:
+            self._fast = self._fast_frames()
+            self._slow = self._slow_frames() if with_slow else self._slow
         if self.faults & {"silent", "bus_off"}:
             return
         release_s = now_s + (LATE_S if "late" in self.faults else 0.0)
         if self._outgoing:
             release_s = max(release_s, self._outgoing[-1][0])  # a bus keeps their order
-        self._outgoing.extend((release_s, Wire(*frame)) for frame in frames)
+        frames = self._fast + (self._slow if with_slow else [])
+        self._outgoing.extend((release_s, frame) for frame in frames)
+
+    def _fast_frames(self) -> list[Wire]:
+        """0x221 and 0x251 to 0x253: every 20 ms."""
+        body, p = self.body, self._parameters
+        speed_mps = body.speed_mps + (LIE_MPS if "lying" in self.faults else 0.0)
+        found = [_frame(codec.MOTION_STATUS, codec.MotionStatus(speed_mps, body.inner_rad))]
+        half = curvature(body.inner_rad, p) * p.track_m / 2
+        drive, steer = p.motor_revolutions_per_m, p.steer_revolutions_per_rad
+        each_a = self.battery.amperes / 2
+        for row, turns, speed, way, amperes in (
+            (codec.REAR_RIGHT_FAST, drive, body.speed_mps * (1 + half), body.right_m, each_a),
+            (codec.REAR_LEFT_FAST, drive, body.speed_mps * (1 - half), body.left_m, each_a),
+            (codec.STEER_MOTOR_FAST, steer, body.steering_radps, body.inner_rad, 0.0),
+        ):
+            pulses = way * turns * p.pulses_per_revolution
+            fast = codec.MotorFast(round(speed * turns * 60), amperes, _wrapped(pulses))
+            found.append(_frame(row, fast))
+        return found
+
+    def _slow_frames(self) -> list[Wire]:
+        """0x211 and 0x261 to 0x263: every 100 ms."""
+        errors, volts = self.chassis.errors, self.battery.volts
+        found = [_frame(codec.SYSTEM_STATUS, self._status())]
+        for motor, row in enumerate(_SLOW):
+            shown = (BITS[error].motor_bits for error in errors if motor in BITS[error].motors)
+            hot = "overtemperature" in errors and motor != STEERING
+            celsius = _HOT_C if hot else _COOL_C
+            slow = codec.MotorSlow(volts, celsius, celsius, _ENABLED | sum(shown))
+            found.append(_frame(row, slow))
+        return found
+
+    def _status(self) -> codec.SystemStatus:
+        """0x211: who drives, whether anybody may, the battery, the errors, the brake."""
+        chassis = self.chassis
+        words = [BITS[error].words for error in chassis.errors]
+        words += [LINK_LOST] if chassis.control is Control.LINK_LOST else []
+        return codec.SystemStatus(
+            state=_STATES[chassis.condition],
+            mode=_MODES[chassis.control],
+            battery_v=self.battery.volts,
+            faults=sum(fault_bits(each, self._profile) for each in words),
+            brake=int(chassis.brake_locked),
+            counter=self._tick // SLOW_EVERY % 256,
+        )
 
     def _released(self, now_s: float) -> list[Wire]:
         found = []
@@ -186,72 +228,8 @@ class MockHunter:
         return found
 
 
-class Reported(NamedTuple):
-    """All that the frames are made of."""
-
-    chassis: Chassis
-    body: Body
-    volts: float
-    amperes: float
-    counter: int
-    lies: bool = False
-
-
-def fast_frames(reported: Reported, parameters: Parameters) -> list[tuple[int, bytes]]:
-    """0x221 and 0x251 to 0x253: every 20 ms."""
-    body = reported.body
-    speed_mps = body.speed_mps + (LIE_MPS if reported.lies else 0.0)
-    motion = codec.MotionStatus(speed_mps, body.inner_rad)
-    found = [_frame(codec.MOTION_STATUS, motion)]
-    half = curvature(body.inner_rad, parameters) * parameters.track_m / 2
-    drive, steer = parameters.motor_revolutions_per_m, parameters.steer_revolutions_per_rad
-    each_a = reported.amperes / 2
-    for row, turns, speed, way, amperes in (
-        (codec.REAR_RIGHT_FAST, drive, body.speed_mps * (1 + half), body.right_m, each_a),
-        (codec.REAR_LEFT_FAST, drive, body.speed_mps * (1 - half), body.left_m, each_a),
-        (codec.STEER_MOTOR_FAST, steer, body.steering_radps, body.inner_rad, 0.0),
-    ):
-        pulses = way * turns * parameters.pulses_per_revolution
-        fast = codec.MotorFast(round(speed * turns * 60), amperes, _wrapped(pulses))
-        found.append(_frame(row, fast))
-    return found
-
-
-def slow_frames(
-    reported: Reported, parameters: Parameters, profile: str
-) -> list[tuple[int, bytes]]:
-    """0x211 and 0x261 to 0x263: every 100 ms."""
-    found = [_frame(codec.SYSTEM_STATUS, status(reported, profile))]
-    for motor, row in enumerate(_SLOW):
-        bits = _ENABLED | sum(
-            BITS[error].motor_bits
-            for error in reported.chassis.errors
-            if motor in BITS[error].motors
-        )
-        hot = "overtemperature" in reported.chassis.errors and motor != STEERING
-        celsius = _HOT_C if hot else _COOL_C
-        found.append(_frame(row, codec.MotorSlow(reported.volts, celsius, celsius, bits)))
-    return found
-
-
-def status(reported: Reported, profile: str) -> codec.SystemStatus:
-    """0x211: who drives, whether anybody may, the battery, the errors, the brake."""
-    chassis = reported.chassis
-    bits = sum(fault_bits(BITS[error].words, profile) for error in chassis.errors)
-    if chassis.control is Control.LINK_LOST:
-        bits |= fault_bits(LINK_LOST, profile)
-    return codec.SystemStatus(
-        state=_STATES[chassis.condition],
-        mode=_MODES[chassis.control],
-        battery_v=reported.volts,
-        faults=bits,
-        brake=int(chassis.brake_locked),
-        counter=reported.counter % 256,
-    )
-
-
-def _frame(row: codec.Frame, message: object) -> tuple[int, bytes]:
-    return row.can_id, codec.encode(row, message)
+def _frame(row: codec.Frame, message: object) -> Wire:
+    return Wire(row.can_id, codec.encode(row, message))
 
 
 def _wrapped(pulses: float) -> int:

@@ -13,9 +13,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
 
 import can
 
@@ -32,23 +31,16 @@ Switch = tuple[str, bool]
 _WORDS = {"on": True, "off": False}
 
 
-def parse_switch(line: str) -> Switch:
-    """``NAME on`` or ``NAME off``. Raises UserError for anything else."""
-    name, _, word = line.strip().partition(" ")
-    if word not in _WORDS:
-        raise UserError(f"{line.strip()!r} is no order: use NAME on, or NAME off")
-    return check_fault(name), _WORDS[word]
-
-
 def read_orders(
     lines: Iterable[str], obey: Callable[[Switch], None], complain: Callable[[str], None]
 ) -> None:
-    """Read lines to their end, in a thread of its own so that nobody waits for them."""
+    """Read ``NAME on`` or ``NAME off``, line by line, in a thread so that nobody waits for them."""
     for line in lines:
-        try:
-            obey(parse_switch(line))
-        except UserError as error:
-            complain(f"error: {error}")
+        name, _, word = line.strip().partition(" ")
+        if name in FAULTS and word in _WORDS:
+            obey((name, _WORDS[word]))
+        else:
+            complain(f"error: {line.strip()!r} is no order: use NAME on, or NAME off")
 
 
 class Server:
@@ -59,12 +51,10 @@ class Server:
         hunter: MockHunter,
         bus: can.BusABC,
         tell: Callable[[str], None] = lambda line: None,
-        later: Sequence[tuple[float, str]] = (),
     ) -> None:
         self.orders: queue.SimpleQueue[Switch] = queue.SimpleQueue()
-        """Switches to obey next, from any thread."""
+        """Faults to switch next, from any thread."""
         self._hunter, self._bus, self._tell = hunter, bus, tell
-        self._later = sorted(later)
         self._ending = threading.Event()
         self._said = ""
         self._fails = False
@@ -75,11 +65,7 @@ class Server:
 
     def run(self) -> None:
         """Obey and report."""
-        begun_s = time.monotonic()
         while not self._ending.is_set():
-            now_s = time.monotonic()
-            while self._later and now_s - begun_s >= self._later[0][0]:
-                self._switch(self._later.pop(0)[1], True)
             while not self.orders.empty():
                 self._switch(*self.orders.get())
             for frame in self._hunter.due(time.monotonic()):
@@ -126,18 +112,9 @@ def _is_plain(message: can.Message) -> bool:
     return not any(odd)
 
 
-class _AfterFault(argparse.Action):
-    """``--after-s`` belongs to the ``--fault`` before it."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
-        if not namespace.fault or namespace.fault[-1][0]:
-            parser.error("--after-s follows a --fault")
-        namespace.fault[-1] = (values, namespace.fault[-1][1])
-
-
 EXAMPLE = examples(
     "python -m hil_tests mock_hunter",
-    "python -m hil_tests mock_hunter --bus socketcan:vcan0 --fault link_steer --after-s 20",
+    "python -m hil_tests mock_hunter --bus socketcan:vcan0 --fault link_steer@20",
 )
 
 
@@ -157,10 +134,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--set", action="append", metavar="NAME=VALUE", help="a parameter's value")
     parser.add_argument(
-        "--fault", action="append", type=_fault, metavar="NAME", help="from the start"
-    )
-    parser.add_argument(
-        "--after-s", action=_AfterFault, type=seconds, metavar="S", help="that fault comes later"
+        "--fault", action="append", type=_fault, metavar="NAME[@S]", help="from the start, or later"
     )
 
 
@@ -170,7 +144,15 @@ def run(arguments: argparse.Namespace) -> int:
     bus, tell = open_bus(_check_reachable(arguments.bus)), partial(print, flush=True)
     try:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
-        server = Server(hunter, bus, tell, arguments.fault or ())
+        server = Server(hunter, bus, tell)
+        for after_s, name in arguments.fault or ():
+            switch = partial(server.orders.put, (name, True))
+            if after_s:
+                later = threading.Timer(after_s, switch)
+                later.daemon = True
+                later.start()
+            else:
+                switch()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: server.stop())
         if isinstance(sys.stdin, io.TextIOWrapper):
@@ -197,7 +179,8 @@ def _check_reachable(text: str) -> BusName:
 
 
 def _fault(text: str) -> tuple[float, str]:
+    name, at, after_s = text.partition("@")
     try:
-        return 0.0, check_fault(text)
+        return seconds(after_s) if at else 0.0, check_fault(name)
     except UserError as error:
         raise argparse.ArgumentTypeError(str(error)) from None

@@ -10,7 +10,8 @@ import json
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,23 +27,18 @@ class Mutant(NamedTuple):
     outcome: str
 
 
-def read_session(path: str) -> list[Mutant]:
+def read_session(path: str) -> Iterator[Mutant]:
     """All mutants of a session that were not filtered out."""
     dump = subprocess.run(["cosmic-ray", "dump", path], check=True, capture_output=True, text=True)
-    pairs = map(json.loads, dump.stdout.splitlines())
-    return [
-        _mutant(item["mutations"][0], result or {})
-        for item, result in pairs
-        if (result or {}).get("worker_outcome") != "skipped"
-    ]
-
-
-def _mutant(mutation: dict, result: dict) -> Mutant:
-    lines = (result.get("diff") or "").splitlines()
-    diff = [line for line in lines if not line.startswith(("--- ", "+++ "))]
-    was, became = (" ".join(line[1:].strip() for line in diff if line[:1] == sign) for sign in "-+")
-    outcome = str(result.get("test_outcome") or "not run")
-    return Mutant(str(mutation["module_path"]), was, became, outcome)
+    for item, result in map(json.loads, dump.stdout.splitlines()):
+        told = result or {}
+        if told.get("worker_outcome") == "skipped":
+            continue
+        lines = (told.get("diff") or "").splitlines()
+        diff = [line for line in lines if not line.startswith(("--- ", "+++ "))]
+        was, became = (" ".join(x[1:].strip() for x in diff if x[:1] == sign) for sign in "-+")
+        file = str(item["mutations"][0]["module_path"])
+        yield Mutant(file, was, became, str(told.get("test_outcome") or "not run"))
 
 
 def read_accepted() -> list[dict[str, str]]:
@@ -52,39 +48,27 @@ def read_accepted() -> list[dict[str, str]]:
 
 def judge(mutants: Iterable[Mutant], accepted: Sequence[dict[str, str]]) -> list[str]:
     """A line for each file with its counts, then one for each survivor that is not accepted."""
-    counts: dict[str, list[int]] = {}
+    counts: dict[str, Counter[str]] = {}
     survived = []
-    for mutant in mutants:
-        count = counts.setdefault(mutant.file, [0, 0, 0])
-        count[0] += 1
-        if mutant.outcome == "killed":
-            count[1] += 1
-        elif any(_fits(mutant, entry) for entry in accepted):
-            count[2] += 1
-        else:
-            survived.append(f"SURVIVED {mutant.file}: `{mutant.was}` became `{mutant.became}`")
-    rows = [
-        f"{file}: {made} mutants, {killed} killed, {reasoned} accepted"
-        for file, (made, killed, reasoned) in counts.items()
-    ]
-    return rows + survived
+    for file, was, became, outcome in mutants:
+        count = counts.setdefault(file, Counter())
+        patterns = (one["became"] for one in accepted if (one["file"], one["was"]) == (file, was))
+        if outcome != "killed" and any(_fits(became, one) for one in patterns):
+            outcome = "accepted"
+        count.update(["made", outcome])
+        if outcome not in ("killed", "accepted"):
+            survived.append(f"SURVIVED {file}: `{was}` became `{became}`")
+    return [
+        f"{file}: {count['made']} mutants, {count['killed']} killed, {count['accepted']} accepted"
+        for file, count in counts.items()
+    ] + survived
 
 
-def _fits(mutant: Mutant, entry: dict[str, str]) -> bool:
-    if (mutant.file, mutant.was) != (entry["file"], entry["was"]):
-        return False
-    pattern = entry["became"]
-    if pattern.endswith("*"):
-        return mutant.became.startswith(pattern[:-1])
-    return mutant.became == pattern
-
-
-def main(sessions: Sequence[str]) -> int:
-    """Print them; 1 where one survived."""
-    lines = judge((m for path in sessions for m in read_session(path)), read_accepted())
-    print("\n".join(lines))
-    return int(any(line.startswith("SURVIVED") for line in lines))
+def _fits(became: str, pattern: str) -> bool:
+    return became.startswith(pattern[:-1]) if pattern.endswith("*") else became == pattern
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    said = judge((m for path in sys.argv[1:] for m in read_session(path)), read_accepted())
+    print("\n".join(said))
+    sys.exit(any(line.startswith("SURVIVED") for line in said))

@@ -34,7 +34,7 @@ def proven(board: str) -> dict:
     if reason := why_not(board):
         pytest.skip(reason)
     kept: list[dict] = []
-    prove(board, str(ROOT / "build/board"), str(ROOT / "build/wheels"), CUTS, kept.append)
+    prove(board, ROOT / "build/board", ROOT / "build/wheels", CUTS, kept.append)
     report = kept[-1]
     assert report["status"]["whole"] == "yes"
     assert report["episode"]["policy_id"] == report["status"]["policy_id"]

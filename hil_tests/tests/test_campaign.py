@@ -1,28 +1,55 @@
-"""The latency campaign: what it says of its rows, that it drives each once, and its two files."""
+"""The campaigns: what they say of their rows, that they drive each once, a rig of real processes,
+and the same loop in virtual time."""
 
 import json
 from itertools import chain, repeat
-from pathlib import Path
 
 import pytest
 
 from edge_runtime.cli import run_cli
+from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
-from hil_tests import campaign
+from hil_tests import campaign, sweep
 from hil_tests.__main__ import main
-from hil_tests.campaign import Chunk
-from hil_tests.report import check_report, write_report
-from hil_tests.sweep import NETWORK_AXES, Axis, Task, budget, limit_of, make_row, turns
+from hil_tests.mock_hunter.body import make_parameters
+from hil_tests.processes import POLICY
+from hil_tests.report import (
+    check_report,
+    lag_sentence,
+    render_comparison,
+    render_sweep,
+    write_report,
+)
+from hil_tests.sweep import (
+    LAG_AXES,
+    LAGS,
+    NETWORK_AXES,
+    VEHICLE,
+    Axis,
+    Lag,
+    Part,
+    Task,
+    budget,
+    cost,
+    join_vehicles,
+    lag_budget,
+    lag_row,
+    limit_of,
+    make_row,
+    run_rig,
+    worth_keeping,
+)
+from hil_tests.virtual_drive import Driven, VirtualDrive
+from trainer.drivers import OnnxDriver, make_environment
 
 DELAY = Axis("delay", "delay", "ms", (0, 50, 100, 150), "delay={}ms", "none", "{} of delay")
 LOSS = Axis("loss", "loss", "%", (0, 10), "loss={}%", "none", "{} of loss")
+JITTER = Axis("jitter", "jitter", "ms", (0, 9), "delay=1ms,jitter={}ms", "delay=1ms", "{}")
+SHORT_TOY = "bridge.tests.toy:BridgeToyShort-v0"
 
 
 def rows_of(axis, *success):
-    return {
-        axis.spec(value): {"success": {"value": share}}
-        for value, share in zip(axis.values, success, strict=True)
-    }
+    return {spec: {"success": {"value": s}} for spec, s in zip(axis.specs, success, strict=True)}
 
 
 @pytest.mark.parametrize(
@@ -38,110 +65,181 @@ def test_the_limit_is_the_largest_value_up_to_which_all_hold(success, limit):
     assert limit_of(DELAY, rows_of(DELAY, *success), 0.98) == limit
 
 
-def test_the_sentence_says_what_was_only_the_end_of_the_table():
-    rows = {**rows_of(DELAY, 1.0, 1.0, 0.9, 0.9), **rows_of(LOSS, 1.0, 1.0)}
-    found = budget([DELAY, LOSS], rows, 0.98, "a policy")
-    assert found["sentence"] == (
-        "a policy holds at least 98% success up to 50 ms of delay and "
-        "10 % of loss (the most that was tested), one at a time."
+@pytest.mark.parametrize(
+    ("success", "sentence"),
+    [
+        (
+            {DELAY: (1.0, 1.0, 0.9, 0.9), LOSS: (1.0, 1.0)},
+            "a policy holds at least 98% success up to 50 ms of delay and "
+            "10 % of loss (the most that was tested), one at a time.",
+        ),
+        (
+            {DELAY: (0.9, 1.0, 1.0, 1.0)},
+            "a policy is below 98% success even on a perfect network.",
+        ),
+        # An axis whose own base fails takes nothing from the others.
+        (
+            {LOSS: (1.0, 0.9), JITTER: (0.9, 1.0)},
+            "a policy holds at least 98% success up to none of loss, one at a time; "
+            "on delay=1ms alone it is below that, so no jitter has a budget.",
+        ),
+    ],
+)
+def test_the_budgets_sentence(success, sentence):
+    rows = {
+        spec: row for axis, some in success.items() for spec, row in rows_of(axis, *some).items()
+    }
+    found = budget(list(success), rows, 0.98, "a policy")
+    assert found["sentence"] == sentence
+    assert found["up_to_the_largest_tested"].get("loss") == (
+        None if LOSS not in success else success[LOSS][-1] == 1.0
     )
-    assert found["up_to_the_largest_tested"] == {"delay": False, "loss": True}
 
 
-def test_a_policy_that_fails_without_any_network_has_no_budget():
-    found = budget([DELAY], rows_of(DELAY, 0.9, 1.0, 1.0, 1.0), 0.98, "a policy")
-    assert found["sentence"] == "a policy is below 98% success even on a perfect network."
-
-
-def test_an_axis_whose_own_base_fails_has_no_limit_and_takes_nothing_from_the_others():
-    jitter = Axis("jitter", "jitter", "ms", (0, 9), "delay=1ms,jitter={}ms", "delay=1ms", "{}")
-    rows = {**rows_of(LOSS, 1.0, 0.9), **rows_of(jitter, 0.9, 1.0)}
-    assert budget([LOSS, jitter], rows, 0.98, "a policy")["sentence"] == (
-        "a policy holds at least 98% success up to none of loss, one at a time; "
-        "on delay=1ms alone it is below that, so no jitter has a budget."
-    )
-
-
-def test_every_axis_can_be_read_and_begins_without_trouble():
-    for axis in NETWORK_AXES:
-        assert axis.values[0] == 0
-        assert list(axis.values) == sorted(axis.values)
-        specs = [axis.spec(value) for value in axis.values]
-        assert len(set(specs)) == len(specs)
+def test_every_axis_begins_without_trouble_and_gets_worse():
+    for axis in (*NETWORK_AXES, *LAG_AXES):
+        assert list(axis.values) == sorted(set(axis.values))
+        assert len(set(axis.specs)) == len(axis.specs)
+        assert axis.base == axis.specs[0]
     delays = next(axis.values for axis in NETWORK_AXES if axis.name == "delay")
     assert {0, 25, 250} <= set(delays)  # 0 to 500 ms there and back
+    assert {spec for axis in LAG_AXES for spec in axis.specs} <= {lag.spec for lag in LAGS}
 
 
-def test_turns_cover_each_seed_once():
-    assert turns(seed=7, runs=60, size=25) == [(7, 25), (32, 25), (57, 10)]
+def test_parts_cover_each_seed_once():
+    parts = Part("none", 7, 60).split(25)
+    assert [part[1:] for part in parts] == [(7, 25), (32, 25), (57, 10)]
 
 
-def chunk_report(outcomes, p99):
-    episodes = [
-        {"seed": n, "outcome": outcome, "distance_m": 20.0 + n, "time_s": 2.0, "steps": 20}
-        for n, outcome in enumerate(outcomes)
-    ]
+def report_of(seed, outcomes, times_s=None, vehicle=None, p99=4.0):
+    """What `bridge simulate` writes, in parts."""
     return {
-        "episodes": episodes,
-        "latency_ms": {"p50": 100.0, "p99": p99},
-        "rejected": {"stale": 2},
-        "safe_stops": 3,
-        "deadline_misses": 10,
-        "wall_s": 0.5,
-        "command": "c",
-    }
+        "command": "c", "wall_s": 9.0,
+        "per_episode": [
+            {"seed": seed + n, "outcome": o, "distance_m": 20.0, "time_s": t, "steps": 20}
+            for n, (o, t) in enumerate(zip(outcomes, times_s or repeat(2.0), strict=False))
+        ],
+        "latency_ms": {"p50": 1.0, "p99": p99}, "deadline_misses": 10, "tick_overruns": 1,
+        "rejected": {"stale": 2}, "safe_stops": 1, "safe_stop_events": [{"reason": "no_feedback"}],
+        "vehicle": vehicle,
+    }  # fmt: skip
 
 
-def test_a_row_joins_its_chunks():
-    chunks = [chunk_report(["goal"] * 8, 110.0), chunk_report(["collision"] * 2, 130.0)]
-    row = make_row("s", chunks)
+def row_of(*reports):
+    return make_row("s", [worth_keeping(report) for report in reports])
+
+
+def test_a_row_joins_its_parts():
+    row = row_of(report_of(0, ["goal"] * 8, p99=110.0), report_of(8, ["collision"] * 2, p99=130.0))
     # Wilson's 95 % interval of 8 in 10.
     assert row["success"] == pytest.approx(
         {"value": 0.8, "low": 0.49016, "high": 0.94331}, abs=1e-5
     )
     assert row["collision_rate"] == 0.2
-    assert row["safe_stops_per_episode"] == 0.6
+    assert row["safe_stops_per_episode"] == 0.2
+    assert row["safe_stop_reasons"] == {"no_feedback": 2}
     assert row["ticks_without_new_command"] == 0.1
-    assert row["latency_ms"] == {"p50": 100.0, "p99": 130.0}
+    assert row["latency_ms"] == {"p50": 1.0, "p99": 130.0}
     assert row["rejected"] == {"stale": 4}
 
 
+def vehicle_of(samples, rmse, lag_ms):
+    return {
+        "name": "hunter", "scale": 0.25, "samples": samples,
+        "speed_error_mps": {"rmse": rmse, "max": 2 * rmse},
+        "action_error": {
+            "pedal": {"rmse": rmse, "max": 1.0}, "steering": {"rmse": None, "max": None},
+        },
+        "lag_ms": {"speed": lag_ms, "pedal": None},
+        "feedback_age_ms": {"p50": 20.0, "p99": 50.0 + samples}, "faults": {"link": 2},
+        "moving_starts": 1,
+    }  # fmt: skip
+
+
+def test_errors_of_several_rigs_are_pooled_by_their_samples():
+    found = join_vehicles([vehicle_of(100, 0.3, 120.0), vehicle_of(300, 0.1, 140.0)])
+    assert found["speed_error_mps"]["rmse"] == pytest.approx((0.25 * 0.09 + 0.75 * 0.01) ** 0.5)
+    assert found["speed_error_mps"]["max"] == 0.6
+    assert found["action_error"]["steering"] == {"rmse": None, "max": None}
+    assert found["lag_ms"] == {"speed": 130.0, "pedal": None}
+    assert (found["feedback_age_ms"]["p99"], found["faults"]) == (350.0, {"link": 4})
+
+
+def test_the_cost_counts_seeds_that_both_loops_bring_to_the_goal():
+    policy = row_of(report_of(0, ["goal", "goal", "timeout"], [8.0, 9.0, 20.0]))
+    vehicle = row_of(
+        report_of(0, ["goal", "collision"], [8.5, 3.0], vehicle_of(10, 0.1, 100.0)),
+        report_of(2, ["goal"], [9.0], vehicle_of(10, 0.1, 100.0)),
+    )
+    found = cost(policy["per_episode"], vehicle["per_episode"])
+    assert (found["seeds"], found["longer_s"]["value"]) == (1, 0.5)
+    comparison = {
+        "scenario": "left_turn", "rows": {"policy": policy, "vehicle": vehicle}, "cost": found,
+        "target_success": 0.95, "holds": False,
+    }  # fmt: skip
+    text = render_comparison(comparison)
+    assert "in 67% (21% to 94%) of 3 episodes: the bar of 95% is NOT met." in text
+    assert "| actuator lag, ms | - | speed 100, pedal - |" in text
+
+
+def row_at(dead_ms, constant_ms, goals, lag_ms=None, stops=0):
+    outcomes = ["goal"] * goals + ["collision"] * (20 - goals)
+    driven = [Driven(seed, outcome, 20.0, 8.0, stops) for seed, outcome in enumerate(outcomes)]
+    tracking = {"lag_ms": {"speed": lag_ms}, "speed_error_mps": {"rmse": 0.1, "max": 0.2}}
+    return lag_row(Lag(dead_ms, constant_ms), driven, tracking)
+
+
+def test_the_lag_budget_is_the_sum_up_to_which_every_point_holds():
+    rows = [
+        row_at(0, 100, 20, 90), row_at(200, 100, 19, 280), row_at(0, 400, 20, 310),
+        row_at(400, 100, 18, 460), row_at(300, 500, 20, 700),
+    ]  # fmt: skip
+    found = lag_budget(rows, 0.95)
+    assert (found["sum_ms"], found["measured_ms"], found["all_hold"]) == (400, 310, False)
+    none = lag_budget([row_at(0, 100, 1, 90), *rows[1:]], 0.95)
+    assert none["sum_ms"] is None
+    for budgeted, words in (
+        (found, "sum up to 400 ms or less (measured: 310 ms)"),
+        (lag_budget(rows[:3], 0.95), "every lag that was tested"),
+        (none, "below 95% success at the least lag"),
+    ):
+        assert words in lag_sentence({"lag_budget": budgeted})
+
+
+def test_the_table_shows_lags_that_were_not_told_as_such():
+    rows = {row["spec"]: row for row in (row_at(0, 100, 20, 90), row_at(50, 200, 10, None, 1))}
+    found = {
+        "rows": rows, "runs": 20, "budget": None, "figures": {"table": "r_table.png"},
+        "lag_budget": lag_budget(list(rows.values()), 0.95),
+    }  # fmt: skip
+    text = render_sweep(found)
+    assert "| 100 | 100% (90) | - |" in text
+    assert "| 200 | - | 50%* (-) |" in text
+
+
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("command", "options", "said"),
     [
-        (["--rows", "lag", "--only", "latency"], "no latency axis 'lag'"),
-        (["--rows", "delay,edge_kiled"], "no fault 'edge_kiled'"),
-        (["--rows", "delay", "--only", "faults"], "no fault"),
-        (["--against", "r.json"], "write NAME=R.json"),
-        (["--against", "a=results/latency/left_turn/realtime.json"], "with its budget"),
-        (["--policy", "nowhere.onnx", "--only", "latency"], "nowhere.onnx"),
+        ("campaign", ["--rows", "lag", "--only", "latency"], "no latency axis 'lag'"),
+        ("campaign", ["--rows", "delay,edge_kiled"], "no fault 'edge_kiled'"),
+        ("campaign", ["--rows", "delay", "--only", "faults"], "no fault"),
+        ("campaign", ["--runs", "1"], "2 or more have an interval"),
+        ("campaign", ["--policy", "nowhere.onnx", "--only", "latency"], "nowhere.onnx"),
+        ("campaign", ["--only", "latency", "--public-key", "no.pub"], "public key no.pub does not"),
+        ("vehicle", ["--lags", "50"], "'50' is no lag"),
+        ("vehicle", ["--lags", "50+0"], "'50+0' is no lag"),
+        ("vehicle", ["--set", "dead_time_s"], "use NAME=VALUE"),
+        ("vehicle", ["--set", "colour=1"], "no parameter 'colour'"),
+        ("vehicle", ["--policy", "nothing.onnx"], "nothing.onnx"),
+        ("vehicle", ["--public-key", "no.pub"], "public key no.pub does not exist"),
     ],
 )
-def test_a_mistake_is_one_line(options, said, tmp_path, capsys):
-    assert run_cli(main, ["campaign", "--out", str(tmp_path / "r.json"), *options]) == 2
+def test_a_mistake_is_one_line_before_anything_is_driven(command, options, said, tmp_path, capsys):
+    assert exit_status(main, [command, "--out", str(tmp_path / "r.json"), *options]) == 2
     errors = capsys.readouterr().err.strip()
     assert said in errors
     assert "\n" not in errors
     assert list(tmp_path.iterdir()) == []
-
-
-def test_another_campaigns_sentence_has_the_name_that_it_is_shown_by():
-    name, latency_part = campaign._other("without_1=results/latency/left_turn/shipped.json")
-    assert latency_part["policy"].endswith("left_turn.onnx")
-    assert latency_part["budget"]["sentence"].startswith(f"{name} holds at least 98%")
-
-
-def test_one_episode_has_no_interval_that_a_report_could_hold(tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["campaign", "--out", str(tmp_path / "r.json"), "--runs", "1"])
-    assert ended.value.code == 2
-    assert "2 or more have an interval" in capsys.readouterr().err
-
-
-def test_a_key_that_is_not_there_is_said_before_anything_is_driven(tmp_path, capsys):
-    options = ["--only", "latency", "--public-key", "nothing.pub"]
-    assert run_cli(main, ["campaign", "--out", str(tmp_path / "r.json"), *options]) == 2
-    assert "public key nothing.pub does not exist" in capsys.readouterr().err
 
 
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
@@ -157,38 +255,34 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
     assert first["budget"]["sentence"] in capsys.readouterr().out
     assert first["budget"]["sentence"] in out.with_suffix(".md").read_text()
 
-    driven: list[Chunk] = []
+    driven: list[Part] = []
 
-    def note(task, chunks, *_):
-        driven.extend(chunks)
+    def drive_network(task, part):
+        driven.append(part)
         raise UserError("drives nothing")
 
-    monkeypatch.setattr(campaign, "drive_chunks", note)
+    monkeypatch.setattr(campaign, "drive_network", drive_network)
     assert run_cli(main, arguments) == 0
     assert json.loads(out.read_text())["latency"]["rows"] == first["rows"]
-    Path(next((tmp_path / "r_rows").iterdir())).unlink()
+    next((tmp_path / "r_rows").iterdir()).unlink()
     assert run_cli(main, arguments) == 2
     assert len(driven) == 1
 
 
 def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeypatch):
-    policy = Path("results/policies/left_turn.onnx")
-    task = Task(policy, "any", "left_turn", "nominal", 1, 1)
-    edges, limits_s = [], chain((0.1,), repeat(120.0))
-    start_edge, wait = campaign.Worker.start_edge, campaign.BackgroundCommand.wait
+    edges: list[str] = []
+    limits_s = chain((0.1,), repeat(120.0))
+    start, wait = sweep.Process.__init__, sweep.Process.wait
 
-    def note_edge(worker):
-        start_edge(worker)
-        edges.append(worker.edge)
+    def note(self, *words, **options):
+        edges.extend(words[:1] if words[0] == "edge_runtime" else ())
+        start(self, *words, **options)
 
-    monkeypatch.setattr(campaign.Worker, "start_edge", note_edge)
-    monkeypatch.setattr(
-        campaign.BackgroundCommand, "wait", lambda self, _limit_s: wait(self, next(limits_s))
-    )
-    reports = []
-    chunk = Chunk("none", 1, 1)
-    campaign.drive_chunks(task, [chunk], 1, lambda _chunk, found: reports.append(found))
-    assert [len(part["episodes"]) for report in reports for part in report["parts"]] == [1]
+    monkeypatch.setattr(sweep.Process, "__init__", note)
+    monkeypatch.setattr(sweep.Process, "wait", lambda self, _limit_s: wait(self, next(limits_s)))
+    task = Task(POLICY, "any", "left_turn", "nominal", 1, 1)
+    (found,) = sweep.drive_network(task, Part("none", 1, 1))
+    assert len(found["episodes"]) == 1
     assert len(edges) == 2
 
 
@@ -206,3 +300,66 @@ def test_what_could_not_be_written_is_said_before_the_work(tmp_path):
     (tmp_path / "r.md").mkdir()
     with pytest.raises(UserError, match="is a directory"):
         check_report(tmp_path / "r.json")
+
+
+def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it():
+    task = Task(POLICY, "any", SHORT_TOY, "nominal", 0, 1, changes={"dead_time_s": 0.1})
+    options = ("--clock", "realtime", "--loop", "vehicle", "--standing")
+    for _ in range(3):  # A busy machine may pause a process for over 2 T.
+        report = run_rig(task, Part(VEHICLE, 0, 1), 120.0, *options, hunter=True)
+        if not report["safe_stops"]:
+            break
+    vehicle = report["vehicle"]
+    assert report["loop"] == "vehicle"
+    assert (vehicle["name"], vehicle["moving_starts"]) == ("hunter", 0)
+    assert vehicle["scale"] == pytest.approx(0.25)
+    assert vehicle["samples"] > 20
+    assert vehicle["speed_error_mps"]["max"] > 0.01
+    assert 0.0 < vehicle["lag_ms"]["speed"] < 1000.0
+    assert report["rejected_by_simulator"] == {}
+
+
+def drive_virtually(seed, **changes):
+    env = make_environment("left_turn")
+    drive = VirtualDrive(env, OnnxDriver(POLICY), make_parameters("hunter-2.0", changes))
+    return drive.episode(seed), drive.tracking.report(drive.action_names)
+
+
+def test_in_virtual_time_a_drive_repeats_and_its_lag_grows_with_the_actuators():
+    driven, tracking = drive_virtually(3)
+    assert driven == drive_virtually(3)[0]
+    assert (driven.outcome, driven.stops) == ("goal", 0)
+    assert tracking["scale"] == pytest.approx(0.25)
+    lag_ms = tracking["lag_ms"]["speed"]
+    # 30 ms of dead time and a time constant of 100 ms, and on the way up to a frame each way.
+    assert 100 <= lag_ms <= 170
+    dead, slow = (
+        drive_virtually(3, **changes)[1]["lag_ms"]["speed"]
+        for changes in ({"dead_time_s": 0.2}, {"speed_time_constant_s": 0.4})
+    )
+    assert dead == pytest.approx(lag_ms + 170, abs=30)
+    assert slow > lag_ms + 100
+
+
+def test_a_vehicle_that_cannot_follow_is_stopped_by_its_driver():
+    driven, _ = drive_virtually(0, dead_time_s=3.0)
+    assert driven.stops >= 1
+    assert driven.outcome != "goal"
+
+
+def test_the_sweep_as_a_command(tmp_path):
+    out = tmp_path / "r.json"
+    options = ["--only", "sweep", "--runs", "2", "--jobs", "1", "--lags", "50+100", "--seed", "3"]
+    assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 0
+    found = json.loads(out.read_text())["sweep"]
+    assert found["rows"]["dead=50ms,constant=100ms"]["outcomes"] == {"goal": 2}
+    assert (tmp_path / found["figures"]["table"]).stat().st_size > 5000
+    (kept,) = (tmp_path / "r_rows").iterdir()
+    (row,) = json.loads(kept.read_text())
+    kept.write_text("{")
+    assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 2
+    kept.write_text(json.dumps([{**row, "outcomes": {"kept": 2}}]))
+    assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 0
+    again = json.loads(out.read_text())["sweep"]
+    assert again["rows"]["dead=50ms,constant=100ms"]["outcomes"] == {"kept": 2}
+    assert "| 100 | 100% (" in (tmp_path / "r.md").read_text()

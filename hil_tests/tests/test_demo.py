@@ -14,7 +14,7 @@ from edge_runtime.util import UserError
 from hil_tests import demo
 from hil_tests.__main__ import main
 from hil_tests.demo import Demo
-from hil_tests.processes import BackgroundCommand
+from hil_tests.processes import Process
 
 SMALL = (
     "--episodes", "2", "--human-episodes", "20", "--human-minutes", "0.001", "--runs", "1",
@@ -83,7 +83,7 @@ def test_a_policy_without_signature_or_key_is_not_offered(tmp_path):
 def test_a_background_command_that_fails_says_why(tmp_path):
     missing = str(tmp_path / "none.onnx")
     with pytest.raises(UserError, match="does not exist"):
-        BackgroundCommand("edge_runtime", "run", "--policy", missing, ready="ready")
+        Process("edge_runtime", "run", "--policy", missing, ready="ready")
 
 
 CHILD = """

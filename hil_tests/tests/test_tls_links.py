@@ -6,8 +6,6 @@ import datetime
 import json
 import re
 import shutil
-import subprocess
-import sys
 import time
 
 import pytest
@@ -23,6 +21,7 @@ from edge_runtime.tests.policies import write_policy
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
+from hil_tests.processes import Process
 from hil_tests.tests.tls_parties import listener, make_certificates, session
 
 LIFE_S = 2.0
@@ -169,13 +168,8 @@ def drive(port, answered, first_step):
 
 
 def start_router(endpoint, parties):
-    command = [sys.executable, "-m", "bridge", "router", "--listen", endpoint]
-    router = subprocess.Popen(
-        [*command, "--tls", str(parties / "router")], stdout=subprocess.PIPE, text=True
-    )
-    assert router.stdout is not None
-    assert router.stdout.readline() == f"ready listen={endpoint}\n"
-    return router
+    words = ("bridge", "router", "--listen", endpoint, "--tls", str(parties / "router"))
+    return Process(*words, ready=f"ready listen={endpoint}")
 
 
 def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(parties, policy_flags):
@@ -193,16 +187,14 @@ def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(par
                 drive(port, answered, 0)
                 heard = [feed.next(1.0) for _ in range(8)]
                 assert {"state", "command"} <= {each.topic for each in heard if each}
-                router.terminate()
-                assert router.wait(10) == 0
+                assert router.end() == 0
                 router = start_router(place, parties)
                 drive(port, answered, 10**6)
             port.close()
         status = ["status", "--connect", place, "--tls", str(parties / "operator-hunter01")]
         assert run_command(*status).returncode == 0
         assert edge.end() == 0
-    router.terminate()
-    assert router.wait(10) == 0
+    assert router.end() == 0
 
 
 @pytest.mark.parametrize("name", ["operator-hunter01", "simulator-hunter01"])

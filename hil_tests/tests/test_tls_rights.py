@@ -20,7 +20,7 @@ from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, run_command
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.util import UserError
-from hil_tests.processes import BackgroundCommand
+from hil_tests.processes import Process
 from hil_tests.tests.tls_parties import SETTLE_S, Intruder, listener, make_certificates, session
 
 STRANGERS = ("edge-hunter02", "simulator-hunter02", "operator-hunter02", "viewer")
@@ -135,15 +135,19 @@ def test_an_edge_takes_no_states_from_another_vehicles_simulator(parties, who, i
     assert len(states) == int(is_believed)
 
 
+def edge_flags(endpoint, parties, folder):
+    policy = make_policy(folder, "constant", 0.1)
+    flags = ["--policy", str(policy), "--allow-unsigned", "--connect", endpoint]
+    return [*flags, "--tls", str(parties / "edge-hunter01")]
+
+
 @pytest.mark.parametrize("is_there_first", [True, False])
 def test_another_vehicles_simulator_ends_no_edge_by_a_forged_token(
     parties, tmp_path, is_there_first
 ):
     """Posing as the server, it claims that an elder runtime has this vehicle's id."""
     endpoint, anything_goes = free_endpoint("tls"), {"enabled": False}
-    policy = make_policy(tmp_path, "constant", 0.1)
-    flags = ["--policy", str(policy), "--allow-unsigned", "--connect", endpoint]
-    flags += ["--tls", str(parties / "edge-hunter01")]
+    flags = edge_flags(endpoint, parties, tmp_path)
     with contextlib.ExitStack() as opened:
         edge = None if is_there_first else opened.enter_context(EdgeProcess(*flags))
         posing = listener(endpoint, parties / "simulator-hunter02", anything_goes)
@@ -163,9 +167,8 @@ def test_another_vehicles_simulator_ends_no_edge_by_a_forged_token(
 @pytest.mark.parametrize("who", ["simulator-hunter01", "router"])
 def test_a_second_runtime_is_still_refused_over_tls(parties, tmp_path, who):
     """What the test above must not have broken."""
-    endpoint, policy = free_endpoint("tls"), make_policy(tmp_path, "constant", 0.1)
-    flags = ["--policy", str(policy), "--allow-unsigned", "--connect", endpoint]
-    flags += ["--tls", str(parties / "edge-hunter01")]
+    endpoint = free_endpoint("tls")
+    flags = edge_flags(endpoint, parties, tmp_path)
     with (
         listener(endpoint, parties / who, rules_for_listener(["hunter01"])),
         EdgeProcess(*flags) as edge,
@@ -197,7 +200,7 @@ def test_a_vehicle_at_a_router_hears_only_its_own(parties, tmp_path, rights, hea
     endpoint, found = free_endpoint("tls"), []
     path = router_file(endpoint, parties, tmp_path / "r.json5", rights)
     with (
-        BackgroundCommand("bridge", "router", "--config", path, ready="ready"),
+        Process("bridge", "router", "--config", path, ready="ready"),
         contextlib.ExitStack() as opened,
     ):
         edge, *simulators = (

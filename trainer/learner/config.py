@@ -88,10 +88,10 @@ class LearnerConfig:
     """Standard deviation of the target policy smoothing (table A5: noise scale)."""
     target_noise_bound: float = 0.5
     """Bound of that noise; TD3's own value, the paper has none."""
-    exploration_initial: float = 0.3
-    """Standard deviation of the exploration noise in the first episode (table A5: 1). More of it,
-    and the human takes over for the noise's sake: the policy hardly drives, and the critic sees
-    hardly anything but the human's steps."""
+    exploration_initial: float = 0.1
+    """Standard deviation of the exploration noise at first (table A5: 1). With 0.3 the congestion
+    is not learned: the noise alone makes the car crash, a return of several steps holds what the
+    noise brought and not what the action was worth, and a human takes over for the noise's sake."""
     exploration_correlation: float = 0.9
     """Correlation of the noise in two control periods in a row; the paper's is 0. A tenth of a
     second of steering moves the car by nothing that a critic could see, a second of it does: noise
@@ -139,6 +139,10 @@ class LearnerConfig:
     """Bound of the initial weights with which the action joins the picture in the critics' first
     connected layer; 0: that of one more feature among 1,792 (0.02), as the paper's networks begin.
     There the action hardly counts in the value at first, and the actor's gradient is noise."""
+    picture_shift: int = 3
+    """Pixels by which the pictures of a minibatch are shifted at random, up, down and aside, at
+    most (DrQ; Kostrikov et al., 2020); the paper has none. What counts is where cars are to one
+    another, and a network that has seen each picture in many places learns that from fewer."""
     warmup_steps: int = 256
     """Transitions stored before the first update."""
     saturation_weight: float = 0.03
@@ -188,6 +192,7 @@ RANGES = {
     "cloning_weight": FROM_ZERO,
     "intervention_penalty": ANY,
     "action_bound": FROM_ZERO,
+    "picture_shift": (0, 20),
     "warmup_steps": FROM_ONE,
     "saturation_weight": FROM_ZERO,
 }
@@ -205,6 +210,7 @@ PRINTED_LEARNER = LearnerConfig(
     split_loss=True,
     penalty_on=HUMANS_ACTION,
     action_bound=0.0,
+    picture_shift=0,
     saturation_weight=0.0,
 )
 """Tables A5 and A6 and the equations as they are printed. The weight on cloning, for which the

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -97,6 +98,9 @@ class TD3Learner:
         c = self.config
         self.updates += 1
         with_policy = self.updates % c.policy_delay == 0
+        batch = replace(
+            batch, frames=self._shift(batch.frames), next_frames=self._shift(batch.next_frames)
+        )
         frames, actions = self._tensor(batch.frames), self._tensor(batch.actions)
         human = self._tensor(batch.human)
         targets = self._targets(batch)
@@ -166,6 +170,20 @@ class TD3Learner:
 
     def _tensor(self, column: NDArray[Any]) -> Tensor:
         return torch.from_numpy(column).to(self.device)
+
+    def _shift(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Each picture [n, 2, 45, 80] a few pixels aside; its border is repeated."""
+        most = self.config.picture_shift
+        if not most:
+            return frames
+        padded = np.pad(frames, ((0, 0), (0, 0), (most, most), (most, most)), "edge")
+        corners = torch.randint(
+            2 * most + 1, (len(frames), 2), generator=self.noise, device=self.device
+        ).tolist()
+        shifted, (height, width) = np.empty_like(frames), frames.shape[2:]
+        for row, (top, left) in enumerate(corners):
+            shifted[row] = padded[row, :, top : top + height, left : left + width]
+        return shifted
 
     @torch.no_grad()
     def _targets(self, batch: Batch) -> Tensor:

@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,9 @@ from trainer.learner.replay import Batch
 from trainer.learner.td3 import TD3Learner
 from trainer.tests.reference import ReferenceLearner
 
-SMALL = LearnerConfig(batch_size=12, precision="float32", saturation_weight=0.0, tau=1e-3)
+SMALL = LearnerConfig(
+    batch_size=12, precision="float32", saturation_weight=0.0, tau=1e-3, picture_shift=0
+)
 
 
 def make_batch(seed: int = 0, humans: int = 4, size: int = 12) -> Batch:
@@ -159,6 +162,32 @@ def test_both_learning_rates_fall_by_the_episode_and_over_the_run():
         assert actor == pytest.approx(SMALL.actor_learning_rate * factor)
         assert critics == pytest.approx(SMALL.critic_learning_rate * factor)
         learner.decay_learning_rates(progress)
+
+
+@pytest.mark.parametrize("most", [1, 3])
+def test_pictures_are_shifted_by_some_pixels_and_by_no_more(most):
+    learner = TD3Learner(replace(SMALL, picture_shift=most), PHIL, seed=0)
+    frames = make_batch(size=60).frames
+    around = np.pad(frames, ((0, 0), (0, 0), (most, most), (most, most)), "edge")
+    seen = set()
+    for shifted, padded in zip(learner._shift(frames), around, strict=True):
+        places = [
+            (top, left)
+            for top, left in itertools.product(range(2 * most + 1), repeat=2)
+            if np.array_equal(shifted, padded[:, top : top + 45, left : left + 80])
+        ]
+        assert len(places) == 1
+        seen.update(places)
+    assert len(seen) > (2 * most + 1) ** 2 / 2
+
+
+def test_an_update_sees_shifted_pictures():
+    plain, shifted = (
+        TD3Learner(replace(SMALL, picture_shift=most), PHIL, seed=0).update(make_batch())
+        for most in (0, 3)
+    )
+    assert plain.critic != shifted.critic
+    assert plain.policy != shifted.policy
 
 
 def test_targets_follow_by_tau():

@@ -71,24 +71,11 @@ def test_the_bus_drives_only_in_can_control_without_errors_and_brake(control, co
     assert rules.obeys(chassis) == drives
 
 
-def test_it_wakes_in_standby_with_the_brake_on():
-    assert (Chassis().control, Chassis().brake_locked) == (Control.STANDBY, True)
-    commanded = rules.take_command(Chassis(brake_locked=False), 0.0)
-    assert not rules.obeys(commanded)
-
-
 def test_the_link_is_lost_after_its_time_and_not_before():
     assert rules.take_time(DRIVING, 0.5, TIMEOUT_S).control is Control.CAN
     assert rules.take_time(DRIVING, 0.501, TIMEOUT_S).control is Control.LINK_LOST
     kept = rules.take_command(DRIVING, 0.4)
     assert rules.take_time(kept, 0.9, TIMEOUT_S).control is Control.CAN
-
-
-def test_the_trap_frames_that_come_back_take_control_by_themselves():
-    lost = rules.take_time(DRIVING, 5.0, TIMEOUT_S)
-    assert not rules.obeys(lost)
-    resumed = rules.take_command(lost, 5.1)
-    assert rules.obeys(resumed)
 
 
 def test_standby_by_frame_is_kept_whatever_is_commanded():
