@@ -168,12 +168,6 @@ def test_a_mistake_is_one_line_before_anything_is_downloaded(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_out_that_is_a_file_is_said(workshop, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot write"):
-        make_bundle(workshop.inputs(), HERE, tmp_path / "file")
-
-
 def test_a_name_that_no_archive_takes_is_said(workshop, tmp_path):
     long = tmp_path / f"{'a' * 190}-1-py3-none-any.whl"
     long.write_bytes(workshop.host.read_bytes())
