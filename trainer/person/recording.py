@@ -185,7 +185,7 @@ def read_steps(path: Path) -> Iterator[Step]:
         with open_regular(path) as stream:
             if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 raise UserError(f"{path} is no recording of a sitting")
-            for message in _messages(Records(stream, path.stat().st_size), path):
+            for message in _messages(Records(stream, path.stat().st_size, str(path)), path):
                 yield msgspec.msgpack.decode(message.data, type=Step)
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
