@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from trainer.drivers import CHECKPOINT_FILE, load_driver, make_environment
-from trainer.person.interface import HUMANS, LET_GO, Person
+from trainer.person import devices
+from trainer.person.interface import LET_GO
 from trainer.person.recording import Recorder, find_recordings, read_steps
 from trainer.person.session import STOPPED
-from trainer.person.tests.people import QUIT, Discarding, Eyes, Hands, recorded_step
+from trainer.person.tests.people import QUIT, Discarding, Puppet, recorded_step
 from trainer.tests.test_commands import call
 from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun
@@ -85,12 +87,15 @@ def test_without_a_screen_it_says_what_to_do(capfd, tmp_path, monkeypatch, drive
     assert errors.count("\n") == 1
 
 
+def sit_down(monkeypatch, person):
+    """Have somebody else at the keyboard."""
+    monkeypatch.setattr(devices, "open_keyboard", lambda arguments: person)
+
+
 def test_whoever_quits_before_the_first_episode_has_lost_nothing(
     capsys, tmp_path, monkeypatch, one_thread
 ):
-    hands = Hands([], then=QUIT)
-    hands.present = False
-    monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, Eyes()))
+    sit_down(monkeypatch, Puppet(then=QUIT, presence=repeat(False)))
     command = ["train", "--human", "keyboard", "--out", str(tmp_path / "run"), "--speed", "1000"]
     status, out, errors = call(capsys, *command)
     assert (status, errors.strip()) == (0, "nothing was driven, and nothing recorded")
@@ -100,8 +105,7 @@ def test_whoever_quits_before_the_first_episode_has_lost_nothing(
 
 def test_a_device_and_a_scenario_are_all_that_must_be_said(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    person = Person(Hands([LET_GO] * 3, then=QUIT), Eyes())
-    monkeypatch.setitem(HUMANS, "keyboard", lambda options: person)
+    sit_down(monkeypatch, Puppet([LET_GO] * 3, then=QUIT))
     command = ("drive", "--scenario", "left_turn", "--device", "keyboard", "--speed", "1000")
     status, out, _ = call(capsys, *command)
     assert status == 0
@@ -115,8 +119,7 @@ def test_a_validation_that_is_left_out_costs_nothing_else(
     def interrupted(*_arguments):
         raise KeyboardInterrupt
 
-    person = Person(Hands([LET_GO] * 3, then=QUIT), Eyes())
-    monkeypatch.setitem(HUMANS, "keyboard", lambda options: person)
+    sit_down(monkeypatch, Puppet([LET_GO] * 3, then=QUIT))
     monkeypatch.setattr(TrainingRun, "_validate", interrupted)
     run_dir = tmp_path / "run"
     command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
@@ -218,9 +221,8 @@ def test_a_person_is_not_imitated_in_what_they_threw_away(
     capsys, tmp_path, monkeypatch, one_thread
 ):
     """Three episodes, the second thrown away after its end: neither stored nor brought back."""
-    eyes, run_dir = Eyes(), tmp_path / "run"
-    hands = Discarding(eyes, discarded={1}, episodes=3)
-    monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, eyes))
+    run_dir = tmp_path / "run"
+    sit_down(monkeypatch, Discarding(discarded={1}, episodes=3))
     command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
     quick = ["--threads", "1", "--set", "evaluate_every_steps=0", "--set", "warmup_steps=8"]
     status, out, errors = call(capsys, *command, *quick)

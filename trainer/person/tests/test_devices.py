@@ -11,7 +11,7 @@ import pytest
 
 from bridge import rerun
 from trainer.drivers import load_driver, make_environment
-from trainer.person.devices import JoystickHands, KeyboardHands, WindowDevice, pygame
+from trainer.person.devices import JoystickHands, KeyboardHands, WindowPerson, pygame
 from trainer.person.profile import SHIPPED, read_profile
 from trainer.person.tests.pages import first_view
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
@@ -128,19 +128,23 @@ def wheel(monkeypatch):
     pygame.quit()
 
 
-def read(device: WindowDevice):
+def at_the_wheel(scenario: str) -> WindowPerson:
+    return WindowPerson(JoystickHands(G29, scenario), Window())
+
+
+def read(device: WindowPerson):
     """SDL tells axes on the next look at its devices."""
     device.poll(time.monotonic())
     return device.poll(time.monotonic())
 
 
 def test_pedals_nobody_has_touched_are_not_half_pressed(wheel):
-    device = WindowDevice(JoystickHands(G29, "left_turn"))
+    device = at_the_wheel("left_turn")
     assert read(device).action == 0.0
 
 
 def test_axes_and_buttons_of_a_wheel(wheel):
-    device = WindowDevice(JoystickHands(G29, "congestion"))
+    device = at_the_wheel("congestion")
     wheel.axis(0, 0.25)
     reading = read(device)
     assert reading.action == pytest.approx(1.0, abs=1e-3)
@@ -154,7 +158,7 @@ def test_axes_and_buttons_of_a_wheel(wheel):
 
 
 def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
-    device = WindowDevice(JoystickHands(G29, "congestion"))
+    device = at_the_wheel("congestion")
     wheel.axis(0, 0.25)
     assert read(device).action > 0.9
     wheel.unplug()

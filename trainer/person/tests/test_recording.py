@@ -9,6 +9,7 @@ import resource
 import signal
 import struct
 import time
+from contextlib import contextmanager
 from typing import cast
 
 import msgspec
@@ -143,19 +144,26 @@ def test_a_file_made_to_keep_its_reader_busy_is_refused(tmp_path, monkeypatch):
         list(read_steps(path))
 
 
-def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
-    recorder = Recorder(tmp_path)
-    recorder.write(recorded_step(1, 0))
+@contextmanager
+def room_for(path, count: int):
+    """A disk that takes so many bytes more of a file."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (recorder.path.stat().st_size + 500, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + count, before[1]))
     try:
-        with pytest.raises(UserError, match="cannot write"):
-            recorder.write(recorded_step(1, 1))
-        with pytest.raises(UserError, match="cannot write"):
-            recorder.close()
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert list(read_steps(recorder.path)) == [recorded_step(1, 0)]
+
+
+def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
+    for room, refused in ((500, "write"), (0, "close")):
+        recorder = Recorder(tmp_path / refused)
+        recorder.write(recorded_step(1, 0))
+        with room_for(recorder.path, room):
+            with pytest.raises(UserError, match="cannot write"):
+                recorder.write(recorded_step(1, 1)) if refused == "write" else recorder.close()
+            recorder.close()
+        assert list(read_steps(recorder.path)) == [recorded_step(1, 0)]
 
 
 def test_a_directory_that_cannot_be_written_is_one_line(tmp_path):

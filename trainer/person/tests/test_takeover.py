@@ -105,20 +105,20 @@ def test_moving_the_wheel_takes_over_and_resting_gives_back():
 
 
 def test_a_device_that_takes_over_by_holding_is_not_moved():
-    intent = Intent()
+    intent = Intent(Moving())
     assert not intent.update(Reading(action=1.0), 0.0)
     assert intent.update(Reading(action=0.0, engaged=True), 0.1)
 
 
 def test_a_wheel_that_is_gone_lets_go_at_once():
-    intent = Intent()
+    intent = Intent(Moving())
     assert intent.update(wheel(1.0), 0.0)
     assert not intent.update(Reading(), 0.1)
 
 
 @given(st.lists(st.tuples(st.floats(-0.15, 0.15), st.floats(0.0, 1.0)), max_size=30))
 def test_below_the_threshold_nothing_is_taken_over(moves):
-    intent, now_s = Intent(), 0.0
+    intent, now_s = Intent(Moving()), 0.0
     for action, waited_s in moves:
         now_s += waited_s
         assert not intent.update(wheel(action), now_s)

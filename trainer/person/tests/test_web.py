@@ -1,5 +1,6 @@
 """What the server hears from pages and shows them; with real clients."""
 
+import argparse
 import asyncio
 import base64
 import json
@@ -15,7 +16,7 @@ import pytest
 
 from edge_runtime.util import UserError
 from trainer.person import web
-from trainer.person.interface import HUMANS, LET_GO, PersonOptions
+from trainer.person.interface import LET_GO, open_person
 from trainer.person.seat import MAX_INPUT_BYTES
 from trainer.person.tests.pages import (
     WAIT_S,
@@ -279,21 +280,27 @@ def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
     asyncio.run(talk_nonsense())
 
 
+def open_web(**options):
+    """The cockpit, as the command line opens it."""
+    given = {"human": "web", "scenario": "left_turn", "profile": None, "speed": 1.0}
+    return open_person(argparse.Namespace(**{"host": "127.0.0.1", "port": 0, **given, **options}))
+
+
 def test_a_port_in_use_is_a_plain_error(cockpit):
     with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1 port {cockpit.port}"):
-        HUMANS["web"](PersonOptions(port=cockpit.port))
+        open_web(port=cockpit.port)
 
 
 def test_a_host_that_is_not_here_is_a_plain_error():
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
         with pytest.raises(UserError, match="cannot listen on"):
-            HUMANS["web"](PersonOptions(host="host.invalid"))
+            open_web(host="host.invalid")
 
 
 def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys):
     for host, warned in (("127.0.0.1", False), ("0.0.0.0", True)):
-        person = HUMANS["web"](PersonOptions(host=host))
+        person = open_web(host=host)
         out, err = capsys.readouterr()
         person.close()
         assert out.startswith("cockpit: open http://")
