@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from trainer.human.guide import Reason
 from trainer.scenarios.ego import EgoVehicle
-from trainer.scenarios.left_turn import LeftTurnEnv, Observation
+from trainer.scenarios.environment import Observation
+from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.scenarios.picture import Rectangle, corners
 
 TABLE_STEP_M = 0.1

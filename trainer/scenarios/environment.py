@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from highway_env.road.road import Road, RoadNetwork
 from numpy.typing import NDArray
 
 from trainer.scenarios.ego import EgoVehicle
@@ -24,36 +26,18 @@ traffic stands closer and leaves less to do right."""
 FAILURES = ("collision", "off_road")
 
 
-def start_speed_mps(drawn_mps: float, options: dict[str, Any] | None) -> float:
-    """The ego car's speed at the start: as drawn, or 0 with the option ``standing`` of ``reset``.
-
-    A robot starts every episode standing. All else stays as the seed has it.
-    """
-    return 0.0 if (options or {}).get("standing", False) else drawn_mps
-
-
-class ScenarioConfig(Protocol):
+@dataclass(frozen=True)
+class ScenarioConfig:
     """The numbers that every scenario has."""
 
-    @property
-    def control_period_s(self) -> float:
-        """Control interval, s."""
-
-    @property
-    def max_steps(self) -> int:
-        """Steps until the timeout."""
-
-    @property
-    def goal_m(self) -> float:
-        """Distance from start to goal, m."""
-
-    @property
-    def goal_reward(self) -> float:
-        """The reward of the goal."""
-
-    @property
-    def fail_reward(self) -> float:
-        """The reward of a failure."""
+    control_period_s: float = 0.1
+    """Control interval of all vehicles (section VI-A)."""
+    max_steps: int = 200
+    """Steps until the episode is cut off as a timeout."""
+    goal_m: float = 0.0
+    """Distance from start to goal."""
+    goal_reward: float = 10.0
+    fail_reward: float = -10.0
 
 
 class DrivingEnv(gymnasium.Env[Observation, Action]):
@@ -62,8 +46,8 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     Observation: uint8 [2, 45, 80], frames [t-1, t]. Action: float32 [1] in [-1, 1]. ``info``:
     ``distance_m``, ``speed_mps``, the accelerations of the step and, at the end, ``outcome``.
 
-    A scenario moves its vehicles in ``step`` and says what is seen (``_frame``), whether it has
-    ended (``_outcome``), and what the step is worth (``_reward``).
+    A scenario places its vehicles (``_place``), moves them in ``step`` (``_move``) and says what is
+    seen (``_frame``), whether it has ended (``_outcome``), and what a step is worth (``_reward``).
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's form)
@@ -72,6 +56,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     config: ScenarioConfig
     ego: EgoVehicle
     traffic: list[TrafficVehicle]
+    network: RoadNetwork
     rasteriser: Rasteriser
 
     def __init__(self, render_mode: str | None) -> None:
@@ -95,6 +80,26 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         """What a viewer needs to draw the scene; plain lists and numbers."""
         raise NotImplementedError
 
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; the seed alone decides traffic and the ego car's start.
+
+        Option ``standing``: the ego car is at rest, as a robot is that starts an episode.
+        """
+        super().reset(seed=seed)
+        self.road = Road(network=self.network, np_random=self.np_random)
+        self.steps, self.distance_m = 0, 0.0
+        self._place()
+        if (options or {}).get("standing", False):
+            self.ego.speed = 0.0
+        self.frames[:] = self._frame(*self._footprints())
+        return self.frames.copy(), self._info(None)
+
+    def _place(self) -> None:
+        """Put the ego car and the traffic on the road, in an order that keeps what seeds mean."""
+        raise NotImplementedError
+
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
         """What the policy sees now, uint8 [45, 80]: from the footprints of ego car and traffic."""
         raise NotImplementedError
@@ -107,10 +112,15 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         """The reward of the step."""
         raise NotImplementedError
 
-    def _first_report(self) -> tuple[Observation, dict[str, Any]]:
-        """What ``reset`` returns: the same frame twice."""
-        self.frames[:] = self._frame(*self._footprints())
-        return self.frames.copy(), self._info(None)
+    def _move(self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float) -> None:
+        """Move all vehicles by one control period, the ego car as it is told."""
+        for car in self.traffic:
+            car.act()
+        for car in self.traffic:
+            car.step(self.config.control_period_s)
+        period_s = self.config.control_period_s
+        self.ego.drive(acceleration_mps2, steering_rad, max_speed_mps, period_s)
+        self.steps += 1
 
     def _report(self) -> Step:
         """What ``step`` returns, after the vehicles have moved."""
@@ -123,7 +133,6 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         return self.frames.copy(), self._reward(outcome), terminated, outcome == "timeout", info
 
     def _footprints(self) -> tuple[Rectangle, list[Rectangle]]:
-        """Of the ego car and of each car of the traffic."""
         return self.ego.footprint, [car.footprint for car in self.traffic]
 
     def _ending_reward(self, outcome: str | None) -> float:

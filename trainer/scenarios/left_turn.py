@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 from highway_env.road.lane import LineType, StraightLane
-from highway_env.road.road import LaneIndex, Road, RoadNetwork
+from highway_env.road.road import LaneIndex, RoadNetwork
 from numpy.typing import NDArray
 
 from trainer.scenarios.ego import EgoVehicle, LeftTurnPath, PathTracker
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
-    Observation,
     Range,
+    ScenarioConfig,
     Scene,
     Step,
-    start_speed_mps,
 )
 from trainer.scenarios.picture import Rasteriser, Rectangle, overlap
 from trainer.scenarios.traffic import (
@@ -71,13 +70,9 @@ def road_areas(lane_width_m: float) -> list[Rectangle]:
 
 
 @dataclass(frozen=True)
-class LeftTurnConfig:
-    """Every number of the scenario."""
+class LeftTurnConfig(ScenarioConfig):
+    """Every number of the scenario, with its reason where there is one."""
 
-    control_period_s: float = 0.1
-    """Control interval of all vehicles (section VI-A)."""
-    max_steps: int = 200
-    """Steps until the episode is cut off as a timeout."""
     lane_width_m: float = 4.0
     straight_m: float = 10.0
     """Path on the side road before the turn."""
@@ -107,8 +102,6 @@ class LeftTurnConfig:
     """How often a gap is a long one."""
     target_speed_mps: float = 5.0
     """Target of the reward's speed term (eq. 31)."""
-    goal_reward: float = 10.0
-    fail_reward: float = -10.0
     speed_weight: float = 0.02
     """Scale of the speed term. With gamma 0.95 and 10 Hz the horizon is 2 s: seen from the stop
     line the goal, 30 steps off, is worth 10 x 0.95^30 = 2.1, a crash 15 steps off -4.6, waiting
@@ -170,25 +163,6 @@ class LeftTurnEnv(DrivingEnv):
             c.view_left_m, c.view_top_m, c.metres_per_pixel, road_areas(c.lane_width_m)
         )
         self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
-        self._offset_m = 0.0
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the seed alone decides traffic and initial speed.
-
-        Option ``standing``: the ego car is at rest.
-        """
-        super().reset(seed=seed)
-        c, random = self.config, self.np_random
-        self.road = Road(network=self.network, np_random=random)
-        self.traffic = self._spawn_traffic()
-        start = self.path.pose(0.0)
-        speed_mps = start_speed_mps(float(random.uniform(*c.ego_speed_mps)), options)
-        self.ego = EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
-        self.tracker = PathTracker(self.path)
-        self.steps, self.distance_m, self._offset_m = 0, 0.0, 0.0
-        return self._first_report()
 
     def step(self, action: Action) -> Step:
         """Hold the pedal for one control interval."""
@@ -198,12 +172,7 @@ class LeftTurnEnv(DrivingEnv):
         steering_rad = self.tracker.steering(
             self.ego, self.distance_m, self._offset_m, c.control_period_s
         )
-        for car in self.traffic:
-            car.act()
-        for car in self.traffic:
-            car.step(c.control_period_s)
-        self.ego.drive(acceleration_mps2, steering_rad, c.max_speed_mps, c.control_period_s)
-        self.steps += 1
+        self._move(acceleration_mps2, steering_rad, c.max_speed_mps)
         self.distance_m, self._offset_m = self.path.project(*self.ego.position.tolist())
         return self._report()
 
@@ -233,6 +202,14 @@ class LeftTurnEnv(DrivingEnv):
             "stop_line": list(self.path.pose(c.stop_line_m + 0.5 * self.ego.LENGTH)[:2]),
             "vehicles": self._vehicles(),
         }
+
+    def _place(self) -> None:
+        self.traffic = self._spawn_traffic()
+        start = self.path.pose(0.0)
+        speed_mps = float(self.np_random.uniform(*self.config.ego_speed_mps))
+        self.ego = EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
+        self.tracker = PathTracker(self.path)
+        self._offset_m = 0.0
 
     def _spawn_traffic(self) -> list[TrafficVehicle]:
         c, random = self.config, self.np_random
