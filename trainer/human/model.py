@@ -17,7 +17,8 @@ from trainer.learner.networks import Actor
 from trainer.util import FROM_ONE, FROM_ZERO, check_ranges, load_torch, save_torch
 
 MODEL_FILE = "human_model.pt"
-
+REFINING_PARTS = 20
+"""Steps in which the learning rate falls while a model is refined."""
 RANGES = {
     "frames": (1, 2),
     "learning_rate": FROM_ZERO,
@@ -67,11 +68,6 @@ class HumanModelConfig:
         check_ranges(self, RANGES)
         if self.unaided_share and not self.label_every_step:
             raise UserError("--unaided-share needs --label-every-step: nothing else teaches there")
-
-
-def refining_parts(updates: int) -> int:
-    """Steps in which the learning rate falls while a model is refined."""
-    return min(updates, 20)
 
 
 class HumanModel:
@@ -131,7 +127,7 @@ class HumanModel:
 
         The rate falls linearly, so that what was learned settles.
         """
-        parts = refining_parts(updates)
+        parts = min(updates, REFINING_PARTS)
         for part in range(parts):
             for group in self.optimiser.param_groups:
                 group["lr"] = self.config.learning_rate * (1.0 - part / parts)

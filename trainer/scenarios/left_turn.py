@@ -163,6 +163,7 @@ class LeftTurnEnv(DrivingEnv):
             c.view_left_m, c.view_top_m, c.metres_per_pixel, road_areas(c.lane_width_m)
         )
         self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
+        self._offset_m = 0.0
 
     def step(self, action: Action) -> Step:
         """Hold the pedal for one control interval."""
@@ -208,8 +209,7 @@ class LeftTurnEnv(DrivingEnv):
         start = self.path.pose(0.0)
         speed_mps = float(self.np_random.uniform(*self.config.ego_speed_mps))
         self.ego = EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
-        self.tracker = PathTracker(self.path)
-        self._offset_m = 0.0
+        self.tracker, self._offset_m = PathTracker(self.path), 0.0
 
     def _spawn_traffic(self) -> list[TrafficVehicle]:
         c, random = self.config, self.np_random
