@@ -20,6 +20,7 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from importlib.resources import files
+from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -52,13 +53,13 @@ HEADERS = {
 """The address holds the token: it shall not be kept, passed on, or framed."""
 NO_TOKEN = "This address holds no token, or an old one: open the one that the trainer printed.\n"
 NO_NAME = "The cockpit has another name: open the address that the trainer printed.\n"
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 MAX_CONNECTIONS = 32
 """A page opens some six for its files, and keeps one."""
 HEADERS_S = 5.0
 """Within which a connection must have shown the token."""
-ACCEPT_AGAIN_S = 0.5
-"""After the process has run out of descriptors, whoever holds them."""
+BACKLOG = 16
+"""Connections that are accepted at once; each needs a descriptor until the door refuses it."""
 
 
 @LOGGER.addFilter
@@ -110,7 +111,6 @@ class Cockpit:
         self._names = {*LOOPBACK, host.lower(), name.lower()}
         shown = f"[{name}]" if ":" in name else name
         self.url = f"http://{shown}:{self.port}/{self._token}/"
-        self._door = Door()
         self._pages: dict[int, Page] = {}
         self._numbers = itertools.count(1)
         self._files = _page_files()
@@ -151,25 +151,16 @@ class Cockpit:
             self._loop.run_until_complete(self._run())
 
     async def _run(self) -> None:
-        app = web.Application(middlewares=[self._check])
-        app.router.add_get("/{token}", _with_slash)
-        app.router.add_get("/{token}/socket", self._talk)
-        app.router.add_get("/{token}/{file:[a-z.]*}", self._file)
-        runner = web.AppRunner(
-            app,
-            access_log=None,  # It would hold the token.
-            logger=LOGGER,
-            handle_signals=False,
-            shutdown_timeout=CLOSING_S,
-            keepalive_timeout=KEEP_ALIVE_S,
+        # An access log would hold the token.
+        self._door = Door(
+            self._answer, access_log=None, logger=LOGGER, keepalive_timeout=KEEP_ALIVE_S
         )
+        runner = web.ServerRunner(self._door, shutdown_timeout=CLOSING_S)
         await runner.setup()
-        assert runner.server is not None
-        with self._listener:
-            accepting = asyncio.create_task(self._door.let_in(self._listener, runner.server))
-            await self._closing.wait()
-            accepting.cancel()
-            await asyncio.wait([accepting])
+        site = web.SockSite(runner, self._listener, backlog=BACKLOG)
+        await site.start()
+        await self._closing.wait()
+        await site.stop()
         good_byes = [_say_goodbye(page.socket) for page in self._pages.values()]
         await asyncio.gather(*good_byes, return_exceptions=True)
         await runner.cleanup()
@@ -179,22 +170,28 @@ class Cockpit:
         for page in self._pages.values():
             page.wake.set()
 
-    @web.middleware
-    async def _check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        given = request.path.partition("/")[2].partition("/")[0]
-        status, text = 0, ""
+    async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
+        given, slash, name = request.path.partition("/")[2].partition("/")
+        status, text = 404, "no such page\n"
         if not self._is_asked_by_name(request):
             status, text = 421, NO_NAME
         elif not hmac.compare_digest(given.encode(), self._token.encode()):
             status, text = 403, NO_TOKEN
-        if status:
-            refusal = web.Response(status=status, text=text, headers=HEADERS)
-            refusal.force_close()
-            return refusal
-        self._door.has_token(request.transport)
-        return await handler(request)
+        else:
+            self._door.has_token(request.transport)
+            if name == "socket":
+                return await self._talk(request)
+            if not slash:  # The page's own files stand beside it only behind the slash.
+                raise web.HTTPFound(request.path + "/", headers=HEADERS)
+            name = name or "index.html"
+            if name in self._files:
+                kind, body = TYPES[name.rpartition(".")[2]], self._files[name]
+                return web.Response(body=body, content_type=kind, charset="utf-8", headers=HEADERS)
+        refusal = web.Response(status=status, text=text, headers=HEADERS)
+        refusal.force_close()
+        return refusal
 
-    def _is_asked_by_name(self, request: web.Request) -> bool:
+    def _is_asked_by_name(self, request: web.BaseRequest) -> bool:
         """Whether the request names this machine. Another site's name may resolve to it, too: a
         page from there would be of the same origin (DNS rebinding).
         """
@@ -206,16 +203,7 @@ class Cockpit:
         arrived_at = request.get_extra_info("sockname", ("",))[0].removeprefix("::ffff:")
         return host is not None and host in {*self._names, arrived_at}
 
-    async def _file(self, request: web.Request) -> web.Response:
-        name = request.match_info["file"] or "index.html"
-        if name not in self._files:
-            raise web.HTTPNotFound
-        kind = TYPES[name.rpartition(".")[2]]
-        return web.Response(
-            body=self._files[name], content_type=kind, charset="utf-8", headers=HEADERS
-        )
-
-    async def _talk(self, request: web.Request) -> web.StreamResponse:
+    async def _talk(self, request: web.BaseRequest) -> web.StreamResponse:
         # A page of another site may open sockets to this machine, but cannot lie about its origin.
         if request.headers.get("Origin") != f"http://{request.host}":
             return web.Response(status=403, text="another site's page\n", headers=HEADERS)
@@ -293,7 +281,6 @@ def _listen(host: str, port: int) -> socket.socket:
         family, address = found[0][0], found[0][4]
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
         listener = socket.create_server(address, family=family, dualstack_ipv6=both)
-        listener.setblocking(False)
     # A name that is none for DNS is a UnicodeError.
     except (OSError, OverflowError, UnicodeError) as error:
         reason = (getattr(error, "strerror", None) or str(error)).partition(" (while")[0]
@@ -301,11 +288,6 @@ def _listen(host: str, port: int) -> socket.socket:
             reason += "; without --port any that is free will do"
         raise UserError(f"the cockpit cannot listen on {host} port {port}: {reason}") from error
     return listener
-
-
-async def _with_slash(request: web.Request) -> web.Response:
-    """The page's own files stand beside it only behind the slash."""
-    raise web.HTTPFound(request.path + "/", headers=HEADERS)
 
 
 async def _say_goodbye(socket: web.WebSocketResponse) -> None:
@@ -320,13 +302,14 @@ def _page_files() -> dict[str, bytes]:
     return {**found, "colours.css": f":root {{ {colours}}}".encode()}
 
 
-class Door:
-    """Accepts connections; a stranger is one that has not shown the token yet.
+class Door(web.Server):
+    """Lets connections in; a stranger is one that has not shown the token yet.
 
     Where it is full, the stranger that has stood there longest goes; without one, the newcomer.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, handler: Handler, **options: Any) -> None:
+        super().__init__(handler, **options)
         self._inside: dict[asyncio.Transport, asyncio.TimerHandle] = {}
         """Open connections in the order in which they came, and when they are shown out."""
 
@@ -335,26 +318,17 @@ class Door:
         if transport in self._inside:
             self._inside[transport].cancel()
 
-    async def let_in(self, listener: socket.socket, server: web.Server) -> None:
-        """Accept for ``server``, until cancelled. ``listener`` does not block."""
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                connection, _ = await loop.sock_accept(listener)
-            except OSError:
-                await asyncio.sleep(ACCEPT_AGAIN_S)
-                continue
-            if not self._has_room():
-                connection.close()
-                continue
-            transport, _ = await loop.connect_accepted_socket(server, connection)
-            self._inside[transport] = loop.call_later(HEADERS_S, transport.abort)
-
-    def _has_room(self) -> bool:
+    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
+        """Called for each newcomer."""
         for gone in [each for each in self._inside if each.is_closing()]:
             self._inside.pop(gone).cancel()
         strangers = (each for each, timer in self._inside.items() if not timer.cancelled())
         if len(self._inside) >= MAX_CONNECTIONS and (longest := next(strangers, None)):
             self._inside.pop(longest).cancel()
             longest.abort()
-        return len(self._inside) < MAX_CONNECTIONS
+        if len(self._inside) >= MAX_CONNECTIONS:
+            transport.abort()
+            return
+        super().connection_made(handler, transport)
+        loop = asyncio.get_running_loop()
+        self._inside[transport] = loop.call_later(HEADERS_S, transport.abort)

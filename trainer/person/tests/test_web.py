@@ -226,12 +226,18 @@ def test_without_the_token_nothing_is_shown(cockpit, path):
 
 
 @pytest.mark.parametrize(
-    "words", [b"GET /\xff HTTP/1.1", b"\x16\x03\x01\x02\x00", b"GET / HTTP/9.9"]
+    ("words", "answer"),
+    [
+        (b"GET /\xff HTTP/1.1", b"400 Bad Request"),
+        (b"\x16\x03\x01\x02\x00", b"400 Bad Request"),
+        (b"GET / HTTP/9.9", b"400 Bad Request"),
+        (b"OPTIONS * HTTP/1.1", b"421 "),
+    ],
 )
-def test_who_speaks_no_http_is_told_so_and_nobody_else(cockpit, caplog, words):
+def test_who_speaks_no_http_is_told_so_and_nobody_else(cockpit, caplog, words, answer):
     with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as link:
         link.sendall(words + b"\r\nHost: x\r\n\r\n")
-        assert b"400 Bad Request" in link.recv(200)
+        assert answer in link.recv(200)
     cockpit.close()
     assert caplog.messages == []
 
