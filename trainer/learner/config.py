@@ -139,6 +139,10 @@ class LearnerConfig:
     """Bound of the initial weights with which the action joins the picture in the critics' first
     connected layer; 0: that of one more feature among 1,792 (0.02), as the paper's networks begin.
     There the action hardly counts in the value at first, and the actor's gradient is noise."""
+    picture_shift: int = 3
+    """Pixels by which the pictures of a minibatch are shifted at random, up, down and aside, at
+    most (DrQ; Kostrikov et al., 2020); the paper has none. What counts is where cars are to one
+    another, and a network that has seen each picture in many places learns that from fewer."""
     warmup_steps: int = 256
     """Transitions stored before the first update."""
     saturation_weight: float = 0.03
@@ -188,6 +192,7 @@ RANGES = {
     "cloning_weight": FROM_ZERO,
     "intervention_penalty": ANY,
     "action_bound": FROM_ZERO,
+    "picture_shift": (0, 20),
     "warmup_steps": FROM_ONE,
     "saturation_weight": FROM_ZERO,
 }
@@ -205,6 +210,7 @@ PRINTED_LEARNER = LearnerConfig(
     split_loss=True,
     penalty_on=HUMANS_ACTION,
     action_bound=0.0,
+    picture_shift=0,
     saturation_weight=0.0,
 )
 """Tables A5 and A6 and the equations as they are printed. The weight on cloning, for which the

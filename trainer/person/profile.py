@@ -45,9 +45,10 @@ class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def action(self, place: float) -> float:
         """The steering in [-1, 1] for the axis' place; no jump at the dead zone's edge."""
-        side = self.right if (place - self.centre) * (self.right - self.centre) > 0 else self.left
-        share = _beyond((place - self.centre) / (side - self.centre), self.dead_zone)
-        return share if side == self.right else -share
+        right, left = (
+            _share(place, self.centre, side, self.dead_zone) for side in (self.right, self.left)
+        )
+        return right - left
 
 
 class Pedal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -64,8 +65,7 @@ class Pedal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def action(self, place: float) -> float:
         """How far it is pressed, in [0, 1]."""
-        way = (place - self.released) / (self.pressed - self.released)
-        return _beyond(way, self.dead_zone)
+        return _share(place, self.released, self.pressed, self.dead_zone)
 
 
 class Buttons(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -124,9 +124,10 @@ def read_profile(path: Path) -> Profile:
         raise UserError(f"profile {path}: {error}") from None
 
 
-def _beyond(share: float, dead_zone: float) -> float:
-    """The share of the way beyond the dead zone, in [0, 1]."""
-    return min(max((share - dead_zone) / (1.0 - dead_zone), 0.0), 1.0)
+def _share(place: float, start: float, end: float, dead_zone: float) -> float:
+    """The share of the way from start to end, beyond the dead zone, in [0, 1]."""
+    way = (place - start) / (end - start)
+    return min(max((way - dead_zone) / (1.0 - dead_zone), 0.0), 1.0)
 
 
 MOVED = 0.2

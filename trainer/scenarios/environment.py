@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.picture import COLUMNS, ROWS, Rasteriser, Rectangle
-from trainer.scenarios.scene import draw_scene, vehicle_entry
+from trainer.scenarios.scene import BODY, draw_scene
 from trainer.scenarios.traffic import TrafficVehicle
 
 Observation = NDArray[np.uint8]
@@ -143,11 +143,12 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
 
     def _vehicles(self) -> list[dict[str, Any]]:
         """The scene's vehicles, the ego car first."""
-        others = [
-            vehicle_entry(number, car.footprint, car.speed, ego=False)
-            for number, car in enumerate(self.traffic, start=1)
+        cars: list[EgoVehicle | TrafficVehicle] = [self.ego, *self.traffic]
+        return [
+            dict(zip(BODY, car.footprint, strict=True))
+            | {"id": number, "speed_mps": float(car.speed), "ego": number == 0}
+            for number, car in enumerate(cars)
         ]
-        return [vehicle_entry(0, self.ego.footprint, self.ego.speed, ego=True), *others]
 
     def _info(self, outcome: str | None) -> dict[str, Any]:
         info = {
