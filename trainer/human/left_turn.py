@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trainer.human.guide import Reason
-from trainer.scenarios.ego import EgoVehicle
-from trainer.scenarios.environment import Observation
+from trainer.scenarios.environment import EgoVehicle, Observation
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.scenarios.picture import Rectangle, corners
 

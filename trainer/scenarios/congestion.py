@@ -12,10 +12,10 @@ from highway_env.road.lane import LineType, StraightLane
 from highway_env.road.road import Road, RoadNetwork
 from numpy.typing import NDArray
 
-from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
+    EgoVehicle,
     Range,
     ScenarioConfig,
     Scene,

@@ -1,7 +1,8 @@
-"""What the scenarios share: spaces, the two frames, what a step reports, and the picture."""
+"""What the scenarios share: the ego car, spaces, the two frames, and what a step reports."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -9,9 +10,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from highway_env.road.road import Road, RoadNetwork
+from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.picture import COLUMNS, ROWS, Rasteriser, Rectangle
 from trainer.scenarios.scene import BODY, draw_scene
 from trainer.scenarios.traffic import TrafficVehicle
@@ -38,6 +39,53 @@ class ScenarioConfig:
     """Distance from start to goal."""
     goal_reward: float = 10.0
     fail_reward: float = -10.0
+
+
+class EgoVehicle(Vehicle):
+    """The controlled car. It stands outside ``road.vehicles``, so that traffic never yields.
+
+    It moves by ``highway_env.vehicle.kinematics.Vehicle.step``; what is added is a speed that
+    stays within ``[0, max_speed_mps]`` and the accelerations of the last step.
+    """
+
+    MAX_STEERING_RAD = math.pi / 4
+    speed: float
+    heading: float
+
+    def __init__(
+        self, road: Road, position: tuple[float, float], heading: float, speed: float
+    ) -> None:
+        super().__init__(road, position, heading, speed)
+        self.longitudinal_acceleration_mps2 = 0.0
+        self.lateral_acceleration_mps2 = 0.0
+
+    def drive(
+        self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float, dt_s: float
+    ) -> None:
+        """Hold an acceleration and a front-wheel angle for one step.
+
+        The step's mean acceleration is bounded so that the speed stays in range: a pressed
+        brake holds a standing car instead of driving it backwards.
+        """
+        before_mps, before_rad = self.speed, self.heading
+        lowest, highest = -self.speed / dt_s, (max_speed_mps - self.speed) / dt_s
+        self.action["acceleration"] = min(max(acceleration_mps2, lowest), highest)
+        self.action["steering"] = steering_rad
+        self.step(dt_s)
+        # A plain float again: arithmetic on numpy's scalars is many times slower.
+        self.heading = float(self.heading)
+        self.speed = min(max(self.speed, 0.0), max_speed_mps)
+        self.longitudinal_acceleration_mps2 = (self.speed - before_mps) / dt_s
+        self.lateral_acceleration_mps2 = self.speed * (self.heading - before_rad) / dt_s
+
+    def on_state_update(self) -> None:
+        """No lane look-up: the planned path says where the car is."""
+
+    @property
+    def footprint(self) -> Rectangle:
+        """The car's rectangle on the ground."""
+        x, y = self.position.tolist()
+        return Rectangle(x, y, self.heading, self.LENGTH, self.WIDTH)
 
 
 class DrivingEnv(gymnasium.Env[Observation, Action]):

@@ -8,7 +8,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from edge_runtime.vehicles.mapping import CARS, similarity_to
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.congestion import CongestionConfig
-from trainer.scenarios.ego import EgoVehicle
+from trainer.scenarios.environment import EgoVehicle
 from trainer.scenarios.left_turn import LeftTurnConfig
 from trainer.scenarios.traffic import CAR
 
