@@ -139,12 +139,7 @@ def watched(run: TrainingRun, sink: Sink) -> Iterator[Callable[[EpisodeMetrics],
 
 
 class Watcher:
-    """Looks on at one run.
-
-    Args:
-        run: the run; its environment is asked for the scene.
-        put: takes what is to be drawn; must not block.
-    """
+    """Looks on at one run; ``put`` takes what is to be drawn, and must not block."""
 
     def __init__(self, run: TrainingRun, put: Draw) -> None:
         self._run, self._put = run, put
@@ -190,9 +185,7 @@ class Watcher:
 class Background:
     """Opens a view, draws each entry in order, and closes it, in a thread of its own.
 
-    Args:
-        opened: a view that may take its time; what it yields draws an entry. What any of it raises
-            is told once, and ends the drawing, not the run.
+    What any of it raises is told once, and ends the drawing, not the run.
     """
 
     def __init__(self, opened: Callable[[], AbstractContextManager[Draw]]) -> None:

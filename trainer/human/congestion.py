@@ -66,11 +66,7 @@ class CongestionExpert:
 
 
 class CongestionTrigger:
-    """Judges the policy's action before it is carried out.
-
-    Args:
-        expert: knows the environment.
-    """
+    """Judges the policy's action before it is carried out."""
 
     HORIZON_S = 1.0
     """How far the judged steering is followed."""

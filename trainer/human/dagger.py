@@ -163,13 +163,7 @@ class HumanEpisode(NamedTuple):
 
 
 class HumanTraining:
-    """Online, incremental imitation of the scripted expert, which takes over while it drives.
-
-    Args:
-        env: a scenario.
-        config: tables A4 and A7.
-        seed: of weights, minibatches and episodes.
-    """
+    """Online, incremental imitation of the scripted expert, which takes over while it drives."""
 
     def __init__(self, env: Any, config: HumanModelConfig, seed: int) -> None:
         self.env, self.config, self.seed = env, config, seed

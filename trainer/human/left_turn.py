@@ -33,12 +33,7 @@ class PedalPlan:
 
 
 class Crossing:
-    """Foresight for one left-turn environment.
-
-    Args:
-        env: the environment looked at.
-        side_clearance_m: room kept to the sides of a passing car.
-    """
+    """Foresight for one left-turn environment, with so much room to the sides of passing cars."""
 
     def __init__(self, env: LeftTurnEnv, side_clearance_m: float) -> None:
         self.env = env
@@ -190,9 +185,6 @@ class LeftTurnTrigger:
     asked only where the present pedal leads would object to each brisk approach to the stop line,
     the expert's own, too; but theorem 1 holds only where no optimal policy goes where the human
     takes over.
-
-    Args:
-        expert: knows the environment and what a driver would do in it.
     """
 
     HOLD_S = 0.5

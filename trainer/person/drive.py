@@ -107,13 +107,10 @@ def run(arguments: argparse.Namespace) -> int:
 def drive(
     sitting: Sitting, policy: Driver | None, run_seed: int, episodes: int | None
 ) -> Counter[str]:
-    """Drive until the person quits, or so many episodes.
+    """Drive until the person quits, or so many episodes (None: no end).
 
-    Args:
-        sitting: the environment with the person in it.
-        policy: drives until the person takes over; None: the person drives alone.
-        run_seed: decides the episodes, which are others in every sitting.
-        episodes: how many; None: no end.
+    The policy drives until the person takes over; without one, the person drives alone. The seed
+    decides the episodes, which are others in every sitting.
 
     Returns:
         How often an episode ended how.

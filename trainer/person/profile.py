@@ -204,15 +204,10 @@ def calibrate(word: str, out: Path) -> None:
 
 
 def ask(joystick: Any, pump: Callable[[], object], say: Callable[[str], None]) -> str:
-    """The profile, as TOML, from what the person does when told.
+    """The profile, as TOML, from what the person does with the joystick (pygame's) when told.
 
-    Args:
-        joystick: pygame's.
-        pump: lets SDL look at its devices.
-        say: tells the person what to do.
-
-    Raises:
-        UserError: no answer, or none that makes sense.
+    ``pump`` lets SDL look at its devices. Raises UserError where there is no answer, or none that
+    makes sense.
     """
 
     def places() -> list[float]:

@@ -215,15 +215,9 @@ def store_again(
 ) -> tuple[int, int]:
     """Put recorded steps into the replay buffer as the run had put them there.
 
-    Episodes that the person discarded are left out.
-
-    Args:
-        store: the learner, or its buffer.
-        steps: in their order.
-        shape: the reward to store (eq. 17), from the environment's and what the person did.
-        penalises: whether what the person did costs the policy the penalty.
-        ticks_late: how many ticks old the observation is that an action answers, behind a network
-            (``training/delayed.py``).
+    Episodes that the person discarded are left out. ``shape`` makes the reward to store (eq. 17)
+    of the environment's and what the person did; ``penalises`` tells whether that costs the policy
+    the penalty. Behind a network an action answers an observation that is ``ticks_late`` ticks old.
 
     Returns:
         How many steps were stored, and how many of them are the person's.
@@ -259,14 +253,7 @@ def demonstrate(
 
     During a hand-over the model gets what the hands said, not the blend that was applied; on the
     way back to the policy the hands have let go, and say nothing. Episodes that the person
-    discarded are left out.
-
-    Args:
-        model: learns from it.
-        recordings: the files.
-        scenario: that was driven.
-        left_out: sittings, and episodes of them, that do not count: ``3``, or ``3:7`` for
-            episode 7 of sitting 3.
+    discarded are left out, and ``left_out``: ``3`` for sitting 3, ``3:7`` for its episode 7.
 
     Returns:
         How many take-overs the recordings hold; a whole episode driven alone is one.

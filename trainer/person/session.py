@@ -30,14 +30,8 @@ class Sitting:
     """A scenario's environment with a person at the wheel, from the window's opening to its end.
 
     The loop calls ``reset``, then ``decide`` before and ``step`` for each control period, and
-    ``rest`` after an episode. All else is the environment's own.
-
-    Args:
-        person: hands and eyes.
-        recorder: keeps every step.
-        env: the scenario that is driven.
-        alone: nobody but the person drives.
-        speed: simulated seconds in one of the person's; below one is slow motion.
+    ``rest`` after an episode. All else is the environment's own. ``alone``: nobody but the person
+    drives; ``speed``: simulated seconds in one of the person's.
     """
 
     def __init__(
@@ -85,9 +79,8 @@ class Sitting:
     def decide(self, observation: Observation, policy_action: float | None) -> Applied:
         """Show what is, wait for the control period, and ask the hands as late as possible.
 
-        Args:
-            observation: what the policy sees, uint8 [2, 45, 80].
-            policy_action: what it would do, in [-1, 1]; None where the person drives alone.
+        ``policy_action`` is what the policy would do about the observation uint8 [2, 45, 80], in
+        [-1, 1]; None where the person drives alone.
         """
         self._frames, self._policy_action = observation, policy_action
         self.show()
@@ -149,11 +142,7 @@ class Sitting:
         return observation, reward, terminated, truncated, info
 
     def rest(self, outcome: str) -> str:
-        """Show for a moment how the episode ended; the person may still discard it.
-
-        Returns:
-            How it ended, now that it is known.
-        """
+        """Show how the episode ended, which the person may still discard; how it really ended."""
         end_s = time.monotonic() + REST_S * self.pacer.period_s / self.env.config.control_period_s
         while not self.stop and time.monotonic() < end_s:
             self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
@@ -248,11 +237,6 @@ class Pacer:
 
     A delay of less than a period is caught up. After a longer one the deadlines begin anew: a car
     that leaps through what was missed cannot be driven.
-
-    Args:
-        period_s: wall time of a control period.
-        clock: monotonic seconds.
-        sleep: waits for so many seconds.
     """
 
     def __init__(

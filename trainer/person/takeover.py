@@ -66,13 +66,7 @@ class TakeOver:
         self._applied: float | None = None
 
     def step(self, policy_action: float, human_action: float, holds: bool) -> Applied:
-        """Decide one control period.
-
-        Args:
-            policy_action: in [-1, 1].
-            human_action: what the device says, in [-1, 1].
-            holds: whether the person wants control (``Intent``).
-        """
+        """Decide one control period; ``holds``: whether the person wants control (``Intent``)."""
         goal = human_action if holds else policy_action
         # At an episode's start there is nothing to leave from but the policy's action.
         last = policy_action if self._applied is None else self._applied

@@ -86,15 +86,7 @@ class Cockpit:
     """A person in a browser.
 
     The loop's thread calls what is public; it only hands over, in microseconds. Everything else
-    runs in the server's thread.
-
-    Args:
-        host: where to listen.
-        port: at which port; 0: any free one.
-        scenario: decides the keys.
-
-    Raises:
-        UserError: the address cannot be listened on.
+    runs in the server's thread. Raises UserError where the address cannot be listened on.
     """
 
     moving = Moving()

@@ -52,12 +52,7 @@ class Pose(NamedTuple):
 class LeftTurnPath:
     """North along the side road, a quarter circle to the left, then west along the main road.
 
-    Args:
-        start: where the path begins (x, y), metres.
-        straight_m: length before the arc.
-        radius_m: radius of the arc.
-
-    Arc length ``s`` counts from the start; beyond the arc the path goes on for ever.
+    Arc length ``s`` counts from the start (x, y); beyond the arc the path goes on for ever.
     """
 
     def __init__(self, start: tuple[float, float], straight_m: float, radius_m: float) -> None:
@@ -99,14 +94,8 @@ class LeftTurnPath:
     def lanes(self, end_m: float, width_m: float) -> list[StraightLane | CircularLane]:
         """The same path as highway-env lanes, ending at arc length ``end_m``."""
         straight_end = (self.start_x, self.centre_y)
-        arc = CircularLane(
-            (self.centre_x, self.centre_y),
-            self.radius_m,
-            0.0,
-            -0.5 * math.pi,
-            clockwise=False,
-            width=width_m,
-        )
+        centre, quarter = (self.centre_x, self.centre_y), (0.0, -0.5 * math.pi)
+        arc = CircularLane(centre, self.radius_m, *quarter, clockwise=False, width=width_m)
         exit_start = (self.centre_x, self.centre_y - self.radius_m)
         exit_m = max(end_m - self.straight_m - self.arc_m, 0.1)
         exit_end = (exit_start[0] - exit_m, exit_start[1])

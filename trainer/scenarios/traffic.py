@@ -31,15 +31,9 @@ def idm_acceleration(
     closing_mps: float = 0.0,
     time_gap_factor: float = 1.0,
 ) -> float:
-    """The acceleration in m/s2.
+    """The acceleration in m/s2 of a vehicle that is ``closing_mps`` faster than its leader.
 
-    Args:
-        kind: the vehicle's parameters.
-        speed_mps: its speed.
-        desired_mps: its speed on a free road.
-        gap_m: to the leader, bumper to bumper; infinite without one.
-        closing_mps: how much faster it is than the leader.
-        time_gap_factor: see ``vehicle_types.equip``.
+    ``gap_m`` is bumper to bumper, infinite without a leader; ``time_gap_factor`` as in ``equip``.
     """
     a, b = kind.acceleration_mps2, kind.deceleration_mps2
     approach_m = speed_mps * closing_mps / (2.0 * math.sqrt(a * b))
@@ -100,12 +94,9 @@ def bodies_m(behind: VehicleType, ahead: VehicleType) -> float:
 def equip(
     cars: list[TrafficVehicle], types: list[VehicleType], time_gap_factor: float = 1.0
 ) -> None:
-    """Give each vehicle its type's size and IDM parameters.
+    """Give each vehicle, which has its leader already, its type's size and IDM parameters.
 
-    Args:
-        cars: vehicles, each with its leader.
-        types: the type of each.
-        time_gap_factor: share of the type's time gap that is kept; people close up in a jam.
+    ``time_gap_factor``: share of the type's time gap that is kept; people close up in a jam.
     """
     for car, kind in zip(cars, types, strict=True):
         car.LENGTH, car.WIDTH = kind.length_m, kind.width_m
@@ -199,18 +190,11 @@ class TrafficVehicle(IDMVehicle):
 
 
 def queue(
-    road: Road,
-    lane_index: LaneIndex,
-    positions_m: list[float],
-    speeds_mps: list[float],
+    road: Road, lane_index: LaneIndex, positions_m: list[float], speeds_mps: list[float]
 ) -> list[TrafficVehicle]:
-    """Cars in one lane, the first leading; each follows the one before it.
+    """Cars in one lane at falling distances along it; each follows the one before it.
 
-    Args:
-        road: the road they drive on (they are added to ``road.vehicles``).
-        lane_index: their lane.
-        positions_m: distances along the lane, falling.
-        speeds_mps: initial and desired speed of each.
+    Speeds are the initial and the desired ones. The cars are added to ``road.vehicles``.
     """
     cars: list[TrafficVehicle] = []
     for position_m, speed_mps in zip(positions_m, speeds_mps, strict=True):
