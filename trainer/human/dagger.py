@@ -9,7 +9,7 @@ import argparse
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,15 +38,8 @@ EXAMPLE = examples(
     "python -m trainer human --scenario congestion --frames 2 --out runs/human_congestion",
     "python -m trainer human --from runs/drives --out runs/me",
 )
-FIELDS = (
-    "episodes",
-    "frames",
-    "updates_per_episode",
-    "demonstrated_share",
-    "label_every_step",
-    "unaided_share",
-    "refining_updates",
-)
+FIXED = ("learning_rate", "batch_size")
+FIELDS = [field.name for field in fields(HumanModelConfig) if field.name not in FIXED]
 """Settings that are options."""
 
 

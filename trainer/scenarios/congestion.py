@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ from trainer.scenarios.traffic import (
 class CongestionConfig(ScenarioConfig):
     """Every number of the scenario, with its reason."""
 
+    scaled = "steer_weight"
     max_steps: int = 300
     """At 4 m/s the goal takes 200."""
     lane_width_m: float = 3.5
@@ -97,37 +98,26 @@ class CongestionConfig(ScenarioConfig):
     ego car, and neither turns nor moves aside: place and heading show as they are, and other cars'
     movement between the two frames is their speed relative to the ego car's."""
 
-    def with_printed_reward(self) -> CongestionConfig:
-        """The same with eq. 32 as it is printed, but for the sign."""
-        return replace(self, steer_weight=1.0)
 
-    @staticmethod
-    def of(scene: Scene) -> CongestionConfig:
-        """The numbers of a scene.
-
-        The variant has more vehicles, and not only cars. Dense is a jam in lanes as narrow as at
-        roadworks, in which cars keep to their lane's middle, and lanes to the jam's speed, about
-        half as well as usual. The narrowest gap leaves 0.5 m to each side of an ego car in mid-lane
-        instead of 1.25, and its walls move; were it narrower, cars of two lanes would touch. Gaps
-        along a lane are from 2 to 8 m, so that the walls have holes, too; a lane's queue is long
-        enough to be there until the goal.
-        """
-        if scene == "nominal":
-            return CongestionConfig()
-        if scene == "variant":
-            return CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=MIXED)
-        return CongestionConfig(
-            lane_width_m=2.9,
-            lane_offset_m=(-0.35, 0.35),
-            lane_speed_mps=(-1.0, 1.0),
-            side_cars=6,
-            side_front_m=(14.0, 22.0),
-            cars_behind=2,
-            gap_m=(2.0, 8.0),
-            ahead_gap_m=(2.5, 9.0),
-        )
-
-
+SCENES: dict[Scene, CongestionConfig] = {
+    "nominal": CongestionConfig(),
+    "variant": CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=MIXED),
+    # A jam in lanes as narrow as at roadworks, in which cars keep to their lane's middle, and lanes
+    # to the jam's speed, about half as well as usual. The narrowest gap leaves 0.5 m to each side
+    # of an ego car in mid-lane instead of 1.25, and its walls move; were it narrower, cars of two
+    # lanes would touch. Gaps along a lane are from 2 to 8 m, so that the walls have holes, too; a
+    # lane's queue is long enough to be there until the goal.
+    "dense": CongestionConfig(
+        lane_width_m=2.9,
+        lane_offset_m=(-0.35, 0.35),
+        lane_speed_mps=(-1.0, 1.0),
+        side_cars=6,
+        side_front_m=(14.0, 22.0),
+        cars_behind=2,
+        gap_m=(2.0, 8.0),
+        ahead_gap_m=(2.5, 9.0),
+    ),
+}
 LANES = 3
 EGO_LANE = 1
 """The middle one, y = 0; lane 0 is to its left."""
@@ -213,7 +203,7 @@ class CongestionEnv(DrivingEnv):
         scene: Scene = "nominal",
     ) -> None:
         super().__init__(render_mode)
-        self.config = c = config or CongestionConfig.of(scene)
+        self.config = c = config or SCENES[scene]
         self.road_width_m = LANES * c.lane_width_m
         self.network = straight_road(c.lane_width_m, c.goal_m)
         road = Rectangle(0.0, 0.0, 0.0, 4.0 * c.goal_m, self.road_width_m)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self
 
 import gymnasium
 import numpy as np
@@ -39,6 +39,13 @@ class ScenarioConfig:
     """Distance from start to goal."""
     goal_reward: float = 10.0
     fail_reward: float = -10.0
+    scaled: ClassVar[str]
+    """The field that scales the third term of the reward."""
+
+    def with_printed_reward(self) -> Self:
+        """The same with eq. 31 or 32 as it is printed, but for the latter's sign."""
+        change: dict[str, Any] = {self.scaled: 1.0}
+        return replace(self, **change)
 
 
 class EgoVehicle(Vehicle):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -174,6 +174,7 @@ def road_areas(lane_width_m: float) -> list[Rectangle]:
 class LeftTurnConfig(ScenarioConfig):
     """Every number of the scenario, with its reason where there is one."""
 
+    scaled = "speed_weight"
     lane_width_m: float = 4.0
     straight_m: float = 10.0
     """Path on the side road before the turn."""
@@ -214,28 +215,20 @@ class LeftTurnConfig(ScenarioConfig):
     """The picture shows 40 m x 22.5 m of ground and does not move: 30 m of the main road to the
     left, so that a car at 6 m/s is seen for longer than the turn takes."""
 
-    def with_printed_reward(self) -> LeftTurnConfig:
-        """The same with eq. 31 as it is printed."""
-        return replace(self, speed_weight=1.0)
 
-    @staticmethod
-    def of(scene: Scene) -> LeftTurnConfig:
-        """The numbers of a scene.
-
-        The variant has more vehicles, and not only cars. Dense is a longer queue whose gaps are
-        neither clearly long nor clearly short: all come from one range. The scripted expert takes
-        no gap of less than 16 m and each one of more than 25 m; between them the two cars' speeds
-        decide, and a policy that only ever met gaps up to 16 m and from 32 m on has to have learned
-        more than to tell these apart. Half of the range is such near-ties, a third cannot be used.
-        """
-        if scene == "nominal":
-            return LeftTurnConfig()
-        # More vehicles may take longer than 20 s to pass; who rightly waits shall not time out.
-        if scene == "variant":
-            return LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300)
-        return LeftTurnConfig(
-            traffic_cars=6, long_gap_m=(12.0, 28.0), long_gap_share=1.0, max_steps=400
-        )
+SCENES: dict[Scene, LeftTurnConfig] = {
+    "nominal": LeftTurnConfig(),
+    # More vehicles may take longer than 20 s to pass; who rightly waits shall not time out.
+    "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300),
+    # A longer queue whose gaps are neither clearly long nor clearly short: all come from one range.
+    # The scripted expert takes no gap of less than 16 m and each one of more than 25 m; between
+    # them the two cars' speeds decide, and a policy that only ever met gaps up to 16 m and from
+    # 32 m on has to have learned more than to tell these apart. Half of the range is such
+    # near-ties, a third cannot be used.
+    "dense": LeftTurnConfig(
+        traffic_cars=6, long_gap_m=(12.0, 28.0), long_gap_share=1.0, max_steps=400
+    ),
+}
 
 
 class LeftTurnEnv(DrivingEnv):
@@ -254,7 +247,7 @@ class LeftTurnEnv(DrivingEnv):
         scene: Scene = "nominal",
     ) -> None:
         super().__init__(render_mode)
-        self.config = c = config or LeftTurnConfig.of(scene)
+        self.config = c = config or SCENES[scene]
         half = 0.5 * c.lane_width_m
         # Right-hand traffic: the ego car comes up the right lane of the side road, crosses the
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
