@@ -57,9 +57,9 @@ EPISODES = (
     Plot("human", "The human's share of the steps", (-0.05, 1.05)),
     Plot("advantage", "Q advantage of the human's action, where it took over"),
 )
-"""Of a training, from top to bottom."""
+"""The plots of a training, from top to bottom."""
 SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
-"""Of recorded sittings, of which a learner has told nothing."""
+"""The plots of recorded sittings, which hold nothing of a learner."""
 RECENT = (
     Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
     Plot("speed", "Speed, m/s, the last 20 s"),
@@ -107,7 +107,7 @@ class Steps(NamedTuple):
     frames: NDArray[np.uint8] | None = None
     """What the policy saw, [2, 45, 80]."""
     scene: dict[str, Any] | None = None
-    """Of the environment; None, too, where the road is not known."""
+    """The environment's; None, too, where the road is not known."""
 
 
 class Episode(NamedTuple):

@@ -39,7 +39,7 @@ FACTS = {
 """What is said, by the reason of the intervention."""
 POLICY, HUMAN, GAUGE = COLOURS["ego"], (46, 139, 76), (200, 206, 196)
 COLOUR_COUNT = 64
-"""Of a GIF's palette: the scene has few colours, and letters some shades."""
+"""A GIF's palette: the scene has few colours, and letters some shades."""
 LAST_S = 1.5
 """How long the last picture stays before it begins anew."""
 

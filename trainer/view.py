@@ -64,7 +64,7 @@ LOOK_S = 0.2
 STEPS_TOGETHER = 50
 """Numbers are handed over with a picture, or when there are so many."""
 CORRECTIONS = 32
-"""Of an episode whose Q advantage is shown: evenly spread, as the critic's time is not for free."""
+"""The Q advantage is shown for so many of an episode, evenly spread: the critic takes time."""
 MOST_WAITING = 500
 """Entries, some 50 s of pictures: a view that is slower loses some, and the loop nothing."""
 Draw = Callable[[Entry], None]

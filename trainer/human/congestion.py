@@ -89,7 +89,7 @@ class CongestionTrigger:
         """Nothing to forget."""
 
     def may_return(self) -> bool:
-        """Whether the wheel can be given back: anywhere, the clock alone decides."""
+        """Whether control can be handed back: anywhere, the clock alone decides."""
         return True
 
     def judge(self, action: NDArray) -> Reason | None:

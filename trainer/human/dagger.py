@@ -1,6 +1,6 @@
 """Train the human model (section V): it drives, the person intervenes, and it learns (DAgger).
 
-The person is the scripted expert, or one whose sittings are recorded.
+The person is the scripted expert, or a real one in recorded sittings.
 """
 
 from __future__ import annotations

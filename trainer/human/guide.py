@@ -53,7 +53,7 @@ class Intervention:
 
 
 class Guide(Protocol):
-    """Whoever watches the policy."""
+    """What watches the policy: a person, or the expert or model that stands for one."""
 
     def reset(self) -> None:
         """Start an episode with the policy in control."""
@@ -67,7 +67,7 @@ class HumanGuide:
     """Turns trigger and driver into interventions.
 
     The human stays in control for ``hold_steps`` from the last reason for it. A second and a half:
-    a person who had to take over first brings the car out of it.
+    a person first brings the car out of what made them take over.
     """
 
     def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int = 15) -> None:

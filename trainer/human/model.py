@@ -57,8 +57,9 @@ class HumanModelConfig:
     the model without an answer where it errs and nobody need step in, as too far from the line."""
     unaided_share: int = 0
     """In one episode in this many, from the first on, nobody takes over from the model, though
-    every step is labelled; 0: never. Those that the person drives alone stay theirs. Who is always
-    helped at once never learns what to do after a mistake, such as having stopped in the lane."""
+    every step is labelled; 0: never. Those that the person drives alone stay theirs. A model that
+    always gets help at once never learns what to do after a mistake, such as stopping in the lane.
+    """
     refining_updates: int = 0
     """Gradient steps after the last episode, under a learning rate that falls to zero. Not in the
     paper. On few examples 2,000 made no difference; on 22,000 examples 12,000 brought the left

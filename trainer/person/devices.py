@@ -161,7 +161,7 @@ class JoystickHands:
         self.moving = Moving(profile.threshold, profile.rest, profile.rest_s)
         self._joystick: Any = None
         self._places: dict[int, float] = {}
-        """Of the axes that have moved: SDL calls the others 0, which is a pedal half pressed."""
+        """Axes that have moved: SDL calls the others 0, which is a pedal half pressed."""
         self._wishes: set[Wish] = set()
         how = "hold the button"
         if profile.take_over == "moving":

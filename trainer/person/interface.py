@@ -19,8 +19,8 @@ Wish = Literal["pause", "restart", "discard", "quit"]
 marks the recorded episode, and nothing learns from it; ``quit`` ends the sitting."""
 WISHES: tuple[Wish, ...] = ("pause", "restart", "discard", "quit")
 Control = Literal["policy", "human", "returning"]
-"""Who decides the applied action; ``returning``: the person has let go and the action is on its way
-back to the policy's, which still counts as the person's."""
+"""What decides the applied action; ``returning``: the person has let go, and the action is on its
+way back to the policy's, which still counts as the person's."""
 KEY_HELP = {
     "left_turn": "hold to take over    Up / W: throttle    Down / S: brake    Space: neither",
     "congestion": "hold to take over    Left / A, Right / D: steer    Space: straight on",

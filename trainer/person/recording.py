@@ -40,14 +40,14 @@ NAME = re.compile(r"sitting-(\d{4,})\.mcap")
 
 
 class Step(msgspec.Struct, frozen=True):
-    """One control period, whole: a transition, and who did what in it."""
+    """One control period, whole: a transition, and what each did in it."""
 
     sitting: int
     index: int
-    """Of the step in the sitting, from 0."""
+    """The step's number in the sitting, from 0."""
     scenario: str
     seed: int
-    """Of the episode."""
+    """The episode's."""
     episode: int
     step: int
     """In the episode, from 0."""
@@ -99,7 +99,7 @@ class Recorder:
     def __init__(self, directory: Path) -> None:
         self.sitting = 1 + max(map(_number, sittings(directory)), default=0)
         self.index = 0
-        """Of the step that comes next."""
+        """The next step's number."""
         self.path = directory / f"sitting-{self.sitting:04d}.mcap"
         self._file = FlushedFile(self.path)
         self._mcap = start_mcap(self._file)
@@ -187,7 +187,7 @@ def read_steps(path: Path) -> Iterator[Step]:
                     yield msgspec.msgpack.decode(record.data, type=Step)
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
-    # Of a chunk whose checksum is right: no kill does that.
+    # The chunk's checksum is right: no kill does that.
     except msgspec.DecodeError as error:
         raise UserError(f"{path} was recorded by another version: {error}") from None
 

@@ -37,7 +37,7 @@ from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun, divergence_said
 
 NICENESS = 10
-"""Of the updates' thread, and of those that torch starts from it: the person's loop goes first."""
+"""The updates' thread, and those that torch starts from it, are nice to the person's loop."""
 LOOK_S = 0.002
 """How often it is asked whether an update is done, where that must be waited for."""
 

@@ -18,7 +18,7 @@ from trainer.scenarios.scene import HEIGHT_M, VIEW, WIDTH_M
 SILENCE_S = 0.5
 """A driver who is not heard for this long has let go."""
 MAX_INPUT_BYTES = 1024
-"""Of a message from a page; the longest honest one is a fifth of this."""
+"""A page's message is not longer; the longest honest one is a fifth of this."""
 Share = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 _ENCODER = msgspec.json.Encoder(
     enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
@@ -63,7 +63,7 @@ class Seat:
             return self._pages[:1] == [page]
 
     def is_heard(self, now_s: float) -> bool:
-        """Whether somebody is there who can act."""
+        """Whether the driver can act."""
         with self._lock:
             return now_s - self._heard_s <= SILENCE_S
 

@@ -50,7 +50,7 @@ class Sitting:
         """The last counts what the others leave out."""
         self._paused = False
         self._last_step: Step | None = None
-        """Of an episode that has ended, until it is known whether the person discards it."""
+        """An ended episode's, until it is known whether the person discards it."""
         self._frames: Observation | None = None
         """What the policy sees; None before the first episode, when there is nothing to show."""
         self._policy_action: float | None = None

@@ -1,4 +1,4 @@
-"""Who is in control, and what the car is told while that changes: a pure state machine.
+"""What is in control, and what the car is told while that changes: a pure state machine.
 
 ```
 state       the person holds     the person has let go

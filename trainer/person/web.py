@@ -57,7 +57,7 @@ Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 MAX_CONNECTIONS = 32
 """A page opens some six for its files, and keeps one."""
 HEADERS_S = 5.0
-"""Within which a connection must have shown the token."""
+"""A connection must show the token within this time."""
 BACKLOG = 16
 """Connections that are accepted at once; each needs a descriptor until the door refuses it."""
 

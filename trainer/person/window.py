@@ -18,9 +18,9 @@ from trainer.person.interface import View
 from trainer.scenarios.scene import draw_scene
 
 SIZE = (1040, 680)
-"""Of what is drawn; the window shows it larger or smaller."""
+"""The drawn picture's; the window shows it larger or smaller."""
 SCREEN_SHARE = 0.9
-"""Of a small screen, as the window's frame and the desktop's bars take some."""
+"""The window takes this much of a small screen: frame and desktop bars need some."""
 SCENE_SIZE = (736, 400)
 FRAME_SCALE = 3
 MARGIN = 16

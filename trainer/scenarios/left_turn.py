@@ -218,7 +218,7 @@ class LeftTurnConfig(ScenarioConfig):
 
 SCENES: dict[Scene, LeftTurnConfig] = {
     "nominal": LeftTurnConfig(),
-    # More vehicles may take longer than 20 s to pass; who rightly waits shall not time out.
+    # More vehicles may take longer than 20 s to pass; a car that rightly waits shall not time out.
     "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300),
     # A longer queue whose gaps are neither clearly long nor clearly short: all come from one range.
     # The scripted expert takes no gap of less than 16 m and each one of more than 25 m; between

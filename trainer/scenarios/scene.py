@@ -18,7 +18,7 @@ VIEW = (-30.0, -7.0)
 """Upper left corner of the ground shown, for a scene that names no ``view`` of its own."""
 GOAL_HALF_M = 2.0
 BODY = ("x", "y", "heading_rad", "length_m", "width_m")
-"""Of a scene's vehicle, in the order of a ``Rectangle``."""
+"""A scene's vehicle in the order of a ``Rectangle``."""
 COLOURS = {
     "ground": (222, 229, 216),
     "road": (92, 97, 105),
@@ -40,7 +40,7 @@ def draw_scene(
 ) -> NDArray[np.uint8]:
     """Draw ``scene`` (see ``DrivingEnv.scene``) and, inset, the two frames of the policy.
 
-    ``ego`` is the ego car's colour: of whoever drives it.
+    ``ego`` is the ego car's colour, which tells what drives it.
 
     Returns:
         uint8 [height, width, 3].

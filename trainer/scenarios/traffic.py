@@ -1,4 +1,4 @@
-"""Surrounding traffic: who drives in it, and highway-env's IDM, which keeps its lane.
+"""Surrounding traffic: its types of vehicles, and highway-env's IDM, which keeps its lane.
 
 The intelligent driver model is that of Treiber, Hennecke and Helbing (2000); it also has the ego
 car's pedals in the congestion. Cars are blind to the ego car unless they follow it.
@@ -169,7 +169,7 @@ class TrafficVehicle(IDMVehicle):
         return wanted - a * (share * share)
 
     def step(self, dt: float) -> None:
-        """Advance by ``dt`` seconds. Who has braked to a stop stands: nobody reverses."""
+        """Advance by ``dt`` seconds. A car that has braked to a stop stands: it never reverses."""
         acceleration = max(self.action["acceleration"], -self.speed / dt)
         self.position[0] += self.speed * dt
         self.speed += acceleration * dt
