@@ -184,7 +184,7 @@ class JoystickHands:
             self._places[event.axis] = float(event.value)
         elif event.type == pygame.JOYBUTTONDOWN:
             buttons = self._profile.buttons
-            self._wishes |= {wish for wish in WISHES if event.button in getattr(buttons, wish)}
+            self._wishes |= {wish for wish in WISHES if event.button in buttons.get(wish, ())}
         elif event.type == pygame.JOYDEVICEREMOVED:
             self._joystick = None
             self._places.clear()
@@ -195,7 +195,7 @@ class JoystickHands:
             return LET_GO
         # Asking for a button that the device does not have is an error in SDL.
         count = self._joystick.get_numbuttons()
-        holding = [number for number in self._profile.buttons.hold if number < count]
+        holding = [number for number in self._profile.buttons.get("hold", ()) if number < count]
         held = any(self._joystick.get_button(number) for number in holding)
         wishes, self._wishes = frozenset(self._wishes), set()
         action = self._profile.action(self._scenario, self._places)

@@ -13,7 +13,7 @@ import msgspec
 
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError, read_toml
-from trainer.person.interface import Moving
+from trainer.person.interface import Moving, Wish
 
 SHIPPED = Path(__file__).parent / "profiles"
 Number = Annotated[int, msgspec.Meta(ge=0, le=63)]
@@ -68,16 +68,6 @@ class Pedal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return _share(place, self.released, self.pressed, self.dead_zone)
 
 
-class Buttons(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Button numbers; any of a list will do."""
-
-    hold: tuple[Number, ...] = ()
-    pause: tuple[Number, ...] = ()
-    restart: tuple[Number, ...] = ()
-    discard: tuple[Number, ...] = ()
-    quit: tuple[Number, ...] = ()
-
-
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One model of wheel or gamepad."""
 
@@ -92,12 +82,13 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     threshold: Share = Moving.threshold
     rest: Share = Moving.rest
     rest_s: Annotated[float, msgspec.Meta(gt=0.0, le=10.0)] = Moving.rest_s
-    buttons: Buttons = Buttons()
+    buttons: dict[Literal["hold"] | Wish, tuple[Number, ...]] = {}
+    """Button numbers; any of a list will do."""
 
     def __post_init__(self) -> None:
         if self.rest >= self.threshold:
             raise ValueError("rest must be below threshold")
-        if self.take_over == "holding" and not self.buttons.hold:
+        if self.take_over == "holding" and not self.buttons.get("hold"):
             raise ValueError("take_over is by holding, but buttons.hold is empty")
 
     def action(self, scenario: str, places: dict[int, float]) -> float:

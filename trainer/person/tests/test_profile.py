@@ -87,6 +87,7 @@ def test_the_g29s_pedals_and_wheel():
         (("axis = 1", "axis = 1\nreleased = 1.0"), "not 0.02 apart"),
         (('name = "mine"', ""), "missing required field `name`"),
         (("hold = [0]", ""), "buttons.hold is empty"),
+        (("hold = [0]", "hold = [0]\nfly = [1]"), "Invalid enum value 'fly'"),
         (('name = "mine"', 'name = "mine"\nrest = 0.5'), "rest must be below threshold"),
         (('name = "mine"', 'name = "mine"\ntake_over = "shouting"'), "shouting"),
         (("axis = 0", "axis = "), "is no TOML"),
@@ -170,7 +171,7 @@ def test_the_answers_become_a_profile(ask, tmp_path):
     path.write_text(ask(ANSWERS))
     profile = read_profile(path)
     assert (profile.name, profile.match) == ('A "quoted" wheel',) * 2
-    assert profile.buttons.hold == (7,)
+    assert profile.buttons == {"hold": (7,)}
     places = {0: 0.5, 1: -1.0, 2: 0.9}
     assert profile.action("congestion", places) == pytest.approx(-1.0, abs=0.01)
     assert profile.action("congestion", {0: -0.4}) == pytest.approx(1.0, abs=0.01)
