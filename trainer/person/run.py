@@ -270,11 +270,6 @@ class UnhurriedLearning:
         """Transitions stored since the run began."""
         return self._inner.added
 
-    @property
-    def idle(self) -> bool:
-        """Whether no update is under way."""
-        return not self._inner.updating
-
     @torch.no_grad()
     def act(self, observation: Observation) -> Action:
         """The action of the actor's copy, float32 [action size]."""

@@ -119,16 +119,8 @@ class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Number of the newest view that was drawn."""
 
 
-_DECODER = msgspec.json.Decoder(Input)
-
-
-def decode_input(text: str) -> Input:
-    """A page's message.
-
-    Raises:
-        msgspec.MsgspecError: it is none.
-    """
-    return _DECODER.decode(text)
+INPUT = msgspec.json.Decoder(Input)
+"""Decodes a page's message; raises msgspec.MsgspecError where it is none."""
 
 
 def encode_view(view: View, number: int, shown_s: float) -> str:

@@ -30,7 +30,7 @@ from aiohttp.http_exceptions import HttpProcessingError
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.interface import KEY_HELP, WISH_HELP, Moving, Person, Reading, View
-from trainer.person.seat import END, MAX_INPUT_BYTES, Seat, decode_input, encode_echo, encode_view
+from trainer.person.seat import END, INPUT, MAX_INPUT_BYTES, Seat, encode_echo, encode_view
 
 TOKEN_BYTES = 16
 KEEP_ALIVE_S = 10.0
@@ -227,7 +227,7 @@ class Cockpit:
             if message.type is not WSMsgType.TEXT:
                 return WSCloseCode.UNSUPPORTED_DATA
             try:
-                said = decode_input(message.data)
+                said = INPUT.decode(message.data)
             except msgspec.MsgspecError:
                 return WSCloseCode.POLICY_VIOLATION
             counts = self.seat.hear(page.number, said, time.monotonic())

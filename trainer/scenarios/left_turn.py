@@ -163,13 +163,6 @@ def t_intersection(path: LeftTurnPath, goal_m: float, lane_width_m: float) -> Ro
     return network
 
 
-def road_areas(lane_width_m: float) -> list[Rectangle]:
-    """The paved ground: the main road across, the side road from below."""
-    width_m = 2 * lane_width_m
-    side_road = Rectangle(0.0, 0.5 * SIDE_ROAD_M, 0.5 * math.pi, SIDE_ROAD_M, width_m)
-    return [Rectangle(0.0, 0.0, 0.0, 2 * LANE_REACH_M, width_m), side_road]
-
-
 @dataclass(frozen=True)
 class LeftTurnConfig(ScenarioConfig):
     """Every number of the scenario, with its reason where there is one."""
@@ -253,9 +246,12 @@ class LeftTurnEnv(DrivingEnv):
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
         start = (half, c.straight_m + c.lane_width_m)
         self.path = LeftTurnPath(start, c.straight_m, c.turn_radius_m)
-        self.rasteriser = Rasteriser(
-            c.view_left_m, c.view_top_m, c.metres_per_pixel, road_areas(c.lane_width_m)
-        )
+        width_m = 2 * c.lane_width_m
+        paved = [
+            Rectangle(0.0, 0.0, 0.0, 2 * LANE_REACH_M, width_m),
+            Rectangle(0.0, 0.5 * SIDE_ROAD_M, 0.5 * math.pi, SIDE_ROAD_M, width_m),
+        ]
+        self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel, paved)
         self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
         self._offset_m = 0.0
 

@@ -94,7 +94,7 @@ def bodies_m(behind: VehicleType, ahead: VehicleType) -> float:
 def equip(
     cars: list[TrafficVehicle], types: list[VehicleType], time_gap_factor: float = 1.0
 ) -> None:
-    """Give each vehicle, which has its leader already, its type's size and IDM parameters.
+    """Give each vehicle, its leader before it, its type's size and IDM parameters.
 
     ``time_gap_factor``: share of the type's time gap that is kept; people close up in a jam.
     """
@@ -103,7 +103,6 @@ def equip(
         car.COMFORT_ACC_MAX = kind.acceleration_mps2
         car.COMFORT_ACC_MIN = -kind.deceleration_mps2
         car.TIME_WANTED = time_gap_factor * kind.time_gap_s
-    for car, kind in zip(cars, types, strict=True):
         # highway-env's IDM takes distances from centre to centre.
         bodies = kind.length_m if car.leader is None else 0.5 * (car.LENGTH + car.leader.LENGTH)
         car.DISTANCE_WANTED = kind.standstill_gap_m + bodies
