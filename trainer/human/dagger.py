@@ -143,14 +143,14 @@ class HumanEpisode(NamedTuple):
     loss: float
     demonstrations: int
     """The human's steps so far."""
-    interventions: int | None = None
-    """None where nobody drove: the model learned from recordings."""
+    interventions: int = 0
     outcome: str = ""
+    """Empty where nobody drove: the model learned from recordings."""
 
     def figures(self) -> dict[str, str]:
         """What the progress bar shows."""
         shown = {"demonstrations": f"{self.demonstrations}", "loss": f"{self.loss:.3f}"}
-        if self.interventions is not None:
+        if self.outcome:
             shown |= {"interventions": f"{self.interventions}", "outcome": self.outcome}
         return shown
 

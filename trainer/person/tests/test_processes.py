@@ -101,9 +101,10 @@ def first_of_the_persons(steps: Sequence[Step]) -> int:
     may.
     """
     (index,) = (index for index, step in enumerate(steps) if step.first)
-    before, taken = steps[index - 1], steps[index]
+    taken, last = steps[index], steps[index].policy_action
     assert not any(step.human for step in steps[:index])
-    last = before.action if before.episode == taken.episode else taken.policy_action
+    if taken.step:
+        last = steps[index - 1].action
     assert last is not None
     assert taken.action == last + min(max(taken.human_action - last, -MAX_SLEW), MAX_SLEW)
     assert taken.action != taken.policy_action
