@@ -9,7 +9,7 @@ from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("trainer.training.command", "train a policy with human guidance"),
     "drive": ("trainer.person.drive", "drive yourself, or take over from a policy; recorded"),
-    "human": ("trainer.commands.human", "train the human model from interventions (DAgger)"),
+    "human": ("trainer.human.dagger", "train the human model from interventions (DAgger)"),
     "evaluate": ("trainer.evaluate", "drive test episodes and report how well it does"),
     "export": ("trainer.export", "write a run's actor as the file that a board drives"),
     "plot": ("trainer.plots", "draw the learning curve of a run"),

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -44,6 +43,7 @@ from edge_runtime.util import counted
 from trainer.human.guide import Reason
 from trainer.learner.networks import Critic
 from trainer.training.metrics import EpisodeMetrics
+from trainer.training.run import Seen
 
 APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
 TIMELINE = "step"
@@ -57,9 +57,9 @@ EPISODES = (
     Plot("human", "The human's share of the steps", (-0.05, 1.05)),
     Plot("advantage", "Q advantage of the human's action, where it took over"),
 )
-"""Of a training, from top to bottom."""
+"""The plots of a training, from top to bottom."""
 SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
-"""Of recorded sittings, of which a learner has told nothing."""
+"""The plots of recorded sittings, which hold nothing of a learner."""
 RECENT = (
     Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
     Plot("speed", "Speed, m/s, the last 20 s"),
@@ -100,42 +100,24 @@ class StepEntry(NamedTuple):
     """Why the human acted; None where the policy did."""
 
 
-@dataclass(frozen=True)
-class Picture:
-    """What is looked at, not more than ten times a second."""
-
-    step: int
-    frames: NDArray[np.uint8]
-    scene: dict[str, Any]
-    """Of the environment; empty where the road is not known."""
-
-
-@dataclass(frozen=True)
-class Correction:
-    """A step at which the human acted."""
-
-    step: int
-    frames: NDArray[np.uint8]
-    policy_action: NDArray[np.float32]
-    action: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Steps:
-    """Some control periods, and perhaps the picture of the last one."""
+class Steps(NamedTuple):
+    """Some control periods, and perhaps the picture of the last one: not more than ten a second."""
 
     entries: list[StepEntry]
-    picture: Picture | None
+    frames: NDArray[np.uint8] | None = None
+    """What the policy saw, [2, 45, 80]."""
+    scene: dict[str, Any] | None = None
+    """The environment's; None, too, where the road is not known."""
 
 
-@dataclass(frozen=True)
-class Episode:
+class Episode(NamedTuple):
     """An episode's end."""
 
     step: int
     metrics: EpisodeMetrics
-    corrections: list[Correction]
-    critic: Critic | None
+    corrections: Sequence[tuple[int, Seen]] = ()
+    """Steps at which the human acted, and what was seen there."""
+    critic: Critic | None = None
     """A copy that nobody trains; None without corrections."""
 
 
@@ -143,20 +125,24 @@ Entry = Steps | Episode
 
 
 @torch.no_grad()
-def q_advantage(critic: Critic, correction: Correction) -> float:
+def q_advantage(critic: Critic, seen: Seen) -> float:
     """Q'(s, a_human) - Q'(s, a_policy): eq. 21b's exponent, for the action that was overruled.
 
     One picture at a time: that takes this thread alone, where a batch would bring a second pool of
     threads beside the learner's.
     """
-    picture = critic.embed(torch.from_numpy(correction.frames)[None])
-    actions = torch.tensor([correction.action.tolist(), correction.policy_action.tolist()])
+    picture = critic.embed(torch.from_numpy(seen.observation)[None])
+    actions = torch.tensor([seen.action.tolist(), seen.policy_action.tolist()])
     human, policy = critic.value(picture.expand(2, -1), actions).tolist()
     return human - policy
 
 
 def make_blueprint(scene: SeenScene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
     """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
+    recent = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seq=-RECENT_STEPS),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
     left = rrb.Vertical(
         road_view(scene, ROAD),
         frames_view(),
@@ -165,28 +151,15 @@ def make_blueprint(scene: SeenScene | None, episodes: Sequence[Plot]) -> rrb.Blu
             name="Who drives: the policy, or the human, and why",
             time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
         ),
-        *(_recent(plot) for plot in RECENT),
+        *(plot_view(plot, recent) for plot in RECENT),
         row_shares=[3, 1.6, 0.9, 1.2, 1.1],
     )
     right = rrb.Vertical(*map(plot_view, episodes))
     return full_blueprint(left, right, [1, 1], TIMELINE)
 
 
-def _recent(plot: Plot) -> rrb.TimeSeriesView:
-    recent = rrb.TimeRange(
-        start=rrb.TimeRangeBoundary.cursor_relative(seq=-RECENT_STEPS),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
-    return plot_view(plot, recent)
-
-
 class TrainingLog:
-    """Draws one run.
-
-    Args:
-        recording: where.
-        episodes: the plots of whole episodes that are laid out.
-    """
+    """Draws one run, with the plots of whole ``episodes`` laid out."""
 
     def __init__(self, recording: rr.RecordingStream, episodes: Sequence[Plot]) -> None:
         self._recording, self._episodes = recording, episodes
@@ -195,52 +168,36 @@ class TrainingLog:
         """What is drawn of the ground: recordings may be of several scenarios."""
         self._returns: deque[float] = deque(maxlen=WINDOW)
         self._successes: deque[float] = deque(maxlen=WINDOW)
-        self._define_series()
+        style_lines(recording, LINES)
+        style_points(recording, POINTS)
+        names, colours = list(DRIVERS), list(DRIVERS.values())
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=colours)
+        recording.log("driver", lanes, static=True)
 
     def draw(self, entry: Entry) -> None:
         """Draw what the loop has handed over."""
-        if isinstance(entry, Steps):
-            self._draw_steps(entry.entries)
-            if entry.picture is not None:
-                self._draw_picture(entry.picture)
-        else:
+        if isinstance(entry, Episode):
             self._draw_episode(entry)
-
-    def _define_series(self) -> None:
-        style_lines(self._recording, LINES)
-        style_points(self._recording, POINTS)
-        lanes = rr.StateConfiguration(
-            values=list(DRIVERS), labels=list(DRIVERS), colors=list(DRIVERS.values())
-        )
-        self._recording.log("driver", lanes, static=True)
-
-    def _draw_steps(self, entries: list[StepEntry]) -> None:
-        steps = np.array([entry.step for entry in entries])
+            return
+        steps = np.array([each.step for each in entry.entries])
         for path, values in (
-            ("action/policy", [entry.policy_action for entry in entries]),
-            ("action/applied", [entry.action for entry in entries]),
-            ("speed/ego", [entry.speed_mps for entry in entries]),
+            ("action/policy", [each.policy_action for each in entry.entries]),
+            ("action/applied", [each.action for each in entry.entries]),
+            ("speed/ego", [each.speed_mps for each in entry.entries]),
         ):
             self._columns(path, steps, np.array(values))
-        for entry in entries:
-            self._tell_driver(entry)
-
-    def _tell_driver(self, entry: StepEntry) -> None:
-        """Draw who drives where that changes."""
-        driver = BY_POLICY if entry.reason is None else entry.reason
-        if driver == self._driver:
-            return
-        self._driver = driver
-        self._stand_at(entry.step)
-        self._recording.log("driver", rr.StateChange(state=driver))
-
-    def _draw_picture(self, picture: Picture) -> None:
-        self._stand_at(picture.step)
-        if picture.scene:
-            self._draw_road(read_scene(picture.scene))
-        before, now = picture.frames
-        self._recording.log("frames/before", rr.Image(before, color_model="L"))
-        self._recording.log("frames/now", rr.Image(now, color_model="L"))
+        for each in entry.entries:
+            driver = each.reason or BY_POLICY
+            if driver != self._driver:
+                self._driver = driver
+                self._stand_at(each.step)
+                self._recording.log("driver", rr.StateChange(state=driver))
+        if entry.frames is not None:
+            self._stand_at(entry.entries[-1].step)
+            if entry.scene is not None:
+                self._draw_road(read_scene(entry.scene))
+            for name, frame in zip(("before", "now"), entry.frames, strict=True):
+                self._recording.log(f"frames/{name}", rr.Image(frame, color_model="L"))
 
     def _draw_road(self, scene: SeenScene) -> None:
         ground = (scene.roads, scene.path, scene.goal)
@@ -248,7 +205,7 @@ class TrainingLog:
             self._ground = ground
             self._recording.send_blueprint(make_blueprint(scene, self._episodes))
             draw_ground(self._recording, scene)
-        draw_cars(self._recording, scene, DRIVERS[self._driver or BY_POLICY])
+        draw_cars(self._recording, scene, DRIVERS[self._driver])
 
     def _draw_episode(self, episode: Episode) -> None:
         metrics = episode.metrics
@@ -256,19 +213,7 @@ class TrainingLog:
         self._successes.append(float(metrics.outcome == GOAL))
         self._stand_at(episode.step)
         self._recording.set_time("episode", sequence=metrics.episode)
-        for path, value in self._numbers(metrics).items():
-            if not math.isnan(value):
-                self._recording.log(path, rr.Scalars(value))
-        self._recording.log("status", _status(metrics))
-        self._recording.reset_time()
-        if episode.critic is not None:
-            steps = np.array([correction.step for correction in episode.corrections])
-            values = [q_advantage(episode.critic, each) for each in episode.corrections]
-            self._columns("advantage/of_the_human", steps, np.array(values))
-        flush(self._recording)  # A viewer that is gone takes everything without a word.
-
-    def _numbers(self, metrics: EpisodeMetrics) -> dict[str, float]:
-        return {
+        for path, value in {
             "return/episode": metrics.episode_return,
             "return/mean_of_20": float(np.mean(self._returns)),
             "success/mean_of_20": float(np.mean(self._successes)),
@@ -279,7 +224,16 @@ class TrainingLog:
             "priority/human": metrics.human_priority,
             "priority/policy": metrics.policy_priority,
             "human/share": metrics.human_steps / metrics.steps,
-        }
+        }.items():
+            if not math.isnan(value):
+                self._recording.log(path, rr.Scalars(value))
+        self._recording.log("status", _status(metrics))
+        self._recording.reset_time()
+        if episode.critic is not None:
+            steps = np.array([step for step, _ in episode.corrections])
+            values = [q_advantage(episode.critic, seen) for _, seen in episode.corrections]
+            self._columns("advantage/of_the_human", steps, np.array(values))
+        flush(self._recording)  # A viewer that is gone takes everything without a word.
 
     def _columns(self, path: str, steps: NDArray[np.int64], values: NDArray[np.float64]) -> None:
         """Many numbers in one call: each of its own costs as much as all of these."""

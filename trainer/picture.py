@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import io
+from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -39,7 +39,7 @@ FACTS = {
 """What is said, by the reason of the intervention."""
 POLICY, HUMAN, GAUGE = COLOURS["ego"], (46, 139, 76), (200, 206, 196)
 COLOUR_COUNT = 64
-"""Of a GIF's palette: the scene has few colours, and letters some shades."""
+"""A GIF's palette: the scene has few colours, and letters some shades."""
 LAST_S = 1.5
 """How long the last picture stays before it begins anew."""
 
@@ -63,10 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what takes over in a film, where the scripted human would (default: nothing)",
     )
     parser.add_argument(
-        "--out",
-        required=True,
-        metavar="F.png|F.gif",
-        help="the picture, or the film",
+        "--out", required=True, metavar="F.png|F.gif", help="the picture, or the film"
     )
 
 
@@ -79,39 +76,27 @@ def run(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
     env = make_environment(arguments.scenario)
     driver, _ = load_driver(arguments.policy, env, arguments.public_key)
+    guide = None
+    if arguments.human is not None:
+        human, _ = load_driver(arguments.human, env)
+        guide = HumanGuide(human, TRIGGERS[env.scenario](EXPERTS[env.scenario](env)))
+    period_s = env.config.control_period_s
+    seconds = arguments.time if is_film else arguments.time + period_s  # and the scene after that
+    moments = drive_moments(env, driver, guide, arguments.seed, seconds)
     if is_film:
-        data = _film(arguments, env, driver)
+        name = ACTIONS[env.scenario].name
+        data = encode_gif([draw_moment(moment, name) for moment in moments], period_s)
     else:
-        data = _picture(env, driver, arguments.seed, arguments.time)
+        [last] = deque(moments, maxlen=1)
+        buffer = io.BytesIO()
+        last.scene.save(buffer, format="png")
+        data = buffer.getvalue()
     write_atomic(arguments.out, data)
     print(arguments.out)
     return 0
 
 
-def _picture(env: Any, driver: Driver, seed: int, time_s: float) -> bytes:
-    observation, _ = env.reset(seed=seed)
-    driver.reset()
-    ended = False
-    while not ended and env.steps * env.config.control_period_s < time_s - 1e-9:
-        observation, _, terminated, truncated, _ = env.step(driver.act(observation))
-        ended = terminated or truncated
-    buffer = io.BytesIO()
-    Image.fromarray(env.render()).save(buffer, format="png")
-    return buffer.getvalue()
-
-
-def _film(arguments: argparse.Namespace, env: Any, driver: Driver) -> bytes:
-    guide = None
-    if arguments.human is not None:
-        human, _ = load_driver(arguments.human, env)
-        guide = HumanGuide(human, TRIGGERS[env.scenario](EXPERTS[env.scenario](env)))
-    moments = drive_moments(env, driver, guide, arguments.seed, arguments.time)
-    pictures = [draw_moment(moment, ACTIONS[env.scenario].name) for moment in moments]
-    return encode_gif(pictures, env.config.control_period_s)
-
-
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """One control period: the scene before it, and who decides what in it."""
 
     scene: Image.Image
@@ -153,48 +138,30 @@ def draw_moment(moment: Moment, action_name: str) -> Image.Image:
     pen.rounded_rectangle(pill, PILL_PIXELS[1] // 2, fill=colour)
     middle = ((pill[0] + pill[2]) // 2, (pill[1] + pill[3]) // 2)
     pen.text(middle, FACTS[reason], fill=(255, 255, 255), anchor="mm", font_size=17)
-    left = image.width - GAUGE_PIXELS[0] - 16
-    for row, (name, value, shade) in enumerate(
-        ((f"{action_name} the policy wants", moment.policy_action, POLICY),
-         (f"{action_name} applied", moment.action, colour))
-    ):  # fmt: skip
-        _draw_gauge(pen, (left, 11 + 22 * row), name, value, shade)
-    return image
-
-
-def _draw_gauge(
-    pen: ImageDraw.ImageDraw,
-    corner: tuple[int, int],
-    name: str,
-    value: float,
-    colour: tuple[int, int, int],
-) -> None:
-    """A bar from the middle: right is positive."""
-    (left, top), (width, height) = corner, GAUGE_PIXELS
-    pen.rectangle((left, top, left + width, top + height), fill=GAUGE)
+    width, height = GAUGE_PIXELS
+    left = image.width - width - 16
     centre = left + width / 2
-    ends = sorted((centre, centre + value * width / 2))
-    pen.rectangle((ends[0], top, ends[1], top + height), fill=colour)
-    pen.line((centre, top - 2, centre, top + height + 2), fill=COLOURS["text"])
-    pen.text((left - 8, top + height / 2), name, fill=COLOURS["text"], anchor="rm", font_size=14)
+    text = COLOURS["text"]
+    for row, (name, value, shade) in enumerate(
+        (("the policy wants", moment.policy_action, POLICY), ("applied", moment.action, colour))
+    ):
+        top = 11 + 22 * row
+        pen.rectangle((left, top, left + width, top + height), fill=GAUGE)
+        ends = sorted((centre, centre + value * width / 2))  # Right is positive.
+        pen.rectangle((ends[0], top, ends[1], top + height), fill=shade)
+        pen.line((centre, top - 2, centre, top + height + 2), fill=text)
+        place = (left - 8, top + height / 2)
+        pen.text(place, f"{action_name} {name}", fill=text, anchor="rm", font_size=14)
+    return image
 
 
 def encode_gif(pictures: Sequence[Image.Image], period_s: float) -> bytes:
     """An endless GIF with one palette for all, so that nothing flickers."""
-    every = Image.fromarray(
-        np.vstack([np.asarray(p) for p in pictures[:: len(pictures) // 8 or 1]])
-    )
-    palette = every.quantize(COLOUR_COUNT, dither=Image.Dither.NONE)
+    some = np.vstack([np.asarray(picture) for picture in pictures[:: len(pictures) // 8 or 1]])
+    palette = Image.fromarray(some).quantize(COLOUR_COUNT, dither=Image.Dither.NONE)
     frames = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
     times_ms = [round(1000 * period_s)] * (len(frames) - 1) + [round(1000 * LAST_S)]
     buffer = io.BytesIO()
-    frames[0].save(
-        buffer,
-        format="gif",
-        save_all=True,
-        append_images=frames[1:],
-        duration=times_ms,
-        loop=0,
-        optimize=True,
-    )
+    more = {"append_images": frames[1:], "duration": times_ms, "loop": 0, "optimize": True}
+    frames[0].save(buffer, format="gif", save_all=True, **more)
     return buffer.getvalue()

@@ -6,7 +6,6 @@ import argparse
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -45,11 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         help="directory of a training run; several are drawn thinly, and their mean",
     )
-    parser.add_argument(
-        "--out",
-        metavar="F.png",
-        help=f"the picture (default: RUN_DIR/{CURVE_FILE})",
-    )
+    text = f"the picture (default: RUN_DIR/{CURVE_FILE})"
+    parser.add_argument("--out", metavar="F.png", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -84,17 +80,31 @@ def write_learning_curves(run_dirs: Sequence[Path], path: Path) -> None:
         UserError: one of them has no metrics yet.
     """
     runs = [_columns(run_dir) for run_dir in run_dirs]
+    shortest = min(len(run["episode"]) for run in runs)
+    episodes = runs[0]["episode"][:shortest]
     figure = Figure(figsize=(10, 6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True).flat
     for panel, (name, title) in zip(panels, PANELS, strict=True):
+        curves = [moving_average(run[name], WINDOW) for run in runs]
+        label = f"mean of {WINDOW}"
         if len(runs) == 1:
-            panel.plot(runs[0]["episode"], runs[0][name], ".", markersize=3, color="0.75")
-        _draw_means(panel, runs, name)
+            panel.plot(episodes, runs[0][name], ".", markersize=3, color="0.75")
+        else:
+            label = f"{len(runs)} runs, {label}"
+            for run, curve in zip(runs, curves, strict=True):
+                panel.plot(run["episode"], curve, color="C0", alpha=0.25, linewidth=1)
+        mean = np.mean([curve[:shortest] for curve in curves], axis=0)
+        panel.plot(episodes, mean, color="C0", label=label)
         panel.set_title(title)
         panel.grid(alpha=0.3)
+    # Success of the policy alone where all runs were validated, and its mean.
+    validated = np.array([run["validation"][:shortest] for run in runs])
+    tested = ~np.isnan(validated).any(axis=0)
+    means = validated[:, tested].mean(axis=0)
     panels = figure.axes
-    _draw_validation(panels[SUCCESS], runs)
-    panels[SUCCESS].legend()
+    success = panels[SUCCESS]
+    success.plot(episodes[tested], means, "o-", color="C1", label="policy alone, validation")
+    success.legend()
     for panel in panels[SUCCESS:]:
         panel.set_xlabel("episode")
     buffer = io.BytesIO()
@@ -127,31 +137,3 @@ def _columns(run_dir: Path) -> dict[str, Values]:
         "human_share": column("human_steps") / column("steps"),
         "validation": column("validation_success"),
     }
-
-
-def _draw_means(panel: Any, runs: list[dict[str, Values]], name: str) -> None:
-    """A moving average for each run; of several, theirs besides, which is what is looked at."""
-    curves = [moving_average(run[name], WINDOW) for run in runs]
-    if len(runs) == 1:
-        panel.plot(runs[0]["episode"], curves[0], color="C0", label=f"mean of {WINDOW}")
-        return
-    for run, curve in zip(runs, curves, strict=True):
-        panel.plot(run["episode"], curve, color="C0", alpha=0.25, linewidth=1)
-    shortest = min(len(curve) for curve in curves)
-    mean = np.mean([curve[:shortest] for curve in curves], axis=0)
-    label = f"{len(runs)} runs, mean of {WINDOW}"
-    panel.plot(runs[0]["episode"][:shortest], mean, color="C0", linewidth=2, label=label)
-
-
-def _draw_validation(panel: Any, runs: list[dict[str, Values]]) -> None:
-    """Success of the policy alone where it was validated; of several runs, the mean."""
-    label = "policy alone, validation"
-    if len(runs) == 1:
-        tested = ~np.isnan(runs[0]["validation"])
-        episodes, successes = runs[0]["episode"][tested], runs[0]["validation"][tested]
-    else:
-        shortest = min(len(run["episode"]) for run in runs)
-        values = np.array([run["validation"][:shortest] for run in runs])
-        tested = ~np.isnan(values).any(axis=0)
-        episodes, successes = runs[0]["episode"][:shortest][tested], values[:, tested].mean(axis=0)
-    panel.plot(episodes, successes, "o-", color="C1", label=label)

@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,8 @@ from trainer.drawing import (
     EPISODES,
     SITTING_APPLICATION,
     SITTINGS,
-    Correction,
     Entry,
     Episode,
-    Picture,
     StepEntry,
     Steps,
     TrainingLog,
@@ -63,11 +62,10 @@ EXAMPLE = examples(
 )
 LOOK_S = 0.2
 """The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
-OnEpisode = Callable[[EpisodeMetrics], None]
 STEPS_TOGETHER = 50
 """Numbers are handed over with a picture, or when there are so many."""
 CORRECTIONS = 32
-"""Of an episode whose Q advantage is shown: evenly spread, as the critic's time is not for free."""
+"""The Q advantage is shown for so many of an episode, evenly spread: the critic takes time."""
 MOST_WAITING = 500
 """Entries, some 50 s of pictures: a view that is slower loses some, and the loop nothing."""
 Draw = Callable[[Entry], None]
@@ -91,7 +89,11 @@ def run(arguments: argparse.Namespace) -> int:
     check_sink(sink)
     for path in paths:  # Before a window opens, or a file takes another's place.
         next(read_steps(path), None)
-    with show_sittings(paths, sink) as shown:
+    with open_sink(sink, SITTING_APPLICATION, make_blueprint(None, SITTINGS)) as recording:
+        log, shown = TrainingLog(recording, SITTINGS), Shown()
+        for entry in shown.entries(paths):
+            log.draw(entry)
+        flush(recording)
         road = f"; {shown.without_road} without their road" if shown.without_road else ""
         print(
             f"{counted(shown.episodes, 'episode')}, {counted(shown.steps, 'step')}, "
@@ -114,7 +116,7 @@ def check_word(word: str) -> Sink:
 
 
 @contextmanager
-def watched(run: TrainingRun, sink: Sink) -> Iterator[OnEpisode]:
+def watched(run: TrainingRun, sink: Sink) -> Iterator[Callable[[EpisodeMetrics], None]]:
     """Show a run for as long as it lasts; what it yields is to be called after each episode."""
 
     @contextmanager
@@ -137,88 +139,54 @@ def watched(run: TrainingRun, sink: Sink) -> Iterator[OnEpisode]:
                 print(f"{background.dropped} entries came faster than drawn", file=sys.stderr)
 
 
-@contextmanager
-def show_sittings(paths: Iterable[Path], sink: Sink) -> Iterator[Shown]:
-    """Draw recorded sittings; what it yields says how much there was."""
-    shown = Shown()
-    with open_sink(sink, SITTING_APPLICATION, make_blueprint(None, SITTINGS)) as recording:
-        log = TrainingLog(recording, SITTINGS)
-        for entry in shown.entries(paths):
-            log.draw(entry)
-        flush(recording)
-        yield shown
-
-
 class Watcher:
-    """Looks on at one run.
+    """Looks on at one run; ``put`` takes what is to be drawn, and must not block."""
 
-    Args:
-        run: the run; its environment is asked for the scene.
-        put: takes what is to be drawn; must not block.
-    """
-
-    def __init__(self, run: TrainingRun, put: Callable[[Entry], None]) -> None:
+    def __init__(self, run: TrainingRun, put: Draw) -> None:
         self._run, self._put = run, put
         self._pace = Pace(PICTURE_INTERVAL_S)
         self._step = run.learning.added
         self._entries: list[StepEntry] = []
-        self._corrections: list[Correction] = []
+        self._corrections: list[tuple[int, Seen]] = []
 
     def on_step(self, seen: Seen) -> None:
         """Take a control period."""
-        intervention = seen.intervention
-        self._entries.append(
-            StepEntry(
-                self._step,
-                float(seen.policy_action[0]),
-                float(seen.action[0]),
-                seen.speed_mps,
-                None if intervention is None else intervention.reason,
-            )
-        )
-        if intervention is not None:
-            self._corrections.append(
-                Correction(self._step, seen.observation, seen.policy_action, seen.action)
-            )
-        if self._pace.due(time.monotonic()):
-            scene: dict[str, Any] = self._run.env.scene()
-            self._hand_over(Picture(self._step, seen.observation, scene))
-        elif len(self._entries) >= STEPS_TOGETHER:
-            self._hand_over(None)
+        reason = None
+        if seen.intervention is not None:
+            reason = seen.intervention.reason
+            self._corrections.append((self._step, seen))
+        actions = float(seen.policy_action[0]), float(seen.action[0])
+        self._entries.append(StepEntry(self._step, *actions, seen.speed_mps, reason))
         self._step += 1
+        if self._pace.due(time.monotonic()):
+            self._hand_over(seen.observation, self._run.env.scene())
+        elif len(self._entries) >= STEPS_TOGETHER:
+            self._hand_over()
 
     def close(self) -> None:
         """Hand over what an episode that was broken off has left."""
-        self._hand_over(None)
+        self._hand_over()
 
     def on_episode(self, metrics: EpisodeMetrics) -> None:
         """Take an episode's end; no update is under way."""
-        self._hand_over(None)
-        chosen = _spread(self._corrections, CORRECTIONS)
+        self._hand_over()
+        corrections, self._corrections = self._corrections, []
         critic = None
-        if chosen:
+        if corrections:
             critic = copy.deepcopy(self._run.learning.learner.target_critics.first).cpu()
-        self._corrections = []
-        self._put(Episode(max(self._step - 1, 0), metrics, chosen, critic))
+        stride = -(-len(corrections) // CORRECTIONS) or 1
+        self._put(Episode(max(self._step - 1, 0), metrics, corrections[::stride], critic))
 
-    def _hand_over(self, picture: Picture | None) -> None:
+    def _hand_over(self, *picture: Any) -> None:
         entries, self._entries = self._entries, []
         if entries:
-            self._put(Steps(entries, picture))
-
-
-def _spread(corrections: list[Correction], most: int) -> list[Correction]:
-    """At most so many, evenly spread, the first among them."""
-    stride = -(-len(corrections) // most) or 1
-    return corrections[::stride]
+            self._put(Steps(entries, *picture))
 
 
 class Background:
     """Opens a view, draws each entry in order, and closes it, in a thread of its own.
 
-    Args:
-        opened: a view that may take its time; what it yields draws an entry. What any of it raises
-            is told once, and ends the drawing, not the run.
+    What any of it raises is told once, and ends the drawing, not the run.
     """
 
     def __init__(self, opened: Callable[[], AbstractContextManager[Draw]]) -> None:
@@ -267,59 +235,44 @@ class Shown:
     def entries(self, paths: Iterable[Path]) -> Iterator[Entry]:
         """Everything in these recordings, end to end; each episode ends with its own entry."""
         for path in paths:
-            for episode in _episodes(read_steps(path)):
-                yield from self._episode(episode)
+            for _, episode in groupby(read_steps(path), key=lambda step: step.episode):
+                yield from self._episode(list(episode))
 
     def _episode(self, episode: list[Step]) -> Iterator[Entry]:
         road = self._drive_again(episode)
-        for step, scene in zip(episode, road, strict=True):
+        for number, step in enumerate(episode):
             policy = math.nan if step.policy_action is None else step.policy_action
             reason: Reason | None = "person" if step.human else None
             entry = StepEntry(self.steps, policy, step.action, step.speed_mps, reason)
-            yield Steps([entry], Picture(self.steps, step.observation, scene))
+            yield Steps([entry], step.observation, road[number] if road else None)
             self.steps += 1
-        self.human_steps += sum(step.human for step in episode)
-        self.without_road += not road[0]
-        yield Episode(self.steps - 1, _metrics(self.episodes, self.steps, episode), [], None)
+        human_steps = sum(step.human for step in episode)
+        # What only a learner knows is nan.
+        known: dict[str, Any] = {
+            "episode": self.episodes,
+            "total_steps": self.steps,
+            "steps": len(episode),
+            "episode_return": sum(step.reward for step in episode),
+            "outcome": episode[-1].outcome or "cut off",
+            "interventions": sum(step.first for step in episode),
+            "human_steps": human_steps,
+        }
+        metrics = EpisodeMetrics(**{**dict.fromkeys(NAMES, math.nan), **known})
+        yield Episode(self.steps - 1, metrics)
+        self.human_steps += human_steps
+        self.without_road += not road
         self.episodes += 1
 
     def _drive_again(self, episode: list[Step]) -> list[dict[str, Any]]:
         """The scene at each step, by the same seed and the same actions; empty where it differs."""
-        first = episode[0]
-        nothing: list[dict[str, Any]] = [{}] * len(episode)
+        first, scenes = episode[0], []
         if first.step != 0:
-            return nothing  # Its beginning was in another file, which is gone.
+            return []  # Its beginning was in another file, which is gone.
         env = self._envs.setdefault(first.scenario, make_environment(first.scenario))
         observation, _ = env.reset(seed=first.seed)
-        scenes = []
         for step in episode:
             if not np.array_equal(observation, step.observation):
-                return nothing
+                return []
             scenes.append(env.scene())
             observation, *_ = env.step(np.array([step.action], np.float32))
         return scenes
-
-
-def _episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
-    episode: list[Step] = []
-    for step in steps:
-        if episode and step.episode != episode[0].episode:
-            yield episode
-            episode = []
-        episode.append(step)
-    if episode:
-        yield episode
-
-
-def _metrics(number: int, total_steps: int, episode: list[Step]) -> EpisodeMetrics:
-    """What a recording tells of an episode; what only a learner knows is nan."""
-    known: dict[str, Any] = {
-        "episode": number,
-        "total_steps": total_steps,
-        "steps": len(episode),
-        "episode_return": sum(step.reward for step in episode),
-        "outcome": episode[-1].outcome or "cut off",
-        "interventions": sum(step.first for step in episode),
-        "human_steps": sum(step.human for step in episode),
-    }
-    return EpisodeMetrics(**{**dict.fromkeys(NAMES, math.nan), **known})

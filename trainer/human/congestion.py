@@ -66,11 +66,7 @@ class CongestionExpert:
 
 
 class CongestionTrigger:
-    """Judges the policy's action before it is carried out.
-
-    Args:
-        expert: knows the environment.
-    """
+    """Judges the policy's action before it is carried out."""
 
     HORIZON_S = 1.0
     """How far the judged steering is followed."""
@@ -93,7 +89,7 @@ class CongestionTrigger:
         """Nothing to forget."""
 
     def may_return(self) -> bool:
-        """Whether the wheel can be given back: anywhere, the clock alone decides."""
+        """Whether control can be handed back: anywhere, the clock alone decides."""
         return True
 
     def judge(self, action: NDArray) -> Reason | None:

@@ -1,4 +1,4 @@
-"""The human beside the policy: watches each action, takes over, and gives back."""
+"""The human beside the policy: watches each action, takes over, and hands control back."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Intervention:
 
 
 class Guide(Protocol):
-    """Whoever watches the policy."""
+    """What watches the policy: a person, or the expert or model that stands for one."""
 
     def reset(self) -> None:
         """Start an episode with the policy in control."""
@@ -66,18 +66,12 @@ class Guide(Protocol):
 class HumanGuide:
     """Turns trigger and driver into interventions.
 
-    Args:
-        driver: who acts while the human is in control.
-        trigger: when the human takes over.
-        hold_steps: shortest time in control, from the last reason for it; None: ``HOLD_STEPS``.
+    The human stays in control for ``hold_steps`` from the last reason for it. A second and a half:
+    a person first brings the car out of what made them take over.
     """
 
-    HOLD_STEPS = 15
-    """A second and a half: a person who had to take over first brings the car out of it."""
-
-    def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int | None = None) -> None:
-        self.driver, self.trigger = driver, trigger
-        self.hold_steps = self.HOLD_STEPS if hold_steps is None else hold_steps
+    def __init__(self, driver: Driver, trigger: Trigger, hold_steps: int = 15) -> None:
+        self.driver, self.trigger, self.hold_steps = driver, trigger, hold_steps
         self.reset()
 
     def reset(self) -> None:

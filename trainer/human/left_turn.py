@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trainer.human.guide import Reason
-from trainer.scenarios.ego import EgoVehicle
-from trainer.scenarios.left_turn import LeftTurnEnv, Observation
+from trainer.scenarios.environment import EgoVehicle, Observation
+from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.scenarios.picture import Rectangle, corners
 
 TABLE_STEP_M = 0.1
@@ -33,12 +33,7 @@ class PedalPlan:
 
 
 class Crossing:
-    """Foresight for one left-turn environment.
-
-    Args:
-        env: the environment looked at.
-        side_clearance_m: room kept to the sides of a passing car.
-    """
+    """Foresight for one left-turn environment, with so much room to the sides of passing cars."""
 
     def __init__(self, env: LeftTurnEnv, side_clearance_m: float) -> None:
         self.env = env
@@ -131,8 +126,8 @@ class LeftTurnExpert:
 
     HORIZON_S = 6.0
     START_MARGIN_M = 2.5
-    """Room to every car while turning. With 1.5 m the expert is as safe, but of its imitators, who
-    start some tenths of a second early or late, every tenth touches the car that just passed."""
+    """Room to every car while turning. With 1.5 m the expert is as safe; but its imitators start
+    some tenths of a second early or late, and one in ten touches the car that just passed."""
     KEEP_MARGIN_M = 0.3
     POINT_OF_NO_RETURN_M = 8.0
     """Path length at which the nose comes within 0.5 m of the cars of the near lane."""
@@ -190,26 +185,23 @@ class LeftTurnTrigger:
     asked only where the present pedal leads would object to each brisk approach to the stop line,
     the expert's own, too; but theorem 1 holds only where no optimal policy goes where the human
     takes over.
-
-    Args:
-        expert: knows the environment and what a driver would do in it.
     """
 
     HOLD_S = 0.5
     """How long the judged pedal is taken to be held: a person's reaction time."""
     RESCUE_BRAKE = 0.85
     """Share of the full brake with which the car could then still be stopped in time; the rest is
-    room for a human who is a network."""
+    room for a human model."""
     STOP_BY_M = LeftTurnExpert.POINT_OF_NO_RETURN_M - 0.5
     """Path length by which it must then stand; past the point of no return a car can only be driven
-    on, and who creeps up to it has not waited."""
+    on, and creeping up to it is not waiting."""
     RESCUE_MARGIN_M = 1.0
     """Room along the lane with which it could then still drive on, at full throttle."""
     HESITATION_S = 1.0
-    """How long the judged pedal is taken to be held by who would then be in the lane."""
+    """How long the judged pedal is taken to be held by a car that would then be in the lane."""
     CRAWL_MPS = 1.5
-    """Who would then be slower than this within the lane is stopping there: nobody's plan, since
-    the traffic does not yield."""
+    """A car that would then be slower than this within the lane is stopping there: nobody's plan,
+    since the traffic does not yield."""
     STANDING_MPS = 0.3
     STANDING_STEPS = 15
     """Steps that a car stands before anybody thinks of it as stuck."""
@@ -240,9 +232,9 @@ class LeftTurnTrigger:
         return "stuck" if self.open_steps > self.OPEN_STEPS and pedal < self.START_PEDAL else None
 
     def may_return(self) -> bool:
-        """Whether the wheel can be given back: nobody does while driving through the lane.
+        """Whether control can be handed back: not while driving through the lane.
 
-        Who stands there gives up: a human who is a network might stand there for ever.
+        A human that stands there gives up: a human model might stand there for ever.
         """
         standing = self.expert.env.ego.speed < self.STANDING_MPS
         return standing or not self.expert.crossing.in_lane(self.expert.env.distance_m)

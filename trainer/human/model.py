@@ -17,7 +17,8 @@ from trainer.learner.networks import Actor
 from trainer.util import FROM_ONE, FROM_ZERO, check_ranges, load_torch, save_torch
 
 MODEL_FILE = "human_model.pt"
-
+REFINING_PARTS = 20
+"""Steps in which the learning rate falls while a model is refined."""
 RANGES = {
     "frames": (1, 2),
     "learning_rate": FROM_ZERO,
@@ -56,8 +57,9 @@ class HumanModelConfig:
     the model without an answer where it errs and nobody need step in, as too far from the line."""
     unaided_share: int = 0
     """In one episode in this many, from the first on, nobody takes over from the model, though
-    every step is labelled; 0: never. Those that the person drives alone stay theirs. Who is always
-    helped at once never learns what to do after a mistake, such as having stopped in the lane."""
+    every step is labelled; 0: never. Those that the person drives alone stay theirs. A model that
+    always gets help at once never learns what to do after a mistake, such as stopping in the lane.
+    """
     refining_updates: int = 0
     """Gradient steps after the last episode, under a learning rate that falls to zero. Not in the
     paper. On few examples 2,000 made no difference; on 22,000 examples 12,000 brought the left
@@ -67,11 +69,6 @@ class HumanModelConfig:
         check_ranges(self, RANGES)
         if self.unaided_share and not self.label_every_step:
             raise UserError("--unaided-share needs --label-every-step: nothing else teaches there")
-
-
-def refining_parts(updates: int) -> int:
-    """Steps in which the learning rate falls while a model is refined."""
-    return min(updates, 20)
 
 
 class HumanModel:
@@ -131,7 +128,7 @@ class HumanModel:
 
         The rate falls linearly, so that what was learned settles.
         """
-        parts = refining_parts(updates)
+        parts = min(updates, REFINING_PARTS)
         for part in range(parts):
             for group in self.optimiser.param_groups:
                 group["lr"] = self.config.learning_rate * (1.0 - part / parts)

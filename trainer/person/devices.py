@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import argparse
+from pathlib import Path
 from typing import Any
 
 import pygame
 
 from edge_runtime.util import UserError
-from trainer.person.interface import KEY_HELP, LET_GO, WISHES, Person, PersonOptions, Reading, Wish
+from trainer.person.interface import (
+    KEY_HELP,
+    LET_GO,
+    WISH_HELP,
+    WISHES,
+    Moving,
+    Person,
+    Reading,
+    View,
+    Wish,
+)
 from trainer.person.profile import SHIPPED, Profile, read_profile
 from trainer.person.window import Window
 
@@ -19,10 +30,6 @@ WISH_KEYS: dict[int, Wish] = {
     pygame.K_ESCAPE: "quit",
     pygame.K_q: "quit",
 }
-WISH_HELP = (
-    "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
-    "    Q / Esc: quit, all is kept"
-)
 SHIPPED_PROFILES = {"gamepad": SHIPPED / "gamepad.toml", "wheel": SHIPPED / "g29.toml"}
 PERIOD_S = 0.1
 KEYS = {
@@ -33,20 +40,16 @@ RATES_PER_S = {"left_turn": 5.0, "congestion": 2.5}
 """How quickly a key presses: a pedal is down in 0.2 s; a wheel is turned by a tap, not thrown."""
 
 
-class WindowDevice:
-    """Hands, and the keys of the window: pause, restart, discard, quit, which closing it is, too.
+class WindowPerson:
+    """Hands before a window, and the window's keys: pause, restart, discard, quit.
 
-    Args:
-        hands: the device proper.
+    Closing the window is quitting.
     """
 
-    def __init__(self, hands: KeyboardHands | JoystickHands) -> None:
-        self._hands = hands
-
-    @property
-    def help(self) -> tuple[str, ...]:
-        """What to press for what."""
-        return (*self._hands.help, WISH_HELP)
+    def __init__(self, hands: KeyboardHands | JoystickHands, window: Window) -> None:
+        self._hands, self._window = hands, window
+        self.help: tuple[str, ...] = (hands.help, WISH_HELP)
+        self.moving = hands.moving
 
     @property
     def present(self) -> bool:
@@ -55,69 +58,66 @@ class WindowDevice:
 
     def poll(self, now_s: float) -> Reading:
         """Take what SDL has heard since the last call."""
-        wishes = frozenset(self._take_events())
+        wishes: set[Wish] = set()
+        for event in pygame.event.get() if pygame.display.get_init() else ():
+            self._hands.handle(event)
+            if event.type == pygame.QUIT:
+                wishes.add("quit")
+            elif event.type == pygame.KEYDOWN and event.key in WISH_KEYS:
+                wishes.add(WISH_KEYS[event.key])
         reading = self._hands.read(now_s)
         return Reading(reading.action, reading.engaged, reading.wishes | wishes, reading.by_moving)
 
+    def show(self, view: View) -> None:
+        """Draw everything anew."""
+        self._window.show(view)
+
     def close(self) -> None:
-        """Nothing of its own: the window closes SDL."""
-
-    def _take_events(self) -> Iterator[Wish]:
-        if not pygame.display.get_init():
-            return
-        for event in pygame.event.get():
-            self._hands.handle(event)
-            if event.type == pygame.QUIT:
-                yield "quit"
-            elif event.type == pygame.KEYDOWN and event.key in WISH_KEYS:
-                yield WISH_KEYS[event.key]
+        """Close the window, and SDL with it."""
+        self._window.close()
 
 
-def open_keyboard(options: PersonOptions) -> Person:
+def open_keyboard(arguments: argparse.Namespace) -> Person:
     """The keyboard and its window; raises UserError without a screen."""
-    window = Window()
-    return Person(WindowDevice(KeyboardHands(options.scenario)), window)
+    return WindowPerson(KeyboardHands(arguments.scenario), Window())
 
 
-def open_joystick(options: PersonOptions, word: str) -> Person:
-    """A ``gamepad`` or a ``wheel``, with a window.
+def open_joystick(arguments: argparse.Namespace) -> Person:
+    """A gamepad or a wheel, with a window.
 
     Raises:
         UserError: no screen, no such device, or a profile that is none.
     """
-    path = options.profile or SHIPPED_PROFILES[word]
+    word = arguments.human
+    path = Path(arguments.profile or SHIPPED_PROFILES[word])
     profile = read_profile(path)
     window = Window()
-    hands = JoystickHands(profile, options.scenario)
+    hands = JoystickHands(profile, arguments.scenario)
     if not hands.present:
-        there = [
-            pygame.joystick.Joystick(number).get_name()
-            for number in range(pygame.joystick.get_count())
-        ]
+        there = ", ".join(joystick.get_name() for joystick in joysticks())
         window.close()
-        seen = f"there is {', '.join(there)}" if there else "none is plugged in"
         raise UserError(
-            f"no {word} that fits the profile {path.name} ({profile.match or 'any'}): {seen}; "
+            f"no {word} that fits the profile {path.name} ({profile.match or 'any'}): "
+            f"{f'there is {there}' if there else 'none is plugged in'}; "
             f"`python -m trainer drive --human {word} --calibrate F.toml` makes a profile"
         )
-    return Person(WindowDevice(hands), window, profile.moving)
+    return WindowPerson(hands, window)
+
+
+def joysticks() -> list[Any]:
+    """Everything that is plugged in; SDL's joysticks must have been started."""
+    return [pygame.joystick.Joystick(number) for number in range(pygame.joystick.get_count())]
 
 
 class KeyboardHands:
-    """Hold a key to take over and drive; the space bar holds without driving.
-
-    Args:
-        scenario: decides the keys.
-    """
+    """Hold a key to take over and drive; the space bar holds without driving."""
 
     present = True
+    moving = Moving()
 
     def __init__(self, scenario: str) -> None:
         self._keys, self._rate_per_s = KEYS[scenario], RATES_PER_S[scenario]
-        self.help = (
-            f"hold to take over    {KEY_HELP[scenario]}",
-            "Space: take over without driving",
-        )
+        self.help = KEY_HELP[scenario]
         self._down: set[int] = set()
         self._tapped: set[int] = set()
         """Pressed since the last reading: a tap shorter than a control period counts for one."""
@@ -147,32 +147,26 @@ class KeyboardHands:
             return LET_GO
         target = min(max(sum(self._keys[key] for key in driving), -1.0), 1.0)
         if target * self._action < 0.0:
-            self._action = 0.0  # Who turns round does not first undo.
+            self._action = 0.0  # Turning round does not first undo.
         step = self._rate_per_s * since_s
         self._action += min(max(target - self._action, -step), step)
         return Reading(action=self._action, engaged=True)
 
 
 class JoystickHands:
-    """A wheel or a gamepad, as its profile has it; it may be unplugged and plugged in again.
-
-    Args:
-        profile: what the axes and buttons mean.
-        scenario: decides which axes drive.
-    """
+    """A wheel or a gamepad, as its profile has it; it may be unplugged and plugged in again."""
 
     def __init__(self, profile: Profile, scenario: str) -> None:
         self._profile, self._scenario = profile, scenario
+        self.moving = Moving(profile.threshold, profile.rest, profile.rest_s)
         self._joystick: Any = None
         self._places: dict[int, float] = {}
-        """Of the axes that have moved: SDL calls the others 0, which is a pedal half pressed."""
+        """Axes that have moved: SDL calls the others 0, which is a pedal half pressed."""
         self._wishes: set[Wish] = set()
-        how = "hold the button to take over"
+        how = "hold the button"
         if profile.take_over == "moving":
-            how = (
-                f"{'turn the wheel' if scenario == 'congestion' else 'press a pedal'} to take over"
-            )
-        self.help = (f"{profile.name}: {how}",)
+            how = "turn the wheel" if scenario == "congestion" else "press a pedal"
+        self.help = f"{profile.name}: {how} to take over"
         self._plug_in()
 
     @property
@@ -189,7 +183,8 @@ class JoystickHands:
         elif event.type == pygame.JOYAXISMOTION:
             self._places[event.axis] = float(event.value)
         elif event.type == pygame.JOYBUTTONDOWN:
-            self._press(event.button)
+            buttons = self._profile.buttons
+            self._wishes |= {wish for wish in WISHES if event.button in buttons.get(wish, ())}
         elif event.type == pygame.JOYDEVICEREMOVED:
             self._joystick = None
             self._places.clear()
@@ -198,23 +193,16 @@ class JoystickHands:
         """What axes and buttons say; nothing of a device that is gone."""
         if self._joystick is None:
             return LET_GO
-        held = any(self._joystick.get_button(b) for b in self._buttons("hold"))
+        # Asking for a button that the device does not have is an error in SDL.
+        count = self._joystick.get_numbuttons()
+        holding = [number for number in self._profile.buttons.get("hold", ()) if number < count]
+        held = any(self._joystick.get_button(number) for number in holding)
         wishes, self._wishes = frozenset(self._wishes), set()
         action = self._profile.action(self._scenario, self._places)
-        moving = self._profile.take_over == "moving"
-        return Reading(action, held, wishes, by_moving=moving)
+        return Reading(action, held, wishes, by_moving=self._profile.take_over == "moving")
 
     def _plug_in(self) -> None:
-        for number in range(pygame.joystick.get_count()):
-            joystick = pygame.joystick.Joystick(number)
+        for joystick in joysticks():
             if self._profile.match.lower() in joystick.get_name().lower():
                 self._joystick, self._instance = joystick, joystick.get_instance_id()
                 return
-
-    def _press(self, button: int) -> None:
-        self._wishes |= {wish for wish in WISHES if button in getattr(self._profile.buttons, wish)}
-
-    def _buttons(self, what: str) -> list[int]:
-        """The profile's numbers that this device has; asking for another is an error in SDL."""
-        count = self._joystick.get_numbuttons()
-        return [number for number in getattr(self._profile.buttons, what) if number < count]

@@ -14,9 +14,9 @@ from trainer import seeds
 from trainer.drivers import load_driver, make_environment
 from trainer.human.guide import Driver
 from trainer.options import add_scenario, add_seed, add_threads, set_threads
-from trainer.person.interface import HUMANS, add_person, person_options
+from trainer.person.interface import HUMANS, add_person, open_person
 from trainer.person.recording import Recorder
-from trainer.person.session import Sitting, SittingOver, WatchedEnv
+from trainer.person.session import Sitting, SittingOver
 from trainer.util import quit_on_signals
 
 EXAMPLE = examples(
@@ -71,13 +71,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Drive until the person quits; returns the exit status."""
     if arguments.calibrate is not None:
-        return _calibrate(arguments)
+        if arguments.human not in ("gamepad", "wheel"):
+            raise UserError("--calibrate asks a --human gamepad or wheel")
+        from trainer.person.profile import calibrate
+
+        calibrate(arguments.human, Path(arguments.calibrate))
+        return 0
     set_threads(arguments.threads)
     env = make_environment(arguments.scenario)
     policy = None
     if arguments.policy is not None:
         policy, _ = load_driver(arguments.policy, env, arguments.public_key)
-    person = HUMANS[arguments.human](person_options(arguments))
+    person = open_person(arguments)
     try:
         recorder = Recorder(Path(arguments.out))
         sitting = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
@@ -88,9 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
             sitting.close()
     finally:
         person.close()
-    ends = ", ".join(f"{count} {word}" for word, count in outcomes.items()) or "none"
     print(
-        f"episodes: {ends}; {counted(recorder.index, 'step')}, "
+        f"episodes: {_listed(outcomes) or 'none'}; {counted(recorder.index, 'step')}, "
         f"{sitting.human_steps} of them yours in "
         f"{counted(sitting.interventions, 'intervention')}; "
         f"{counted(sitting.pacer.late, 'control period')} late"
@@ -100,54 +104,39 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _calibrate(arguments: argparse.Namespace) -> int:
-    if arguments.human not in ("gamepad", "wheel"):
-        raise UserError("--calibrate asks a --human gamepad or wheel")
-    from trainer.person.profile import calibrate
-
-    calibrate(arguments.human, Path(arguments.calibrate))
-    return 0
-
-
 def drive(
     sitting: Sitting, policy: Driver | None, run_seed: int, episodes: int | None
 ) -> Counter[str]:
-    """Drive until the person quits, or so many episodes.
+    """Drive until the person quits, or so many episodes (None: no end).
 
-    Args:
-        sitting: whoever sits there.
-        policy: from whom the person takes over; None: from nobody.
-        run_seed: decides the episodes, which are others in every sitting.
-        episodes: how many; None: no end.
+    The policy drives until the person takes over; without one, the person drives alone. The seed
+    decides the episodes, which are others in every sitting.
 
     Returns:
         How often an episode ended how.
     """
-    env, outcomes = WatchedEnv(sitting.env, sitting), Counter[str]()
+    outcomes = Counter[str]()
     number = sitting.recorder.sitting
     while not sitting.stop and outcomes.total() != episodes:
-        seed = seeds.episode_seed(run_seed, seeds.SITTINGS, (number << 32) + env.episode)
+        seed = seeds.episode_seed(run_seed, seeds.SITTINGS, (number << 32) + sitting.episode)
         try:
-            outcome = _episode(env, sitting, policy, seed)
+            observation, _ = sitting.reset(seed)
         except SittingOver:
             break
-        outcome = sitting.rest(outcome)
-        outcomes[outcome] += 1
-        env.episode += 1
-        sitting.progress = ", ".join(f"{count} {word}" for word, count in outcomes.items())
+        if policy is not None:
+            policy.reset()
+        ended = False
+        while not ended:
+            policy_action = None if policy is None else float(policy.act(observation)[0])
+            applied = sitting.decide(observation, policy_action)
+            action = np.array([applied.action], np.float32)
+            observation, _, terminated, truncated, info = sitting.step(action)
+            ended = terminated or truncated
+        outcomes[sitting.rest(info["outcome"])] += 1
+        sitting.episode += 1
+        sitting.progress = _listed(outcomes)
     return outcomes
 
 
-def _episode(env: WatchedEnv, sitting: Sitting, policy: Driver | None, seed: int) -> str:
-    """One episode; how it ended."""
-    observation, info = env.reset(seed=seed)
-    if policy is not None:
-        policy.reset()
-    ended = False
-    while not ended:
-        policy_action = None if policy is None else float(policy.act(observation)[0])
-        applied = sitting.decide(observation, policy_action)
-        action = np.array([applied.action], np.float32)
-        observation, _, terminated, truncated, info = env.step(action)
-        ended = terminated or truncated
-    return str(info["outcome"])
+def _listed(outcomes: Counter[str]) -> str:
+    return ", ".join(f"{count} {word}" for word, count in outcomes.items())

@@ -1,17 +1,11 @@
-"""A person as the loop and the command line know one: a device to ask, a display to show.
-
-The loop's thread calls everything here, once a control period while driving and about as often
-while paused; nothing may block for longer than a few milliseconds. A window is two objects, a
-browser may be one that is both.
-"""
+"""A person at the wheel, as the loop and the command line see one."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -21,18 +15,21 @@ from edge_runtime.cli import positive_number, whole_number
 from edge_runtime.util import UserError
 
 Wish = Literal["pause", "restart", "discard", "quit"]
-"""``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard``
-does so and throws it away: it stays in the recording, marked, and nothing learns from it; ``quit``
-ends the sitting."""
+"""``pause`` pauses and goes on; ``restart`` ends the episode and starts the next; ``discard`` also
+marks the recorded episode, and nothing learns from it; ``quit`` ends the sitting."""
 WISHES: tuple[Wish, ...] = ("pause", "restart", "discard", "quit")
 Control = Literal["policy", "human", "returning"]
-"""Who decides the applied action; ``returning``: the person has let go and the action is on its way
-back to the policy's, which still counts as the person's."""
+"""What decides the applied action; ``returning``: the person has let go, and the action is on its
+way back to the policy's, which still counts as the person's."""
 KEY_HELP = {
-    "left_turn": "Up / W: throttle    Down / S: brake",
-    "congestion": "Left / A, Right / D: steer",
+    "left_turn": "hold to take over    Up / W: throttle    Down / S: brake    Space: neither",
+    "congestion": "hold to take over    Left / A, Right / D: steer    Space: straight on",
 }
 """Scenario -> what its keys do, in a window and in the browser alike."""
+WISH_HELP = (
+    "P: pause    R: restart the episode    Backspace: discard it, or the one that has just ended"
+    "    Q: quit, all is kept"
+)
 PERSON = "person"
 """``RunConfig.human`` of every device: a run may go on with another one."""
 
@@ -49,17 +46,16 @@ class Reading:
     wishes: frozenset[Wish] = frozenset()
     """What was asked for since the last reading; each press is reported once."""
     by_moving: bool = False
-    """Whether moving ``action`` away from rest takes over, too, as a steering wheel does
+    """Whether moving ``action`` away from rest also takes over, as with a steering wheel
     (``Moving``)."""
 
 
 LET_GO = Reading()
-"""Nobody there."""
 
 
 @dataclass(frozen=True)
 class Moving:
-    """When moving a wheel or a pedal takes over, and when its resting gives back."""
+    """When moving a wheel or a pedal takes over, and when its resting hands control back."""
 
     threshold: float = 0.15
     """How far from rest ``Reading.action`` must be to take over."""
@@ -67,7 +63,7 @@ class Moving:
     """Below this it rests. Less than ``threshold``, so that a hand that trembles there does not
     take over time and again."""
     rest_s: float = 0.6
-    """How long it must rest to give back: a wheel passes its middle in every bend."""
+    """How long it must rest to hand control back: a wheel passes its middle in every bend."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +72,7 @@ class View:
 
     scenario: str
     scene: dict[str, Any]
-    """``DrivingEnv.scene()``: roads, path, goal, vehicles (the ego car first), and the corner of
-    the ground shown, in metres; plain lists and numbers, y downwards. Draw with it what
-    ``scenarios/scene.py`` draws."""
+    """``DrivingEnv.scene()``: plain lists and numbers in metres, y downwards, the ego car first."""
     frames: NDArray[np.uint8]
     """What the policy sees: [2, 45, 80], the older frame first."""
     policy_action: float | None
@@ -86,7 +80,6 @@ class View:
     human_action: float
     """What the device says, in control or not."""
     applied_action: float
-    """What the car was told."""
     control: Control
     speed_mps: float
     distance_m: float
@@ -102,96 +95,54 @@ class View:
     """One line on the learner; empty without one."""
     message: str = ""
     """What is going on besides driving: "saving", "episode ended: goal"; mostly empty."""
-    help: tuple[str, ...] = field(default=())
+    help: tuple[str, ...] = ()
     """The device's keys, one line each."""
 
 
-class Device(Protocol):
-    """Where the person's hands are."""
+class Person(Protocol):
+    """Hands and eyes: a device to ask, a display to show.
 
-    @property
-    def help(self) -> tuple[str, ...]:
-        """What to press for what, one short line each."""
-        ...
+    The loop's thread calls all of it, about once a control period; nothing may block for longer
+    than a few milliseconds.
+    """
+
+    help: tuple[str, ...]
+    """What to press for what, one short line each."""
+    moving: Moving
 
     @property
     def present(self) -> bool:
-        """Whether a person can act: a browser has the wheel, a gamepad is plugged in. Before an
-        episode the loop waits for it; within one, somebody absent has let go.
+        """Whether a person can act: a browser has the wheel, a gamepad is plugged in.
+
+        Before an episode the loop waits for it; within one, an absent person has let go.
         """
         ...
 
     def poll(self, now_s: float) -> Reading:
-        """What the person does at ``now_s`` (``time.monotonic``). Never blocks, never raises: a
-        device that is gone reads ``LET_GO``.
-        """
+        """What the person does at ``now_s`` (``time.monotonic``); ``LET_GO`` without a device."""
         ...
 
-    def close(self) -> None:
-        """Let go of the device; twice is once."""
-
-
-class Display(Protocol):
-    """Where the person's eyes are."""
-
     def show(self, view: View) -> None:
-        """Show the newest view; never blocks, and may leave out views it has no time for."""
+        """Show the newest view; it may leave out views that it has no time for."""
 
     def close(self) -> None:
-        """Close it; twice is once."""
-
-
-@dataclass(frozen=True)
-class Person:
-    """Hands and eyes. ``device`` and ``display`` may be the same object."""
-
-    device: Device
-    display: Display
-    moving: Moving = Moving()
-
-    def close(self) -> None:
-        """Close both."""
-        self.device.close()
-        self.display.close()
-
-
-@dataclass(frozen=True)
-class PersonOptions:
-    """What the command line says about the person's device."""
-
-    scenario: str = "left_turn"
-    profile: Path | None = None
-    """Axes and buttons of a gamepad or wheel; None: the shipped one."""
-    host: str = "127.0.0.1"
-    port: int = 0
-    """Of the browser cockpit; 0: any free one."""
-
-
-def _opener(module: str, name: str, *more: str) -> Callable[[PersonOptions], Person]:
-    """Opens a device; the libraries behind it are imported only then."""
-
-    def open_device(options: PersonOptions) -> Person:
-        opened: Person = getattr(import_module(module), name)(options, *more)
-        return opened
-
-    return open_device
+        """Close device and display; twice is once."""
 
 
 HUMANS = {
-    "keyboard": _opener("trainer.person.devices", "open_keyboard"),
-    "gamepad": _opener("trainer.person.devices", "open_joystick", "gamepad"),
-    "wheel": _opener("trainer.person.devices", "open_joystick", "wheel"),
-    "web": _opener("trainer.person.web", "open_cockpit"),
+    "keyboard": "trainer.person.devices:open_keyboard",
+    "gamepad": "trainer.person.devices:open_joystick",
+    "wheel": "trainer.person.devices:open_joystick",
+    "web": "trainer.person.web:open_cockpit",
 }
-"""Word of ``--human`` -> opens device and display; raises UserError where there is none."""
-USEFUL = {
-    "profile": ("gamepad", "wheel"),
-    "host": ("web",),
-    "port": ("web",),
-    "speed": tuple(HUMANS),
+"""Word of ``--human`` -> what opens it; the libraries behind it are imported only then."""
+DEVICE_OPTIONS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "profile": (None, ("gamepad", "wheel")),
+    "host": ("127.0.0.1", ("web",)),
+    "port": (0, ("web",)),
+    "speed": (1.0, tuple(HUMANS)),
 }
-"""Option of a person -> the devices that have a use for it."""
-DEFAULTS = {"profile": None, "host": PersonOptions.host, "port": PersonOptions.port, "speed": 1.0}
+"""Option -> its default, and the devices that have a use for it."""
 
 
 def add_person(parser: argparse.ArgumentParser) -> None:
@@ -203,39 +154,33 @@ def add_person(parser: argparse.ArgumentParser) -> None:
         help="what the axes and buttons of --human gamepad or wheel mean (default: as shipped)",
     )
     group.add_argument(
-        "--host",
-        default=DEFAULTS["host"],
-        help="the address at which --human web listens; by default this machine's alone",
+        "--host", help="the address at which --human web listens; by default this machine's alone"
     )
     group.add_argument(
         "--port",
         type=whole_number(0, 65535),
-        default=DEFAULTS["port"],
         metavar="N",
         help="the port of --human web; 0: any that is free",
     )
     group.add_argument(
         "--speed",
         type=positive_number,
-        default=DEFAULTS["speed"],
         metavar="X",
         help="simulated seconds in one of yours: 0.5 is slow motion",
     )
-
-
-def person_options(arguments: argparse.Namespace) -> PersonOptions:
-    """What the command line says about the device.
-
-    Raises:
-        UserError: an option that the device has no use for.
-    """
-    check_person_options(arguments)
-    profile = None if arguments.profile is None else Path(arguments.profile)
-    return PersonOptions(arguments.scenario, profile, arguments.host, arguments.port)
+    group.set_defaults(**{name: default for name, (default, _) in DEVICE_OPTIONS.items()})
 
 
 def check_person_options(arguments: argparse.Namespace) -> None:
     """Refuse what ``--human``, a device or not, has no use for; raises UserError."""
-    for name, devices in USEFUL.items():
-        if getattr(arguments, name) != DEFAULTS[name] and arguments.human not in devices:
+    for name, (default, devices) in DEVICE_OPTIONS.items():
+        if getattr(arguments, name) != default and arguments.human not in devices:
             raise UserError(f"--{name} means nothing with --human {arguments.human}")
+
+
+def open_person(arguments: argparse.Namespace) -> Person:
+    """Open the device and the display of ``--human``; raises UserError where there is none."""
+    check_person_options(arguments)
+    module, _, name = HUMANS[arguments.human].partition(":")
+    opener: Callable[[argparse.Namespace], Person] = getattr(import_module(module), name)
+    return opener(arguments)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError, read_toml
-from trainer.person.interface import Moving
+from trainer.person.interface import Moving, Wish
 
 SHIPPED = Path(__file__).parent / "profiles"
 Number = Annotated[int, msgspec.Meta(ge=0, le=63)]
@@ -23,16 +23,6 @@ SHORTEST = 0.02
 """The least way of a wheel or pedal: its noise must not be a full action."""
 DeadZone = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 Share = Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)]
-MOVED = 0.2
-"""How far an axis must go to be the one that was asked for."""
-STEADY, STEADY_S = 0.02, 0.7
-"""How still it must then be held, and for how long."""
-FIRST_S = 2.0
-"""For pressing and turning everything once."""
-LOOK_S = 0.02
-PATIENCE_S = 60.0
-"""How long a question is asked."""
-Say = Callable[[str], None]
 
 
 class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,9 +45,10 @@ class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def action(self, place: float) -> float:
         """The steering in [-1, 1] for the axis' place; no jump at the dead zone's edge."""
-        side = self.right if (place - self.centre) * (self.right - self.centre) > 0 else self.left
-        share = _beyond((place - self.centre) / (side - self.centre), self.dead_zone)
-        return share if side == self.right else -share
+        right, left = (
+            _share(place, self.centre, side, self.dead_zone) for side in (self.right, self.left)
+        )
+        return right - left
 
 
 class Pedal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -74,18 +65,7 @@ class Pedal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def action(self, place: float) -> float:
         """How far it is pressed, in [0, 1]."""
-        way = (place - self.released) / (self.pressed - self.released)
-        return _beyond(way, self.dead_zone)
-
-
-class Buttons(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Button numbers; any of a list will do."""
-
-    hold: tuple[Number, ...] = ()
-    pause: tuple[Number, ...] = ()
-    restart: tuple[Number, ...] = ()
-    discard: tuple[Number, ...] = ()
-    quit: tuple[Number, ...] = ()
+        return _share(place, self.released, self.pressed, self.dead_zone)
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,29 +82,24 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     threshold: Share = Moving.threshold
     rest: Share = Moving.rest
     rest_s: Annotated[float, msgspec.Meta(gt=0.0, le=10.0)] = Moving.rest_s
-    buttons: Buttons = Buttons()
+    buttons: dict[Literal["hold"] | Wish, tuple[Number, ...]] = {}
+    """Button numbers; any of a list will do."""
 
     def __post_init__(self) -> None:
         if self.rest >= self.threshold:
             raise ValueError("rest must be below threshold")
-        if self.take_over == "holding" and not self.buttons.hold:
+        if self.take_over == "holding" and not self.buttons.get("hold"):
             raise ValueError("take_over is by holding, but buttons.hold is empty")
-
-    @property
-    def moving(self) -> Moving:
-        """What counts as moving."""
-        return Moving(self.threshold, self.rest, self.rest_s)
 
     def action(self, scenario: str, places: dict[int, float]) -> float:
         """The scenario's action from the axes' places; an axis not in ``places`` is at rest."""
         if scenario == "congestion":
-            return self._of(self.steering, places, self.steering.centre)
-        throttle = self._of(self.throttle, places, self.throttle.released)
-        return throttle - self._of(self.brake, places, self.brake.released)
-
-    @staticmethod
-    def _of(axis: Steering | Pedal, places: dict[int, float], at_rest: float) -> float:
-        return axis.action(places.get(axis.axis, at_rest))
+            return self.steering.action(places.get(self.steering.axis, self.steering.centre))
+        throttle, brake = (
+            pedal.action(places.get(pedal.axis, pedal.released))
+            for pedal in (self.throttle, self.brake)
+        )
+        return throttle - brake
 
 
 def read_profile(path: Path) -> Profile:
@@ -140,125 +115,58 @@ def read_profile(path: Path) -> Profile:
         raise UserError(f"profile {path}: {error}") from None
 
 
-def _beyond(share: float, dead_zone: float) -> float:
-    """The share of the way beyond the dead zone, in [0, 1]."""
-    return min(max((share - dead_zone) / (1.0 - dead_zone), 0.0), 1.0)
+def _share(place: float, start: float, end: float, dead_zone: float) -> float:
+    """The share of the way from start to end, beyond the dead zone, in [0, 1]."""
+    way = (place - start) / (end - start)
+    return min(max((way - dead_zone) / (1.0 - dead_zone), 0.0), 1.0)
 
 
-@dataclass(frozen=True)
-class Found:
-    """An axis, and where it was held."""
+MOVED = 0.2
+"""How far an axis must go to be the one that was asked for."""
+STEADY, STEADY_S = 0.02, 0.7
+"""How still it must then be held, and for how long."""
+FIRST_S = 2.0
+"""For pressing and turning everything once."""
+LOOK_S = 0.02
+PATIENCE_S = 60.0
+"""How long a question is asked."""
+Answer = TypeVar("Answer")
+WRITTEN = """\
+# Written by `python -m trainer drive --calibrate`.
+name = {name}
+match = {name}
+take_over = "moving"  # or "holding": a button of buttons.hold alone
+
+[steering]
+axis = {left.axis}
+left = {left.place:.3f}
+centre = {left.rest:.3f}
+right = {right.place:.3f}
+dead_zone = 0.03
+
+[throttle]
+axis = {throttle.axis}
+released = {throttle.rest:.3f}
+pressed = {throttle.place:.3f}
+dead_zone = 0.05
+
+[brake]
+axis = {brake.axis}
+released = {brake.rest:.3f}
+pressed = {brake.place:.3f}
+dead_zone = 0.05
+
+[buttons]
+hold = [{hold}]
+"""
+
+
+class Found(NamedTuple):
+    """An axis, where it was held, and where it rests."""
 
     axis: int
     place: float
-
-
-class Questions:
-    """What is asked of the person, about one device.
-
-    Args:
-        joystick: pygame's.
-        pump: lets SDL look at its devices.
-        say: tells the person what to do.
-    """
-
-    def __init__(self, joystick: Any, pump: Callable[[], None], say: Say) -> None:
-        self._joystick, self._pump, self._say = joystick, pump, say
-
-    def at_rest(self) -> list[float]:
-        """Where all axes are when nobody touches them. UserError: it has none."""
-        if not self._joystick.get_numaxes():
-            raise UserError(f"{self._joystick.get_name()} has no axes to calibrate")
-        self._say("Press every pedal and turn the wheel once, then let go of everything.")
-        time.sleep(FIRST_S)
-        self._until(lambda: self._still() or None)
-        return self._places()
-
-    def axis(self, rest: list[float], what: str) -> Found:
-        """Which axis is held away from ``rest``, and where."""
-        self._say(what)
-
-        def held() -> Found | None:
-            places = self._places()
-            away = [abs(here - there) for here, there in zip(places, rest, strict=True)]
-            number = max(range(len(away)), key=away.__getitem__)
-            return Found(number, places[number]) if away[number] > MOVED and self._still() else None
-
-        found = self._until(held)
-        self._say("  and let go.")
-        self._until(lambda: abs(self._places()[found.axis] - rest[found.axis]) < MOVED or None)
-        return found
-
-    def button(self, what: str) -> int:
-        """Which button is pressed."""
-        self._say(what)
-
-        def pressed() -> int | None:
-            down = [
-                b for b in range(self._joystick.get_numbuttons()) if self._joystick.get_button(b)
-            ]
-            return down[0] if down else None
-
-        return self._until(pressed)
-
-    def _still(self) -> bool:
-        """Whether all axes stay where they are for a while."""
-        before, end_s = self._places(), time.monotonic() + STEADY_S
-        while time.monotonic() < end_s:
-            time.sleep(LOOK_S)
-            now = self._places()
-            if any(abs(a - b) > STEADY for a, b in zip(now, before, strict=True)):
-                return False
-        return True
-
-    def _places(self) -> list[float]:
-        self._pump()
-        return [self._joystick.get_axis(axis) for axis in range(self._joystick.get_numaxes())]
-
-    def _until(self, answer: Callable[[], Any]) -> Any:
-        """The first answer that is not None."""
-        end_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < end_s:
-            self._pump()
-            given = answer()
-            if given is not None:
-                return given
-            time.sleep(LOOK_S)
-        raise UserError("nothing was pressed for a minute; no profile was written")
-
-
-def ask(questions: Questions, name: str) -> str:
-    """The profile, as TOML, from the answers."""
-    rest = questions.at_rest()
-    left = questions.axis(rest, "Turn LEFT as far as full steering is to be, and hold.")
-    right = questions.axis(rest, "Turn RIGHT as far, and hold.")
-    if left.axis != right.axis:
-        raise UserError(f"left was axis {left.axis}, right axis {right.axis}: begin again")
-    throttle = questions.axis(rest, "Press the THROTTLE fully, and hold.")
-    brake = questions.axis(rest, "Press the BRAKE fully, and hold.")
-    hold = questions.button("Press the button that is to take over while it is held.")
-    shown = name.replace("\\", "\\\\").replace('"', '\\"')
-    return "\n".join(
-        [
-            "# Written by `python -m trainer drive --calibrate`.",
-            f'name = "{shown}"',
-            f'match = "{shown}"',
-            'take_over = "moving"  # or "holding": a button of buttons.hold alone',
-            "",
-            "[steering]",
-            f"axis = {left.axis}",
-            f"left = {left.place:.3f}",
-            f"centre = {rest[left.axis]:.3f}",
-            f"right = {right.place:.3f}",
-            "dead_zone = 0.03",
-            *_pedal("throttle", throttle, rest),
-            *_pedal("brake", brake, rest),
-            "",
-            "[buttons]",
-            f"hold = [{hold}]",
-            "",
-        ]
-    )
+    rest: float
 
 
 def calibrate(word: str, out: Path) -> None:
@@ -270,28 +178,90 @@ def calibrate(word: str, out: Path) -> None:
     check_writable(out)
     # Axes are read without a window, too, but not without SDL's video.
     os.environ["SDL_VIDEODRIVER"] = "dummy"
-    from trainer.person.devices import pygame
+    from trainer.person.devices import joysticks, pygame
 
     pygame.display.init()
     pygame.joystick.init()
     try:
-        if not pygame.joystick.get_count():
+        devices = joysticks()
+        if not devices:
             raise UserError(f"no {word} is plugged in")
-        joystick = pygame.joystick.Joystick(0)
-        questions = Questions(joystick, pygame.event.pump, lambda line: print(line, flush=True))
-        print(f"{joystick.get_name()}:")
-        write_atomic(out, ask(questions, joystick.get_name()).encode())
+        print(f"{devices[0].get_name()}:")
+        profile = ask(devices[0], pygame.event.pump, lambda line: print(line, flush=True))
+        write_atomic(out, profile.encode())
     finally:
         pygame.quit()
     print(out)
 
 
-def _pedal(name: str, found: Found, rest: list[float]) -> list[str]:
-    return [
-        "",
-        f"[{name}]",
-        f"axis = {found.axis}",
-        f"released = {rest[found.axis]:.3f}",
-        f"pressed = {found.place:.3f}",
-        "dead_zone = 0.05",
-    ]
+def ask(joystick: Any, pump: Callable[[], object], say: Callable[[str], None]) -> str:
+    """The profile, as TOML, from what the person does with the joystick (pygame's) when told.
+
+    ``pump`` lets SDL look at its devices. Raises UserError where there is no answer, or none that
+    makes sense.
+    """
+
+    def places() -> list[float]:
+        pump()
+        return [joystick.get_axis(axis) for axis in range(joystick.get_numaxes())]
+
+    def until(answer: Callable[[], Answer | None]) -> Answer:
+        """The first answer that is neither None nor False."""
+        end_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end_s:
+            given = answer()
+            if given is not None and given is not False:
+                return given
+            time.sleep(LOOK_S)
+        raise UserError("nothing was pressed for a minute; no profile was written")
+
+    def still() -> bool:
+        """Whether all axes stay where they are for a while."""
+        before, end_s = places(), time.monotonic() + STEADY_S
+        while time.monotonic() < end_s:
+            time.sleep(LOOK_S)
+            if any(abs(a - b) > STEADY for a, b in zip(places(), before, strict=True)):
+                return False
+        return True
+
+    def held() -> Found | None:
+        """The axis that is held away from its rest, where it is once it is still."""
+        away = [abs(here - there) for here, there in zip(places(), rest, strict=True)]
+        axis = max(range(len(away)), key=away.__getitem__)
+        if away[axis] <= MOVED or not still():
+            return None
+        return Found(axis, places()[axis], rest[axis])
+
+    def ask_axis(what: str) -> Found:
+        say(what)
+        found = until(held)
+        say("  and let go.")
+        until(lambda: abs(places()[found.axis] - found.rest) < MOVED)
+        return found
+
+    def pressed() -> int | None:
+        pump()
+        return next(filter(joystick.get_button, range(joystick.get_numbuttons())), None)
+
+    name = joystick.get_name()
+    if not joystick.get_numaxes():
+        raise UserError(f"{name} has no axes to calibrate")
+    say("Press every pedal and turn the wheel once, then let go of everything.")
+    time.sleep(FIRST_S)
+    until(still)
+    rest = places()
+    left = ask_axis("Turn LEFT as far as full steering is to be, and hold.")
+    right = ask_axis("Turn RIGHT as far, and hold.")
+    if left.axis != right.axis:
+        raise UserError(f"left was axis {left.axis}, right axis {right.axis}: begin again")
+    throttle = ask_axis("Press the THROTTLE fully, and hold.")
+    brake = ask_axis("Press the BRAKE fully, and hold.")
+    say("Press the button that is to take over while it is held.")
+    return WRITTEN.format(
+        name=json.dumps(name, ensure_ascii=False),  # in TOML a string is written as in JSON
+        left=left,
+        right=right,
+        throttle=throttle,
+        brake=brake,
+        hold=until(pressed),
+    )

@@ -13,19 +13,17 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import IO
 
 import msgspec
 import numpy as np
 from mcap.records import Channel, Message
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
+from bridge.record import FlushedFile, start_mcap
 from bridge.recording import Records
-from edge_runtime import __version__
-from edge_runtime.files import lock_file, make_directory
 from edge_runtime.util import UserError, open_regular
-from trainer.human.guide import Action, Intervention
+from trainer.human.guide import Intervention
 from trainer.human.model import HumanModel
 from trainer.person.interface import Control
 from trainer.training.delayed import Store
@@ -39,23 +37,17 @@ DISCARDED = "discarded"
 """Outcome of an episode that the person threw away: it is shown, and nothing learns from it."""
 FRAME_SHAPE = (45, 80)
 NAME = re.compile(r"sitting-(\d{4,})\.mcap")
-Position = tuple[int, int]
-"""Sitting and index of a recorded step."""
-Shape = Callable[[float, Intervention | None], float]
-"""The reward to store (eq. 17), from the environment's and what the person did."""
-Penalises = Callable[[Intervention | None], bool]
-"""Whether what the person did costs the policy the penalty."""
 
 
 class Step(msgspec.Struct, frozen=True):
-    """One control period, whole: a transition, and who did what in it."""
+    """One control period, whole: a transition, and what each did in it."""
 
     sitting: int
     index: int
-    """Of the step in the sitting, from 0."""
+    """The step's number in the sitting, from 0."""
     scenario: str
     seed: int
-    """Of the episode."""
+    """The episode's."""
     episode: int
     step: int
     """In the episode, from 0."""
@@ -105,52 +97,42 @@ class Recorder:
     """
 
     def __init__(self, directory: Path) -> None:
-        make_directory(directory)
-        self.sitting, self.index = 1, 0
-        for path in sittings(directory):
-            self.sitting = max(self.sitting, _number(path) + 1)
+        self.sitting = 1 + max(map(_number, sittings(directory)), default=0)
+        self.index = 0
+        """The next step's number."""
         self.path = directory / f"sitting-{self.sitting:04d}.mcap"
-        try:
-            self._file: IO[bytes] = self.path.open("xb")
-        except OSError as error:
-            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
-        lock_file(self._file.fileno())  # `bridge repair` keeps away meanwhile.
-        self._mcap = Writer(self._file, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        self._mcap.start(profile="", library=f"phil-hil {__version__}")
+        self._file = FlushedFile(self.path)
+        self._mcap = start_mcap(self._file)
         self._channel = self._mcap.register_channel(TOPIC, "msgpack", 0)
-        self._flush()
-
-    @property
-    def position(self) -> tuple[int, int]:
-        """Sitting and index of the step that comes next."""
-        return self.sitting, self.index
+        self._closed = self._torn = False
+        self._write_out(self._mcap.flush)
 
     def write(self, step: Step) -> None:
         """Keep a step; from here on no kill takes it away. UserError on a full disk."""
         data = msgspec.msgpack.encode(step)
         self._mcap.add_message(self._channel, step.time_ns, data, step.time_ns, self.index)
         self.index += 1
-        self._flush()
+        self._write_out(self._mcap.flush)
 
     def close(self) -> None:
         """Write the index and close the file; a sitting without steps leaves none behind."""
-        if self._file.closed:
+        if self._closed:
             return
+        self._closed = True
         try:
-            try:
-                self._mcap.finish()
-            finally:
-                self._file.close()
-        except OSError as error:
-            raise UserError(f"cannot write {self.path}: {error.strerror}") from None
+            if not self._torn:  # An index would tell of a step that the disk did not take.
+                self._write_out(self._mcap.finish)
+                self._write_out(self._file.flush)
+        finally:
+            self._file.close()
         if self.index == 0:
             self.path.unlink()
 
-    def _flush(self) -> None:
+    def _write_out(self, write: Callable[[], None]) -> None:
         try:
-            self._mcap.flush()
-            self._file.flush()
+            write()
         except OSError as error:
+            self._torn = True
             raise UserError(f"cannot write {self.path}: {error.strerror}") from None
 
 
@@ -158,6 +140,10 @@ def sittings(directory: Path) -> list[Path]:
     """The recordings in a directory, in their order; none where it is not there."""
     found = [path for path in directory.glob("sitting-*.mcap") if NAME.fullmatch(path.name)]
     return sorted(found, key=_number)
+
+
+def _number(path: Path) -> int:
+    return int(NAME.sub(r"\1", path.name))
 
 
 def find_recordings(places: Sequence[Path]) -> list[Path]:
@@ -185,11 +171,23 @@ def read_steps(path: Path) -> Iterator[Step]:
         with open_regular(path) as stream:
             if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 raise UserError(f"{path} is no recording of a sitting")
-            for message in _messages(Records(stream, path.stat().st_size), path):
-                yield msgspec.msgpack.decode(message.data, type=Step)
+            records = Records(stream, path.stat().st_size, str(path))
+            for record in records.walk():
+                if records.damaged_places:
+                    return
+                if isinstance(record, Channel) and record.topic.startswith(WIRE):
+                    raise UserError(
+                        f"{path} is a recording of the wire, as `bridge record` makes them: "
+                        f"`python -m bridge view {path}` shows it"
+                    )
+                if isinstance(record, Channel) and record.topic != TOPIC:
+                    what = f"it holds {record.topic}"
+                    raise UserError(f"{path} is no recording of a sitting: {what}")
+                if isinstance(record, Message):
+                    yield msgspec.msgpack.decode(record.data, type=Step)
     except OSError as error:
         raise UserError(f"recording {path} cannot be read: {error.strerror}") from None
-    # Of a chunk whose checksum is right: no kill does that.
+    # The chunk's checksum is right: no kill does that.
     except msgspec.DecodeError as error:
         raise UserError(f"{path} was recorded by another version: {error}") from None
 
@@ -202,34 +200,8 @@ def read_episodes(steps: Iterable[Step]) -> Iterator[list[Step]]:
             yield episode
 
 
-def _messages(records: Records, path: Path) -> Iterator[Message]:
-    for record in records.walk():
-        if records.damaged_places:
-            return
-        if isinstance(record, Channel) and record.topic != TOPIC:
-            raise UserError(_foreign(path, record.topic))
-        if isinstance(record, Message):
-            yield record
-
-
-def _foreign(path: Path, topic: str) -> str:
-    """Why a whole MCAP file of somebody else's is not read."""
-    if topic.startswith(WIRE):
-        return (
-            f"{path} is a recording of the wire, as `bridge record` makes them: "
-            f"`python -m bridge view {path}` shows it"
-        )
-    return f"{path} is no recording of a sitting: it holds {topic}"
-
-
-def _number(path: Path) -> int:
-    match = NAME.fullmatch(path.name)
-    assert match is not None
-    return int(match.group(1))
-
-
-def steps_since(directory: Path, position: Position) -> Iterator[Step]:
-    """The recorded steps from ``position`` on, over all sittings."""
+def steps_since(directory: Path, position: tuple[int, int]) -> Iterator[Step]:
+    """The recorded steps from ``position``, a sitting and an index, on, over all sittings."""
     for path in sittings(directory):
         yield from (step for step in read_steps(path) if (step.sitting, step.index) >= position)
 
@@ -237,21 +209,15 @@ def steps_since(directory: Path, position: Position) -> Iterator[Step]:
 def store_again(
     store: Store,
     steps: Iterable[Step],
-    shape: Shape,
-    penalises: Penalises,
+    shape: Callable[[float, Intervention | None], float],
+    penalises: Callable[[Intervention | None], bool],
     ticks_late: int = 0,
 ) -> tuple[int, int]:
     """Put recorded steps into the replay buffer as the run had put them there.
 
-    Episodes that the person discarded are left out.
-
-    Args:
-        store: the learner, or its buffer.
-        steps: in their order.
-        shape: the run's reward shaping.
-        penalises: whether the run charges an intervention to the overruled action.
-        ticks_late: how many ticks old the observation is that an action answers, behind a network
-            (``training/wheel.py``).
+    Episodes that the person discarded are left out. ``shape`` makes the reward to store (eq. 17)
+    of the environment's and what the person did; ``penalises`` tells whether that costs the policy
+    the penalty. Behind a network an action answers an observation that is ``ticks_late`` ticks old.
 
     Returns:
         How many steps were stored, and how many of them are the person's.
@@ -262,6 +228,9 @@ def store_again(
             if step is episode[ticks_late]:
                 store.start_episode(known.observation)
             action = np.array([step.action], np.float32)
+            overruled = action
+            if step.policy_action is not None:
+                overruled = np.array([step.policy_action], np.float32)
             by_person = Intervention(action, "person", step.first) if step.human else None
             store.add(
                 action,
@@ -269,7 +238,7 @@ def store_again(
                 known.next_observation,
                 step.terminated,
                 step.human,
-                overruled=_array(step.policy_action, action),
+                overruled=overruled,
                 penalised=penalises(by_person),
             )
             stored += 1
@@ -277,25 +246,14 @@ def store_again(
     return stored, human
 
 
-def _array(value: float | None, otherwise: Action) -> Action:
-    return otherwise if value is None else np.array([value], np.float32)
-
-
 def demonstrate(
     model: HumanModel, recordings: Sequence[Path], scenario: str, left_out: Sequence[str] = ()
 ) -> int:
     """Give the model every recorded step in which the person was in control.
 
-    Of a hand-over, the model gets what the hands said, not the blend that was applied; on the way
-    back to the policy the hands have let go, and say nothing. Episodes that the person discarded
-    are left out.
-
-    Args:
-        model: learns from it.
-        recordings: the files.
-        scenario: that was driven.
-        left_out: sittings, and episodes of them, that do not count: ``3``, or ``3:7`` for
-            episode 7 of sitting 3.
+    During a hand-over the model gets what the hands said, not the blend that was applied; on the
+    way back to the policy the hands have let go, and say nothing. Episodes that the person
+    discarded are left out, and ``left_out``: ``3`` for sitting 3, ``3:7`` for its episode 7.
 
     Returns:
         How many take-overs the recordings hold; a whole episode driven alone is one.
@@ -306,28 +264,19 @@ def demonstrate(
     """
     interventions, unknown = 0, set(left_out)
     for path in recordings:
-        for episode in read_episodes(_of_scenario(path, scenario)):
-            names = {f"{episode[0].sitting}", f"{episode[0].sitting}:{episode[0].episode}"}
+        for episode in read_episodes(read_steps(path)):
+            first = episode[0]
+            if first.scenario != scenario:
+                raise UserError(f"{path} was driven in {first.scenario}, not in {scenario}")
+            names = {f"{first.sitting}", f"{first.sitting}:{first.episode}"}
             unknown -= names
             if names.isdisjoint(left_out):
-                interventions += _learn(model, episode)
+                interventions += sum(step.first for step in episode)
+                for step in episode:
+                    if step.control == "human":
+                        model.add(step.observation, np.array([step.human_action], np.float32))
     if unknown:
         raise UserError(f"--leave-out {min(unknown)}: there is no such episode in these recordings")
     if not model.demonstrations:
         raise UserError("nobody took over in these recordings: there is nothing to imitate")
     return interventions
-
-
-def _learn(model: HumanModel, episode: Sequence[Step]) -> int:
-    """Add what the person did in an episode; how often they took over."""
-    for step in episode:
-        if step.control == "human":
-            model.add(step.observation, np.array([step.human_action], np.float32))
-    return sum(step.first for step in episode)
-
-
-def _of_scenario(path: Path, scenario: str) -> Iterator[Step]:
-    for step in read_steps(path):
-        if step.scenario != scenario:
-            raise UserError(f"{path} was driven in {step.scenario}, not in {scenario}")
-        yield step

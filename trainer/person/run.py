@@ -17,9 +17,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -28,18 +27,17 @@ from edge_runtime.files import make_directory
 from edge_runtime.util import UserError, counted
 from trainer.human.guide import Guide, Intervention
 from trainer.learner.config import ALGORITHMS
-from trainer.learner.td3 import TD3Learner
-from trainer.person.interface import HUMANS, Person, person_options
+from trainer.person.interface import Person, open_person
 from trainer.person.recording import DIRECTORY, DISCARDED, Recorder, steps_since, store_again
-from trainer.person.session import Sitting, SittingOver, WatchedEnv
+from trainer.person.session import Sitting, SittingOver
 from trainer.training.config import RunConfig
 from trainer.training.delayed import Store, behind, ticks_late
-from trainer.training.learning import Action, EpisodeLearning, Learning, LearningThread, Observation
+from trainer.training.learning import Action, Learning, LearningThread, Observation
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun, divergence_said
 
 NICENESS = 10
-"""Of the updates' thread, and of those that torch starts from it: the person's loop goes first."""
+"""The updates' thread, and those that torch starts from it, are nice to the person's loop."""
 LOOK_S = 0.002
 """How often it is asked whether an update is done, where that must be waited for."""
 
@@ -48,9 +46,9 @@ LOOK_S = 0.002
 def training_with_person(
     arguments: argparse.Namespace, config: RunConfig, run_dir: Path
 ) -> Iterator[PersonRun]:
-    """A run with a person in it, who keeps everything whatever ends it."""
+    """A run with a person in it; everything is kept, whatever ends it."""
     check_settings(config)
-    person = HUMANS[arguments.human](person_options(arguments))
+    person = open_person(arguments)
     try:
         make_directory(run_dir)
         training = PersonRun(config, run_dir, person, arguments.resume, arguments.speed)
@@ -85,25 +83,16 @@ class PersonRun(TrainingRun):
     """``TrainingRun`` in a sitting; what an episode has shown is stored at its end.
 
     Args:
-        config: what to train; ``human`` is ``options.PERSON``.
+        config: what to train; it passed ``check_settings``.
         run_dir: where everything goes; the recordings into ``sittings`` there.
         person: hands and eyes; closed with the run.
         resume: go on from the checkpoint, and from what was recorded after it.
         speed: simulated seconds in one of the person's.
-
-    Raises:
-        UserError: settings that leave no place for a person.
     """
 
     def __init__(
-        self,
-        config: RunConfig,
-        run_dir: Path,
-        person: Person,
-        resume: bool = False,
-        speed: float = 1.0,
+        self, config: RunConfig, run_dir: Path, person: Person, resume: bool, speed: float
     ) -> None:
-        check_settings(config)
         self._resumed = resume
         self.longest_save_s = 0.0
         """The longest that a checkpoint has kept the person between two episodes."""
@@ -115,7 +104,7 @@ class PersonRun(TrainingRun):
         self.guide = PersonGuide(self.sitting)
         self.kept_back = KeptBack(self.learning)
         self.policy = behind(self.network, self.kept_back, self.env)
-        self.watched = self.env = WatchedEnv(self.env, self.sitting)
+        self.env = self.sitting
 
     def train(
         self,
@@ -138,7 +127,7 @@ class PersonRun(TrainingRun):
 
     def advance(self) -> EpisodeMetrics:
         """Train one episode, and rest."""
-        self.watched.episode = self.episode
+        self.sitting.episode = self.episode
         metrics = super().advance()
         metrics.outcome = self.sitting.rest(metrics.outcome)
         self.kept_back.release(discarded=metrics.outcome == DISCARDED)
@@ -152,7 +141,7 @@ class PersonRun(TrainingRun):
 
     def save(self) -> None:
         """Write the checkpoint, which the person sees."""
-        self.sitting.announce("saving")
+        self.sitting.show("saving")
         began_s = time.perf_counter()
         with divergence_said(self.episode):  # The update under way may be the one.
             super().save()
@@ -166,7 +155,7 @@ class PersonRun(TrainingRun):
         return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
 
     def _around(self, learning: LearningThread) -> Learning:
-        return UnhurriedLearning(learning)
+        return cast(Learning, UnhurriedLearning(learning))
 
     def _make_guide(self) -> Guide | None:
         return None  # The sitting is opened when all else is known to work.
@@ -196,12 +185,12 @@ class PersonRun(TrainingRun):
         return True  # Whenever it is done: a person's run has no other end than a sitting's.
 
     def _more_state(self) -> dict[str, Any]:
-        return {"recorded": list(self.sitting.recorder.position)}
+        return {"recorded": [self.sitting.recorder.sitting, self.sitting.recorder.index]}
 
     def _restore(self, state: dict[str, Any]) -> None:
         super()._restore(state)
-        position = tuple(state["recorded"])
-        steps = steps_since(self.run_dir / DIRECTORY, position)
+        sitting, index = state["recorded"]
+        steps = steps_since(self.run_dir / DIRECTORY, (sitting, index))
         self.recovered = store_again(
             self.learning, steps, self._shape, self._penalises, ticks_late(self.network)
         )
@@ -218,11 +207,7 @@ def check_settings(config: RunConfig) -> None:
 
 
 class PersonGuide:
-    """Asks the person each control period, and waits for it to begin.
-
-    Args:
-        sitting: whoever sits there.
-    """
+    """Asks the person each control period, and waits for it to begin."""
 
     def __init__(self, sitting: Sitting) -> None:
         self._sitting = sitting
@@ -244,11 +229,7 @@ class PersonGuide:
 
 
 class KeptBack:
-    """A ``Store`` that stores when it is told to.
-
-    Args:
-        store: where the transitions of an episode go that is not discarded.
-    """
+    """A ``Store`` that passes an episode's transitions on to ``store`` when it is told to."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -256,11 +237,11 @@ class KeptBack:
 
     def start_episode(self, observation: Observation) -> None:
         """Take an episode's first observation."""
-        self._calls.append(partial(self._store.start_episode, observation))
+        self._calls.append(lambda: self._store.start_episode(observation))
 
     def add(self, *transition: Any, **guidance: Any) -> None:
         """Take a transition; arguments as ``Store.add``."""
-        self._calls.append(partial(self._store.add, *transition, **guidance))
+        self._calls.append(lambda: self._store.add(*transition, **guidance))
 
     def release(self, discarded: bool) -> None:
         """Store what was taken since the last call, or forget it."""
@@ -272,8 +253,7 @@ class KeptBack:
 class UnhurriedLearning:
     """``Learning`` whose ``act``, ``begin`` and ``finish`` never wait for an update.
 
-    Args:
-        inner: where it learns.
+    All else is the inner learner's own, and waits for the update that is under way.
     """
 
     def __init__(self, inner: LearningThread) -> None:
@@ -281,41 +261,19 @@ class UnhurriedLearning:
         self._actor = copy.deepcopy(inner.learner.actor).eval()
         inner.in_thread(_step_aside)
 
+    def __getattr__(self, name: str) -> Any:
+        self.settle()
+        return getattr(self._inner, name)
+
     @property
     def added(self) -> int:
         """Transitions stored since the run began."""
         return self._inner.added
 
-    @property
-    def learner(self) -> TD3Learner:
-        """The networks, as of the last finished update: waits for one that is under way."""
-        self.settle()
-        return self._inner.learner
-
-    @property
-    def idle(self) -> bool:
-        """Whether no update is under way."""
-        return not self._inner.updating
-
     @torch.no_grad()
     def act(self, observation: Observation) -> Action:
         """The action of the actor's copy, float32 [action size]."""
         return self._actor(torch.from_numpy(observation)[None])[0].numpy()
-
-    def act_together(self, observations: Observation, averaged: bool) -> Action:
-        """For validation between sittings: waits for the update, as ``Learning.act_together``."""
-        self.settle()
-        return self._inner.act_together(observations, averaged)
-
-    def start_episode(self, observation: Observation) -> None:
-        """Take an episode's first observation. Waits for the update."""
-        self.settle()
-        self._inner.start_episode(observation)
-
-    def add(self, *transition: Any, **guidance: Any) -> None:
-        """Store a transition; arguments as ``Store.add``. Waits for the update."""
-        self.settle()
-        self._inner.add(*transition, **guidance)
 
     def begin(self, beta: float) -> None:
         """Start an update on what is stored, unless the last one is still under way."""
@@ -325,16 +283,6 @@ class UnhurriedLearning:
     def finish(self) -> float:
         """Nothing is waited for: 0 seconds."""
         return 0.0
-
-    def end_episode(self, progress: float) -> EpisodeLearning:
-        """What was learned since the last call; learning rates decay. Waits for the update."""
-        self.settle()
-        return self._inner.end_episode(progress)
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on. Waits for the update."""
-        self.settle()
-        return self._inner.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up what ``state_dict`` gave."""

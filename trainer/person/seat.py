@@ -18,7 +18,7 @@ from trainer.scenarios.scene import HEIGHT_M, VIEW, WIDTH_M
 SILENCE_S = 0.5
 """A driver who is not heard for this long has let go."""
 MAX_INPUT_BYTES = 1024
-"""Of a message from a page; the longest honest one is a fifth of this."""
+"""A page's message is not longer; the longest honest one is a fifth of this."""
 Share = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 _ENCODER = msgspec.json.Encoder(
     enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
@@ -63,7 +63,7 @@ class Seat:
             return self._pages[:1] == [page]
 
     def is_heard(self, now_s: float) -> bool:
-        """Whether somebody is there who can act."""
+        """Whether the driver can act."""
         with self._lock:
             return now_s - self._heard_s <= SILENCE_S
 
@@ -76,7 +76,9 @@ class Seat:
                 self._let_go()
             self._heard_s = now_s
             self._wishes |= set(said.wishes)
-            self._hands_were_off |= _hands_are_off(said)
+            # Nothing is held, and a wheel that takes over by moving is at rest.
+            resting = not said.by_moving or abs(said.action) <= Moving.rest
+            self._hands_were_off |= resting and not said.engaged
             if not self._hands_were_off:
                 self._said = LET_GO
                 return False
@@ -103,12 +105,6 @@ class Seat:
         self._heard_s = float("-inf")
 
 
-def _hands_are_off(said: Input) -> bool:
-    """Whether nothing is held, nor a wheel that takes over by moving away from its rest."""
-    resting = not said.by_moving or abs(said.action) <= Moving.rest
-    return resting and not said.engaged
-
-
 class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a page says, at least every 100 ms; saying nothing is letting go."""
 
@@ -123,25 +119,14 @@ class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Number of the newest view that was drawn."""
 
 
-_DECODER = msgspec.json.Decoder(Input)
-
-
-def decode_input(text: str) -> Input:
-    """A page's message.
-
-    Raises:
-        msgspec.MsgspecError: it is none.
-    """
-    return _DECODER.decode(text)
+INPUT = msgspec.json.Decoder(Input)
+"""Decodes a page's message; raises msgspec.MsgspecError where it is none."""
 
 
 def encode_view(view: View, number: int, shown_s: float) -> str:
-    """One view. ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show.
+    """View ``number``, from 1, which the loop gave at ``shown_s`` (``time.monotonic``).
 
-    Args:
-        view: what is seen.
-        number: of the view, from 1.
-        shown_s: ``time.monotonic`` when the loop gave it.
+    ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show.
     """
     left_m, top_m = view.scene.get("view", VIEW)
     fields: dict[str, Any] = {name: getattr(view, name) for name in view.__dataclass_fields__}
@@ -152,12 +137,8 @@ def encode_view(view: View, number: int, shown_s: float) -> str:
 
 
 def encode_echo(at_ms: float, driving: bool, refused: bool) -> str:
-    """The answer to an input: its own clock, and what came of it.
-
-    Args:
-        at_ms: the page's clock in the input.
-        driving: whether this page has the wheel; others watch.
-        refused: the driver's hold does not count: the hands must be off once.
+    """The answer to an input: its own clock, whether this page has the wheel (others watch), and
+    whether its hold is refused because the hands must be off once.
     """
     echo = {"kind": "echo", "at_ms": at_ms, "driving": driving, "refused": refused}
     return _ENCODER.encode(echo).decode()

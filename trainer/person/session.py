@@ -1,8 +1,4 @@
-"""One sitting: a person, a pace and a recording around what drives the environment.
-
-The loop calls ``begin`` after a reset, ``decide`` before and ``moved`` after each of the
-environment's steps, and ``rest`` after an episode.
-"""
+"""One sitting: a person, a pace and a recording around what drives the environment."""
 
 from __future__ import annotations
 
@@ -10,17 +6,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
-from trainer.person.interface import LET_GO, Person, View
+from trainer.person.interface import LET_GO, Person, Reading, View
 from trainer.person.recording import DISCARDED, Recorder, Step
 from trainer.person.takeover import Applied, Intent, TakeOver
-from trainer.scenarios.environment import Action
+from trainer.scenarios.environment import Action, Observation
 from trainer.scenarios.environment import Step as EnvironmentStep
 
-Observation = NDArray[np.uint8]
 REST_S = 1.0
 """Between two episodes: time to see how it ended, and to take the hands to rest."""
 STOPPED, RESTARTED = "stopped", "restarted"
@@ -34,106 +27,122 @@ class SittingOver(Exception):  # noqa: N818 (no error: it was asked for)
 
 
 class Sitting:
-    """From the opening of the window to its closing.
+    """A scenario's environment with a person at the wheel, from the window's opening to its end.
 
-    Args:
-        person: hands and eyes.
-        recorder: keeps every step.
-        env: the scenario that is driven, to show it.
-        alone: nobody but the person drives.
-        speed: simulated seconds in one of the person's; below one is slow motion.
+    The loop calls ``reset``, then ``decide`` before and ``step`` for each control period, and
+    ``rest`` after an episode. All else is the environment's own. ``alone``: nobody but the person
+    drives; ``speed``: simulated seconds in one of the person's.
     """
 
     def __init__(
         self, person: Person, recorder: Recorder, env: Any, alone: bool = False, speed: float = 1.0
     ) -> None:
-        self.person, self.recorder, self.env, self.alone = person, recorder, env, alone
+        self.env = env
+        self.person, self.recorder, self.alone = person, recorder, alone
         self.pacer = Pacer(env.config.control_period_s / speed)
         self.stop = False
         """The sitting is to end: asked for by the person, or by a signal."""
+        self.closed = False
+        self.episode = 0
+        """The number of the episode, or of the next one; the loop counts."""
         self.progress = ""
         self.episodes = self.interventions = self.human_steps = self.discarded = 0
         """The last counts what the others leave out."""
-        self._last_step: Step | None = None
-        """Of an episode that has ended, until it is known whether the person discards it."""
-        self._take_over, self._intent = TakeOver(), Intent(person.moving)
         self._paused = False
-        self.closed = False
-        self._begun = False
-        """There is something to show."""
+        self._last_step: Step | None = None
+        """An ended episode's, until it is known whether the person discards it."""
+        self._frames: Observation | None = None
+        """What the policy sees; None before the first episode, when there is nothing to show."""
         self._policy_action: float | None = None
-        self._frames: Observation = env.frames
-        self._forget(0, 0)
+        self._forget(0)
 
-    def begin(self, observation: Observation, episode: int, seed: int) -> None:
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.env, name)
+
+    def reset(self, seed: int) -> tuple[Observation, dict[str, Any]]:
         """Start an episode as soon as the person is there.
 
         Raises:
             SittingOver: the person quits instead.
         """
-        self._forget(episode, seed)
-        self._frames, self._begun = observation, True
-        while not self.person.device.present and not self.stop:
+        observation, info = self.env.reset(seed=seed)
+        self._forget(seed)
+        self._frames = observation
+        while not self.person.present and not self.stop:
             self._idle("waiting for the person's device")
         if self.stop:
             raise SittingOver
         self._restart = self._discard = False
         self.pacer.restart()
+        return observation, info
 
     def decide(self, observation: Observation, policy_action: float | None) -> Applied:
         """Show what is, wait for the control period, and ask the hands as late as possible.
 
-        Args:
-            observation: what the policy sees, uint8 [2, 45, 80].
-            policy_action: what it would do, in [-1, 1]; None where the person drives alone.
+        ``policy_action`` is what the policy would do about the observation uint8 [2, 45, 80], in
+        [-1, 1]; None where the person drives alone.
         """
         self._frames, self._policy_action = observation, policy_action
-        self._show()
+        self.show()
         self.pacer.wait()
         self._read()
         if self._paused:
-            self._pause()
-        self._applied = self._weigh(policy_action)
+            while self._paused and not (self.stop or self._restart or self._discard):
+                self._idle("")
+            self._paused = False
+            self.pacer.restart()
+        if policy_action is not None:
+            holds = self._intent.update(self._reading, time.monotonic())
+            self._applied = self._take_over.step(policy_action, self._reading.action, holds)
+        elif self.person.present:
+            first = self._number == 0 or not self._applied.human
+            self._applied = Applied(self._reading.action, "human", True, first)
+        else:  # The car rolls, and that demonstrates nothing.
+            self._applied = Applied(0.0, "policy", False, False)
         return self._applied
 
-    def moved(
-        self,
-        next_observation: Observation,
-        reward: float,
-        terminated: bool,
-        truncated: bool,
-        outcome: str | None,
-    ) -> tuple[bool, str | None]:
-        """Keep the step that ``decide`` led to.
-
-        Args:
-            next_observation: s', uint8 [2, 45, 80].
-            reward: the environment's.
-            terminated: it ends the episode.
-            truncated: its time is over.
-            outcome: how it ended, if it did.
-
-        Returns:
-            ``truncated`` and ``outcome``, as the person has them who may end the episode here.
-        """
+    def step(self, action: Action) -> EnvironmentStep:
+        """One control period; it is recorded. The person may end the episode after it."""
+        assert self._frames is not None
+        observation, reward, terminated, truncated, info = self.env.step(action)
         if not (terminated or truncated) and (self.stop or self._restart or self._discard):
-            outcome, truncated = STOPPED if self.stop else RESTARTED, True
-        step = self._step(next_observation, reward, terminated, truncated, outcome)
+            truncated = True
+            info = {**info, "outcome": STOPPED if self.stop else RESTARTED}
+        applied = self._applied
+        step = Step(
+            sitting=self.recorder.sitting,
+            index=self.recorder.index,
+            scenario=self.env.scenario,
+            seed=self._seed,
+            episode=self.episode,
+            step=self._number,
+            time_ns=self._read_ns,
+            time_s=self._number * self.env.config.control_period_s,
+            frames=self._frames.tobytes(),
+            next_frame=observation[1].tobytes(),
+            policy_action=self._policy_action,
+            human_action=self._reading.action,
+            action=applied.action,
+            control=applied.control,
+            human=applied.human,
+            first=applied.first,
+            reward=float(reward),
+            terminated=terminated,
+            truncated=truncated,
+            speed_mps=float(self.env.ego.speed),
+            outcome=info.get("outcome", ""),
+        )
         if terminated or truncated:
             self._last_step = step
         else:
             self.recorder.write(step)
-        self._human_steps += self._applied.human
-        self._interventions += self._applied.first
+        self._human_steps += applied.human
+        self._interventions += applied.first
         self._number += 1
-        return truncated, outcome
+        return observation, reward, terminated, truncated, info
 
     def rest(self, outcome: str) -> str:
-        """Show for a moment how the episode ended; the person may still discard it.
-
-        Returns:
-            How it ended, now that it is known.
-        """
+        """Show how the episode ended, which the person may still discard; how it really ended."""
         end_s = time.monotonic() + REST_S * self.pacer.period_s / self.env.config.control_period_s
         while not self.stop and time.monotonic() < end_s:
             self._idle("episode discarded" if self._discard else f"episode ended: {outcome}")
@@ -148,9 +157,32 @@ class Sitting:
         self.interventions += self._interventions
         return outcome
 
-    def announce(self, message: str) -> None:
-        """Show a line before something that takes a moment."""
-        self._show(message)
+    def show(self, message: str = "") -> None:
+        """Show what is, and a line on what is going on besides driving."""
+        if self._frames is None or self.closed:
+            return
+        env = self.env
+        view = View(
+            scenario=env.scenario,
+            scene=env.scene(),
+            frames=self._frames,
+            policy_action=self._policy_action,
+            human_action=self._reading.action,
+            applied_action=self._applied.action,
+            control=self._applied.control,
+            speed_mps=float(env.ego.speed),
+            distance_m=float(env.distance_m),
+            goal_m=float(env.config.goal_m),
+            episode=self.episode,
+            step=self._number,
+            time_s=self._number * env.config.control_period_s,
+            late_ticks=self.pacer.late,
+            paused=self._paused,
+            progress=self.progress,
+            message=message,
+            help=self.person.help,
+        )
+        self.person.show(view)
 
     def quit(self) -> bool:
         """Ask for the end of the sitting; False where it is over already."""
@@ -171,114 +203,33 @@ class Sitting:
             outcome = DISCARDED if self._discard else step.outcome
             self.recorder.write(structs.replace(step, outcome=outcome))
 
-    def _forget(self, episode: int, seed: int) -> None:
+    def _forget(self, seed: int) -> None:
         """Nothing of an episode has happened yet."""
-        self._episode, self._seed, self._number = episode, seed, 0
-        self._take_over.reset()
-        self._intent.reset()
-        self._reading, self._read_ns = LET_GO, 0
+        self._seed, self._number = seed, 0
+        self._take_over, self._intent = TakeOver(), Intent(self.person.moving)
+        self._reading: Reading = LET_GO
+        self._read_ns = 0
         self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
         self._policy_action = None
         self._human_steps = self._interventions = 0
         self._restart = self._discard = False
 
-    def _weigh(self, policy_action: float | None) -> Applied:
-        if policy_action is None:
-            return self._alone()
-        holds = self._intent.update(self._reading, time.monotonic())
-        return self._take_over.step(policy_action, self._reading.action, holds)
-
-    def _alone(self) -> Applied:
-        """The hands decide; where they are gone, the car rolls, and that demonstrates nothing."""
-        if not self.person.device.present:
-            return Applied(0.0, "policy", False, False)
-        first = self._number == 0 or not self._applied.human
-        return Applied(self._reading.action, "human", True, first)
-
     def _read(self) -> None:
         """Ask the hands, and heed what they wish."""
         self._read_ns = time.time_ns()
-        self._reading = self.person.device.poll(time.monotonic())
+        self._reading = self.person.poll(time.monotonic())
         wishes = self._reading.wishes
-        self.stop = self.stop or "quit" in wishes
-        self._restart = self._restart or "restart" in wishes
-        self._discard = self._discard or "discard" in wishes
-        self._paused = self._paused != ("pause" in wishes)
-
-    def _pause(self) -> None:
-        """Stand still until the person goes on, quits or begins anew."""
-        while self._paused and not (self.stop or self._restart or self._discard):
-            self._idle("")
-        self._paused = False
-        self.pacer.restart()
+        self.stop |= "quit" in wishes
+        self._restart |= "restart" in wishes
+        self._discard |= "discard" in wishes
+        self._paused ^= "pause" in wishes
 
     def _idle(self, message: str) -> None:
         """A control period in which nothing moves."""
-        self._show(message)
+        self.show(message)
         self.pacer.restart()
         self.pacer.wait()
         self._read()
-
-    def _show(self, message: str = "") -> None:
-        if self._begun and not self.closed:
-            self.person.display.show(self._view(message))
-
-    def _view(self, message: str) -> View:
-        env = self.env
-        return View(
-            scenario=env.scenario,
-            scene=env.scene(),
-            frames=self._frames,
-            policy_action=self._policy_action,
-            human_action=self._reading.action,
-            applied_action=self._applied.action,
-            control=self._applied.control,
-            speed_mps=float(env.ego.speed),
-            distance_m=float(env.distance_m),
-            goal_m=float(env.config.goal_m),
-            episode=self._episode,
-            step=self._number,
-            time_s=self._number * env.config.control_period_s,
-            late_ticks=self.pacer.late,
-            paused=self._paused,
-            progress=self.progress,
-            message=message,
-            help=self.person.device.help,
-        )
-
-    def _step(
-        self,
-        next_observation: Observation,
-        reward: float,
-        terminated: bool,
-        truncated: bool,
-        outcome: str | None,
-    ) -> Step:
-        env, applied = self.env, self._applied
-        sitting, index = self.recorder.position
-        return Step(
-            sitting=sitting,
-            index=index,
-            scenario=env.scenario,
-            seed=self._seed,
-            episode=self._episode,
-            step=self._number,
-            time_ns=self._read_ns,
-            time_s=self._number * env.config.control_period_s,
-            frames=self._frames.tobytes(),
-            next_frame=next_observation[1].tobytes(),
-            policy_action=self._policy_action,
-            human_action=self._reading.action,
-            action=applied.action,
-            control=applied.control,
-            human=applied.human,
-            first=applied.first,
-            reward=reward,
-            terminated=terminated,
-            truncated=truncated,
-            speed_mps=float(env.ego.speed),
-            outcome=outcome or "",
-        )
 
 
 class Pacer:
@@ -286,11 +237,6 @@ class Pacer:
 
     A delay of less than a period is caught up. After a longer one the deadlines begin anew: a car
     that leaps through what was missed cannot be driven.
-
-    Args:
-        period_s: wall time of a control period.
-        clock: monotonic seconds.
-        sleep: waits for so many seconds.
     """
 
     def __init__(
@@ -309,54 +255,14 @@ class Pacer:
         """Let the next period begin one period from now: after a pause, or a new episode."""
         self._deadline_s = self._clock() + self.period_s
 
-    def wait(self) -> float:
-        """Wait for the next period to begin; returns by how many seconds it is late."""
+    def wait(self) -> None:
+        """Wait for the next period to begin."""
         # Python's main thread sleeps on through a signal that another thread took; a period is
         # short enough to hear of it afterwards.
         while (left_s := self._deadline_s - self._clock()) > 0.0:
             self._sleep(left_s)
-        late_s = max(-left_s, 0.0)
-        self.late += late_s > LATE_S
-        if late_s < self.period_s:
+        self.late += -left_s > LATE_S
+        if -left_s < self.period_s:
             self._deadline_s += self.period_s
         else:
             self.restart()
-        return late_s
-
-
-class WatchedEnv:
-    """A scenario's environment in a sitting; all else is the scenario's own.
-
-    Args:
-        env: the scenario.
-        sitting: whoever sits there.
-    """
-
-    def __init__(self, env: Any, sitting: Sitting) -> None:
-        self._env, self._sitting = env, sitting
-        self.episode = 0
-        """The number of the next episode."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._env, name)
-
-    def reset(self, seed: int) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        """Start an episode, once the person is there.
-
-        Raises:
-            SittingOver: the person quits instead.
-        """
-        observation, info = self._env.reset(seed=seed)
-        self._sitting.begin(observation, self.episode, seed)
-        return observation, info
-
-    def step(self, action: Action) -> EnvironmentStep:
-        """One control period; the person may end the episode after it, which truncates it."""
-        observation, reward, terminated, truncated, info = self._env.step(action)
-        outcome = info.get("outcome")
-        truncated, outcome = self._sitting.moved(
-            observation, float(reward), terminated, truncated, outcome
-        )
-        if outcome is not None:
-            info = {**info, "outcome": outcome}
-        return observation, reward, terminated, truncated, info

@@ -1,4 +1,4 @@
-"""Who is in control, and what the car is told while that changes: a pure state machine.
+"""What is in control, and what the car is told while that changes: a pure state machine.
 
 ```
 state       the person holds     the person has let go
@@ -24,13 +24,6 @@ MAX_SLEW = 0.5
 """The most that the action changes in a control period of a hand-over. From full throttle to full
 brake takes four of them, 0.4 s: about what a foot needs from pedal to pedal."""
 State = Literal["policy", "taking", "human", "returning"]
-CONTROL: dict[State, Control] = {
-    "policy": "policy",
-    "taking": "human",
-    "human": "human",
-    "returning": "returning",
-}
-"""What a state is to everybody else."""
 NEXT: dict[tuple[State, bool, bool], State] = {
     ("policy", False, True): "policy",
     ("policy", False, False): "policy",
@@ -66,68 +59,44 @@ class Applied:
 
 
 class TakeOver:
-    """Decides each control period from what the policy and the person want."""
+    """Decides each control period from what the policy and the person want, for one episode."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Start an episode: the policy is in control and nothing has been applied."""
         self.state: State = "policy"
         self._applied: float | None = None
 
     def step(self, policy_action: float, human_action: float, holds: bool) -> Applied:
-        """Decide one control period.
-
-        Args:
-            policy_action: in [-1, 1].
-            human_action: what the device says, in [-1, 1].
-            holds: whether the person wants control (``Intent``).
-        """
+        """Decide one control period; ``holds``: whether the person wants control (``Intent``)."""
         goal = human_action if holds else policy_action
         # At an episode's start there is nothing to leave from but the policy's action.
         last = policy_action if self._applied is None else self._applied
         before = self.state
         self.state = NEXT[before, holds, abs(goal - last) <= MAX_SLEW]
         handing_over = self.state in ("taking", "returning")
-        moved = last + min(max(goal - last, -MAX_SLEW), MAX_SLEW)
-        self._applied = moved if handing_over else goal
+        self._applied = last + min(max(goal - last, -MAX_SLEW), MAX_SLEW) if handing_over else goal
+        control: Control = "human" if self.state == "taking" else self.state
         human = self.state != "policy"
-        return Applied(
-            self._applied, CONTROL[self.state], human, first=human and before == "policy"
-        )
+        return Applied(self._applied, control, human, first=human and before == "policy")
 
 
 class Intent:
-    """Whether the person wants control: holds something, or has moved the wheel.
+    """Whether the person wants control: holds something, or has moved the wheel."""
 
-    Args:
-        moving: what counts as moving and as resting; None: the defaults.
-    """
-
-    def __init__(self, moving: Moving | None = None) -> None:
-        self.moving = moving or Moving()
-        self.reset()
-
-    def reset(self) -> None:
-        """Nobody has moved anything."""
+    def __init__(self, moving: Moving) -> None:
+        self.moving = moving
         self._moved = False
         self._resting_since_s: float | None = None
 
     def update(self, reading: Reading, now_s: float) -> bool:
         """Whether the person wants control, from the newest reading."""
+        away = abs(reading.action)
         if not reading.by_moving:
-            self.reset()
-        else:
-            self._watch_wheel(abs(reading.action), now_s)
-        return reading.engaged or self._moved
-
-    def _watch_wheel(self, away: float, now_s: float) -> None:
-        if away > self.moving.threshold:
-            self._moved = True
-        if away > self.moving.rest:
+            self._moved, self._resting_since_s = False, None
+        elif away > self.moving.rest:
+            self._moved |= away > self.moving.threshold
             self._resting_since_s = None
         elif self._resting_since_s is None:
             self._resting_since_s = now_s
         elif now_s - self._resting_since_s >= self.moving.rest_s:
             self._moved = False
+        return reading.engaged or self._moved

@@ -18,10 +18,10 @@ from trainer.person.interface import View
 from trainer.scenarios.scene import draw_scene
 
 SIZE = (1040, 680)
-"""Of what is drawn; the window shows it larger or smaller."""
+"""The drawn picture's; the window shows it larger or smaller."""
 SCREEN_SHARE = 0.9
-"""Of a small screen, as the window's frame and the desktop's bars take some."""
-SCENE_WIDTH = 736
+"""The window takes this much of a small screen: frame and desktop bars need some."""
+SCENE_SIZE = (736, 400)
 FRAME_SCALE = 3
 MARGIN = 16
 COLOURS = {
@@ -33,21 +33,13 @@ COLOURS = {
     "warning": (255, 110, 100),
 }
 UNSEEN = ("offscreen", "dummy", "evdev")
-"""Drivers of SDL that it takes by itself where nobody could see anything."""
-CONTROL_TEXT = {"policy": "the policy drives", "human": "YOU drive", "returning": "giving back"}
-STDERR = 2
+"""Drivers that SDL takes by itself where nobody could see anything: it would draw into memory."""
+CONTROL_TEXT = {"policy": "the policy drives", "human": "YOU drive", "returning": "handing back"}
 
 
-def _check_visible() -> None:
-    """Raise pygame's error where SDL found no screen and would draw into memory, unless told to."""
-    driver = pygame.display.get_driver()
-    if driver in UNSEEN and "SDL_VIDEODRIVER" not in os.environ:
-        raise pygame.error(f"SDL would draw {driver}")
-
-
-def _fitted(room: tuple[float, float]) -> tuple[int, int]:
+def _fitted(width: float, height: float) -> tuple[int, int]:
     """The largest size of the picture's shape that fits."""
-    scale = min(room[0] / SIZE[0], room[1] / SIZE[1])
+    scale = min(width / SIZE[0], height / SIZE[1])
     return max(int(SIZE[0] * scale), 1), max(int(SIZE[1] * scale), 1)
 
 
@@ -58,15 +50,19 @@ class Window:
         UserError: there is no screen to open it on.
     """
 
-    def __init__(self, title: str = "PHIL-TD3: at the wheel") -> None:
+    def __init__(self) -> None:
         try:
-            with quiet_stderr():
+            with _quiet_stderr():
                 pygame.display.init()
-                _check_visible()
+                driver = pygame.display.get_driver()
+                if driver in UNSEEN and "SDL_VIDEODRIVER" not in os.environ:
+                    raise pygame.error(f"SDL would draw {driver}")
                 pygame.joystick.init()
                 pygame.font.init()
-                screen = [SCREEN_SHARE * length for length in pygame.display.get_desktop_sizes()[0]]
-                size = _fitted((min(screen[0], SIZE[0]), min(screen[1], SIZE[1])))
+                width, height = pygame.display.get_desktop_sizes()[0]
+                size = _fitted(
+                    min(SCREEN_SHARE * width, SIZE[0]), min(SCREEN_SHARE * height, SIZE[1])
+                )
                 self._window = pygame.display.set_mode(size, pygame.RESIZABLE)
         except pygame.error as error:
             pygame.quit()
@@ -74,7 +70,7 @@ class Window:
                 f"no window can be opened ({error}): there is no screen here, or DISPLAY does not "
                 "name it; --human web needs none"
             ) from None
-        pygame.display.set_caption(title)
+        pygame.display.set_caption("PHIL-TD3: at the wheel")
         self._screen = pygame.Surface(SIZE)
         self._fonts = {size: pygame.font.Font(None, size) for size in (20, 24, 38)}
 
@@ -87,14 +83,16 @@ class Window:
         self._frames(view)
         self._state(view)
         self._bars(view)
-        self._lines(view)
-        size = _fitted(self._window.get_size())
-        left, top = ((a - b) // 2 for a, b in zip(self._window.get_size(), size, strict=True))
-        self._window.fill(COLOURS["background"])
+        for row, line in enumerate((*view.help, view.progress)):
+            colour = "text" if row < len(view.help) else "dim"
+            self._text(line, (MARGIN, 588 + 21 * row), colour)
+        room = self._window.get_size()
+        size = _fitted(*room)
         drawn = self._screen
         if size != SIZE:
             drawn = pygame.transform.smoothscale(drawn, size)
-        self._window.blit(drawn, (left, top))
+        self._window.fill(COLOURS["background"])
+        self._window.blit(drawn, ((room[0] - size[0]) // 2, (room[1] - size[1]) // 2))
         pygame.display.flip()
 
     def close(self) -> None:
@@ -103,7 +101,7 @@ class Window:
 
     def _frames(self, view: View) -> None:
         """What the policy sees, the older frame first."""
-        top = 400 + MARGIN + 22
+        top = SCENE_SIZE[1] + MARGIN + 22
         for place, (frame, when) in enumerate(zip(view.frames, ("0.1 s ago", "now"), strict=True)):
             large = np.repeat(np.repeat(frame, FRAME_SCALE, axis=0), FRAME_SCALE, axis=1)
             left = MARGIN + place * (large.shape[1] + MARGIN)
@@ -112,7 +110,7 @@ class Window:
 
     def _state(self, view: View) -> None:
         """The right column: who is in control, and how the drive is going."""
-        left, top = SCENE_WIDTH + MARGIN, MARGIN
+        left, top = SCENE_SIZE[0] + MARGIN, MARGIN
         nobody = view.control == "policy" and view.policy_action is None
         who = "nobody drives" if nobody else CONTROL_TEXT[view.control]
         self._text(who, (left, top), view.control, 38)
@@ -128,19 +126,17 @@ class Window:
             late = f"{view.late_ticks} control periods began late"
             self._text(late, (left, top + 44 + 28 * len(lines)), "warning")
         message = "paused: P goes on" if view.paused else view.message
-        if message:
-            self._text(message, (left, top + 220), "warning", 24)
+        self._text(message, (left, top + 220), "warning", 24)
 
     def _bars(self, view: View) -> None:
         """The three actions, one above the other, -1 to 1."""
         left, width = 2 * (MARGIN + 80 * FRAME_SCALE) + 2 * MARGIN, 400
-        policy = 0.0 if view.policy_action is None else view.policy_action
         words = ("left", "right") if view.scenario == "congestion" else ("brake", "throttle")
-        top = 400 + MARGIN
+        top = SCENE_SIZE[1] + MARGIN
         self._text(words[0], (left, top), "dim")
         self._text(words[1], (left + width, top), "dim", right=True)
         rows = (
-            ("policy", policy, "policy"),
+            ("policy", view.policy_action or 0.0, "policy"),
             ("you", view.human_action, "human"),
             ("applied", view.applied_action, "applied"),
         )
@@ -151,24 +147,12 @@ class Window:
             reach = int(action * width / 2)
             bar = pygame.Rect(left + width // 2 + min(reach, 0), y, abs(reach), 18)
             pygame.draw.rect(self._screen, COLOURS[colour], bar)
-            pygame.draw.line(
-                self._screen, COLOURS["dim"], box.midtop, (box.centerx, box.bottom - 1)
-            )
+            bottom = (box.centerx, box.bottom - 1)
+            pygame.draw.line(self._screen, COLOURS["dim"], box.midtop, bottom)
             self._text(f"{name} {action:+.2f}", (left, y + 20), "dim")
 
-    def _lines(self, view: View) -> None:
-        """Key help and the learner's progress, at the bottom."""
-        for row, line in enumerate((*view.help, view.progress)):
-            colour = "text" if row < len(view.help) else "dim"
-            self._text(line, (MARGIN, 588 + 21 * row), colour)
-
     def _text(
-        self,
-        text: str,
-        place: tuple[int, int],
-        colour: str,
-        size: int = 20,
-        right: bool = False,
+        self, text: str, place: tuple[int, int], colour: str, size: int = 20, right: bool = False
     ) -> None:
         drawn = self._fonts[size].render(text, True, COLOURS[colour])
         x, y = place
@@ -182,22 +166,21 @@ class Window:
 
 
 @contextmanager
-def quiet_stderr() -> Iterator[None]:
+def _quiet_stderr() -> Iterator[None]:
     """Drop what is written to stderr meanwhile, by any thread: keep it short.
 
     SDL and what it tries say more than one line where there is no screen; ours says it all.
     """
     sys.stderr.flush()
     try:
-        kept = os.dup(STDERR)
+        kept = os.dup(2)
     except OSError:  # It was closed, and nobody would read it.
         yield
         return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
     try:
-        os.dup2(nowhere, STDERR)
         yield
     finally:
-        os.dup2(kept, STDERR)
+        os.dup2(kept, 2)
         os.close(kept)
-        os.close(nowhere)

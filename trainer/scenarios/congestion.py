@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from highway_env.road.lane import LineType, StraightLane
-from highway_env.road.road import LaneIndex, Road, RoadNetwork
+from highway_env.road.road import Road, RoadNetwork
 from numpy.typing import NDArray
 
-from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
-    Observation,
+    EgoVehicle,
     Range,
+    ScenarioConfig,
     Scene,
     Step,
-    start_speed_mps,
 )
 from trainer.scenarios.picture import ROWS, Rasteriser, Rectangle, overlap
 from trainer.scenarios.traffic import (
@@ -29,6 +28,7 @@ from trainer.scenarios.traffic import (
     MIXED,
     Mix,
     TrafficVehicle,
+    VehicleType,
     bodies_m,
     draw_types,
     equip,
@@ -38,16 +38,14 @@ from trainer.scenarios.traffic import (
 
 
 @dataclass(frozen=True)
-class CongestionConfig:
-    """One field a number, with its reason."""
+class CongestionConfig(ScenarioConfig):
+    """Every number of the scenario, with its reason."""
 
-    control_period_s: float = 0.1
-    """Control interval of all vehicles (section VI-A)."""
+    scaled = "steer_weight"
     max_steps: int = 300
-    """Steps until the episode is cut off as a timeout; at 4 m/s the goal takes 200."""
+    """At 4 m/s the goal takes 200."""
     lane_width_m: float = 3.5
     goal_m: float = 80.0
-    """Distance along the road from start to goal."""
     lambda_rad: float = 0.15
     """Front-wheel angle at full action: eq. 29's 5 lambda pi. With 5 pi rad of steering wheel for
     the front wheels' 45 degrees, lambda is 0.19. At 5 m/s the heading then changes by at most
@@ -86,8 +84,6 @@ class CongestionConfig:
     lane_offset_m: Range = (-0.2, 0.2)
     """Where in its lane each car drives; the narrowest gap then leaves 1.3 m to each side of an
     ego car in mid-lane, in the variant 1.1 m."""
-    goal_reward: float = 10.0
-    fail_reward: float = -10.0
     steer_weight: float = 0.1
     """Scale of the steering term: this times the change of the action, which costs (eq. 32 is
     printed without the minus sign that its text demands). With gamma 0.95 and 10 Hz the horizon is
@@ -102,37 +98,26 @@ class CongestionConfig:
     ego car, and neither turns nor moves aside: place and heading show as they are, and other cars'
     movement between the two frames is their speed relative to the ego car's."""
 
-    def with_printed_reward(self) -> CongestionConfig:
-        """The same with eq. 32 as it is printed, but for the sign."""
-        return replace(self, steer_weight=1.0)
 
-    @staticmethod
-    def of(scene: Scene) -> CongestionConfig:
-        """The numbers of a scene.
-
-        The variant has more vehicles, and not only cars. Dense is a jam in lanes as narrow as at
-        roadworks, in which cars keep to their lane's middle, and lanes to the jam's speed, about
-        half as well as usual. The narrowest gap leaves 0.5 m to each side of an ego car in mid-lane
-        instead of 1.25, and its walls move; were it narrower, cars of two lanes would touch. Gaps
-        along a lane are from 2 to 8 m, so that the walls have holes, too; a lane's queue is long
-        enough to be there until the goal.
-        """
-        if scene == "nominal":
-            return CongestionConfig()
-        if scene == "variant":
-            return CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=MIXED)
-        return CongestionConfig(
-            lane_width_m=2.9,
-            lane_offset_m=(-0.35, 0.35),
-            lane_speed_mps=(-1.0, 1.0),
-            side_cars=6,
-            side_front_m=(14.0, 22.0),
-            cars_behind=2,
-            gap_m=(2.0, 8.0),
-            ahead_gap_m=(2.5, 9.0),
-        )
-
-
+SCENES: dict[Scene, CongestionConfig] = {
+    "nominal": CongestionConfig(),
+    "variant": CongestionConfig(side_cars=4, cars_behind=2, traffic_mix=MIXED),
+    # A jam in lanes as narrow as at roadworks, in which cars keep to their lane's middle, and lanes
+    # to the jam's speed, about half as well as usual. The narrowest gap leaves 0.5 m to each side
+    # of an ego car in mid-lane instead of 1.25, and its walls move; were it narrower, cars of two
+    # lanes would touch. Gaps along a lane are from 2 to 8 m, so that the walls have holes, too; a
+    # lane's queue is long enough to be there until the goal.
+    "dense": CongestionConfig(
+        lane_width_m=2.9,
+        lane_offset_m=(-0.35, 0.35),
+        lane_speed_mps=(-1.0, 1.0),
+        side_cars=6,
+        side_front_m=(14.0, 22.0),
+        cars_behind=2,
+        gap_m=(2.0, 8.0),
+        ahead_gap_m=(2.5, 9.0),
+    ),
+}
 LANES = 3
 EGO_LANE = 1
 """The middle one, y = 0; lane 0 is to its left."""
@@ -153,7 +138,7 @@ def straight_road(lane_width_m: float, goal_m: float) -> RoadNetwork:
     return network
 
 
-def spawn_jam(
+def spawn_traffic(
     road: Road, ego: EgoVehicle, config: CongestionConfig, random: np.random.Generator
 ) -> list[TrafficVehicle]:
     """Surround the ego car: cars ahead of it, beside it, and in the variant behind it."""
@@ -161,10 +146,14 @@ def spawn_jam(
     cars: list[TrafficVehicle] = []
     for lane in range(LANES):
         first_mps = jam_mps + float(random.uniform(*config.lane_speed_mps))
-        if lane == EGO_LANE:
-            own = _own_lane(road, ego, config, random)
-        else:
-            own = _side_lane(road, lane, config, random)
+        types, x = (_own_lane if lane == EGO_LANE else _side_lane)(config, random)
+        speeds = [float(v) for v in random.uniform(*config.traffic_speed_mps, size=len(x))]
+        own = queue(road, ("start", "end", lane), [REACH_M + place for place in x], speeds)
+        for car in own:
+            car.target_speed = config.desired_speed_mps
+        if lane == EGO_LANE and config.cars_behind:
+            own[1].leader = ego
+        equip(own, types, config.time_gap_factor)
         # The first of a lane goes with the jam, the others would go faster if they could.
         own[0].speed = own[0].target_speed = first_mps
         cars += own
@@ -174,44 +163,28 @@ def spawn_jam(
 
 
 def _side_lane(
-    road: Road, lane: int, config: CongestionConfig, random: np.random.Generator
-) -> list[TrafficVehicle]:
+    config: CongestionConfig, random: np.random.Generator
+) -> tuple[list[VehicleType], list[float]]:
+    """The vehicles of a neighbouring lane, and where they are."""
     types = draw_types(config.traffic_mix, config.side_cars, random)
     x = [float(random.uniform(*config.side_front_m))]
     for ahead, behind in itertools.pairwise(types):
         x.append(x[-1] - bodies_m(behind, ahead) - float(random.uniform(*config.gap_m)))
-    cars = _queue(road, lane, x, config, random)
-    equip(cars, types, config.time_gap_factor)
-    return cars
+    return types, x
 
 
 def _own_lane(
-    road: Road, ego: EgoVehicle, config: CongestionConfig, random: np.random.Generator
-) -> list[TrafficVehicle]:
+    config: CongestionConfig, random: np.random.Generator
+) -> tuple[list[VehicleType], list[float]]:
     """One car ahead of the ego car; those behind follow the ego car as one of theirs."""
     types = draw_types(config.traffic_mix, 1 + config.cars_behind, random)
-    nose_m = 0.5 * ego.LENGTH
+    nose_m = 0.5 * EgoVehicle.LENGTH
     x = [nose_m + float(random.uniform(*config.ahead_gap_m)) + 0.5 * types[0].length_m]
     tail_m = -nose_m
     for kind in types[1:]:
         x.append(tail_m - float(random.uniform(*config.gap_m)) - 0.5 * kind.length_m)
         tail_m = x[-1] - 0.5 * kind.length_m
-    cars = _queue(road, EGO_LANE, x, config, random)
-    if config.cars_behind:
-        cars[1].leader = ego
-    equip(cars, types, config.time_gap_factor)
-    return cars
-
-
-def _queue(
-    road: Road, lane: int, x: list[float], config: CongestionConfig, random: np.random.Generator
-) -> list[TrafficVehicle]:
-    index: LaneIndex = ("start", "end", lane)
-    speeds = [float(v) for v in random.uniform(*config.traffic_speed_mps, size=len(x))]
-    cars = queue(road, index, [REACH_M + place for place in x], speeds)
-    for car in cars:
-        car.target_speed = config.desired_speed_mps
-    return cars
+    return types, x
 
 
 class CongestionEnv(DrivingEnv):
@@ -230,15 +203,14 @@ class CongestionEnv(DrivingEnv):
         scene: Scene = "nominal",
     ) -> None:
         super().__init__(render_mode)
-        self.config = c = config or CongestionConfig.of(scene)
+        self.config = c = config or SCENES[scene]
         self.road_width_m = LANES * c.lane_width_m
         self.network = straight_road(c.lane_width_m, c.goal_m)
         road = Rectangle(0.0, 0.0, 0.0, 4.0 * c.goal_m, self.road_width_m)
         self.rasteriser = Rasteriser(
             -c.view_behind_m, -0.5 * ROWS * c.metres_per_pixel, c.metres_per_pixel, [road]
         )
-        self._steering = self._last_steering = 0.0
-        self._braking = False
+        self._steering = 0.0
 
     @property
     def brake_action(self) -> Action:
@@ -247,52 +219,19 @@ class CongestionEnv(DrivingEnv):
 
     @property
     def view_corner_m(self) -> tuple[float, float]:
-        """Where on the ground the upper left corner of the policy's picture is, metres."""
+        """As ``DrivingEnv.view_corner_m``, for a picture that moves with the ego car."""
         return float(self.ego.position[0]) + self.rasteriser.left_m, self.rasteriser.top_m
 
     def press_brake(self, pressed: bool) -> None:
         """Full brake instead of the IDM, until released or reset: the simulator's safe stop."""
         self._braking = pressed
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the seed alone decides traffic and the ego car's place and speed.
-
-        Option ``standing``: the ego car is at rest.
-        """
-        super().reset(seed=seed)
-        c, random = self.config, self.np_random
-        self.road = Road(network=self.network, np_random=random)
-        offset_m, heading_rad, speed_mps = (
-            float(random.uniform(*limits))
-            for limits in (c.start_offset_m, c.start_heading_rad, c.ego_speed_mps)
-        )
-        speed_mps = start_speed_mps(speed_mps, options)
-        self.ego = EgoVehicle(self.road, (0.0, offset_m), heading_rad, speed_mps)
-        self.traffic = spawn_jam(self.road, self.ego, c, random)
-        self._steering = self._last_steering = 0.0
-        self._braking = False
-        self.steps, self.distance_m = 0, 0.0
-        return self._first_report()
-
     def step(self, action: Action) -> Step:
         """Hold the steering angle for one control interval."""
         c = self.config
         self._last_steering = self._steering
         self._steering = min(max(float(action[0]), -1.0), 1.0)
-        acceleration_mps2 = self._pedals()
-        for car in self.traffic:
-            car.act()
-        for car in self.traffic:
-            car.step(c.control_period_s)
-        self.ego.drive(
-            acceleration_mps2,
-            self._steering * c.lambda_rad,
-            c.desired_speed_mps,
-            c.control_period_s,
-        )
-        self.steps += 1
+        self._move(self._pedals(), self._steering * c.lambda_rad, c.desired_speed_mps)
         self.distance_m = float(self.ego.position[0])
         return self._report()
 
@@ -311,6 +250,17 @@ class CongestionEnv(DrivingEnv):
             "vehicles": self._vehicles(),
         }
 
+    def _place(self) -> None:
+        c, random = self.config, self.np_random
+        offset_m, heading_rad, speed_mps = (
+            float(random.uniform(*limits))
+            for limits in (c.start_offset_m, c.start_heading_rad, c.ego_speed_mps)
+        )
+        self.ego = EgoVehicle(self.road, (0.0, offset_m), heading_rad, speed_mps)
+        self.traffic = spawn_traffic(self.road, self.ego, c, random)
+        self._steering = self._last_steering = 0.0
+        self._braking = False
+
     def _pedals(self) -> float:
         """The ego car's acceleration in m/s2: the IDM's, or the brake's."""
         c, leader = self.config, self._leader()
@@ -321,10 +271,9 @@ class CongestionEnv(DrivingEnv):
             gap_m = float(leader.position[0] - self.ego.position[0])
             gap_m -= 0.5 * (leader.LENGTH + self.ego.LENGTH)
             closing_mps = self.ego.speed - leader.speed
-        wanted_mps2 = idm_acceleration(
-            CAR, self.ego.speed, c.desired_speed_mps, gap_m, closing_mps, c.time_gap_factor
-        )
-        return max(wanted_mps2, -c.brake_mps2)
+        speed_mps, wanted_mps = self.ego.speed, c.desired_speed_mps
+        idm = idm_acceleration(CAR, speed_mps, wanted_mps, gap_m, closing_mps, c.time_gap_factor)
+        return max(idm, -c.brake_mps2)
 
     def _leader(self) -> TrafficVehicle | None:
         """The nearest vehicle ahead in the ego car's corridor, whatever the lane."""
@@ -337,8 +286,9 @@ class CongestionEnv(DrivingEnv):
         return min(ahead, key=lambda car: float(car.position[0]), default=None)
 
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
-        seen = [_seen_from(ego.x, shape) for shape in cars]
-        return self.rasteriser.frame(seen, _seen_from(ego.x, ego))
+        # The picture moves along the road with the ego car.
+        cars = [shape._replace(x=shape.x - ego.x) for shape in cars]
+        return self.rasteriser.frame(cars, ego._replace(x=0.0))
 
     def _outcome(self, ego: Rectangle, cars: list[Rectangle]) -> str | None:
         if any(overlap(ego, car) for car in cars):
@@ -356,8 +306,3 @@ class CongestionEnv(DrivingEnv):
         """Eq. 32: goal, failure, and the cost of changing the steering."""
         change = abs(self._steering - self._last_steering)
         return -self.config.steer_weight * change + self._ending_reward(outcome)
-
-
-def _seen_from(x: float, shape: Rectangle) -> Rectangle:
-    """A rectangle as the picture has it, which moves along the road with the ego car."""
-    return Rectangle(shape.x - x, *shape[1:])

@@ -1,17 +1,20 @@
-"""What the scenarios share: spaces, the two frames, what a step reports, and the picture."""
+"""What the scenarios share: the ego car, spaces, the two frames, and what a step reports."""
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from highway_env.road.road import Road, RoadNetwork
+from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from trainer.scenarios.ego import EgoVehicle
 from trainer.scenarios.picture import COLUMNS, ROWS, Rasteriser, Rectangle
-from trainer.scenarios.scene import draw_scene, vehicle_entry
+from trainer.scenarios.scene import BODY, draw_scene
 from trainer.scenarios.traffic import TrafficVehicle
 
 Observation = NDArray[np.uint8]
@@ -24,36 +27,72 @@ traffic stands closer and leaves less to do right."""
 FAILURES = ("collision", "off_road")
 
 
-def start_speed_mps(drawn_mps: float, options: dict[str, Any] | None) -> float:
-    """The ego car's speed at the start: as drawn, or 0 with the option ``standing`` of ``reset``.
-
-    A robot starts every episode standing. All else stays as the seed has it.
-    """
-    return 0.0 if (options or {}).get("standing", False) else drawn_mps
-
-
-class ScenarioConfig(Protocol):
+@dataclass(frozen=True)
+class ScenarioConfig:
     """The numbers that every scenario has."""
 
-    @property
-    def control_period_s(self) -> float:
-        """Control interval, s."""
+    control_period_s: float = 0.1
+    """Control interval of all vehicles (section VI-A)."""
+    max_steps: int = 200
+    """Steps until the episode is cut off as a timeout."""
+    goal_m: float = 0.0
+    """Distance from start to goal."""
+    goal_reward: float = 10.0
+    fail_reward: float = -10.0
+    scaled: ClassVar[str]
+    """The field that scales the third term of the reward."""
+
+    def with_printed_reward(self) -> Self:
+        """The same with eq. 31 or 32 as it is printed, but for the latter's sign."""
+        change: dict[str, Any] = {self.scaled: 1.0}
+        return replace(self, **change)
+
+
+class EgoVehicle(Vehicle):
+    """The controlled car. It stands outside ``road.vehicles``, so that traffic never yields.
+
+    It moves by ``highway_env.vehicle.kinematics.Vehicle.step``; what is added is a speed that
+    stays within ``[0, max_speed_mps]`` and the accelerations of the last step.
+    """
+
+    MAX_STEERING_RAD = math.pi / 4
+    speed: float
+    heading: float
+
+    def __init__(
+        self, road: Road, position: tuple[float, float], heading: float, speed: float
+    ) -> None:
+        super().__init__(road, position, heading, speed)
+        self.longitudinal_acceleration_mps2 = 0.0
+        self.lateral_acceleration_mps2 = 0.0
+
+    def drive(
+        self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float, dt_s: float
+    ) -> None:
+        """Hold an acceleration and a front-wheel angle for one step.
+
+        The step's mean acceleration is bounded so that the speed stays in range: a pressed
+        brake holds a standing car instead of driving it backwards.
+        """
+        before_mps, before_rad = self.speed, self.heading
+        lowest, highest = -self.speed / dt_s, (max_speed_mps - self.speed) / dt_s
+        self.action["acceleration"] = min(max(acceleration_mps2, lowest), highest)
+        self.action["steering"] = steering_rad
+        self.step(dt_s)
+        # A plain float again: arithmetic on numpy's scalars is many times slower.
+        self.heading = float(self.heading)
+        self.speed = min(max(self.speed, 0.0), max_speed_mps)
+        self.longitudinal_acceleration_mps2 = (self.speed - before_mps) / dt_s
+        self.lateral_acceleration_mps2 = self.speed * (self.heading - before_rad) / dt_s
+
+    def on_state_update(self) -> None:
+        """No lane look-up: the planned path says where the car is."""
 
     @property
-    def max_steps(self) -> int:
-        """Steps until the timeout."""
-
-    @property
-    def goal_m(self) -> float:
-        """Distance from start to goal, m."""
-
-    @property
-    def goal_reward(self) -> float:
-        """The reward of the goal."""
-
-    @property
-    def fail_reward(self) -> float:
-        """The reward of a failure."""
+    def footprint(self) -> Rectangle:
+        """The car's rectangle on the ground."""
+        x, y = self.position.tolist()
+        return Rectangle(x, y, self.heading, self.LENGTH, self.WIDTH)
 
 
 class DrivingEnv(gymnasium.Env[Observation, Action]):
@@ -62,8 +101,8 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     Observation: uint8 [2, 45, 80], frames [t-1, t]. Action: float32 [1] in [-1, 1]. ``info``:
     ``distance_m``, ``speed_mps``, the accelerations of the step and, at the end, ``outcome``.
 
-    A scenario moves its vehicles in ``step`` and says what is seen (``_frame``), whether it has
-    ended (``_outcome``), and what the step is worth (``_reward``).
+    A scenario places its vehicles (``_place``), moves them in ``step`` (``_move``) and says what is
+    seen (``_frame``), whether it has ended (``_outcome``), and what a step is worth (``_reward``).
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (gymnasium's form)
@@ -72,6 +111,7 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
     config: ScenarioConfig
     ego: EgoVehicle
     traffic: list[TrafficVehicle]
+    network: RoadNetwork
     rasteriser: Rasteriser
 
     def __init__(self, render_mode: str | None) -> None:
@@ -95,6 +135,26 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         """What a viewer needs to draw the scene; plain lists and numbers."""
         raise NotImplementedError
 
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; the seed alone decides traffic and the ego car's start.
+
+        Option ``standing``: the ego car is at rest, as a robot is that starts an episode.
+        """
+        super().reset(seed=seed)
+        self.road = Road(network=self.network, np_random=self.np_random)
+        self.steps, self.distance_m = 0, 0.0
+        self._place()
+        if (options or {}).get("standing", False):
+            self.ego.speed = 0.0
+        self.frames[:] = self._frame(*self._footprints())
+        return self.frames.copy(), self._info(None)
+
+    def _place(self) -> None:
+        """Put the ego car and the traffic on the road, in an order that keeps what seeds mean."""
+        raise NotImplementedError
+
     def _frame(self, ego: Rectangle, cars: list[Rectangle]) -> NDArray[np.uint8]:
         """What the policy sees now, uint8 [45, 80]: from the footprints of ego car and traffic."""
         raise NotImplementedError
@@ -107,10 +167,15 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         """The reward of the step."""
         raise NotImplementedError
 
-    def _first_report(self) -> tuple[Observation, dict[str, Any]]:
-        """What ``reset`` returns: the same frame twice."""
-        self.frames[:] = self._frame(*self._footprints())
-        return self.frames.copy(), self._info(None)
+    def _move(self, acceleration_mps2: float, steering_rad: float, max_speed_mps: float) -> None:
+        """Move all vehicles by one control period, the ego car as it is told."""
+        for car in self.traffic:
+            car.act()
+        for car in self.traffic:
+            car.step(self.config.control_period_s)
+        period_s = self.config.control_period_s
+        self.ego.drive(acceleration_mps2, steering_rad, max_speed_mps, period_s)
+        self.steps += 1
 
     def _report(self) -> Step:
         """What ``step`` returns, after the vehicles have moved."""
@@ -123,7 +188,6 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
         return self.frames.copy(), self._reward(outcome), terminated, outcome == "timeout", info
 
     def _footprints(self) -> tuple[Rectangle, list[Rectangle]]:
-        """Of the ego car and of each car of the traffic."""
         return self.ego.footprint, [car.footprint for car in self.traffic]
 
     def _ending_reward(self, outcome: str | None) -> float:
@@ -134,11 +198,12 @@ class DrivingEnv(gymnasium.Env[Observation, Action]):
 
     def _vehicles(self) -> list[dict[str, Any]]:
         """The scene's vehicles, the ego car first."""
-        others = [
-            vehicle_entry(number, car.footprint, car.speed, ego=False)
-            for number, car in enumerate(self.traffic, start=1)
+        cars: list[EgoVehicle | TrafficVehicle] = [self.ego, *self.traffic]
+        return [
+            dict(zip(BODY, car.footprint, strict=True))
+            | {"id": number, "speed_mps": float(car.speed), "ego": number == 0}
+            for number, car in enumerate(cars)
         ]
-        return [vehicle_entry(0, self.ego.footprint, self.ego.speed, ego=True), *others]
 
     def _info(self, outcome: str | None) -> dict[str, Any]:
         info = {

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from highway_env.road.lane import LineType, StraightLane
-from highway_env.road.road import LaneIndex, Road, RoadNetwork
+from highway_env.road.lane import CircularLane, LineType, StraightLane
+from highway_env.road.road import LaneIndex, RoadNetwork
+from highway_env.utils import wrap_to_pi
 from numpy.typing import NDArray
 
-from trainer.scenarios.ego import EgoVehicle, LeftTurnPath, PathTracker
 from trainer.scenarios.environment import (
     Action,
     DrivingEnv,
-    Observation,
+    EgoVehicle,
     Range,
+    ScenarioConfig,
     Scene,
     Step,
-    start_speed_mps,
 )
 from trainer.scenarios.picture import Rasteriser, Rectangle, overlap
 from trainer.scenarios.traffic import (
@@ -39,6 +39,106 @@ LANE_REACH_M = 100.0
 SIDE_ROAD_M = 40.0
 NEAR_LANE: LaneIndex = ("west", "east", 0)
 """The lane of the main road that the ego car must cross; the other one it joins."""
+
+
+class Pose(NamedTuple):
+    """Position in metres and heading in rad, highway-env's frame (y down)."""
+
+    x: float
+    y: float
+    heading: float
+
+
+class LeftTurnPath:
+    """North along the side road, a quarter circle to the left, then west along the main road.
+
+    Arc length ``s`` counts from the start (x, y); beyond the arc the path goes on for ever.
+    """
+
+    def __init__(self, start: tuple[float, float], straight_m: float, radius_m: float) -> None:
+        self.start_x, self.start_y = start
+        self.straight_m = straight_m
+        self.radius_m = radius_m
+        self.arc_m = 0.5 * math.pi * radius_m
+        self.centre_x = self.start_x - radius_m
+        self.centre_y = self.start_y - straight_m
+
+    def pose(self, s_m: float) -> Pose:
+        """The pose at arc length ``s_m`` (metres)."""
+        on_arc_m = s_m - self.straight_m
+        if on_arc_m <= 0.0:
+            return Pose(self.start_x, self.start_y - s_m, -0.5 * math.pi)
+        if on_arc_m <= self.arc_m:
+            angle = on_arc_m / self.radius_m
+            x = self.centre_x + self.radius_m * math.cos(angle)
+            y = self.centre_y - self.radius_m * math.sin(angle)
+            return Pose(x, y, -0.5 * math.pi - angle)
+        beyond_m = on_arc_m - self.arc_m
+        return Pose(self.centre_x - beyond_m, self.centre_y - self.radius_m, -math.pi)
+
+    def project(self, x: float, y: float) -> tuple[float, float]:
+        """The nearest point of the path: its arc length and the offset to its right, metres."""
+        if y >= self.centre_y:
+            return self.start_y - y, x - self.start_x
+        if x <= self.centre_x:
+            offset_m = (self.centre_y - self.radius_m) - y
+            return self.straight_m + self.arc_m + (self.centre_x - x), offset_m
+        dx, dy = x - self.centre_x, self.centre_y - y
+        angle = math.atan2(dy, dx)
+        return self.straight_m + angle * self.radius_m, math.hypot(dx, dy) - self.radius_m
+
+    def curvature(self, s_m: float) -> float:
+        """Signed curvature at ``s_m``, 1/m; negative is a left turn (headings are clockwise)."""
+        return -1.0 / self.radius_m if 0.0 < s_m - self.straight_m <= self.arc_m else 0.0
+
+    def lanes(self, end_m: float, width_m: float) -> list[StraightLane | CircularLane]:
+        """The same path as highway-env lanes, ending at arc length ``end_m``."""
+        straight_end = (self.start_x, self.centre_y)
+        centre, quarter = (self.centre_x, self.centre_y), (0.0, -0.5 * math.pi)
+        arc = CircularLane(centre, self.radius_m, *quarter, clockwise=False, width=width_m)
+        exit_start = (self.centre_x, self.centre_y - self.radius_m)
+        exit_m = max(end_m - self.straight_m - self.arc_m, 0.1)
+        exit_end = (exit_start[0] - exit_m, exit_start[1])
+        return [
+            StraightLane((self.start_x, self.start_y), straight_end, width=width_m),
+            arc,
+            StraightLane(exit_start, exit_end, width=width_m),
+        ]
+
+
+class PathTracker:
+    """PI control of the front wheels along a planned path (section VI, auxiliary functions).
+
+    The proportional part acts on heading error and lateral offset, the integral part on the
+    offset; the path's curvature is fed forward, so that the feedback only has to take up what the
+    kinematic model leaves over.
+    """
+
+    HEADING_GAIN = 1.5
+    OFFSET_GAIN_RAD_PER_M = 0.5
+    INTEGRAL_GAIN_RAD_PER_MS = 0.1
+    INTEGRAL_LIMIT_MS = 1.0
+
+    def __init__(self, path: LeftTurnPath) -> None:
+        self.path = path
+        self.integral_ms = 0.0
+
+    def steering(self, ego: EgoVehicle, s_m: float, offset_m: float, dt_s: float) -> float:
+        """The front-wheel angle in rad for the car at arc length ``s_m``, ``offset_m`` right."""
+        limit = self.INTEGRAL_LIMIT_MS
+        self.integral_ms = min(max(self.integral_ms + offset_m * dt_s, -limit), limit)
+        curvature = self.path.curvature(s_m)
+        # In a bend the car's centre moves at the slip angle to its heading.
+        slip_rad = math.asin(0.5 * ego.LENGTH * curvature)
+        course_rad = self.path.pose(s_m).heading
+        course_error = wrap_to_pi(course_rad - slip_rad - ego.heading)
+        angle = (
+            math.atan(2.0 * math.tan(slip_rad))
+            + self.HEADING_GAIN * course_error
+            - self.OFFSET_GAIN_RAD_PER_M * offset_m
+            - self.INTEGRAL_GAIN_RAD_PER_MS * self.integral_ms
+        )
+        return min(max(angle, -ego.MAX_STEERING_RAD), ego.MAX_STEERING_RAD)
 
 
 def t_intersection(path: LeftTurnPath, goal_m: float, lane_width_m: float) -> RoadNetwork:
@@ -63,21 +163,11 @@ def t_intersection(path: LeftTurnPath, goal_m: float, lane_width_m: float) -> Ro
     return network
 
 
-def road_areas(lane_width_m: float) -> list[Rectangle]:
-    """The paved ground: the main road across, the side road from below."""
-    width_m = 2 * lane_width_m
-    side_road = Rectangle(0.0, 0.5 * SIDE_ROAD_M, 0.5 * math.pi, SIDE_ROAD_M, width_m)
-    return [Rectangle(0.0, 0.0, 0.0, 2 * LANE_REACH_M, width_m), side_road]
-
-
 @dataclass(frozen=True)
-class LeftTurnConfig:
-    """Every number of the scenario."""
+class LeftTurnConfig(ScenarioConfig):
+    """Every number of the scenario, with its reason where there is one."""
 
-    control_period_s: float = 0.1
-    """Control interval of all vehicles (section VI-A)."""
-    max_steps: int = 200
-    """Steps until the episode is cut off as a timeout."""
+    scaled = "speed_weight"
     lane_width_m: float = 4.0
     straight_m: float = 10.0
     """Path on the side road before the turn."""
@@ -107,8 +197,6 @@ class LeftTurnConfig:
     """How often a gap is a long one."""
     target_speed_mps: float = 5.0
     """Target of the reward's speed term (eq. 31)."""
-    goal_reward: float = 10.0
-    fail_reward: float = -10.0
     speed_weight: float = 0.02
     """Scale of the speed term. With gamma 0.95 and 10 Hz the horizon is 2 s: seen from the stop
     line the goal, 30 steps off, is worth 10 x 0.95^30 = 2.1, a crash 15 steps off -4.6, waiting
@@ -120,28 +208,20 @@ class LeftTurnConfig:
     """The picture shows 40 m x 22.5 m of ground and does not move: 30 m of the main road to the
     left, so that a car at 6 m/s is seen for longer than the turn takes."""
 
-    def with_printed_reward(self) -> LeftTurnConfig:
-        """The same with eq. 31 as it is printed."""
-        return replace(self, speed_weight=1.0)
 
-    @staticmethod
-    def of(scene: Scene) -> LeftTurnConfig:
-        """The numbers of a scene.
-
-        The variant has more vehicles, and not only cars. Dense is a longer queue whose gaps are
-        neither clearly long nor clearly short: all come from one range. The scripted expert takes
-        no gap of less than 16 m and each one of more than 25 m; between them the two cars' speeds
-        decide, and a policy that only ever met gaps up to 16 m and from 32 m on has to have learned
-        more than to tell these apart. Half of the range is such near-ties, a third cannot be used.
-        """
-        if scene == "nominal":
-            return LeftTurnConfig()
-        # More vehicles may take longer than 20 s to pass; who rightly waits shall not time out.
-        if scene == "variant":
-            return LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300)
-        return LeftTurnConfig(
-            traffic_cars=6, long_gap_m=(12.0, 28.0), long_gap_share=1.0, max_steps=400
-        )
+SCENES: dict[Scene, LeftTurnConfig] = {
+    "nominal": LeftTurnConfig(),
+    # More vehicles may take longer than 20 s to pass; a car that rightly waits shall not time out.
+    "variant": LeftTurnConfig(traffic_cars=5, traffic_mix=MIXED, max_steps=300),
+    # A longer queue whose gaps are neither clearly long nor clearly short: all come from one range.
+    # The scripted expert takes no gap of less than 16 m and each one of more than 25 m; between
+    # them the two cars' speeds decide, and a policy that only ever met gaps up to 16 m and from
+    # 32 m on has to have learned more than to tell these apart. Half of the range is such
+    # near-ties, a third cannot be used.
+    "dense": LeftTurnConfig(
+        traffic_cars=6, long_gap_m=(12.0, 28.0), long_gap_share=1.0, max_steps=400
+    ),
+}
 
 
 class LeftTurnEnv(DrivingEnv):
@@ -160,35 +240,20 @@ class LeftTurnEnv(DrivingEnv):
         scene: Scene = "nominal",
     ) -> None:
         super().__init__(render_mode)
-        self.config = c = config or LeftTurnConfig.of(scene)
+        self.config = c = config or SCENES[scene]
         half = 0.5 * c.lane_width_m
         # Right-hand traffic: the ego car comes up the right lane of the side road, crosses the
         # near lane of the main road (y > 0, eastbound) and ends in its far lane (y < 0).
         start = (half, c.straight_m + c.lane_width_m)
         self.path = LeftTurnPath(start, c.straight_m, c.turn_radius_m)
-        self.rasteriser = Rasteriser(
-            c.view_left_m, c.view_top_m, c.metres_per_pixel, road_areas(c.lane_width_m)
-        )
+        width_m = 2 * c.lane_width_m
+        paved = [
+            Rectangle(0.0, 0.0, 0.0, 2 * LANE_REACH_M, width_m),
+            Rectangle(0.0, 0.5 * SIDE_ROAD_M, 0.5 * math.pi, SIDE_ROAD_M, width_m),
+        ]
+        self.rasteriser = Rasteriser(c.view_left_m, c.view_top_m, c.metres_per_pixel, paved)
         self.network = t_intersection(self.path, c.goal_m, c.lane_width_m)
         self._offset_m = 0.0
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; the seed alone decides traffic and initial speed.
-
-        Option ``standing``: the ego car is at rest.
-        """
-        super().reset(seed=seed)
-        c, random = self.config, self.np_random
-        self.road = Road(network=self.network, np_random=random)
-        self.traffic = self._spawn_traffic()
-        start = self.path.pose(0.0)
-        speed_mps = start_speed_mps(float(random.uniform(*c.ego_speed_mps)), options)
-        self.ego = EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
-        self.tracker = PathTracker(self.path)
-        self.steps, self.distance_m, self._offset_m = 0, 0.0, 0.0
-        return self._first_report()
 
     def step(self, action: Action) -> Step:
         """Hold the pedal for one control interval."""
@@ -198,12 +263,7 @@ class LeftTurnEnv(DrivingEnv):
         steering_rad = self.tracker.steering(
             self.ego, self.distance_m, self._offset_m, c.control_period_s
         )
-        for car in self.traffic:
-            car.act()
-        for car in self.traffic:
-            car.step(c.control_period_s)
-        self.ego.drive(acceleration_mps2, steering_rad, c.max_speed_mps, c.control_period_s)
-        self.steps += 1
+        self._move(acceleration_mps2, steering_rad, c.max_speed_mps)
         self.distance_m, self._offset_m = self.path.project(*self.ego.position.tolist())
         return self._report()
 
@@ -233,6 +293,13 @@ class LeftTurnEnv(DrivingEnv):
             "stop_line": list(self.path.pose(c.stop_line_m + 0.5 * self.ego.LENGTH)[:2]),
             "vehicles": self._vehicles(),
         }
+
+    def _place(self) -> None:
+        self.traffic = self._spawn_traffic()
+        start = self.path.pose(0.0)
+        speed_mps = float(self.np_random.uniform(*self.config.ego_speed_mps))
+        self.ego = EgoVehicle(self.road, (start.x, start.y), start.heading, speed_mps)
+        self.tracker, self._offset_m = PathTracker(self.path), 0.0
 
     def _spawn_traffic(self) -> list[TrafficVehicle]:
         c, random = self.config, self.np_random

@@ -58,14 +58,7 @@ GROUND, ROAD, EGO, TRAFFIC = 0, 70, 150, 255
 
 
 class Rasteriser:
-    """Draws rectangles into a picture of a fixed part of the ground.
-
-    Args:
-        left_m: x of the picture's left edge.
-        top_m: y of the picture's upper edge (y grows downwards).
-        metres_per_pixel: side of a pixel.
-        roads: the paved ground.
-    """
+    """Draws rectangles into a picture of a fixed part of the ground; y grows downwards."""
 
     def __init__(
         self, left_m: float, top_m: float, metres_per_pixel: float, roads: Sequence[Rectangle] = ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ WIDTH_M, HEIGHT_M = 46.0, 25.0
 VIEW = (-30.0, -7.0)
 """Upper left corner of the ground shown, for a scene that names no ``view`` of its own."""
 GOAL_HALF_M = 2.0
+BODY = ("x", "y", "heading_rad", "length_m", "width_m")
+"""A scene's vehicle in the order of a ``Rectangle``."""
 COLOURS = {
     "ground": (222, 229, 216),
     "road": (92, 97, 105),
@@ -38,104 +40,60 @@ def draw_scene(
 ) -> NDArray[np.uint8]:
     """Draw ``scene`` (see ``DrivingEnv.scene``) and, inset, the two frames of the policy.
 
-    ``ego`` is the ego car's colour: of whoever drives it.
+    ``ego`` is the ego car's colour, which tells what drives it.
 
     Returns:
         uint8 [height, width, 3].
     """
     size = (int(WIDTH_M * PIXELS_PER_METRE), int(HEIGHT_M * PIXELS_PER_METRE))
     image = Image.new("RGB", size, COLOURS["ground"])
-    pen = _GroundPen(image, scene.get("view", VIEW))
-    _draw_roads(pen, scene)
-    pen.line(scene["path"], "path", 4)
+    pen, corner = ImageDraw.Draw(image), scene.get("view", VIEW)
+
+    def pixels(points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
+        return [
+            ((x - corner[0]) * PIXELS_PER_METRE, (y - corner[1]) * PIXELS_PER_METRE)
+            for x, y in points
+        ]
+
+    def line(points: Iterable[Sequence[float]], colour: str, width_pixels: int) -> None:
+        pen.line(pixels(points), fill=COLOURS[colour], width=width_pixels)
+
+    for road in scene["roads"]:
+        line(road, "road", int(scene["road_width_m"] * PIXELS_PER_METRE))
+    # Lane lines of their own, or the centre line of every road outside their crossing.
+    lines, skip_m = scene.get("lane_lines"), 0.0
+    if lines is None:
+        lines, skip_m = scene["roads"], 0.5 * scene["road_width_m"]
+    for each in lines:
+        for dash in _dashes(each, skip_m):
+            line(dash, "marking", 2)
+    line(scene["path"], "path", 4)
     x, y = scene["goal"]
-    pen.line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], "goal", 8)
+    line([[x, y - GOAL_HALF_M], [x, y + GOAL_HALF_M]], "goal", 8)
     for vehicle in scene["vehicles"]:
-        _draw_vehicle(pen, vehicle, ego if vehicle["ego"] else COLOURS["traffic"])
+        body = Rectangle(*(vehicle[name] for name in BODY))
+        ahead = 0.18 * body.length * np.array([np.cos(body.heading), np.sin(body.heading)])
+        glass = Rectangle(
+            body.x + ahead[0], body.y + ahead[1], body.heading, 0.16 * body.length, 0.8 * body.width
+        )
+        colour = ego if vehicle["ego"] else COLOURS["traffic"]
+        pen.polygon(pixels(corners(body)), fill=colour, outline=COLOURS["glass"], width=2)
+        pen.polygon(pixels(corners(glass)), fill=COLOURS["glass"])
     if frames is not None:
         _inset_frames(image, frames)
-    ImageDraw.Draw(image).multiline_text(
-        (size[0] - 12, size[1] - 12), caption, COLOURS["text"], anchor="rd", font_size=15
-    )
+    end = (size[0] - 12, size[1] - 12)
+    pen.multiline_text(end, caption, COLOURS["text"], anchor="rd", font_size=15)
     return np.asarray(image)
 
 
-def vehicle_entry(number: int, shape: Rectangle, speed_mps: float, ego: bool) -> dict[str, Any]:
-    """One of a scene's ``vehicles``."""
-    return {
-        "id": number,
-        "x": shape.x,
-        "y": shape.y,
-        "heading_rad": shape.heading,
-        "length_m": shape.length,
-        "width_m": shape.width,
-        "speed_mps": float(speed_mps),
-        "ego": ego,
-    }
-
-
-class _GroundPen:
-    """Draws what is given in metres on the ground.
-
-    Args:
-        image: the picture.
-        corner: the ground's point in its upper left corner.
-    """
-
-    def __init__(self, image: Image.Image, corner: Sequence[float]) -> None:
-        self._pen = ImageDraw.Draw(image)
-        self._left_m, self._top_m = corner
-
-    def line(self, points: Iterable[Sequence[float]], colour: str, width_pixels: int) -> None:
-        self._pen.line(self._pixels(points), fill=COLOURS[colour], width=width_pixels)
-
-    def area(self, shape: Rectangle, colour: Colour, outlined: bool = False) -> None:
-        outline = COLOURS["glass"] if outlined else None
-        self._pen.polygon(self._pixels(corners(shape)), fill=colour, outline=outline, width=2)
-
-    def _pixels(self, points: Iterable[Sequence[float]]) -> list[tuple[float, float]]:
-        scale = PIXELS_PER_METRE
-        return [((x - self._left_m) * scale, (y - self._top_m) * scale) for x, y in points]
-
-
-def _draw_roads(pen: _GroundPen, scene: dict[str, Any]) -> None:
-    width = int(scene["road_width_m"] * PIXELS_PER_METRE)
-    for road in scene["roads"]:
-        pen.line(road, "road", width)
-    # Lane lines of their own, or the centre line of every road outside their crossing.
-    for line in scene.get("lane_lines", []):
-        _draw_dashes(pen, line, skip_m=0.0)
-    for road in scene["roads"] if "lane_lines" not in scene else []:
-        _draw_dashes(pen, road, skip_m=0.5 * scene["road_width_m"])
-
-
-def _draw_dashes(pen: _GroundPen, road: list[list[float]], skip_m: float) -> None:
+def _dashes(road: Sequence[Sequence[float]], skip_m: float) -> Iterator[list[list[float]]]:
     """A line dashed every 2 m, leaving out what is nearer to the origin than ``skip_m``."""
-    (x0, y0), (x1, y1) = road[0], road[-1]
-    length_m = float(np.hypot(x1 - x0, y1 - y0))
+    start, end = np.array(road[0]), np.array(road[-1])
+    length_m = float(np.hypot(*(end - start)))
     for start_m in np.arange(0.0, length_m, 4.0):
-        ends = [
-            np.array([x0, y0]) + (m / length_m) * np.array([x1 - x0, y1 - y0])
-            for m in (start_m, start_m + 2.0)
-        ]
-        if all(np.abs(end).max() >= skip_m for end in ends):
-            pen.line([end.tolist() for end in ends], "marking", 2)
-
-
-def _draw_vehicle(pen: _GroundPen, vehicle: dict[str, Any], colour: Colour) -> None:
-    body = Rectangle(
-        vehicle["x"],
-        vehicle["y"],
-        vehicle["heading_rad"],
-        vehicle["length_m"],
-        vehicle["width_m"],
-    )
-    pen.area(body, colour, outlined=True)
-    ahead = 0.18 * body.length * np.array([np.cos(body.heading), np.sin(body.heading)])
-    glass = Rectangle(
-        body.x + ahead[0], body.y + ahead[1], body.heading, 0.16 * body.length, 0.8 * body.width
-    )
-    pen.area(glass, COLOURS["glass"])
+        ends = [start + (m / length_m) * (end - start) for m in (start_m, start_m + 2.0)]
+        if all(np.abs(each).max() >= skip_m for each in ends):
+            yield [each.tolist() for each in ends]
 
 
 def _inset_frames(image: Image.Image, frames: NDArray[np.uint8]) -> None:

@@ -1,4 +1,4 @@
-"""Surrounding traffic: who drives in it, and highway-env's IDM, which keeps its lane.
+"""Surrounding traffic: its types of vehicles, and highway-env's IDM, which keeps its lane.
 
 The intelligent driver model is that of Treiber, Hennecke and Helbing (2000); it also has the ego
 car's pedals in the congestion. Cars are blind to the ego car unless they follow it.
@@ -31,15 +31,9 @@ def idm_acceleration(
     closing_mps: float = 0.0,
     time_gap_factor: float = 1.0,
 ) -> float:
-    """The acceleration in m/s2.
+    """The acceleration in m/s2 of a vehicle that is ``closing_mps`` faster than its leader.
 
-    Args:
-        kind: the vehicle's parameters.
-        speed_mps: its speed.
-        desired_mps: its speed on a free road.
-        gap_m: to the leader, bumper to bumper; infinite without one.
-        closing_mps: how much faster it is than the leader.
-        time_gap_factor: see ``vehicle_types.equip``.
+    ``gap_m`` is bumper to bumper, infinite without a leader; ``time_gap_factor`` as in ``equip``.
     """
     a, b = kind.acceleration_mps2, kind.deceleration_mps2
     approach_m = speed_mps * closing_mps / (2.0 * math.sqrt(a * b))
@@ -100,19 +94,15 @@ def bodies_m(behind: VehicleType, ahead: VehicleType) -> float:
 def equip(
     cars: list[TrafficVehicle], types: list[VehicleType], time_gap_factor: float = 1.0
 ) -> None:
-    """Give each vehicle its type's size and IDM parameters.
+    """Give each vehicle, its leader before it, its type's size and IDM parameters.
 
-    Args:
-        cars: vehicles, each with its leader.
-        types: the type of each.
-        time_gap_factor: share of the type's time gap that is kept; people close up in a jam.
+    ``time_gap_factor``: share of the type's time gap that is kept; people close up in a jam.
     """
     for car, kind in zip(cars, types, strict=True):
         car.LENGTH, car.WIDTH = kind.length_m, kind.width_m
         car.COMFORT_ACC_MAX = kind.acceleration_mps2
         car.COMFORT_ACC_MIN = -kind.deceleration_mps2
         car.TIME_WANTED = time_gap_factor * kind.time_gap_s
-    for car, kind in zip(cars, types, strict=True):
         # highway-env's IDM takes distances from centre to centre.
         bodies = kind.length_m if car.leader is None else 0.5 * (car.LENGTH + car.leader.LENGTH)
         car.DISTANCE_WANTED = kind.standstill_gap_m + bodies
@@ -178,7 +168,7 @@ class TrafficVehicle(IDMVehicle):
         return wanted - a * (share * share)
 
     def step(self, dt: float) -> None:
-        """Advance by ``dt`` seconds. Who has braked to a stop stands: nobody reverses."""
+        """Advance by ``dt`` seconds. A car that has braked to a stop stands: it never reverses."""
         acceleration = max(self.action["acceleration"], -self.speed / dt)
         self.position[0] += self.speed * dt
         self.speed += acceleration * dt
@@ -199,18 +189,11 @@ class TrafficVehicle(IDMVehicle):
 
 
 def queue(
-    road: Road,
-    lane_index: LaneIndex,
-    positions_m: list[float],
-    speeds_mps: list[float],
+    road: Road, lane_index: LaneIndex, positions_m: list[float], speeds_mps: list[float]
 ) -> list[TrafficVehicle]:
-    """Cars in one lane, the first leading; each follows the one before it.
+    """Cars in one lane at falling distances along it; each follows the one before it.
 
-    Args:
-        road: the road they drive on (they are added to ``road.vehicles``).
-        lane_index: their lane.
-        positions_m: distances along the lane, falling.
-        speeds_mps: initial and desired speed of each.
+    Speeds are the initial and the desired ones. The cars are added to ``road.vehicles``.
     """
     cars: list[TrafficVehicle] = []
     for position_m, speed_mps in zip(positions_m, speeds_mps, strict=True):

@@ -1,4 +1,4 @@
-"""Pedals, a driver who knows only one of them, and drives to which a human may object."""
+"""Pedals, a driver that knows only one of them, whole episodes, and whether a human objects."""
 
 import numpy as np
 
@@ -16,6 +16,19 @@ class Brakes:
 
     def act(self, observation):
         return BRAKE
+
+
+def drive(env, driver, seed=0):
+    """An episode of a driver, or of one action throughout: its rewards, and the last info."""
+    act = driver.act if hasattr(driver, "act") else lambda _: driver
+    observation, info = env.reset(seed=seed)
+    rewards, ended = [], False
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(act(observation))
+        rewards.append(reward)
+        assert terminated == (info.get("outcome") in ("goal", "collision", "off_road"))
+        ended = terminated or truncated
+    return rewards, info
 
 
 def objections(env, driver, drives):

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,22 +9,12 @@ import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.drivers import make_environment
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
 from trainer.scenarios.picture import corners, overlap
+from trainer.tests.humans import drive
 
 STRAIGHT, RIGHT, LEFT = (np.array([steering], np.float32) for steering in (0.0, 1.0, -1.0))
 CENTRED = CongestionConfig(
     start_offset_m=(0.0, 0.0), start_heading_rad=(0.0, 0.0), lane_offset_m=(0.0, 0.0)
 )
-
-
-def drive(env: CongestionEnv, action: np.ndarray, seed: int = 0) -> tuple[list[float], dict]:
-    env.reset(seed=seed)
-    rewards = []
-    while True:
-        _, reward, terminated, truncated, info = env.step(action)
-        rewards.append(reward)
-        assert terminated == (info.get("outcome") in ("goal", "collision", "off_road"))
-        if terminated or truncated:
-            return rewards, info
 
 
 def test_eight_cars_within_20_m_and_the_ego_car_between_them():
@@ -71,16 +62,13 @@ def test_the_printed_reward_is_eq_32_without_a_weight():
 
 def test_zero_steering_succeeds_in_less_than_half_and_random_rarely():
     env, random = CongestionEnv(), np.random.default_rng(0)
-    straight = sum(drive(env, STRAIGHT, seed)[1]["outcome"] == "goal" for seed in range(40))
-    assert 8 <= straight <= 20
-    wandering = 0
-    for seed in range(20):
-        env.reset(seed=seed)
-        info: dict = {}
-        while "outcome" not in info:
-            *_, info = env.step(random.uniform(-1, 1, 1).astype(np.float32))
-        wandering += info["outcome"] == "goal"
-    assert wandering <= 5
+    wandering = SimpleNamespace(act=lambda _: random.uniform(-1, 1, 1).astype(np.float32))
+    arrived = [
+        sum(drive(env, driver, seed)[1]["outcome"] == "goal" for seed in range(drives))
+        for driver, drives in ((STRAIGHT, 40), (wandering, 20))
+    ]
+    assert 8 <= arrived[0] <= 20
+    assert arrived[1] <= 5
 
 
 @pytest.mark.parametrize(("action", "sign"), [(RIGHT, 1.0), (LEFT, -1.0)])
@@ -109,31 +97,21 @@ def test_changing_the_steering_costs_and_holding_it_does_not():
     assert env.step(STRAIGHT)[1] == 0.0
 
 
-def test_a_car_beside_is_a_collision_and_fails():
-    env = CongestionEnv(CENTRED)
-    rewards, info = drive(env, np.array([0.3], np.float32))
-    assert info["outcome"] == "collision"
-    assert rewards[-1] == -10.0
-    assert env.ego.position[1] > 0.5
-
-
-def test_leaving_the_road_fails():
-    env = CongestionEnv(replace(CENTRED, side_cars=1, side_front_m=(60.0, 60.0)))
-    rewards, info = drive(env, LEFT)
-    assert info["outcome"] == "off_road"
-    assert rewards[-1] == -10.0
-    assert corners(env.ego.footprint)[:, 1].min() < -5.25
+@pytest.mark.parametrize(
+    ("changes", "steering", "outcome"),
+    [({}, 0.3, "collision"), ({"side_cars": 1, "side_front_m": (60.0, 60.0)}, -1.0, "off_road")],
+)
+def test_touching_a_car_or_leaving_the_road_fails(changes, steering, outcome):
+    env = CongestionEnv(replace(CENTRED, **changes))
+    rewards, info = drive(env, np.array([steering], np.float32))
+    assert (info["outcome"], rewards[-1]) == (outcome, -10.0)
+    sides_m = corners(env.ego.footprint)[:, 1]
+    assert sides_m.min() < -5.25 if outcome == "off_road" else env.ego.position[1] > 0.5
 
 
 def test_time_runs_out_without_a_terminal():
-    env = CongestionEnv(replace(CENTRED, max_steps=20))
-    env.reset(seed=0)
-    for _ in range(19):
-        _, _, terminated, truncated, _ = env.step(STRAIGHT)
-        assert not terminated
-        assert not truncated
-    _, reward, terminated, truncated, info = env.step(STRAIGHT)
-    assert (terminated, truncated, info["outcome"], reward) == (False, True, "timeout", 0.0)
+    rewards, info = drive(CongestionEnv(replace(CENTRED, max_steps=20)), STRAIGHT)
+    assert (len(rewards), rewards[-1], info["outcome"]) == (20, 0.0, "timeout")
 
 
 def test_the_ego_car_follows_whoever_is_in_its_corridor():
@@ -188,3 +166,66 @@ def test_the_brake_action_is_the_last_steering():
     assert env.brake_action == pytest.approx([0.4])
     env.reset(seed=0)
     assert env.brake_action == pytest.approx([0.0])
+
+
+def test_the_picture_moves_along_the_road_but_neither_aside_nor_round():
+    def picture(offset_m: float, heading_rad: float) -> np.ndarray:
+        config = replace(
+            CENTRED,
+            start_offset_m=(offset_m, offset_m),
+            start_heading_rad=(heading_rad, heading_rad),
+        )
+        return CongestionEnv(config).reset(seed=0)[0][1]
+
+    def ego_rows(frame: np.ndarray, columns: slice) -> float:
+        ego = np.abs(frame[:, columns].astype(float) - 70.0) * (np.arange(45) > 17)[:, None]
+        ego[27:] = 0.0
+        return float((ego.sum(axis=1) * np.arange(45)).sum() / ego.sum())
+
+    nose, tail = slice(34, 38), slice(26, 30)
+    middle = ego_rows(picture(0.0, 0.0), nose)
+    assert middle == pytest.approx(22.0, abs=0.05)
+    # 0.3 m to the right is 0.8 pixels down; a heading of 0.05 rad tilts by 0.4 pixels in 8.
+    assert ego_rows(picture(0.3, 0.0), nose) - middle == pytest.approx(0.8, abs=0.1)
+    tilted = picture(0.0, 0.05)
+    assert ego_rows(tilted, nose) - ego_rows(tilted, tail) == pytest.approx(0.4, abs=0.1)
+    env = CongestionEnv(CENTRED)
+    env.reset(seed=0)
+    for _ in range(40):
+        frames, *_ = env.step(STRAIGHT)
+    assert env.ego.position[0] > 10.0
+    assert ego_rows(frames[1], nose) == pytest.approx(middle, abs=0.05)
+
+
+def test_no_lane_marking_is_in_the_picture():
+    env = CongestionEnv(CENTRED)
+    frames, _ = env.reset(seed=0)
+    shapes = [env.ego.footprint, *(car.footprint for car in env.traffic)]
+    free = np.ones((45, 80), bool)
+    for shape in shapes:
+        points = corners(shape) - [env.ego.position[0], 0.0]
+        left, top = points.min(axis=0) - 0.4
+        right, bottom = points.max(axis=0) + 0.4
+        x = -12.0 + (np.arange(80) + 0.5) * 0.375
+        y = (np.arange(45) - 22) * 0.375
+        free &= ~np.outer((y > top) & (y < bottom), (x > left) & (x < right))
+    inside = np.abs(np.arange(45) - 22) * 0.375 < 5.0
+    assert free[inside].sum() > 500
+    assert np.unique(frames[1][inside][free[inside]]).tolist() == [70]
+
+
+def test_render_and_scene_show_what_is_there():
+    env = CongestionEnv(render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.dtype == np.uint8
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 10
+    scene = env.scene()
+    assert [v["ego"] for v in scene["vehicles"]] == [True] + 8 * [False]
+    assert scene["road_width_m"] == 10.5
+    for _ in range(100):
+        env.step(STRAIGHT)
+    # The view goes with the car: it stays where it is in the picture.
+    blue = (40, 120, 230)
+    columns = [np.flatnonzero((p == blue).all(axis=2).any(axis=0)) for p in (first, env.render())]
+    assert columns[0].min() == pytest.approx(columns[1].min(), abs=2)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trainer.scenarios.ego import LeftTurnPath
+from trainer.scenarios.left_turn import LeftTurnPath
 from trainer.scenarios.picture import Rectangle, corners, overlap
 
 CAR = Rectangle(0.0, 0.0, 0.0, 5.0, 2.0)

@@ -1,11 +1,14 @@
-"""The human beside the policy: for how long, and whose step is the intervention."""
+"""The human beside the policy: when it takes over, for how long, and what an intervention is."""
 
 from itertools import repeat
 
 import numpy as np
+import pytest
 
+from trainer.drivers import EXPERTS, make_environment
+from trainer.evaluate import drive_episodes
 from trainer.human.guide import HumanGuide
-from trainer.tests.humans import BRAKE, FULL, Brakes
+from trainer.tests.humans import BRAKE, FULL, Brakes, objections
 
 ANYWHERE = repeat(True)
 
@@ -22,6 +25,24 @@ class ScriptedTrigger:
 
     def may_return(self):
         return next(self.places)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "condition", "drives"),
+    [("left_turn", "nominal", 60), ("congestion", "nominal", 20), ("congestion", "noise", 20)],
+)
+def test_the_expert_always_arrives(scenario, condition, drives):
+    env = make_environment(scenario)
+    results = drive_episodes(env, EXPERTS[scenario](env), range(drives), condition)
+    assert {result.outcome for result in results} == {"goal"}
+
+
+@pytest.mark.parametrize(("scenario", "drives"), [("left_turn", 20), ("congestion", 10)])
+def test_the_trigger_lets_the_expert_drive(scenario, drives):
+    """Or the policy would be punished for driving like the human: theorem 1's assumption."""
+    env = make_environment(scenario)
+    counted = objections(env, EXPERTS[scenario](env), drives)
+    assert counted == {"drives": drives, "arrived": drives, "objected_of_these": 0}
 
 
 def watch(reasons: list, hold_steps: int, places=ANYWHERE) -> list:

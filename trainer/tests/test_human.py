@@ -11,6 +11,7 @@ from trainer.drivers import load_driver
 from trainer.human.dagger import HumanTraining
 from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
 from trainer.learner.networks import Actor
+from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.tests.humans import BRAKE, FULL
 
@@ -68,14 +69,16 @@ def test_refining_takes_its_updates_under_a_falling_learning_rate():
     assert np.isfinite(losses).all()
 
 
-def test_training_is_reproducible_and_survives_saving(tmp_path):
+@pytest.mark.parametrize("kind", [LeftTurnEnv, CongestionEnv])
+def test_training_is_reproducible_and_survives_saving(tmp_path, kind):
     config = HumanModelConfig(episodes=2, updates_per_episode=2, batch_size=8)
     models = []
     for _ in range(2):
-        training = HumanTraining(LeftTurnEnv(), config, seed=5)
+        training = HumanTraining(kind(), config, seed=5)
         episodes = list(training.episodes())
         models.append(training.model)
-    assert episodes[-1].demonstrations == models[0].demonstrations > 0
+    assert episodes[0].interventions
+    assert episodes[-1].demonstrations == models[0].demonstrations > episodes[0].demonstrations
     frames = np.full((2, 45, 80), 70, np.uint8)
     assert models[0].act(frames) == models[1].act(frames)
     models[0].save(tmp_path, {"scenario": "left_turn"})

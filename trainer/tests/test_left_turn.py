@@ -7,19 +7,9 @@ import pytest
 import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.drivers import make_environment
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
+from trainer.tests.humans import BRAKE, FULL, NOTHING, drive
 
-FULL, NOTHING, BRAKE = (np.array([pedal], np.float32) for pedal in (1.0, 0.0, -1.0))
 EMPTY_ROAD = LeftTurnConfig(traffic_cars=0)
-
-
-def drive(env: LeftTurnEnv, action: np.ndarray, seed: int = 0) -> tuple[list[float], dict]:
-    env.reset(seed=seed)
-    rewards = []
-    while True:
-        _, reward, terminated, truncated, info = env.step(action)
-        rewards.append(reward)
-        if terminated or truncated:
-            return rewards, info
 
 
 def test_on_an_empty_road_full_throttle_reaches_the_goal():

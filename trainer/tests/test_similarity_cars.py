@@ -8,30 +8,28 @@ from highway_env.vehicle.kinematics import Vehicle
 from edge_runtime.vehicles.mapping import CARS, similarity_to
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.congestion import CongestionConfig
-from trainer.scenarios.ego import EgoVehicle
+from trainer.scenarios.environment import EgoVehicle
 from trainer.scenarios.left_turn import LeftTurnConfig
 from trainer.scenarios.traffic import CAR
 
-
-def test_the_left_turns_car():
-    config, car = LeftTurnConfig(), CARS["left_turn"]
-    assert car.throttle_mps2 == config.throttle_mps2
-    assert car.brake_mps2 == config.brake_mps2
-    assert car.max_speed_mps == config.max_speed_mps
-    assert car.full_steering_rad == EgoVehicle.MAX_STEERING_RAD
-
-
-def test_the_congestions_car():
-    config, car = CongestionConfig(), CARS["congestion"]
-    assert car.throttle_mps2 == CAR.acceleration_mps2
-    assert car.brake_mps2 == config.brake_mps2
-    assert car.max_speed_mps == config.desired_speed_mps
-    assert car.full_steering_rad == -config.lambda_rad  # its +1 turns right
+TURN, JAM = LeftTurnConfig(), CongestionConfig()
+NUMBERS = {
+    "left_turn": (
+        TURN.throttle_mps2, TURN.brake_mps2, TURN.max_speed_mps, EgoVehicle.MAX_STEERING_RAD
+    ),
+    # Its +1 turns right.
+    "congestion": (
+        CAR.acceleration_mps2, JAM.brake_mps2, JAM.desired_speed_mps, -JAM.lambda_rad
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_every_scenario_has_its_car_as_long_as_highway_envs(scenario):
-    assert CARS[scenario].wheelbase_m == EgoVehicle.LENGTH == Vehicle.LENGTH
+    car = CARS[scenario]
+    numbers = (car.throttle_mps2, car.brake_mps2, car.max_speed_mps, car.full_steering_rad)
+    assert numbers == NUMBERS[scenario]
+    assert car.wheelbase_m == EgoVehicle.LENGTH == Vehicle.LENGTH
 
 
 def test_the_curvature_is_the_bicycles_own():

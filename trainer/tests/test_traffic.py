@@ -1,6 +1,7 @@
-"""The cars of the traffic move as highway-env's do, only sooner."""
+"""The vehicles of the traffic: their types, the IDM, and that they move as highway-env's do."""
 
 import copy
+import math
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from trainer.drivers import make_environment
+from trainer.scenarios.traffic import CAR, MIXED, draw_types, idm_acceleration
 
 
 def by_highway_env(car, dt_s):
@@ -53,3 +55,41 @@ def test_whoever_brakes_to_a_stop_stands():
     car.speed, car.action = 0.2, {"steering": 0.0, "acceleration": -6.0}
     car.step(0.1)
     assert car.speed == 0.0
+
+
+def test_types_accelerate_as_they_are():
+    env = make_environment("congestion", "variant")
+    for seed in range(10):
+        env.reset(seed=seed)
+        for car in env.traffic:
+            (kind,) = (kind for kind, _ in MIXED if kind.length_m == car.LENGTH)
+            car.speed, car.target_speed, car.leader = 0.0, 6.0, None
+            car.act()
+            assert car.action["acceleration"] == pytest.approx(kind.acceleration_mps2)
+
+
+def test_shares_of_the_mix_and_no_draw_for_one_type():
+    random = np.random.default_rng(0)
+    before = random.bit_generator.state
+    assert draw_types(((CAR, 1.0),), 3, random) == [CAR] * 3
+    assert random.bit_generator.state == before
+    drawn = draw_types(MIXED, 4000, random)
+    for kind, share in MIXED:
+        assert drawn.count(kind) / 4000 == pytest.approx(share, abs=0.03)
+    assert sum(share for _, share in MIXED) == pytest.approx(1.0)
+
+
+def test_idm_by_hand():
+    # Free road at half the desired speed: 3 x (1 - 1/16).
+    assert idm_acceleration(CAR, 3.0, 6.0) == pytest.approx(2.8125)
+    assert idm_acceleration(CAR, 6.0, 6.0) == pytest.approx(0.0)
+    # Standing 2 m behind a standing car: the free road's pull and the gap's push are equal.
+    assert idm_acceleration(CAR, 0.0, 6.0, gap_m=2.0) == pytest.approx(0.0)
+    # 5 m/s, 1 m/s faster, 10 m behind: wanted 2 + 5 x 0.8 + 5 / (2 sqrt 15) m.
+    wanted_m = 6.0 + 5.0 / (2.0 * math.sqrt(15.0))
+    expected = 3.0 * (1.0 - (5.0 / 6.0) ** 4 - (wanted_m / 10.0) ** 2)
+    assert idm_acceleration(CAR, 5.0, 6.0, 10.0, 1.0) == pytest.approx(expected)
+    half = 3.0 * (1.0 - (5.0 / 6.0) ** 4 - 0.16)
+    assert idm_acceleration(CAR, 5.0, 6.0, 10.0, 0.0, 0.5) == pytest.approx(half)
+    # A leader that pulls away asks for no less than the room at rest.
+    assert idm_acceleration(CAR, 1.0, 6.0, 2.0, -50.0) == pytest.approx(-3.0 / 6.0**4)

@@ -25,7 +25,6 @@ from trainer.__main__ import main
 from trainer.drawing import (
     DRIVERS,
     LINES,
-    Correction,
     Entry,
     Episode,
     Steps,
@@ -157,7 +156,7 @@ def test_the_q_advantage_is_the_critics():
     batch = torch.from_numpy(frames)[None]
     with torch.no_grad():
         expected = critic(batch, torch.tensor([[0.75]])) - critic(batch, torch.tensor([[-0.5]]))
-    found = q_advantage(critic, Correction(0, frames, policy, human))
+    found = q_advantage(critic, Seen(frames, policy, None, human, speed_mps=0.0))
     assert found == pytest.approx(float(expected), abs=1e-6)
     assert found != 0.0
 
@@ -189,7 +188,7 @@ def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(monkeypatch):
     steps = [entry.step for part in kept if isinstance(part, Steps) for entry in part.entries]
     assert steps == list(range(40, 1040))
     assert all(len(part.entries) <= STEPS_TOGETHER for part in kept if isinstance(part, Steps))
-    pictures = [part.picture for part in kept if isinstance(part, Steps) and part.picture]
+    pictures = [part for part in kept if isinstance(part, Steps) and part.frames is not None]
     assert len(pictures) == pytest.approx(20, abs=2)
 
 
@@ -219,7 +218,7 @@ def test_corrections_are_spread_over_the_episode(human_steps):
     assert len(episode.corrections) <= CORRECTIONS
     assert (episode.critic is None) == (human_steps == 0)
     if human_steps:
-        steps = [correction.step for correction in episode.corrections]
+        steps = [step for step, _ in episode.corrections]
         assert (steps[0], len(set(np.diff(steps)))) == (40, min(len(steps) - 1, 1))
         assert len(steps) >= min(human_steps, CORRECTIONS // 2)
 
@@ -232,7 +231,7 @@ def test_a_slow_view_holds_nobody_up():
         drawn.append(entry)
 
     background = Background(lambda: nullcontext(draw))
-    entries = [Steps([], None) for _ in range(MOST_WAITING + 100)]
+    entries = [Steps([]) for _ in range(MOST_WAITING + 100)]
     for entry in entries:
         background.put(entry)
     assert background.dropped in (99, 100)  # One may be in its hands already.
@@ -253,7 +252,7 @@ def test_a_view_that_fails_does_not_end_the_run(capsys, error):
 
     background = Background(lambda: nullcontext(draw))
     for _ in range(3):
-        background.put(Steps([], None))
+        background.put(Steps([]))
     background.close()
     (line,) = capsys.readouterr().err.splitlines()
     assert line == "viewer gone; the run is unharmed: disk full"
@@ -393,8 +392,7 @@ def test_a_road_that_would_be_driven_differently_is_not_made_up(tmp_path):
     other.close()
     shown = Shown()
     entries = list(shown.entries([other.path]))
-    pictures = [entry.picture for entry in entries if isinstance(entry, Steps)]
-    scenes = [bool(picture and picture.scene) for picture in pictures]
+    scenes = [entry.scene is not None for entry in entries if isinstance(entry, Steps)]
     assert scenes == [False] * 15 + [True] * 15
     assert shown.without_road == 1
 

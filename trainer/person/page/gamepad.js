@@ -4,7 +4,7 @@
 // in one axis, a pair of pedals is two.
 
 const KEPT = "phil-cockpit-gamepad"; // in localStorage, by device and scenario
-const MOVING = "moving"; // instead of a button: moving the wheel takes over, letting it rest gives back
+const MOVING = "moving"; // instead of a button: moving the wheel takes over, letting it rest hands control back
 
 const SOURCES = {
   axis: (pad, index) => pad.axes[index] ?? 0,

@@ -1,4 +1,4 @@
-// Keyboard and sliding pad. A held key or finger takes over; letting go gives back.
+// Keyboard and sliding pad. A held key or finger takes over; letting go hands control back.
 
 // A pedal is down in 0.2 s; a wheel is turned by a tap, not thrown. As in trainer/person/devices.py.
 const KEYS = {

@@ -1,6 +1,7 @@
 """A cockpit, and one Chromium for all tests of the page."""
 
 import asyncio
+import inspect
 
 import pytest
 
@@ -21,6 +22,17 @@ globalThis.plug = (id, mapping, axes, buttons) => {
 };
 """
 """Headless Chromium has no gamepad: the page is given one that says what the test wants."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Run a test that is a coroutine, in the browser's event loop where it has one."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    names = inspect.signature(pyfuncitem.obj).parameters
+    test = pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in names})
+    pyfuncitem.funcargs.get("runner", asyncio).run(test)
+    return True
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from trainer.drivers import make_environment
-from trainer.person.interface import LET_GO, Person, Reading, View, Wish
+from trainer.person.interface import LET_GO, Moving, Reading, View, Wish
 from trainer.person.recording import Recorder, Step
 from trainer.person.session import Sitting
 
@@ -17,32 +17,47 @@ QUICK = 1000.0
 """Simulated seconds in one of a test's."""
 
 
-class Hands:
-    """Reads off a list, and then nothing more, or ``quit``."""
+class Puppet:
+    """A person who does what a list says, and then ``then`` for good; remembers every view.
 
-    help = ("a test",)
+    ``presence``: whether the device is there, each time it is asked for; then it is for good.
+    """
 
-    def __init__(self, readings: Iterable[Reading], then: Reading = LET_GO) -> None:
-        self._readings, self._then = iter(readings), then
-        self.present, self.closed = True, False
+    help: tuple[str, ...] = ("a test",)
+    moving = Moving()
+
+    def __init__(
+        self,
+        readings: Iterable[Reading] = (),
+        then: Reading = LET_GO,
+        presence: Iterable[bool] = (),
+    ) -> None:
+        self._readings, self._then, self._presence = iter(readings), then, iter(presence)
+        self.views: list[View] = []
+
+    @property
+    def present(self) -> bool:
+        return next(self._presence, True)
 
     def poll(self, now_s: float) -> Reading:
         return next(self._readings, self._then)
 
+    def show(self, view: View) -> None:
+        self.views.append(view)
+
     def close(self) -> None:
-        self.closed = True
+        """Nothing to close."""
 
 
-class Discarding:
-    """Hands that hold full brake, and throw these episodes away: in the rest after their end."""
+class Discarding(Puppet):
+    """Holds full brake, and throws these episodes away: in the rest after their end."""
 
-    help, present = ("a test",), True
-
-    def __init__(self, eyes: Eyes, discarded: Iterable[int], episodes: int) -> None:
-        self._eyes, self._discarded, self._episodes = eyes, set(discarded), episodes
+    def __init__(self, discarded: Iterable[int], episodes: int) -> None:
+        super().__init__()
+        self._discarded, self._episodes = set(discarded), episodes
 
     def poll(self, now_s: float) -> Reading:
-        seen = self._eyes.views[-1]
+        seen = self.views[-1]
         ended = seen.message.startswith("episode")
         wishes: set[Wish] = set()
         if ended and seen.episode + 1 == self._episodes:
@@ -50,22 +65,6 @@ class Discarding:
         if ended and seen.episode in self._discarded:
             wishes.add("discard")
         return Reading(-1.0, engaged=True, wishes=frozenset(wishes))
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-
-class Eyes:
-    """Remember every view."""
-
-    def __init__(self) -> None:
-        self.views: list[View] = []
-
-    def show(self, view: View) -> None:
-        self.views.append(view)
-
-    def close(self) -> None:
-        """Nothing to close."""
 
 
 def hold(action: float) -> Reading:
@@ -81,14 +80,9 @@ def wish(*wishes) -> Reading:
 QUIT = wish("quit")
 
 
-def make_sitting(
-    directory: Path, readings: Iterable[Reading], alone: bool = False, then: Reading = QUIT
-) -> tuple[Sitting, Eyes]:
-    """A quick sitting in the left turn of a person who does what the list says, then ``then``."""
-    eyes = Eyes()
-    person = Person(Hands(readings, then), eyes)
-    env = make_environment("left_turn")
-    return Sitting(person, Recorder(directory), env, alone, QUICK), eyes
+def make_sitting(directory: Path, person: Puppet, alone: bool = False) -> Sitting:
+    """A quick sitting of a person in the left turn."""
+    return Sitting(person, Recorder(directory), make_environment("left_turn"), alone, QUICK)
 
 
 def picture(value: int) -> bytes:

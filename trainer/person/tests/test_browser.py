@@ -24,97 +24,77 @@ from trainer.person.tests.pages import (
 pytestmark = pytest.mark.usefixtures("opened")
 
 
-def test_a_held_key_takes_over_and_grows_and_its_release_lets_go(runner, browser, cockpit):
-    async def drive():
-        await browser.keyboard.down("ArrowUp")
-        assert (await reads(cockpit, lambda r: r.engaged)).action >= 0.5
-        await reads(cockpit, lambda r: r.action == 1.0)
-        await browser.keyboard.down("ArrowDown")
-        await browser.keyboard.up("ArrowUp")
-        await reads(cockpit, lambda r: r.action == -1.0)
-        await browser.keyboard.up("ArrowDown")
-        await reads(cockpit, lambda r: r == LET_GO)
-
-    runner.run(drive())
+async def test_a_held_key_takes_over_and_grows_and_its_release_lets_go(browser, cockpit):
+    await browser.keyboard.down("ArrowUp")
+    assert (await reads(cockpit, lambda r: r.engaged)).action >= 0.5
+    await reads(cockpit, lambda r: r.action == 1.0)
+    await browser.keyboard.down("ArrowDown")
+    await browser.keyboard.up("ArrowUp")
+    await reads(cockpit, lambda r: r.action == -1.0)
+    await browser.keyboard.up("ArrowDown")
+    await reads(cockpit, lambda r: r == LET_GO)
 
 
-def test_the_space_bar_holds_without_driving_and_presses_no_button(runner, browser, cockpit):
-    async def hold():
-        await browser.evaluate("document.querySelector('[data-wish=restart]').focus()")
-        await browser.keyboard.down("Space")
-        reading = await reads(cockpit, lambda r: r.engaged)
-        assert reading.action == 0.0
-        await browser.keyboard.up("Space")
-        assert not (await reads(cockpit, lambda r: not r.engaged)).wishes
-
-    runner.run(hold())
+async def test_the_space_bar_holds_without_driving_and_presses_no_button(browser, cockpit):
+    await browser.evaluate("document.querySelector('[data-wish=restart]').focus()")
+    await browser.keyboard.down("Space")
+    reading = await reads(cockpit, lambda r: r.engaged)
+    assert reading.action == 0.0
+    await browser.keyboard.up("Space")
+    assert not (await reads(cockpit, lambda r: not r.engaged)).wishes
 
 
-def test_in_the_congestion_left_and_right_steer(runner, browser, cockpit):
-    async def steer():
-        cockpit.show(first_view("congestion"))
-        await until(browser, "document.getElementById('pad').className === 'level'")
-        await browser.keyboard.down("ArrowLeft")
-        await reads(cockpit, lambda r: r.action == -1.0)
-        await browser.keyboard.up("ArrowLeft")
-        await reads(cockpit, lambda r: r == LET_GO)
-        await browser.keyboard.down("ArrowUp")
-        await browser.evaluate(TWO_HEARTBEATS)
-        assert not poll(cockpit).engaged
-        await browser.keyboard.up("ArrowUp")
-
-    runner.run(steer())
+async def test_in_the_congestion_left_and_right_steer(browser, cockpit):
+    cockpit.show(first_view("congestion"))
+    await until(browser, "document.getElementById('pad').className === 'level'")
+    await browser.keyboard.down("ArrowLeft")
+    await reads(cockpit, lambda r: r.action == -1.0)
+    await browser.keyboard.up("ArrowLeft")
+    await reads(cockpit, lambda r: r == LET_GO)
+    await browser.keyboard.down("ArrowUp")
+    await browser.evaluate(TWO_HEARTBEATS)
+    assert not poll(cockpit).engaged
+    await browser.keyboard.up("ArrowUp")
 
 
-def test_a_page_that_loses_the_focus_has_let_go(runner, browser, cockpit):
-    async def leave():
-        await browser.keyboard.down("ArrowUp")
-        await reads(cockpit, lambda r: r.engaged)
-        await browser.evaluate("dispatchEvent(new Event('blur'))")
-        await reads(cockpit, lambda r: not r.engaged)
-        await browser.keyboard.up("ArrowUp")
-
-    runner.run(leave())
+async def test_a_page_that_loses_the_focus_has_let_go(browser, cockpit):
+    await browser.keyboard.down("ArrowUp")
+    await reads(cockpit, lambda r: r.engaged)
+    await browser.evaluate("dispatchEvent(new Event('blur'))")
+    await reads(cockpit, lambda r: not r.engaged)
+    await browser.keyboard.up("ArrowUp")
 
 
-def test_a_page_that_hangs_has_let_go_and_must_press_again(runner, browser, cockpit):
-    async def hang():
-        await browser.keyboard.down("ArrowUp")
-        await reads(cockpit, lambda r: r.engaged)
-        busy = asyncio.create_task(
-            browser.evaluate("(() => { const t = Date.now(); while (Date.now() - t < 1000); })()")
-        )
-        await reads(cockpit, lambda r: r == LET_GO)
-        assert not cockpit.present
-        await busy
-        await until(browser, f"{WHY}.includes('press again')")
-        assert not poll(cockpit).engaged
-        await browser.keyboard.up("ArrowUp")
-        await browser.keyboard.down("ArrowUp")
-        await reads(cockpit, lambda r: r.engaged)
-        await browser.keyboard.up("ArrowUp")
-
-    runner.run(hang())
+async def test_a_page_that_hangs_has_let_go_and_must_press_again(browser, cockpit):
+    await browser.keyboard.down("ArrowUp")
+    await reads(cockpit, lambda r: r.engaged)
+    busy = asyncio.create_task(
+        browser.evaluate("(() => { const t = Date.now(); while (Date.now() - t < 1000); })()")
+    )
+    await reads(cockpit, lambda r: r == LET_GO)
+    assert not cockpit.present
+    await busy
+    await until(browser, f"{WHY}.includes('press again')")
+    assert not poll(cockpit).engaged
+    await browser.keyboard.up("ArrowUp")
+    await browser.keyboard.down("ArrowUp")
+    await reads(cockpit, lambda r: r.engaged)
+    await browser.keyboard.up("ArrowUp")
 
 
-def test_a_finger_on_the_pad_drives(runner, browser, cockpit):
-    async def slide():
-        link = await browser.context.new_cdp_session(browser)
-        box = await browser.evaluate(
-            "document.getElementById('pad').getBoundingClientRect().toJSON()"
-        )
-        x, middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        await touch(link, "Start", (x, middle))
-        assert abs((await reads(cockpit, lambda r: r.engaged)).action) < 0.05
-        await touch(link, "Move", (x, middle - 0.45 * box["height"]))
-        await reads(cockpit, lambda r: r.action == 1.0)
-        await touch(link, "Move", (x, middle + 0.225 * box["height"]))
-        reading = await reads(cockpit, lambda r: r.action < 0.0)
-        assert reading.action == pytest.approx(-0.5, abs=0.05)
-        await touch(link, "End")
-        await reads(cockpit, lambda r: r == LET_GO)
-
-    runner.run(slide())
+async def test_a_finger_on_the_pad_drives(browser, cockpit):
+    link = await browser.context.new_cdp_session(browser)
+    box = await browser.evaluate("document.getElementById('pad').getBoundingClientRect().toJSON()")
+    x, middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    await touch(link, "Start", (x, middle))
+    assert abs((await reads(cockpit, lambda r: r.engaged)).action) < 0.05
+    await touch(link, "Move", (x, middle - 0.45 * box["height"]))
+    await reads(cockpit, lambda r: r.action == 1.0)
+    await touch(link, "Move", (x, middle + 0.225 * box["height"]))
+    reading = await reads(cockpit, lambda r: r.action < 0.0)
+    assert reading.action == pytest.approx(-0.5, abs=0.05)
+    await touch(link, "End")
+    await reads(cockpit, lambda r: r == LET_GO)
 
 
 TOUCHED = [(844, 390), (667, 375), (932, 430), (390, 844), (360, 640), (1024, 768), (768, 1024)]
@@ -123,162 +103,138 @@ TOUCHED = [(844, 390), (667, 375), (932, 430), (390, 844), (360, 640), (1024, 76
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 @pytest.mark.parametrize("size", TOUCHED, ids=str)
-def test_a_thumb_finds_pad_and_buttons_beside_the_road(runner, cockpit, size, scenario):
+async def test_a_thumb_finds_pad_and_buttons_beside_the_road(cockpit, size, scenario):
     width, height = size
 
-    async def hold():
-        viewport = {"width": width, "height": height}
-        async with open_browser(viewport=viewport, is_mobile=True, has_touch=True) as page:
-            await page.goto(cockpit.url)
-            cockpit.show(first_view(scenario))
-            await until(page, READY)
-            boxes = await page.evaluate(
-                "Object.fromEntries(['pad', 'scene', 'control', 'buttons'].map((id) => "
-                "[id, document.getElementById(id).getBoundingClientRect().toJSON()]))"
-            )
-            for box in boxes.values():
-                assert box["left"] >= 0
-                assert box["right"] <= width
-                assert box["bottom"] <= height
-            assert boxes["pad"]["width"] >= 240
-            assert boxes["pad"]["height"] >= 190
-            assert boxes["scene"]["width"] >= 0.55 * width
-            pad, road = boxes["pad"], boxes["scene"]
-            assert pad["left"] >= road["right"] or pad["top"] >= road["bottom"]
-
-    runner.run(hold())
+    viewport = {"width": width, "height": height}
+    async with open_browser(viewport=viewport, is_mobile=True, has_touch=True) as page:
+        await page.goto(cockpit.url)
+        cockpit.show(first_view(scenario))
+        await until(page, READY)
+        boxes = await page.evaluate(
+            "Object.fromEntries(['pad', 'scene', 'control', 'buttons'].map((id) => "
+            "[id, document.getElementById(id).getBoundingClientRect().toJSON()]))"
+        )
+        for box in boxes.values():
+            assert box["left"] >= 0
+            assert box["right"] <= width
+            assert box["bottom"] <= height
+        assert boxes["pad"]["width"] >= 240
+        assert boxes["pad"]["height"] >= 190
+        assert boxes["scene"]["width"] >= 0.55 * width
+        pad, road = boxes["pad"], boxes["scene"]
+        assert pad["left"] >= road["right"] or pad["top"] >= road["bottom"]
 
 
 @pytest.mark.parametrize("name", ["policy", "human", "applied"])
-def test_colours_are_those_of_every_view(runner, browser, name):
+async def test_colours_are_those_of_every_view(browser, name):
     shown = f"getComputedStyle(document.querySelector('.bar.{name} u')).backgroundColor"
-    assert runner.run(browser.evaluate(shown)) == f"rgb{BY_NAME[name]}"
+    assert await browser.evaluate(shown) == f"rgb{BY_NAME[name]}"
 
 
-def test_a_gamepads_triggers_drive_while_its_button_is_held(runner, browser, cockpit):
-    async def press():
-        buttons = [0.0] * 17
-        for index, value in ((7, 1.0), (6, 0.0)):
-            buttons[index] = value
-        await browser.evaluate(f"plug('Pad', 'standard', [0, 0, 0, 0], {buttons})")
-        assert not (await reads(cockpit, lambda r: r.action == 1.0)).engaged
-        buttons[5] = 1.0
-        await browser.evaluate(f"plug('Pad', 'standard', [0, 0, 0, 0], {buttons})")
-        assert (await reads(cockpit, lambda r: r.engaged)).action == 1.0
-        await browser.evaluate("delete pads[0]")
-        await reads(cockpit, lambda r: r == LET_GO)
-
-    runner.run(press())
+async def test_a_gamepads_triggers_drive_while_its_button_is_held(browser, cockpit):
+    buttons = [0.0] * 17
+    for index, value in ((7, 1.0), (6, 0.0)):
+        buttons[index] = value
+    await browser.evaluate(f"plug('Pad', 'standard', [0, 0, 0, 0], {buttons})")
+    assert not (await reads(cockpit, lambda r: r.action == 1.0)).engaged
+    buttons[5] = 1.0
+    await browser.evaluate(f"plug('Pad', 'standard', [0, 0, 0, 0], {buttons})")
+    assert (await reads(cockpit, lambda r: r.engaged)).action == 1.0
+    await browser.evaluate("delete pads[0]")
+    await reads(cockpit, lambda r: r == LET_GO)
 
 
-def test_a_wheel_takes_over_by_moving_and_its_choices_are_kept(runner, browser, cockpit):
-    async def turn():
-        cockpit.show(first_view("congestion"))
-        await until(browser, "document.getElementById('pad').className === 'level'")
-        wheel = f"plug('G29', '', [-0.25, 0, 1, 1], {[0.0] * 24})"
-        await browser.evaluate(wheel)
-        reading = await reads(cockpit, lambda r: r.by_moving)
-        assert reading.action == -1.0, "a quarter of its travel is full action"
-        await browser.evaluate(
-            "full.value = 1; full.dispatchEvent(new Event('input'));"
-            "invert.checked = true; invert.dispatchEvent(new Event('input'))"
-        )
-        turned = (0.25 - 0.02) / 0.98
-        assert (await reads(cockpit, lambda r: r.action > 0.0)).action == pytest.approx(turned)
+async def test_a_wheel_takes_over_by_moving_and_its_choices_are_kept(browser, cockpit):
+    cockpit.show(first_view("congestion"))
+    await until(browser, "document.getElementById('pad').className === 'level'")
+    wheel = f"plug('G29', '', [-0.25, 0, 1, 1], {[0.0] * 24})"
+    await browser.evaluate(wheel)
+    reading = await reads(cockpit, lambda r: r.by_moving)
+    assert reading.action == -1.0, "a quarter of its travel is full action"
+    await browser.evaluate(
+        "full.value = 1; full.dispatchEvent(new Event('input'));"
+        "invert.checked = true; invert.dispatchEvent(new Event('input'))"
+    )
+    turned = (0.25 - 0.02) / 0.98
+    assert (await reads(cockpit, lambda r: r.action > 0.0)).action == pytest.approx(turned)
+    await browser.goto(cockpit.url)
+    await browser.evaluate(wheel)
+    assert (await reads(cockpit, lambda r: r.by_moving)).action == pytest.approx(turned)
+
+
+async def test_buttons_and_keys_wish_once_and_quitting_asks_again(browser, cockpit):
+    await browser.evaluate("document.querySelector('[data-wish=pause]').click()")
+    await reads(cockpit, lambda r: r.wishes == {"pause"})
+    await browser.keyboard.press("KeyR")
+    await reads(cockpit, lambda r: r.wishes == {"restart"})
+    await browser.evaluate("document.querySelector('[data-wish=discard]').click()")
+    await reads(cockpit, lambda r: r.wishes == {"discard"})
+    await browser.evaluate("dispatchEvent(new KeyboardEvent('keydown', {code: 'Backspace'}))")
+    await reads(cockpit, lambda r: r.wishes == {"discard"})
+    await browser.keyboard.press("KeyQ")
+    await until(browser, "document.querySelector('[data-wish=quit]').textContent[0] === 'R'")
+    assert not poll(cockpit).wishes
+    await browser.keyboard.press("KeyQ")
+    await reads(cockpit, lambda r: r.wishes == {"quit"})
+
+
+async def test_what_is_shown_is_drawn(browser, cockpit):
+    view = replace(first_view(), control="human", speed_mps=4.25, message="saving", episode=7)
+    cockpit.show(view)
+    await until(browser, "document.body.dataset.control === 'human'")
+    assert await browser.text_content("#who") == "You drive"
+    assert await browser.text_content("#speed-value") == "4.3"
+    assert await browser.text_content("#message") == "saving"
+    assert (await browser.text_content("#place")).startswith("episode 7")
+    assert await browser.text_content(".bar.policy output") == "0.25"
+    # The newer frame's pixels are the policy's own, and the road is drawn in more than one
+    # colour.
+    pixel = (
+        "[...document.querySelectorAll('#frames canvas')[1].getContext('2d')"
+        ".getImageData(0, 0, 80, 45).data].filter((_, i) => i % 4 === 0)"
+    )
+    assert await browser.evaluate(pixel) == view.frames[1].ravel().tolist()
+    colours = (
+        "new Set(new Uint32Array(scene.getContext('2d')"
+        ".getImageData(0, 0, scene.width, scene.height).data.buffer)).size"
+    )
+    assert await browser.evaluate(colours) > 10
+
+
+async def test_a_second_page_is_told_that_it_watches(browser, cockpit):
+    await browser.goto("about:blank")
+    async with page(cockpit):
         await browser.goto(cockpit.url)
-        await browser.evaluate(wheel)
-        assert (await reads(cockpit, lambda r: r.by_moving)).action == pytest.approx(turned)
-
-    runner.run(turn())
-
-
-def test_buttons_and_keys_wish_once_and_quitting_asks_again(runner, browser, cockpit):
-    async def wish():
-        await browser.evaluate("document.querySelector('[data-wish=pause]').click()")
-        await reads(cockpit, lambda r: r.wishes == {"pause"})
-        await browser.keyboard.press("KeyR")
-        await reads(cockpit, lambda r: r.wishes == {"restart"})
-        await browser.evaluate("document.querySelector('[data-wish=discard]').click()")
-        await reads(cockpit, lambda r: r.wishes == {"discard"})
-        await browser.evaluate("dispatchEvent(new KeyboardEvent('keydown', {code: 'Backspace'}))")
-        await reads(cockpit, lambda r: r.wishes == {"discard"})
-        await browser.keyboard.press("KeyQ")
-        await until(browser, "document.querySelector('[data-wish=quit]').textContent[0] === 'R'")
-        assert not poll(cockpit).wishes
-        await browser.keyboard.press("KeyQ")
-        await reads(cockpit, lambda r: r.wishes == {"quit"})
-
-    runner.run(wish())
+        await until(browser, "document.body.classList.contains('watching')")
+        await browser.keyboard.down("ArrowUp")
+        await until(browser, f"{YOU} === '1.00'")
+        assert not poll(cockpit).engaged
+        await browser.keyboard.up("ArrowUp")
+    await until(browser, "!document.body.classList.contains('watching')")
 
 
-def test_what_is_shown_is_drawn(runner, browser, cockpit):
-    async def look():
-        view = replace(first_view(), control="human", speed_mps=4.25, message="saving", episode=7)
-        cockpit.show(view)
-        await until(browser, "document.body.dataset.control === 'human'")
-        assert await browser.text_content("#who") == "You drive"
-        assert await browser.text_content("#speed-value") == "4.3"
-        assert await browser.text_content("#message") == "saving"
-        assert (await browser.text_content("#place")).startswith("episode 7")
-        assert await browser.text_content(".bar.policy output") == "0.25"
-        # The newer frame's pixels are the policy's own, and the road is drawn in more than one
-        # colour.
-        pixel = (
-            "[...document.querySelectorAll('#frames canvas')[1].getContext('2d')"
-            ".getImageData(0, 0, 80, 45).data].filter((_, i) => i % 4 === 0)"
-        )
-        assert await browser.evaluate(pixel) == view.frames[1].ravel().tolist()
-        colours = (
-            "new Set(new Uint32Array(scene.getContext('2d')"
-            ".getImageData(0, 0, scene.width, scene.height).data.buffer)).size"
-        )
-        assert await browser.evaluate(colours) > 10
-
-    runner.run(look())
-
-
-def test_a_second_page_is_told_that_it_watches(runner, browser, cockpit):
-    async def watch():
-        await browser.goto("about:blank")
-        async with page(cockpit):
-            await browser.goto(cockpit.url)
-            await until(browser, "document.body.classList.contains('watching')")
-            await browser.keyboard.down("ArrowUp")
-            await until(browser, f"{YOU} === '1.00'")
-            assert not poll(cockpit).engaged
-            await browser.keyboard.up("ArrowUp")
-        await until(browser, "!document.body.classList.contains('watching')")
-
-    runner.run(watch())
-
-
-def test_the_end_of_the_sitting_is_told(runner, browser, cockpit):
-    async def end():
-        cockpit.close()
-        await until(browser, "document.body.dataset.link === 'over'")
-        assert await browser.text_content("#who") == "The sitting is over"
-
-    runner.run(end())
+async def test_the_end_of_the_sitting_is_told(browser, cockpit):
+    cockpit.close()
+    await until(browser, "document.body.dataset.link === 'over'")
+    assert await browser.text_content("#who") == "The sitting is over"
 
 
 @pytest.mark.parametrize("how", ["closed", "silent"])
-def test_a_lost_connection_is_letting_go_and_comes_back(runner, browser, cockpit, how):
+async def test_a_lost_connection_is_letting_go_and_comes_back(browser, cockpit, how):
     """Through a tunnel, as over ``ssh -L``, that is cut or swallows everything."""
 
-    async def lose():
-        async with Tunnel(cockpit.port) as tunnel:
-            await browser.goto(cockpit.url.replace(str(cockpit.port), str(tunnel.port)))
-            await until(browser, READY)
-            await browser.keyboard.down("ArrowUp")
-            await reads(cockpit, lambda r: r.engaged)
-            tunnel.cut() if how == "closed" else tunnel.swallow()
-            await reads(cockpit, lambda r: r == LET_GO)
-            await until(browser, "document.body.dataset.link === 'lost'")
-            await until(browser, f"{LIVE} && {WHY}.includes('press again')")
-            assert poll(cockpit) == LET_GO, "held all the while"
-            await browser.keyboard.up("ArrowUp")
-            await browser.keyboard.down("ArrowUp")
-            await reads(cockpit, lambda r: r.engaged)
-            await browser.keyboard.up("ArrowUp")
-
-    runner.run(lose())
+    async with Tunnel(cockpit.port) as tunnel:
+        await browser.goto(cockpit.url.replace(str(cockpit.port), str(tunnel.port)))
+        await until(browser, READY)
+        await browser.keyboard.down("ArrowUp")
+        await reads(cockpit, lambda r: r.engaged)
+        tunnel.cut() if how == "closed" else tunnel.swallow()
+        await reads(cockpit, lambda r: r == LET_GO)
+        await until(browser, "document.body.dataset.link === 'lost'")
+        await until(browser, f"{LIVE} && {WHY}.includes('press again')")
+        assert poll(cockpit) == LET_GO, "held all the while"
+        await browser.keyboard.up("ArrowUp")
+        await browser.keyboard.down("ArrowUp")
+        await reads(cockpit, lambda r: r.engaged)
+        await browser.keyboard.up("ArrowUp")

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from trainer.drivers import CHECKPOINT_FILE, load_driver, make_environment
-from trainer.person.interface import HUMANS, LET_GO, Person
+from trainer.person import devices
+from trainer.person.interface import LET_GO
 from trainer.person.recording import Recorder, find_recordings, read_steps
 from trainer.person.session import STOPPED
-from trainer.person.tests.people import QUIT, Discarding, Eyes, Hands, recorded_step
+from trainer.person.tests.people import QUIT, Discarding, Puppet, recorded_step
 from trainer.tests.test_commands import call
 from trainer.training.metrics import read_metrics
 from trainer.training.run import TrainingRun
@@ -85,47 +87,48 @@ def test_without_a_screen_it_says_what_to_do(capfd, tmp_path, monkeypatch, drive
     assert errors.count("\n") == 1
 
 
-def test_whoever_quits_before_the_first_episode_has_lost_nothing(
-    capsys, tmp_path, monkeypatch, one_thread
-):
-    hands = Hands([], then=QUIT)
-    hands.present = False
-    monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, Eyes()))
-    command = ["train", "--human", "keyboard", "--out", str(tmp_path / "run"), "--speed", "1000"]
-    status, out, errors = call(capsys, *command)
+@pytest.fixture
+def sit_down(monkeypatch, tmp_path, capsys, one_thread):
+    """Run a command with somebody else at the keyboard; its status, stdout and stderr."""
+
+    def sit_down(person, *command):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(devices, "open_keyboard", lambda arguments: person)
+        return call(capsys, *command, "--speed", "1000")
+
+    return sit_down
+
+
+TRAIN_HERE = ("train", "--human", "keyboard", "--out", "run")
+
+
+def test_whoever_quits_before_the_first_episode_has_lost_nothing(sit_down):
+    nobody = Puppet(then=QUIT, presence=repeat(False))
+    status, out, errors = sit_down(nobody, *TRAIN_HERE)
     assert (status, errors.strip()) == (0, "nothing was driven, and nothing recorded")
     assert "no episodes" in out
-    assert call(capsys, *command, "--resume")[0] == 0
+    assert sit_down(nobody, *TRAIN_HERE, "--resume")[0] == 0
 
 
-def test_a_device_and_a_scenario_are_all_that_must_be_said(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    person = Person(Hands([LET_GO] * 3, then=QUIT), Eyes())
-    monkeypatch.setitem(HUMANS, "keyboard", lambda options: person)
-    command = ("drive", "--scenario", "left_turn", "--device", "keyboard", "--speed", "1000")
-    status, out, _ = call(capsys, *command)
+def test_a_device_and_a_scenario_are_all_that_must_be_said(sit_down):
+    command = ("drive", "--scenario", "left_turn", "--device", "keyboard")
+    status, out, _ = sit_down(Puppet([LET_GO] * 3, then=QUIT), *command)
     assert status == 0
-    (recording,) = (tmp_path / "runs" / "drives").iterdir()
-    assert str(recording.relative_to(tmp_path)) in out
+    (recording,) = Path("runs/drives").iterdir()
+    assert str(recording) in out
 
 
-def test_a_validation_that_is_left_out_costs_nothing_else(
-    capsys, tmp_path, monkeypatch, one_thread
-):
+def test_a_validation_that_is_left_out_costs_nothing_else(sit_down, monkeypatch):
     def interrupted(*_arguments):
         raise KeyboardInterrupt
 
-    person = Person(Hands([LET_GO] * 3, then=QUIT), Eyes())
-    monkeypatch.setitem(HUMANS, "keyboard", lambda options: person)
     monkeypatch.setattr(TrainingRun, "_validate", interrupted)
-    run_dir = tmp_path / "run"
-    command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
-    status, out, errors = call(capsys, *command)
+    status, out, errors = sit_down(Puppet([LET_GO] * 3, then=QUIT), *TRAIN_HERE)
     assert status == 0
     assert "validation left out" in errors
     assert "1 episode, 4 steps" in out
-    assert [row["outcome"] for row in read_metrics(run_dir)] == [STOPPED]
-    assert (run_dir / "learning_curve.png").is_file()
+    assert [row["outcome"] for row in read_metrics(Path("run"))] == [STOPPED]
+    assert Path("run/learning_curve.png").is_file()
 
 
 def record(directory, steps):
@@ -202,50 +205,42 @@ def test_what_was_thrown_away_or_is_left_out_is_not_imitated(
         assert (status, "nobody took over" in errors) == (2, True)
 
 
-@pytest.mark.parametrize(
-    ("left_out", "complaint"),
-    [("1:9", "no such episode"), ("2", "no such episode"), ("1:2:3", "no SITTING"), ("-1", "")],
-)
-def test_leaving_out_what_is_not_there_is_one_line(capsys, tmp_path, left_out, complaint):
-    episodes_of_two_steps(tmp_path / "rec")
-    command = ["human", "--from", str(tmp_path / "rec"), "--out", str(tmp_path / "me")]
-    status, _, errors = call(capsys, *command, "--leave-out", left_out)
-    assert (status, complaint in errors, errors.count("\n")) == (2, True, 1)
-    assert not (tmp_path / "me" / "human.pt").exists()
-
-
-def test_a_person_is_not_imitated_in_what_they_threw_away(
-    capsys, tmp_path, monkeypatch, one_thread
-):
+def test_a_person_is_not_imitated_in_what_they_threw_away(sit_down):
     """Three episodes, the second thrown away after its end: neither stored nor brought back."""
-    eyes, run_dir = Eyes(), tmp_path / "run"
-    hands = Discarding(eyes, discarded={1}, episodes=3)
-    monkeypatch.setitem(HUMANS, "keyboard", lambda options: Person(hands, eyes))
-    command = ["train", "--human", "keyboard", "--out", str(run_dir), "--speed", "1000"]
     quick = ["--threads", "1", "--set", "evaluate_every_steps=0", "--set", "warmup_steps=8"]
-    status, out, errors = call(capsys, *command, *quick)
+    person = Discarding(discarded={1}, episodes=3)
+    status, out, errors = sit_down(person, *TRAIN_HERE, *quick)
     assert status == 0, errors
     assert "2 episodes, 1 episode discarded" in errors
-    rows = read_metrics(run_dir)
+    rows = read_metrics(Path("run"))
     assert [row["outcome"] == "discarded" for row in rows] == [False, True, False]
     lengths = [int(row["steps"]) for row in rows]
     kept = lengths[0] + lengths[2]
     assert [int(row["total_steps"]) for row in rows] == [lengths[0], lengths[0], kept]
     assert f"{kept} steps" in out
-    replay = load_torch(run_dir / CHECKPOINT_FILE)["learning"]["replay"]
+    replay = load_torch(Path("run") / CHECKPOINT_FILE)["learning"]["replay"]
     assert int(replay["human"].sum()) == sum(int(rows[n]["human_steps"]) for n in (0, 2))
-    (recording,) = find_recordings([run_dir])
+    (recording,) = find_recordings([Path("run")])
     assert len(list(read_steps(recording))) == sum(lengths), "all of it is recorded"
 
 
-def test_recordings_that_teach_nothing_are_refused(capsys, tmp_path):
+@pytest.mark.parametrize(
+    ("recorded", "more", "complaint"),
+    [
+        ("policy", (), "nobody took over"),
+        ("person", ("--scenario", "congestion"), "was driven in left_turn, not in congestion"),
+        ("person", ("--label-every-step",), "ask the scripted expert"),
+        ("person", ("--unaided-share", "4"), "ask the scripted expert"),
+        ("person", ("--leave-out", "1:9"), "no such episode"),
+        ("person", ("--leave-out", "2"), "no such episode"),
+        ("person", ("--leave-out", "1:2:3"), "no SITTING"),
+        ("person", ("--leave-out", "-1"), ""),
+    ],
+)
+def test_recordings_that_teach_nothing_are_refused(capsys, tmp_path, recorded, more, complaint):
     record(tmp_path / "policy", [recorded_step(1, 0)])
-    record(tmp_path / "other", [demonstrated(0)])
-    command = ["human", "--out", str(tmp_path / "me"), "--from"]
-    assert "nobody took over" in call(capsys, *command, str(tmp_path / "policy"))[2]
-    wrong = call(capsys, *command, str(tmp_path / "other"), "--scenario", "congestion")
-    assert "was driven in left_turn, not in congestion" in wrong[2]
-    label = call(capsys, *command, str(tmp_path / "other"), "--label-every-step")
-    unaided = call(capsys, *command, str(tmp_path / "other"), "--unaided-share", "4")
-    assert all("ask the scripted expert" in refused[2] for refused in (label, unaided))
-    assert {wrong[0], label[0], unaided[0]} == {2}
+    record(tmp_path / "person", [demonstrated(0)])
+    command = ["human", "--out", str(tmp_path / "me"), "--from", str(tmp_path / recorded)]
+    status, _, errors = call(capsys, *command, *more)
+    assert (status, complaint in errors, errors.count("\n")) == (2, True, 1)
+    assert not (tmp_path / "me").exists()

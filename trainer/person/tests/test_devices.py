@@ -11,7 +11,8 @@ import pytest
 
 from bridge import rerun
 from trainer.drivers import load_driver, make_environment
-from trainer.person.devices import JoystickHands, KeyboardHands, WindowDevice, pygame
+from trainer.person.devices import JoystickHands, KeyboardHands, WindowPerson, pygame
+from trainer.person.interface import LET_GO
 from trainer.person.profile import SHIPPED, read_profile
 from trainer.person.tests.pages import first_view
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
@@ -24,22 +25,27 @@ def key(down: bool, code: int):
     return pygame.event.Event(pygame.KEYDOWN if down else pygame.KEYUP, key=code)
 
 
+def press(hands, *codes, down=True):
+    for code in codes:
+        hands.handle(key(down, code))
+
+
 def test_a_held_key_takes_over_and_its_action_grows():
     hands = KeyboardHands("left_turn")
     assert not hands.read(0.0).engaged
-    hands.handle(key(True, pygame.K_DOWN))
+    press(hands, pygame.K_DOWN)
     readings = [hands.read(0.1 * period) for period in range(1, 4)]
     assert [r.action for r in readings] == pytest.approx([-0.5, -1.0, -1.0])
     assert all(r.engaged for r in readings)
-    hands.handle(key(False, pygame.K_DOWN))
-    assert hands.read(0.5) == KeyboardHands("left_turn").read(0.0)
+    press(hands, pygame.K_DOWN, down=False)
+    assert hands.read(0.5) == LET_GO
 
 
 def test_a_tap_between_two_readings_is_not_missed():
     hands = KeyboardHands("congestion")
     hands.read(0.0)
-    hands.handle(key(True, pygame.K_LEFT))
-    hands.handle(key(False, pygame.K_LEFT))
+    press(hands, pygame.K_LEFT)
+    press(hands, pygame.K_LEFT, down=False)
     reading = hands.read(0.1)
     assert reading.engaged
     assert reading.action == pytest.approx(-0.25)
@@ -48,30 +54,28 @@ def test_a_tap_between_two_readings_is_not_missed():
 
 def test_turning_round_does_not_first_undo():
     hands = KeyboardHands("congestion")
-    hands.handle(key(True, pygame.K_RIGHT))
+    press(hands, pygame.K_RIGHT)
     for period in range(5):
         hands.read(0.1 * period)
-    hands.handle(key(False, pygame.K_RIGHT))
-    hands.handle(key(True, pygame.K_LEFT))
+    press(hands, pygame.K_RIGHT, down=False)
+    press(hands, pygame.K_LEFT)
     assert hands.read(0.5).action == pytest.approx(-0.25)
 
 
-def test_the_space_bar_holds_without_driving():
+@pytest.mark.parametrize(
+    ("code", "engaged"),
+    [(pygame.K_SPACE, True), (pygame.K_LEFT, False)],  # of the other scenario
+)
+def test_the_space_bar_holds_without_driving_and_other_keys_do_nothing(code, engaged):
     hands = KeyboardHands("left_turn")
-    hands.handle(key(True, pygame.K_SPACE))
+    press(hands, code)
     reading = hands.read(0.0)
-    assert (reading.engaged, reading.action) == (True, 0.0)
-
-
-def test_keys_of_the_other_scenario_do_nothing():
-    hands = KeyboardHands("left_turn")
-    hands.handle(key(True, pygame.K_LEFT))
-    assert not hands.read(0.0).engaged
+    assert (reading.engaged, reading.action) == (engaged, 0.0)
 
 
 def test_a_window_without_focus_holds_nothing():
     hands = KeyboardHands("left_turn")
-    hands.handle(key(True, pygame.K_UP))
+    press(hands, pygame.K_UP)
     hands.read(0.0)
     hands.handle(pygame.event.Event(pygame.WINDOWFOCUSLOST))
     assert not hands.read(0.1).engaged
@@ -105,9 +109,8 @@ def test_keys_are_enough_to_drive(scenario, keys):
             wanted.append(float(expert.act(observation)[0]))
             pressed = keys_for(wanted[-3], action, keys, down)
             if pressed != down:
-                for code, is_down in ((down, False), (pressed, True)):
-                    if code is not None:
-                        hands.handle(key(is_down, code))
+                press(hands, *filter(None, [down]), down=False)
+                press(hands, *filter(None, [pressed]))
                 down = pressed
             now_s += 0.1
             action = hands.read(now_s).action
@@ -128,19 +131,23 @@ def wheel(monkeypatch):
     pygame.quit()
 
 
-def read(device: WindowDevice):
+def at_the_wheel(scenario: str) -> WindowPerson:
+    return WindowPerson(JoystickHands(G29, scenario), Window())
+
+
+def read(device: WindowPerson):
     """SDL tells axes on the next look at its devices."""
     device.poll(time.monotonic())
     return device.poll(time.monotonic())
 
 
 def test_pedals_nobody_has_touched_are_not_half_pressed(wheel):
-    device = WindowDevice(JoystickHands(G29, "left_turn"))
+    device = at_the_wheel("left_turn")
     assert read(device).action == 0.0
 
 
 def test_axes_and_buttons_of_a_wheel(wheel):
-    device = WindowDevice(JoystickHands(G29, "congestion"))
+    device = at_the_wheel("congestion")
     wheel.axis(0, 0.25)
     reading = read(device)
     assert reading.action == pytest.approx(1.0, abs=1e-3)
@@ -154,7 +161,7 @@ def test_axes_and_buttons_of_a_wheel(wheel):
 
 
 def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
-    device = WindowDevice(JoystickHands(G29, "congestion"))
+    device = at_the_wheel("congestion")
     wheel.axis(0, 0.25)
     assert read(device).action > 0.9
     wheel.unplug()

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from trainer.drivers import CHECKPOINT_FILE
-from trainer.person.recording import DIRECTORY, Step, find_recordings, read_steps, sittings
+from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
 from trainer.person.takeover import MAX_SLEW
 from trainer.person.tests.browser import (
     PERSON_DRIVES,
@@ -35,27 +35,14 @@ SMALL = ["--threads", "1", "--set", "batch_size=4", "--set", "evaluate_every_ste
 
 
 class Training:
-    """A ``trainer train`` with a person in it.
+    """A ``trainer train`` with a person in it, by a module that has the trainer's command line."""
 
-    Args:
-        run_dir: its directory.
-        module: whose command line begins with the trainer's command.
-        arguments: more of the command's.
-        environment: more variables.
-    """
-
-    def __init__(
-        self, run_dir: Path, module: str, arguments: Sequence[str], environment: dict[str, str]
-    ) -> None:
+    def __init__(self, run_dir: Path, *more: str, module: str = "trainer", **environment: str):
         self.run_dir = run_dir
-        command = [sys.executable, "-m", module, "train", "--out", str(run_dir)]
+        command = [sys.executable, "-m", module, "train", "--out", str(run_dir), *SMALL, *more]
+        pipes: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         self.process = subprocess.Popen(
-            [*command, *SMALL, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **environment},
+            command, **pipes, text=True, env={**os.environ, **environment}
         )
 
     def __enter__(self) -> Training:
@@ -96,39 +83,42 @@ def newest_sitting(run_dir: Path) -> list[Step]:
     return list(read_steps(there[-1])) if there else []
 
 
-def all_steps(run_dir: Path) -> list[Step]:
-    """The steps of all sittings."""
-    return [step for path in sittings(run_dir / DIRECTORY) for step in read_steps(path)]
-
-
-def assert_all_in_replay(run_dir: Path) -> None:
-    """The saved replay buffer holds the recorded steps, each with its mask and its action."""
+def all_in_replay(run_dir: Path) -> list[Step]:
+    """All recorded steps; the saved replay buffer holds each with its mask and its action."""
     replay: dict[str, Any] = load_torch(run_dir / CHECKPOINT_FILE)["learning"]["replay"]
-    steps = all_steps(run_dir)
+    steps = [step for path in sittings(run_dir / DIRECTORY) for step in read_steps(path)]
     assert replay["human"].tolist() == [step.human for step in steps]
     actions = np.array([step.action for step in steps], np.float32)
     np.testing.assert_array_equal(replay["actions"].numpy()[:, 0], actions)
     assert replay["terminals"].tolist() == [float(step.terminated) for step in steps]
+    return steps
+
+
+def first_of_the_persons(steps: Sequence[Step]) -> int:
+    """The index of the step with which the only intervention begins.
+
+    The action has moved from what was applied before towards what the person wants, as far as it
+    may.
+    """
+    (index,) = (index for index, step in enumerate(steps) if step.first)
+    taken, last = steps[index], steps[index].policy_action
+    assert not any(step.human for step in steps[:index])
+    if taken.step:
+        last = steps[index - 1].action
+    assert last is not None
+    assert taken.action == last + min(max(taken.human_action - last, -MAX_SLEW), MAX_SLEW)
+    assert taken.action != taken.policy_action
+    return index
 
 
 def assert_taken_over_at_once(steps: Sequence[Step], began_ns: int, done_ns: int) -> None:
     """The first control period that asked the hands after ``done_ns`` is already the person's.
 
-    One between ``began_ns`` and ``done_ns`` may be: a key is down before who presses it says so.
+    One between ``began_ns`` and ``done_ns`` may be: a key is down before the press is confirmed.
     """
-    taken = next(number for number, step in enumerate(steps) if step.human)
-    before, after = steps[:taken], steps[taken:]
-    assert before
-    assert after[0].time_ns >= began_ns
-    assert before[-1].time_ns < done_ns
-    assert after[0].first
-    assert after[0].action != after[0].policy_action
-    # It has moved from what was applied before towards what the person wants, as far as it may.
-    together = before[-1].episode == after[0].episode
-    last = before[-1].action if together else after[0].policy_action
-    wanted = after[0].human_action
-    assert last is not None
-    assert after[0].action == last + min(max(wanted - last, -MAX_SLEW), MAX_SLEW)
+    taken = first_of_the_persons(steps)
+    assert steps[taken].time_ns >= began_ns
+    assert steps[taken - 1].time_ns < done_ns
 
 
 @pytest.fixture
@@ -158,15 +148,14 @@ def xdotool(display, *words) -> int:
 
 
 def test_a_key_takes_over_at_once_and_everything_is_kept(tmp_path, display):
-    run_dir = tmp_path / "run"
-    with Training(run_dir, "trainer", ["--human", "keyboard"], display) as training:
+    with Training(tmp_path / "run", "--human", "keyboard", **display) as training:
         training.wait_for_step(lambda step: step.step >= 2)
         began_ns = time.time_ns()
         done_ns = xdotool(display, "keydown", "Down")
         training.wait_for_step(lambda step: step.human and step.action < -0.99)
         let_go_ns = xdotool(display, "keyup", "Down")
         back = training.wait_for_step(lambda step: step.time_ns > let_go_ns and not step.human)
-        steps = newest_sitting(run_dir)
+        steps = newest_sitting(training.run_dir)
         assert_taken_over_at_once(steps, began_ns, done_ns)
         after = next(step for step in steps if step.time_ns > let_go_ns)
         assert after.control != "human"
@@ -174,15 +163,12 @@ def test_a_key_takes_over_at_once_and_everything_is_kept(tmp_path, display):
         xdotool(display, "key", "q")
         status, errors = training.end()
     assert status == 0, errors
-    assert_all_in_replay(run_dir)
-
-
-WHEEL = "trainer.person.tests.virtual_wheel"
-WITHOUT_SCREEN = {"SDL_VIDEODRIVER": "dummy"}
+    all_in_replay(training.run_dir)
 
 
 def train(run_dir, *more):
-    return Training(run_dir, WHEEL, ["--human", "wheel", *more], WITHOUT_SCREEN)
+    module = "trainer.person.tests.virtual_wheel"
+    return Training(run_dir, "--human", "wheel", *more, module=module, SDL_VIDEODRIVER="dummy")
 
 
 def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
@@ -206,12 +192,10 @@ def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
     assert status == 0, errors
     human = sum(step.human for step in killed)
     assert f"{len(killed)} recorded steps after the checkpoint, {human} of them yours" in errors
-    assert len(all_steps(run_dir)) > len(killed)
-    assert_all_in_replay(run_dir)
+    assert len(all_in_replay(run_dir)) > len(killed)
 
 
 APPLIED = "document.querySelector('.bar.applied output').textContent"
-QUICK = ("--set", "warmup_steps=8")
 
 
 @pytest.mark.skipif(
@@ -219,7 +203,6 @@ QUICK = ("--set", "warmup_steps=8")
 )
 def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path):
     pytest.importorskip("playwright")
-    run_dir = tmp_path / "run"
 
     async def sit(url):
         async with open_browser() as page:
@@ -232,23 +215,11 @@ def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path):
             await quit_sitting(page)
             await until(page, "document.body.dataset.link === 'over'")
 
-    with Training(run_dir, "trainer", ["--human", "web", *QUICK], {}) as training:
+    with Training(tmp_path / "run", "--human", "web", "--set", "warmup_steps=8") as training:
         asyncio.run(sit(address(training.process)))
         status, errors = training.end()
     assert status == 0, errors
-    [recording] = find_recordings([run_dir])
-    steps = list(read_steps(recording))
-    ours = [step for step in steps if step.human]
-    assert sum(step.first for step in steps) == 1
-    assert ours[0].first
-    # Towards the brake within the first period, by no more than a hand-over may.
-    first = ours[0]
-    before = steps[steps.index(first) - 1].action if first.step else first.policy_action
-    assert before is not None
-    towards = min(max(first.human_action - before, -MAX_SLEW), MAX_SLEW)
-    assert first.human_action < 0.0
-    assert first.action == pytest.approx(before + towards)
-    assert -1.0 in [step.action for step in ours]
+    steps = all_in_replay(training.run_dir)
+    assert steps[first_of_the_persons(steps)].human_action < 0.0
+    assert -1.0 in [step.action for step in steps if step.human]
     assert steps[-1].outcome == "stopped"
-    replay = load_torch(run_dir / CHECKPOINT_FILE)["learning"]["replay"]
-    assert int(replay["human"].sum()) == len(ours)

@@ -7,10 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from trainer.person import profile as calibrate
-from trainer.person.devices import pygame
+from trainer.person import profile as module
 from trainer.person.profile import SHIPPED, SHORTEST, Pedal, Steering, read_profile
-from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
 
 PLACE = st.floats(-1.0, 1.0)
 DEAD_ZONE = st.floats(0.0, 0.9)
@@ -89,6 +87,7 @@ def test_the_g29s_pedals_and_wheel():
         (("axis = 1", "axis = 1\nreleased = 1.0"), "not 0.02 apart"),
         (('name = "mine"', ""), "missing required field `name`"),
         (("hold = [0]", ""), "buttons.hold is empty"),
+        (("hold = [0]", "hold = [0]\nfly = [1]"), "Invalid enum value 'fly'"),
         (('name = "mine"', 'name = "mine"\nrest = 0.5'), "rest must be below threshold"),
         (('name = "mine"', 'name = "mine"\ntake_over = "shouting"'), "shouting"),
         (("axis = 0", "axis = "), "is no TOML"),
@@ -107,57 +106,72 @@ def test_a_wrong_profile_is_one_line(tmp_path, change, complaint):
 def test_a_good_one_is_read(tmp_path):
     path = tmp_path / "good.toml"
     path.write_text(GOOD)
-    assert read_profile(path).moving.threshold == 0.15
+    assert read_profile(path).threshold == 0.15
+
+
+class Trembling:
+    """A wheel with two pedals whose axes tremble before they are held still; a look is a moment."""
+
+    def __init__(self) -> None:
+        self._coming = {0: [0.0], 1: [-1.0], 2: [-1.0]}
+        self._pressed: set[int] = set()
+
+    def look(self) -> None:
+        for places in self._coming.values():
+            if len(places) > 1:
+                places.pop(0)
+
+    def press(self, axis: int, place: float) -> None:
+        self._coming[axis] = [0.5, 0.7, 0.4, 0.6] * 5 + [place]
+
+    def answer(self, line: str, answers) -> None:
+        """Press what is asked for, and let go when told."""
+        for word, (axis, place) in answers.items():
+            if word in line:
+                self.press(axis, place)
+        if "let go" in line:
+            self._coming |= {0: [0.0], 1: [-1.0], 2: [-1.0]}
+        if "button" in line:
+            self._pressed.add(7)
+
+    def get_name(self) -> str:
+        return 'A "quoted" wheel'
+
+    def get_numaxes(self) -> int:
+        return len(self._coming)
+
+    def get_axis(self, axis: int) -> float:
+        return self._coming[axis][0]
+
+    def get_numbuttons(self) -> int:
+        return 12
+
+    def get_button(self, number: int) -> bool:
+        return number in self._pressed
+
+
+ANSWERS = {"LEFT": (0, 0.5), "RIGHT": (0, -0.4), "THROTTLE": (2, 0.9), "BRAKE": (1, 1.0)}
 
 
 @pytest.fixture
-def wheel(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    monkeypatch.setattr(calibrate, "STEADY_S", 0.05)
-    monkeypatch.setattr(calibrate, "FIRST_S", 0.05)
-    if load_sdl() is None:
-        pytest.skip("this pygame has no SDL of its own with virtual joysticks")
-    pygame.display.init()
-    pygame.joystick.init()
-    wheel = VirtualWheel()
-    for pedal in (1, 2):
-        wheel.axis(pedal, -1.0)
-    yield wheel
-    pygame.quit()
+def ask(monkeypatch):
+    """Asks whoever answers so, in a hurry."""
+    for name, value in {"STEADY_S": 0.05, "FIRST_S": 0.0, "LOOK_S": 0.001}.items():
+        monkeypatch.setattr(module, name, value)
+
+    def ask(answers):
+        wheel = Trembling()
+        return module.ask(wheel, wheel.look, lambda line: wheel.answer(line, answers))
+
+    return ask
 
 
-ANSWERS = {"LEFT": (0, 0.5, 0.0), "RIGHT": (0, -0.4, 0.0), "THROTTLE": (2, 0.9, -1.0)}
-
-
-def answering(wheel, answers):
-    """Whoever holds an axis while it is asked for, and lets go when told."""
-    held = []
-
-    def say(line: str) -> None:
-        for word, (axis, place, rest) in answers.items():
-            if word in line:
-                wheel.axis(axis, place)
-                held.append((axis, rest))
-        if "let go" in line and held:
-            wheel.axis(*held.pop())
-        if "button" in line:
-            wheel.button(7, True)
-
-    return say
-
-
-def questions(wheel, answers):
-    joystick = pygame.joystick.Joystick(wheel.index)
-    return calibrate.Questions(joystick, pygame.event.pump, answering(wheel, answers))
-
-
-def test_the_answers_become_a_profile(wheel, tmp_path):
-    answers = {**ANSWERS, "BRAKE": (1, 1.0, -1.0)}
+def test_the_answers_become_a_profile(ask, tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text(calibrate.ask(questions(wheel, answers), 'A "quoted" wheel'))
+    path.write_text(ask(ANSWERS))
     profile = read_profile(path)
-    assert profile.name == 'A "quoted" wheel'
-    assert profile.buttons.hold == (7,)
+    assert (profile.name, profile.match) == ('A "quoted" wheel',) * 2
+    assert profile.buttons == {"hold": (7,)}
     places = {0: 0.5, 1: -1.0, 2: 0.9}
     assert profile.action("congestion", places) == pytest.approx(-1.0, abs=0.01)
     assert profile.action("congestion", {0: -0.4}) == pytest.approx(1.0, abs=0.01)
@@ -165,41 +179,12 @@ def test_the_answers_become_a_profile(wheel, tmp_path):
     assert profile.action("left_turn", {2: -1.0, 1: 1.0}) == pytest.approx(-1.0, abs=0.01)
 
 
-def test_left_and_right_on_different_axes_is_refused(wheel):
-    answers = {**ANSWERS, "RIGHT": (3, 0.5, 0.0)}
-    with pytest.raises(calibrate.UserError, match="left was axis 0, right axis 3"):
-        calibrate.ask(questions(wheel, answers), "x")
+def test_left_and_right_on_different_axes_is_refused(ask):
+    with pytest.raises(UserError, match="left was axis 0, right axis 2"):
+        ask({**ANSWERS, "RIGHT": (2, 0.5)})
 
 
-def test_no_answer_ends_it(wheel, monkeypatch):
-    monkeypatch.setattr(calibrate, "PATIENCE_S", 0.3)
-    with pytest.raises(calibrate.UserError, match="no profile was written"):
-        calibrate.ask(questions(wheel, {}), "x")
-
-
-class Trembling:
-    """An axis that is never still until it has moved for a while; each look is a moment."""
-
-    def __init__(self) -> None:
-        self.places = [0.5, 0.7, 0.4, 0.6] * 5 + [0.8] * 200
-
-    def look(self) -> None:
-        self.places.pop(0)
-
-    def get_numaxes(self) -> int:
-        return 1
-
-    def get_axis(self, axis: int) -> float:
-        return self.places[0]
-
-
-def test_an_axis_that_moves_is_waited_for(monkeypatch):
-    monkeypatch.setattr(calibrate, "STEADY_S", 0.05)
-    hand = Trembling()
-
-    def say(line: str) -> None:
-        if "let go" in line:
-            hand.places = [0.0] * 100
-
-    found = calibrate.Questions(hand, hand.look, say).axis([0.0], "hold it")
-    assert found == calibrate.Found(0, 0.8)
+def test_no_answer_ends_it(ask, monkeypatch):
+    monkeypatch.setattr(module, "PATIENCE_S", 0.3)
+    with pytest.raises(UserError, match="no profile was written"):
+        ask({})

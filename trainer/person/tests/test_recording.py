@@ -9,6 +9,7 @@ import resource
 import signal
 import struct
 import time
+from contextlib import contextmanager
 from typing import cast
 
 import msgspec
@@ -35,10 +36,12 @@ from trainer.person.tests.people import recorded_step
 
 
 def record(directory, count: int) -> list[Step]:
-    recorder = Recorder(directory)
-    steps = [recorded_step(recorder.sitting, index) for index in range(count)]
-    for step in steps:
-        recorder.write(step)
+    """A sitting of so many steps, each of which is there before the next is taken."""
+    recorder, steps = Recorder(directory), []
+    for index in range(count):
+        steps.append(recorded_step(recorder.sitting, index))
+        recorder.write(steps[-1])
+        assert list(read_steps(recorder.path)) == steps
     recorder.close()
     return steps
 
@@ -95,13 +98,6 @@ def test_a_sitting_is_held_until_it_is_closed(tmp_path):
         assert try_to_lock_file(other.fileno())
 
 
-def test_every_step_is_there_before_the_next_is_taken(tmp_path):
-    recorder = Recorder(tmp_path)
-    for index in range(3):
-        recorder.write(recorded_step(1, index))
-        assert [step.index for step in read_steps(recorder.path)] == list(range(index + 1))
-
-
 def test_sittings_add_up_and_are_never_overwritten(tmp_path):
     first, second = record(tmp_path, 2), record(tmp_path, 3)
     paths = sittings(tmp_path)
@@ -110,8 +106,11 @@ def test_sittings_add_up_and_are_never_overwritten(tmp_path):
 
 
 def test_a_sitting_without_a_step_leaves_nothing_behind(tmp_path):
-    record(tmp_path, 0)
-    assert sittings(tmp_path) == []
+    record(tmp_path / "rec", 0)
+    assert sittings(tmp_path / "rec") == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot create"):
+        Recorder(tmp_path / "file")
 
 
 def test_recordings_are_found_by_file_directory_and_run_each_once(tmp_path):
@@ -139,29 +138,30 @@ def test_another_file_is_refused(tmp_path, data):
 def test_a_file_made_to_keep_its_reader_busy_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(recording, "MAX_CHUNK_BYTES", MIB)
     path = crafted(tmp_path / "sitting-0001.mcap", *[(zeros(1), MIB)] * 40)
-    with pytest.raises(UserError, match="is refused"):
+    with pytest.raises(UserError, match=r"sitting-0001\.mcap is refused"):
         list(read_steps(path))
 
 
-def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
-    recorder = Recorder(tmp_path)
-    recorder.write(recorded_step(1, 0))
+@contextmanager
+def room_for(path, count: int):
+    """A disk that takes so many bytes more of a file."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (recorder.path.stat().st_size + 500, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + count, before[1]))
     try:
-        with pytest.raises(UserError, match="cannot write"):
-            recorder.write(recorded_step(1, 1))
-        with pytest.raises(UserError, match="cannot write"):
-            recorder.close()
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert list(read_steps(recorder.path)) == [recorded_step(1, 0)]
 
 
-def test_a_directory_that_cannot_be_written_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot create"):
-        Recorder(tmp_path / "file")
+def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
+    for room, refused in ((500, "write"), (0, "close")):
+        recorder = Recorder(tmp_path / refused)
+        recorder.write(recorded_step(1, 0))
+        with room_for(recorder.path, room):
+            with pytest.raises(UserError, match="cannot write"):
+                recorder.write(recorded_step(1, 1)) if refused == "write" else recorder.close()
+            recorder.close()
+        assert list(read_steps(recorder.path)) == [recorded_step(1, 0)]
 
 
 def shape(reward, intervention):
@@ -189,6 +189,14 @@ def episode(sitting: int, first: int, length: int, human: range):
     ]
 
 
+def assert_pictures(buffer, steps):
+    """What is drawn from the buffer is what was recorded."""
+    batch = buffer.sample(200, np.random.default_rng(0))
+    for row, index in enumerate(batch.indices):
+        np.testing.assert_array_equal(batch.frames[row], steps[index].observation)
+        np.testing.assert_array_equal(batch.next_frames[row], steps[index].next_observation)
+
+
 def test_steps_come_back_with_mask_action_reward_and_pictures():
     steps = [*episode(1, 0, 4, range(1, 3)), *episode(1, 4, 3, range(0))]
     buffer = ReplayBuffer(100)
@@ -201,10 +209,7 @@ def test_steps_come_back_with_mask_action_reward_and_pictures():
     np.testing.assert_allclose(
         state["overruled"][:, 0], [np.float32(step.policy_action) for step in steps]
     )
-    batch = buffer.sample(200, np.random.default_rng(0))
-    for row, index in enumerate(batch.indices):
-        np.testing.assert_array_equal(batch.frames[row], steps[index].observation)
-        np.testing.assert_array_equal(batch.next_frames[row], steps[index].next_observation)
+    assert_pictures(buffer, steps)
 
 
 def test_an_episode_that_was_thrown_away_does_not_come_back():
@@ -222,16 +227,9 @@ def test_behind_a_network_the_action_answers_an_older_picture():
     state = buffer.state_dict()
     assert state["rewards"].tolist() == [2.0, 3.0, 4.0]
     np.testing.assert_allclose(state["actions"][:, 0], [0.2, 0.3, 0.4])
-    batch = buffer.sample(50, np.random.default_rng(0))
-    for row, index in enumerate(batch.indices):
-        np.testing.assert_array_equal(batch.frames[row], steps[index].observation)
-        np.testing.assert_array_equal(batch.next_frames[row], steps[index].next_observation)
-
-
-def test_an_episode_killed_before_the_network_answered_stores_nothing():
-    buffer = ReplayBuffer(100)
-    assert store_again(buffer, episode(1, 0, 2, range(0)), shape, penalises, ticks_late=2) == (0, 0)
-    assert buffer.added == 0
+    assert_pictures(buffer, steps)
+    # One that was killed before the network answered stores nothing.
+    assert store_again(buffer, steps[:2], shape, penalises, ticks_late=2) == (0, 0)
 
 
 @pytest.mark.parametrize(("position", "left"), [((1, 0), 5), ((1, 2), 3), ((2, 0), 2), ((3, 0), 0)])

@@ -25,63 +25,40 @@ def take_over(seat, page=1, now_s=0.0):
     return seat.hear(page, HOLD, now_s)
 
 
-def test_a_hold_is_read_at_once(seat):
+def test_a_hold_is_read_at_once_and_silence_is_letting_go(seat):
     assert take_over(seat)
-    reading = seat.poll(0.0)
-    assert reading.engaged
-    assert reading.action == 0.8
-
-
-def test_silence_is_letting_go(seat):
-    take_over(seat)
-    assert seat.poll(SILENCE_S).engaged
+    reading = seat.poll(SILENCE_S)
+    assert (reading.engaged, reading.action) == (True, 0.8)
     assert seat.poll(SILENCE_S + 1e-6) == LET_GO
     assert not seat.is_heard(SILENCE_S + 1e-6)
 
 
-def test_after_a_silence_the_hands_must_be_off_once(seat):
-    take_over(seat)
-    late_s = SILENCE_S + 0.1
-    assert not seat.hear(1, HOLD, late_s)
-    assert seat.poll(late_s) == LET_GO
-    seat.hear(1, OFF, late_s + 0.1)
-    assert seat.hear(1, HOLD, late_s + 0.2)
-    assert seat.poll(late_s + 0.2).engaged
-
-
-def test_a_wheel_that_is_turned_when_the_connection_comes_back_must_rest_first(seat):
-    seat.hear(1, RESTING, 0.0)
-    seat.hear(1, TURNED, 0.1)
-    assert seat.poll(0.1).action == 0.8
+@pytest.mark.parametrize(("off", "on"), [(OFF, HOLD), (RESTING, TURNED)])
+def test_after_a_silence_the_hands_must_be_off_once_and_a_wheel_at_rest(seat, off, on):
+    assert not seat.hear(1, on, 0.0), "it came holding"
+    seat.hear(1, off, 0.0)
+    assert seat.hear(1, on, 0.1)
+    assert (seat.poll(0.1).action, seat.poll(0.1).by_moving) == (0.8, on.by_moving)
     late_s = 0.1 + SILENCE_S + 0.1
-    assert not seat.hear(1, TURNED, late_s)
+    assert not seat.hear(1, on, late_s)
     assert seat.poll(late_s) == LET_GO
-    seat.hear(1, RESTING, late_s + 0.1)
-    assert seat.hear(1, TURNED, late_s + 0.2)
+    seat.hear(1, off, late_s + 0.1)
+    assert seat.hear(1, on, late_s + 0.2)
     assert seat.poll(late_s + 0.2).action == 0.8
-
-
-def test_a_page_that_comes_holding_does_not_take_over(seat):
-    assert not seat.hear(1, HOLD, 0.0)
-    assert not seat.poll(0.0).engaged
 
 
 def test_the_driver_going_is_letting_go_and_the_next_page_drives(seat):
     seat.sit_down(2)
+    seat.sit_down(3)
     take_over(seat)
     assert not take_over(seat, page=2)
+    seat.get_up(3)
+    assert seat.poll(0.0).engaged, "a watcher going changes nothing"
     seat.get_up(1)
     assert seat.poll(0.0) == LET_GO
     assert seat.is_driver(2)
     assert not seat.hear(2, HOLD, 0.1), "held while it watched"
     assert take_over(seat, page=2, now_s=0.2)
-
-
-def test_a_watcher_going_changes_nothing(seat):
-    seat.sit_down(2)
-    take_over(seat)
-    seat.get_up(2)
-    assert seat.poll(0.0).engaged
 
 
 def test_a_tap_between_two_polls_counts_for_one(seat):
@@ -99,25 +76,13 @@ def test_a_hold_that_was_polled_ends_with_its_release(seat):
     assert not seat.poll(0.1).engaged
 
 
-def test_a_tap_before_a_lost_connection_is_lost_with_it(seat):
+def test_a_wish_outlives_its_page_and_is_told_once_and_a_tap_is_lost_with_it(seat):
     take_over(seat)
-    seat.hear(1, OFF, 0.05)
+    seat.hear(1, Input(at_ms=0.0, action=0.0, engaged=False, wishes=("quit",)), 0.05)
     seat.get_up(1)
-    assert seat.poll(0.1) == LET_GO
-
-
-def test_a_wish_outlives_its_page_and_is_told_once(seat):
-    seat.hear(1, Input(at_ms=0.0, action=0.0, engaged=False, wishes=("quit",)), 0.0)
-    seat.get_up(1)
-    assert seat.poll(5.0).wishes == {"quit"}
-    assert not seat.poll(5.0).wishes
-
-
-def test_a_wheel_takes_over_by_moving_only_while_it_is_heard(seat):
-    seat.hear(1, RESTING, 0.0)
-    seat.hear(1, TURNED, 0.0)
-    assert seat.poll(0.1).by_moving
-    assert not seat.poll(1.0).by_moving
+    reading = seat.poll(0.1)
+    assert (reading.wishes, reading.engaged) == ({"quit"}, False)
+    assert not seat.poll(0.1).wishes
 
 
 PAGES = st.integers(1, 3)

@@ -13,48 +13,22 @@ STEPS = st.lists(st.tuples(ACTION, ACTION, st.booleans()), min_size=1, max_size=
 EPSILON = 1e-12
 
 
-def decisions(steps):
-    take_over = TakeOver()
-    return [(step, take_over.step(*step)) for step in steps]
-
-
 @given(STEPS)
-def test_a_hand_over_never_jumps(steps):
+def test_a_hand_over_never_jumps_and_all_but_the_policys_own_action_is_the_persons(steps):
     """Within a hand-over and at both of its ends the action moves by at most the slew."""
     take_over, last, before = TakeOver(), None, "policy"
-    for step in steps:
-        applied = take_over.step(*step)
+    for policy, human, holds in steps:
+        applied = take_over.step(policy, human, holds)
         followed = before == take_over.state in ("policy", "human")
         if last is not None and not followed:
             assert abs(applied.action - last) <= MAX_SLEW + EPSILON
-        last, before = applied.action, take_over.state
-
-
-@given(STEPS)
-def test_the_first_period_of_a_take_over_moves_towards_the_person(steps):
-    last = None
-    for (policy, human, _), applied in decisions(steps):
-        start = policy if last is None else last
+        # An intervention has one first step, which already moves towards the person.
+        assert applied.first == (applied.human and before == "policy")
         if applied.first:
+            start = policy if last is None else last
             assert abs(human - applied.action) <= max(abs(human - start) - MAX_SLEW, 0.0) + EPSILON
-        last = applied.action
-
-
-@given(STEPS)
-def test_the_mask_is_set_wherever_the_policys_action_is_not_what_was_applied(steps):
-    for (policy, _, holds), applied in decisions(steps):
-        if holds:
-            assert applied.human
-        if not applied.human:
-            assert applied.action == policy
-
-
-@given(STEPS)
-def test_an_intervention_has_one_first_step(steps):
-    before = False
-    for _, applied in decisions(steps):
-        assert applied.first == (applied.human and not before)
-        before = applied.human
+        assert applied.human or (applied.action == policy and not holds)
+        last, before = applied.action, take_over.state
 
 
 @given(STEPS, ACTION, ACTION)
@@ -62,12 +36,11 @@ def test_whoever_holds_or_lets_go_for_long_is_followed_exactly(steps, policy, hu
     take_over = TakeOver()
     for step in steps:
         take_over.step(*step)
-    for _ in range(4):
-        applied = take_over.step(policy, human, True)
-    assert (applied.action, applied.control, applied.human) == (human, "human", True)
-    for _ in range(4):
-        applied = take_over.step(policy, human, False)
-    assert (applied.action, applied.control, applied.human) == (policy, "policy", False)
+    for action, control in ((human, "human"), (policy, "policy")):
+        for _ in range(4):
+            applied = take_over.step(policy, human, control == "human")
+        decided = (applied.action, applied.control, applied.human)
+        assert decided == (action, control, control == "human")
 
 
 def test_the_table_has_every_row():
@@ -86,8 +59,8 @@ def test_on_the_way_back_the_steps_are_the_persons():
     assert [b.human for b in back] == [True, False, False, False]
 
 
-def wheel(action, engaged=False):
-    return Reading(action=action, engaged=engaged, by_moving=True)
+def wheel(action):
+    return Reading(action=action, by_moving=True)
 
 
 def test_moving_the_wheel_takes_over_and_resting_gives_back():
@@ -104,21 +77,17 @@ def test_moving_the_wheel_takes_over_and_resting_gives_back():
     assert not intent.update(wheel(0.1), 1.6)
 
 
-def test_a_device_that_takes_over_by_holding_is_not_moved():
-    intent = Intent()
+def test_a_device_that_takes_over_by_holding_is_not_moved_and_one_that_is_gone_lets_go():
+    intent = Intent(Moving())
     assert not intent.update(Reading(action=1.0), 0.0)
     assert intent.update(Reading(action=0.0, engaged=True), 0.1)
-
-
-def test_a_wheel_that_is_gone_lets_go_at_once():
-    intent = Intent()
-    assert intent.update(wheel(1.0), 0.0)
-    assert not intent.update(Reading(), 0.1)
+    assert intent.update(wheel(1.0), 0.2)
+    assert not intent.update(Reading(), 0.3)
 
 
 @given(st.lists(st.tuples(st.floats(-0.15, 0.15), st.floats(0.0, 1.0)), max_size=30))
 def test_below_the_threshold_nothing_is_taken_over(moves):
-    intent, now_s = Intent(), 0.0
+    intent, now_s = Intent(Moving()), 0.0
     for action, waited_s in moves:
         now_s += waited_s
         assert not intent.update(wheel(action), now_s)

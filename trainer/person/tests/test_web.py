@@ -1,5 +1,6 @@
 """What the server hears from pages and shows them; with real clients."""
 
+import argparse
 import asyncio
 import base64
 import json
@@ -7,7 +8,7 @@ import resource
 import socket
 import struct
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 
 import aiohttp
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 
 from edge_runtime.util import UserError
 from trainer.person import web
-from trainer.person.interface import HUMANS, LET_GO, PersonOptions
+from trainer.person.interface import LET_GO, open_person
 from trainer.person.seat import MAX_INPUT_BYTES
 from trainer.person.tests.pages import (
     WAIT_S,
@@ -34,166 +35,134 @@ RESET = struct.pack("ii", 1, 0)
 """SO_LINGER that closes without a good-bye."""
 
 
-def test_what_a_page_holds_is_polled_and_its_closing_is_letting_go(cockpit):
-    async def drive():
-        async with page(cockpit) as link:
-            assert not cockpit.present
-            echo = await say(link)
-            assert echo == {"kind": "echo", "at_ms": 12.5, "driving": True, "refused": False}
-            assert cockpit.present
-            assert not (await say(link, True, -0.75))["refused"]
-            reading = poll(cockpit)
-            assert (reading.engaged, reading.action) == (True, -0.75)
-        await until(lambda: not poll(cockpit).engaged)
+async def test_what_a_page_holds_is_polled_and_its_closing_is_letting_go(cockpit):
+    async with page(cockpit) as link:
         assert not cockpit.present
-
-    asyncio.run(drive())
-
-
-def test_a_page_that_falls_silent_has_let_go_and_is_shown_out(cockpit):
-    async def drive():
-        async with page(cockpit) as link:
-            await say(link)
-            await say(link, True, 1.0)
-            said_s = time.monotonic()
-            assert cockpit.poll(said_s).engaged
-            assert cockpit.poll(said_s + 0.51) == LET_GO
-            message = await link.receive(timeout=WAIT_S)
-            assert message.type is aiohttp.WSMsgType.CLOSE
-
-    asyncio.run(drive())
+        echo = await say(link)
+        assert echo == {"kind": "echo", "at_ms": 12.5, "driving": True, "refused": False}
+        assert cockpit.present
+        assert not (await say(link, True, -0.75))["refused"]
+        reading = poll(cockpit)
+        assert (reading.engaged, reading.action) == (True, -0.75)
+    await until(lambda: not poll(cockpit).engaged)
+    assert not cockpit.present
 
 
-def test_a_second_page_watches_until_the_first_is_gone(cockpit):
-    async def drive():
-        async with page(cockpit) as first:
-            await say(first)
-            async with page(cockpit) as watching:
-                assert not (await say(watching))["driving"]
-                await say(watching, True, 1.0)
-                assert not poll(cockpit).engaged
-                await say(first, True, 0.5)
-                assert poll(cockpit).action == 0.5
-                await first.close()
-                await until(lambda: not poll(cockpit).engaged)
-                assert (await say(watching))["driving"]
-
-    asyncio.run(drive())
+async def test_a_page_that_falls_silent_has_let_go_and_is_shown_out(cockpit):
+    async with page(cockpit) as link:
+        await say(link)
+        await say(link, True, 1.0)
+        said_s = time.monotonic()
+        assert cockpit.poll(said_s).engaged
+        assert cockpit.poll(said_s + 0.51) == LET_GO
+        message = await link.receive(timeout=WAIT_S)
+        assert message.type is aiohttp.WSMsgType.CLOSE
 
 
-def test_a_view_arrives_whole(cockpit):
-    async def look():
-        async with page(cockpit) as link:
-            cockpit.show(first_view())
-            view = await hear(link, "view")
-            expected = first_view()
-            frames = np.frombuffer(base64.b64decode(view["frames"]), np.uint8)
-            assert np.array_equal(frames.reshape(2, 45, 80), expected.frames)
-            assert view["scene"] == json.loads(json.dumps(expected.scene))
-            assert view["policy_action"] == 0.25
-            assert view["ground"]["left_m"] == -30.0
-            assert view["number"] == 1
-
-    asyncio.run(look())
+async def test_a_second_page_watches_until_the_first_is_gone(cockpit):
+    async with page(cockpit) as first:
+        await say(first)
+        async with page(cockpit) as watching:
+            assert not (await say(watching))["driving"]
+            await say(watching, True, 1.0)
+            assert not poll(cockpit).engaged
+            await say(first, True, 0.5)
+            assert poll(cockpit).action == 0.5
+            await first.close()
+            await until(lambda: not poll(cockpit).engaged)
+            assert (await say(watching))["driving"]
 
 
-def test_a_page_that_comes_later_sees_the_newest_view(cockpit):
-    async def look():
-        cockpit.show(view_of_step(1))
-        cockpit.show(view_of_step(2))
-        async with page(cockpit) as link:
-            assert (await hear(link, "view"))["step"] == 2
-
-    asyncio.run(look())
-
-
-def test_a_slow_page_gets_fewer_views_and_never_old_ones(cockpit):
-    async def look():
-        async with page(cockpit) as link:
-            steps = []
-            for step in range(1, 21):
-                cockpit.show(view_of_step(step))
-                if step <= VIEWS_UNDERWAY:
-                    steps.append((await hear(link, "view"))["step"])
-            assert steps == [1, 2]
-            # It has drawn none of the two yet: whatever it says, no view comes before the echo.
-            await link.send_json({"at_ms": 1.0, "action": 0.0, "engaged": False, "seen": 0})
-            assert (await link.receive_json(timeout=WAIT_S))["kind"] == "echo"
-            await say(link, seen=2)
-            assert (await hear(link, "view"))["step"] == 20
-
-    asyncio.run(look())
+async def test_a_view_arrives_whole(cockpit):
+    async with page(cockpit) as link:
+        cockpit.show(first_view())
+        view = await hear(link, "view")
+        expected = first_view()
+        frames = np.frombuffer(base64.b64decode(view["frames"]), np.uint8)
+        assert np.array_equal(frames.reshape(2, 45, 80), expected.frames)
+        assert view["scene"] == json.loads(json.dumps(expected.scene))
+        assert view["policy_action"] == 0.25
+        assert view["ground"]["left_m"] == -30.0
+        assert view["number"] == 1
 
 
-def test_a_page_that_reads_nothing_holds_nobody_up(cockpit):
+async def test_a_page_that_comes_later_sees_the_newest_view(cockpit):
+    cockpit.show(view_of_step(1))
+    cockpit.show(view_of_step(2))
+    async with page(cockpit) as link:
+        assert (await hear(link, "view"))["step"] == 2
+
+
+async def test_a_slow_page_gets_fewer_views_and_never_old_ones(cockpit):
+    async with page(cockpit) as link:
+        steps = []
+        for step in range(1, 21):
+            cockpit.show(view_of_step(step))
+            if step <= VIEWS_UNDERWAY:
+                steps.append((await hear(link, "view"))["step"])
+        assert steps == [1, 2]
+        # It has drawn none of the two yet: whatever it says, no view comes before the echo.
+        await link.send_json({"at_ms": 1.0, "action": 0.0, "engaged": False, "seen": 0})
+        assert (await link.receive_json(timeout=WAIT_S))["kind"] == "echo"
+        await say(link, seen=2)
+        assert (await hear(link, "view"))["step"] == 20
+
+
+async def test_a_page_that_reads_nothing_holds_nobody_up(cockpit):
     """Its views and echoes pile up in front of a closed window; the loop's thread goes on."""
 
-    async def stare():
-        reader, writer = await asyncio.open_connection("127.0.0.1", cockpit.port, limit=256)
-        path = cockpit.url.partition(str(cockpit.port))[2]
-        request = (
-            f"GET {path}socket HTTP/1.1",
-            f"Host: 127.0.0.1:{cockpit.port}",
-            f"Origin: {origin(cockpit)}",
-            "Connection: Upgrade",
-            "Upgrade: websocket",
-            "Sec-WebSocket-Version: 13",
-            f"Sec-WebSocket-Key: {'A' * 22}==",
-        )
-        writer.write("".join(f"{line}\r\n" for line in (*request, "")).encode())
-        assert b"101" in await reader.readline()
-        for step in range(2000):
-            cockpit.show(view_of_step(step))
-        async with page(cockpit) as link:
-            assert (await hear(link, "view"))["step"] == 1999
-        writer.close()
-
-    asyncio.run(stare())
+    reader, writer = await asyncio.open_connection("127.0.0.1", cockpit.port, limit=256)
+    path = cockpit.url.partition(str(cockpit.port))[2]
+    request = (
+        f"GET {path}socket HTTP/1.1",
+        f"Host: 127.0.0.1:{cockpit.port}",
+        f"Origin: {origin(cockpit)}",
+        "Connection: Upgrade",
+        "Upgrade: websocket",
+        "Sec-WebSocket-Version: 13",
+        f"Sec-WebSocket-Key: {'A' * 22}==",
+    )
+    writer.write("".join(f"{line}\r\n" for line in (*request, "")).encode())
+    assert b"101" in await reader.readline()
+    for step in range(2000):
+        cockpit.show(view_of_step(step))
+    async with page(cockpit) as link:
+        assert (await hear(link, "view"))["step"] == 1999
+    writer.close()
 
 
-def test_pages_that_are_cut_off_while_they_speak_are_no_error(cockpit, caplog):
-    async def speak_and_go():
+async def test_pages_that_are_cut_off_while_they_speak_are_no_error(cockpit, caplog):
+    for _ in range(10):
         async with page(cockpit) as link:
             for _ in range(50):
                 await link.send_json({"at_ms": 1.0, "action": 0.0, "engaged": False})
             link.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             link._response.connection.transport.abort()
-
-    async def several():
-        for _ in range(10):
-            await speak_and_go()
-        await until(lambda: not cockpit.present)
-
-    asyncio.run(several())
+    await until(lambda: not cockpit.present)
     cockpit.close()
     assert caplog.messages == []
 
 
-def test_closing_tells_every_page_and_frees_the_port():
+async def test_closing_tells_every_page_and_frees_the_port():
     cockpit = Cockpit()
 
-    async def stay():
-        async with page(cockpit) as link:
-            await say(link)
-            cockpit.close()
-            assert (await link.receive_json(timeout=WAIT_S))["kind"] == "end"
-            assert (await link.receive(timeout=WAIT_S)).type is aiohttp.WSMsgType.CLOSE
+    async with page(cockpit) as link:
+        await say(link)
+        cockpit.close()
+        assert (await link.receive_json(timeout=WAIT_S))["kind"] == "end"
+        assert (await link.receive(timeout=WAIT_S)).type is aiohttp.WSMsgType.CLOSE
 
-    asyncio.run(stay())
     cockpit.close()
     cockpit.show(first_view())
     assert poll(cockpit) == LET_GO
     Cockpit(port=cockpit.port).close()
 
 
-def test_a_wish_reaches_the_loop_once(cockpit):
-    async def ask():
-        async with page(cockpit) as link:
-            await say(link, wishes=["pause", "restart"])
-            assert poll(cockpit).wishes == {"pause", "restart"}
-            assert not poll(cockpit).wishes
-
-    asyncio.run(ask())
+async def test_a_wish_reaches_the_loop_once(cockpit):
+    async with page(cockpit) as link:
+        await say(link, wishes=["pause", "restart"])
+        assert poll(cockpit).wishes == {"pause", "restart"}
+        assert not poll(cockpit).wishes
 
 
 async def status_of(url, **more):
@@ -201,48 +170,48 @@ async def status_of(url, **more):
         return answer.status, await answer.text(), answer.headers
 
 
-def test_the_page_and_its_files_are_served_behind_the_token(cockpit):
-    async def look():
-        status, text, headers = await status_of(cockpit.url)
-        assert status == 200
-        assert "<title>PHIL cockpit</title>" in text
-        assert headers["Referrer-Policy"] == "no-referrer"
-        assert "default-src 'self'" in headers["Content-Security-Policy"]
-        for name in ("cockpit.js", "hands.js", "link.js", "gamepad.js", "scene.js", "cockpit.css"):
-            assert (await status_of(cockpit.url + name))[0] == 200, name
-        assert (await status_of(cockpit.url + "server.py"))[0] == 404
-        assert (await status_of(cockpit.url + "..%2fserver.py"))[0] == 404
-        assert (await status_of(cockpit.url.rstrip("/")))[0] == 200, "without the last slash"
-
-    asyncio.run(look())
+async def test_the_page_and_its_files_are_served_behind_the_token(cockpit):
+    status, text, headers = await status_of(cockpit.url)
+    assert status == 200
+    assert "<title>PHIL cockpit</title>" in text
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert "default-src 'self'" in headers["Content-Security-Policy"]
+    for name in ("cockpit.js", "hands.js", "link.js", "gamepad.js", "scene.js", "cockpit.css"):
+        assert (await status_of(cockpit.url + name))[0] == 200, name
+    assert (await status_of(cockpit.url + "server.py"))[0] == 404
+    assert (await status_of(cockpit.url + "..%2fserver.py"))[0] == 404
+    assert (await status_of(cockpit.url.rstrip("/")))[0] == 200, "without the last slash"
 
 
 @pytest.mark.parametrize("path", ["", "wrong/", "wrong/cockpit.js", "wrong/socket", "socket"])
-def test_without_the_token_nothing_is_shown(cockpit, path):
-    status, text, _ = asyncio.run(status_of(f"{origin(cockpit)}/{path}"))
+async def test_without_the_token_nothing_is_shown(cockpit, path):
+    status, text, _ = await status_of(f"{origin(cockpit)}/{path}")
     assert status == 403
     assert "token" in text
 
 
 @pytest.mark.parametrize(
-    "words", [b"GET /\xff HTTP/1.1", b"\x16\x03\x01\x02\x00", b"GET / HTTP/9.9"]
+    ("words", "answer"),
+    [
+        (b"GET /\xff HTTP/1.1", b"400 Bad Request"),
+        (b"\x16\x03\x01\x02\x00", b"400 Bad Request"),
+        (b"GET / HTTP/9.9", b"400 Bad Request"),
+        (b"OPTIONS * HTTP/1.1", b"421 "),
+    ],
 )
-def test_who_speaks_no_http_is_told_so_and_nobody_else(cockpit, caplog, words):
+def test_who_speaks_no_http_is_told_so_and_nobody_else(cockpit, caplog, words, answer):
     with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as link:
         link.sendall(words + b"\r\nHost: x\r\n\r\n")
-        assert b"400 Bad Request" in link.recv(200)
+        assert answer in link.recv(200)
     cockpit.close()
     assert caplog.messages == []
 
 
 @pytest.mark.parametrize("from_where", ["http://evil.example", "null", None])
-def test_another_sites_page_gets_no_socket(cockpit, from_where):
-    async def knock():
+async def test_another_sites_page_gets_no_socket(cockpit, from_where):
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
         async with page(cockpit, origin=from_where):
             pass
-
-    with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-        asyncio.run(knock())
     assert refusal.value.status == 403
     assert not cockpit.present
 
@@ -264,36 +233,34 @@ def test_another_sites_page_gets_no_socket(cockpit, from_where):
         b"\x00",
     ],
 )
-def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
-    async def talk_nonsense():
-        async with page(cockpit) as link:
-            await say(link)
-            await say(link, True, 1.0)
-            await (link.send_bytes if isinstance(text, bytes) else link.send_str)(text)
-            while not (await link.receive(timeout=WAIT_S)).type.name.startswith("CLOS"):
-                pass
-        await until(lambda: not poll(cockpit).engaged)
-        async with page(cockpit) as link:
-            assert (await say(link))["driving"], "and it serves on"
-
-    asyncio.run(talk_nonsense())
+async def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
+    async with page(cockpit) as link:
+        await say(link)
+        await say(link, True, 1.0)
+        await (link.send_bytes if isinstance(text, bytes) else link.send_str)(text)
+        while not (await link.receive(timeout=WAIT_S)).type.name.startswith("CLOS"):
+            pass
+    await until(lambda: not poll(cockpit).engaged)
+    async with page(cockpit) as link:
+        assert (await say(link))["driving"], "and it serves on"
 
 
-def test_a_port_in_use_is_a_plain_error(cockpit):
-    with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1 port {cockpit.port}"):
-        HUMANS["web"](PersonOptions(port=cockpit.port))
+def open_web(**options):
+    """The cockpit, as the command line opens it."""
+    given = {"human": "web", "scenario": "left_turn", "profile": None, "speed": 1.0}
+    return open_person(argparse.Namespace(**{"host": "127.0.0.1", "port": 0, **given, **options}))
 
 
-def test_a_host_that_is_not_here_is_a_plain_error():
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))
-        with pytest.raises(UserError, match="cannot listen on"):
-            HUMANS["web"](PersonOptions(host="host.invalid"))
+def test_an_address_that_cannot_be_listened_on_is_a_plain_error(cockpit):
+    for where in ({"port": cockpit.port}, {"host": "host.invalid"}):
+        given = {"host": "127.0.0.1", "port": 0} | where
+        with pytest.raises(UserError, match="cannot listen on {host} port {port}".format(**given)):
+            open_web(**where)
 
 
 def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys):
     for host, warned in (("127.0.0.1", False), ("0.0.0.0", True)):
-        person = HUMANS["web"](PersonOptions(host=host))
+        person = open_web(host=host)
         out, err = capsys.readouterr()
         person.close()
         assert out.startswith("cockpit: open http://")
@@ -316,8 +283,10 @@ def few_descriptors():
 
 @pytest.mark.usefixtures("few_descriptors")
 @pytest.mark.parametrize("said", [b"", b"GET / HTTP/1.1\r\nHost: "])
-def test_a_crowd_that_says_nothing_takes_no_descriptors_and_fills_no_log(cockpit, caplog, said):
-    async def drive():
+async def test_a_crowd_that_says_nothing_takes_no_descriptors_and_fills_no_log(
+    cockpit, caplog, said
+):
+    with ExitStack() as idle:
         async with page(cockpit) as link:
             await say(link)
             for _ in range(CROWD):
@@ -328,29 +297,23 @@ def test_a_crowd_that_says_nothing_takes_no_descriptors_and_fills_no_log(cockpit
                 await say(link)  # A page that falls silent is shown out.
             assert (await status_of(cockpit.url))[0] == 200
             assert (await say(link))["driving"], "who was there first stays"
-
-    with ExitStack() as idle:
-        asyncio.run(drive())
     cockpit.close()
     assert caplog.messages == []
 
 
-def test_a_full_house_of_pages_keeps_newcomers_out_and_lets_them_in_afterwards(
+async def test_a_full_house_of_pages_keeps_newcomers_out_and_lets_them_in_afterwards(
     cockpit, monkeypatch
 ):
     monkeypatch.setattr(web, "MAX_CONNECTIONS", 2)
 
-    async def visit():
-        async with page(cockpit) as first, page(cockpit) as second:
-            for link in (first, second):
-                await say(link)
-            with pytest.raises(aiohttp.ClientError):
-                await status_of(cockpit.url)
-            await say(first)
-        await until(lambda: not cockpit.present)
-        assert (await status_of(cockpit.url))[0] == 200
-
-    asyncio.run(visit())
+    async with page(cockpit) as first, page(cockpit) as second:
+        for link in (first, second):
+            await say(link)
+        with pytest.raises(aiohttp.ClientError):
+            await status_of(cockpit.url)
+        await say(first)
+    await until(lambda: not cockpit.present)
+    assert (await status_of(cockpit.url))[0] == 200
 
 
 @pytest.mark.parametrize("said", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: "])
@@ -376,35 +339,28 @@ def test_a_connection_without_the_token_is_closed_with_the_answer(cockpit):
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:{port}", "[::1", "127.0.0.1.evil", ""]
 )
-def test_a_name_that_is_not_this_machines_is_refused(cockpit, host):
+async def test_a_name_that_is_not_this_machines_is_refused(cockpit, host):
     """DNS rebinding: the other site's page would be of the same origin as the cockpit."""
     name = host.format(port=cockpit.port)
 
-    async def knock():
-        status, text, _ = await status_of(cockpit.url, headers={"Host": name})
-        assert (status, "address" in text) == (421, True)
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-            async with page(cockpit, origin=f"http://{name}", headers={"Host": name}):
-                pass
-        assert refusal.value.status == 421
-
-    asyncio.run(knock())
+    status, text, _ = await status_of(cockpit.url, headers={"Host": name})
+    assert (status, "address" in text) == (421, True)
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
+        async with page(cockpit, origin=f"http://{name}", headers={"Host": name}):
+            pass
+    assert refusal.value.status == 421
 
 
 @pytest.mark.parametrize("host", ["localhost:7", "LOCALHOST", "[::1]:80", "127.0.0.1"])
-def test_loopback_by_any_port_is_let_in_as_through_a_tunnel(cockpit, host):
-    assert asyncio.run(status_of(cockpit.url, headers={"Host": host}))[0] == 200
+async def test_loopback_by_any_port_is_let_in_as_through_a_tunnel(cockpit, host):
+    assert (await status_of(cockpit.url, headers={"Host": host}))[0] == 200
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.2"])
-def test_the_address_that_it_listens_on_is_let_in(host):
-    cockpit = Cockpit(host=host)
-    here = cockpit.url.replace(cockpit.url.split("/")[2], f"127.0.0.2:{cockpit.port}")
-    try:
-        assert asyncio.run(status_of(here))[0] == 200
-        printed = {"Host": cockpit.url.split("/")[2]}
-        assert asyncio.run(status_of(here, headers=printed))[0] == 200
-        evil = {"Host": f"evil.example:{cockpit.port}"}
-        assert asyncio.run(status_of(here, headers=evil))[0] == 421
-    finally:
-        cockpit.close()
+async def test_the_address_that_it_listens_on_is_let_in(host):
+    with closing(Cockpit(host=host)) as cockpit:
+        printed = cockpit.url.split("/")[2]
+        here = cockpit.url.replace(printed, f"127.0.0.2:{cockpit.port}")
+        evil = f"evil.example:{cockpit.port}"
+        for headers, status in (({}, 200), ({"Host": printed}, 200), ({"Host": evil}, 421)):
+            assert (await status_of(here, headers=headers))[0] == status

@@ -1,22 +1,25 @@
-"""The dense scenes of both scenarios: a fourth test condition, which nobody trains in."""
+"""The test conditions beside the nominal one: variant and dense scenes, and noise."""
 
 import itertools
+import json
 
 import numpy as np
 import pytest
 
 from bridge.environments import CONDITIONS as SERVED
+from trainer.__main__ import main
 from trainer.drivers import CONDITIONS, EXPERTS, make_environment
 from trainer.evaluate import drive_episodes
 from trainer.scenarios.picture import overlap
-from trainer.scenarios.traffic import CAR
+from trainer.scenarios.traffic import CAR, CARS_ONLY, MIXED
 
 every_scenario = pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
+NAMES = ("nominal", "variant", "dense")
 
 
-def gaps_m(env):
-    """Bumper to bumper, of each two vehicles one behind the other in a lane without the ego car."""
-    others = [car for car in env.traffic if abs(car.position[1]) > 1.0]
+def gaps_m(env, of_the_ego_lane=False):
+    """Bumper to bumper, of each two vehicles one behind the other in a lane."""
+    others = [car for car in env.traffic if of_the_ego_lane or abs(car.position[1]) > 1.0]
     cars = sorted(others, key=lambda car: (car.lane_index, car.position[0]))
     return [
         ahead.position[0] - behind.position[0] - 0.5 * (ahead.LENGTH + behind.LENGTH)
@@ -26,20 +29,43 @@ def gaps_m(env):
 
 
 @every_scenario
-def test_the_expert_drives_it(scenario):
-    env = make_environment(scenario, "dense")
-    results = drive_episodes(env, EXPERTS[scenario](env), range(25), "dense")
+@pytest.mark.parametrize("condition", ["variant", "dense"])
+def test_the_expert_drives_it(scenario, condition):
+    env = make_environment(scenario, condition)
+    results = drive_episodes(env, EXPERTS[scenario](env), range(25), condition)
     assert sum(result.outcome == "goal" for result in results) >= 24
 
 
 @every_scenario
-def test_there_are_more_cars_than_in_training_and_no_other_ones(scenario):
-    nominal, dense = make_environment(scenario), make_environment(scenario, "dense")
+def test_there_are_more_vehicles_of_every_type_in_the_variant_and_of_no_other_in_the_dense(
+    scenario,
+):
+    nominal, variant, dense = (make_environment(scenario, name) for name in NAMES)
     assert dense.config.traffic_mix == nominal.config.traffic_mix
-    for seed in range(10):
-        nominal.reset(seed=seed)
-        dense.reset(seed=seed)
-        assert len(dense.traffic) > len(nominal.traffic)
+    usual, seen = set(), set()
+    for seed in range(20):
+        for env in (nominal, variant, dense):
+            env.reset(seed=seed)
+        assert len(variant.traffic) > len(nominal.traffic) < len(dense.traffic)
+        usual |= {(car.LENGTH, car.WIDTH) for car in nominal.traffic}
+        seen |= {(car.LENGTH, car.WIDTH) for car in variant.traffic}
+    assert usual == {(kind.length_m, kind.width_m) for kind, _ in CARS_ONLY}
+    assert seen == {(kind.length_m, kind.width_m) for kind, _ in MIXED}
+
+
+@every_scenario
+def test_noise_is_the_nominal_scene(scenario):
+    nominal, noise = make_environment(scenario), make_environment(scenario, "noise")
+    assert noise.config == nominal.config
+    assert np.array_equal(nominal.reset(seed=1)[0], noise.reset(seed=1)[0])
+
+
+@every_scenario
+def test_vehicles_do_not_start_inside_each_other(scenario):
+    env = make_environment(scenario, "variant")
+    for seed in range(30):
+        env.reset(seed=seed)
+        assert min(gaps_m(env, of_the_ego_lane=True)) > 3.0
 
 
 @every_scenario
@@ -85,3 +111,13 @@ def test_the_jam_is_closer_and_less_even():
 
 def test_every_scene_can_be_served():
     assert set(SERVED) == {condition.scene for condition in CONDITIONS.values()}
+
+
+def test_evaluate_takes_the_condition(tmp_path):
+    out = tmp_path / "r.json"
+    arguments = ["evaluate", "expert", "--scenario", "congestion", "--condition", "variant"]
+    assert main([*arguments, "--runs", "2", "--out", str(out)]) == 0
+    report = json.loads(out.read_text())
+    assert (report["scenario"], report["condition"]) == ("congestion", "variant")
+    assert report["success_rate"] == 1.0
+    assert report["surviving_distance_m"]["mean"] == pytest.approx(80.2, abs=0.4)
