@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Type
+import argparse
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple, Type
 
 import msgspec
 
 from edge_runtime import log
+from edge_runtime.cli import add_public_key
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, check_fits
 from edge_runtime.util import PathLike, UserError, read_toml
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
@@ -93,6 +95,42 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def vehicle_setup(self, scenario: str) -> VehicleSetup:
         """What a driver is made from, for a policy of this scenario."""
         return VehicleSetup(scenario, self.bus, self.hunter, self.similarity, self.ros2)
+
+
+# The settings that are flags as well: metavar and help.
+_FLAGS: Dict[str, Tuple[str, str]] = {
+    "policy": ("POLICY.onnx", "the policy file"),
+    "connect": ("PROTOCOL/HOST:PORT", "where the simulator listens"),
+    "tls": (
+        "DIR",
+        "ca.pem, cert.pem, key.pem of this party (python -m deploy certs); endpoint tls/...",
+    ),
+    "vehicle_id": ("ID", "the vehicle's part of the Zenoh keys"),
+    "vehicle": ("|".join(VEHICLE_NAMES), "the vehicle to move besides"),
+    "bus": ("INTERFACE:CHANNEL", "with --vehicle hunter: its CAN bus, as python-can names it"),
+    "log_level": ("|".join(log.LEVELS), "least level that goes to stderr"),
+    "log_format": ("|".join(log.FORMATS), "a line of words, or a JSON object a line"),
+}
+
+
+def add_flags(parser: argparse.ArgumentParser, *names: str) -> None:
+    """The flags of these settings, or of all. One that is not given is None: the file has it."""
+    for name in names or _FLAGS:
+        metavar, text = _FLAGS[name]
+        default = getattr(Config(), name)
+        shown = f"{text} (default: {default})" if default else text
+        parser.add_argument(f"--{name.replace('_', '-')}", metavar=metavar, help=shown)
+
+
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """The flags that say which policy may drive."""
+    add_public_key(parser)
+    parser.add_argument(
+        "--allow-unsigned",
+        action="store_true",
+        default=None,
+        help="also take a policy whose origin cannot be verified",
+    )
 
 
 _TABLES: Dict[str, Type[msgspec.Struct]] = {

@@ -73,7 +73,6 @@ def test_policies_that_may_not_drive(tmp_path, command):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], ["COMMAND"]),
         (["fly"], ["fly", "--help"]),
         (["check"], ["POLICY.onnx"]),
         (["run"], ["--policy"]),

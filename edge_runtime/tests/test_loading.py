@@ -17,7 +17,7 @@ from edge_runtime.vehicles.mapping import SPECS
 from edge_runtime.vehicles.ros2.names import check_settings
 
 ROOT = Path(edge_runtime.__file__).parent
-MOST_LINES = 3000
+MOST_LINES = 3400
 # Only who asks for them loads them.
 LAZY = {"commands", "files", "link_probe", "realtime", "tls", "vehicles"}
 _LOADED = """
@@ -37,7 +37,7 @@ def loaded_by(what: str) -> List[Path]:
 
 
 def test_run_without_a_vehicle_loads_no_more_than_it_needs():
-    loaded = loaded_by("import edge_runtime.run")
+    loaded = loaded_by("import edge_runtime.__main__, edge_runtime.run")
     assert not LAZY & {path.relative_to(ROOT).parts[0].replace(".py", "") for path in loaded}
     assert sum(len(path.read_text().splitlines()) for path in loaded) < MOST_LINES
 
