@@ -28,7 +28,7 @@ from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.tls import TlsFiles, tls_for
 from edge_runtime.transport import check_endpoint
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.mapping import CARS, ScenarioCar, Similarity
+from edge_runtime.vehicles.mapping import CARS, ScenarioCar
 from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.vehicles.ros2.names import (
     DEFAULT_ROS2_ENDPOINT,
@@ -401,7 +401,7 @@ def _acceleration(pedal: float, car: ScenarioCar) -> float:
 
 def _curvature(policy: Policy, values: Sequence[float], scale: float) -> float:
     steering = policy.action(values, "steering") or 0.0
-    return Similarity(policy.car, scale).vehicle_curvature(steering)
+    return policy.car.curvature(steering) / scale
 
 
 def _diagonal(x: float, y: float, yaw: float) -> list[float]:

@@ -31,7 +31,7 @@ from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 from edge_runtime.vehicles.registry import make_vehicle, vehicle_limits
 
 SPEC = SPECS["2.0"]
-LEFT_TURN = similarity_to(CARS["left_turn"], SPEC.max_speed_mps)
+LEFT_TURN = similarity_to(CARS["left_turn"], SPEC)
 _numbers = itertools.count()
 
 
@@ -99,7 +99,7 @@ def chassis(channel):
 
 @pytest.fixture
 def vehicle(channel):
-    vehicle = HunterVehicle(BusName("virtual", channel, None), SPEC, "v2", LEFT_TURN)
+    vehicle = HunterVehicle(BusName("virtual", channel, None), LEFT_TURN, "v2")
     yield vehicle
     vehicle.close()
 

@@ -18,14 +18,7 @@ from typing import ClassVar, Deque, Dict, List, NamedTuple, Optional, Tuple
 
 from edge_runtime.safety import SILENCE_S
 from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.mapping import (
-    HunterSpec,
-    SetPoint,
-    Similarity,
-    Wish,
-    acceleration_to_pedal,
-    wish_of,
-)
+from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, wish_of
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 # A beat later than the runtime's own silence rule, which then tells the reason; still within
@@ -174,13 +167,13 @@ class StreamedCore(abc.ABC):
 
     leads_to: ClassVar[Dict[Event, Dict[State, State]]] = LEADS_TO
 
-    def __init__(self, spec: HunterSpec, similarity: Similarity, heard: Speeds) -> None:
+    def __init__(self, similarity: Similarity, heard: Speeds) -> None:
         self.state = State.DISABLED
         self.cause: Optional[Event] = None  # what stopped it
         self.words = ""  # the same for a person; empty where our own side asked for the stop
-        self.set_point = SetPoint(spec, similarity)
-        self._spec, self._similarity, self._heard = spec, similarity, heard
-        self._speed_watch = SpeedWatch(spec.max_speed_mps)
+        self.set_point = SetPoint(similarity)
+        self._similarity, self._spec, self._heard = similarity, similarity.spec, heard
+        self._speed_watch = SpeedWatch(self._spec.max_speed_mps)
         self._wish: Optional[Wish] = None  # None: stand
         self._wished_s = self._ticked_s = -math.inf
         self._since_s = -math.inf  # when this state began
@@ -222,7 +215,7 @@ class StreamedCore(abc.ABC):
             self_braking=self.state is not State.ENABLED,
             faults=self._faults(now_s),
             standing=self.standing(now_s),
-            scenario_speed_mps=self._similarity.scenario_mps(speed_mps),
+            scenario_speed_mps=speed_mps / self._similarity.scale,
             commanded_speed_mps=self.set_point.speed_mps,
         )
 
@@ -296,4 +289,4 @@ class StreamedCore(abc.ABC):
         """From the measured acceleration; the brake where it stands and is to stand."""
         if self._heard.stands and self.set_point.speed_mps == 0.0:
             return -1.0
-        return acceleration_to_pedal(self._heard.acceleration_mps2(), self._similarity)
+        return self._similarity.pedal(self._heard.acceleration_mps2())

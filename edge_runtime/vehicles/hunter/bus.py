@@ -29,7 +29,7 @@ from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import BITRATE, COMMANDS, Frame
-from edge_runtime.vehicles.mapping import HunterSpec, Similarity, limits_of
+from edge_runtime.vehicles.mapping import Similarity
 from edge_runtime.vehicles.stream import PERIOD_S, StreamedVehicle
 
 _LISTEN_S = 0.1
@@ -229,15 +229,13 @@ class HunterVehicle(StreamedVehicle):
 
     name: ClassVar[str] = "hunter"
 
-    def __init__(
-        self, bus: BusName, spec: HunterSpec, profile: str, similarity: Similarity
-    ) -> None:
+    def __init__(self, bus: BusName, similarity: Similarity, profile: str) -> None:
         self._bus: Any = open_bus(bus)
         self._gate = Gate(self._bus)
         self._ignores_commands = bus.hears_itself
         self._core: HunterCore
-        super().__init__(HunterCore(spec, profile, similarity))
-        self.limits: Dict[str, ActionLimit] = limits_of(spec, similarity)
+        super().__init__(HunterCore(similarity, profile))
+        self.limits: Dict[str, ActionLimit] = similarity.limits()
         self._stopping = False
         self._listener = threading.Thread(target=self._listen, name="hunter-listener", daemon=True)
 

@@ -30,7 +30,7 @@ from edge_runtime.vehicles.hunter.protocol import (
     motor_faults,
     status_faults,
 )
-from edge_runtime.vehicles.mapping import HunterSpec, Similarity, steering_of
+from edge_runtime.vehicles.mapping import HunterSpec, Similarity
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 MOTION_SILENCE_S = 2 * CONTROL_PERIOD_S  # ten frames of 0x221
@@ -158,9 +158,9 @@ class Reports(Speeds):
 class HunterCore(StreamedCore):
     """The state machine, what was heard, and what is asked for."""
 
-    def __init__(self, spec: HunterSpec, profile: str, similarity: Similarity) -> None:
-        self.reports = Reports(spec, profile)
-        super().__init__(spec, similarity, self.reports)
+    def __init__(self, similarity: Similarity, profile: str) -> None:
+        self.reports = Reports(similarity.spec, profile)
+        super().__init__(similarity, self.reports)
         self._ask_s = math.inf  # when to ask the chassis for something next
         self._bus_words = ""  # empty while it works
         self._bus_failed_s: Optional[float] = None  # when the failures began
@@ -291,7 +291,7 @@ class HunterCore(StreamedCore):
     def _steering(self) -> float:
         motion = self.reports.motion
         inner_rad = motion.inner_steering_rad if motion else 0.0
-        return steering_of(inner_rad, self._spec, self._similarity)
+        return self._similarity.steering(self._spec.centre_rad(inner_rad))
 
 
 def _sent(frame: protocol.Frame, message: object) -> Sent:

@@ -19,13 +19,7 @@ from edge_runtime.vehicles.core import (
     State,
     StreamedCore,
 )
-from edge_runtime.vehicles.mapping import (
-    HunterSpec,
-    Similarity,
-    centre_to_steering,
-    inner_to_centre,
-    steering_of,
-)
+from edge_runtime.vehicles.mapping import HunterSpec, Similarity
 from edge_runtime.vehicles.ros2.names import STEERING
 from edge_runtime.wire import CONTROL_PERIOD_S
 
@@ -105,9 +99,9 @@ class Ros2Core(StreamedCore):
 
     leads_to = ROS2_LEADS_TO
 
-    def __init__(self, settings: Ros2Settings, spec: HunterSpec, similarity: Similarity) -> None:
-        self.odometry = OdometryReports(settings, spec)
-        super().__init__(spec, similarity, self.odometry)
+    def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
+        self.odometry = OdometryReports(settings, similarity.spec)
+        super().__init__(similarity, self.odometry)
         self._topic = settings.odometry_topic
 
     def enable(self, now_s: float) -> None:
@@ -135,9 +129,8 @@ class Ros2Core(StreamedCore):
         if self.state is State.DISABLED:
             return None
         self._step(now_s)
-        spec, set_point = self._spec, self.set_point
-        centre_rad = inner_to_centre(set_point.inner_rad, spec.wheelbase_m, spec.track_m)
-        return Motion(set_point.speed_mps, centre_rad)
+        set_point = self.set_point
+        return Motion(set_point.speed_mps, self._spec.centre_rad(set_point.inner_rad))
 
     def is_at_rest(self, now_s: float) -> bool:
         """Whether the vehicle is known to stand, or nothing was ever asked of it."""
@@ -164,5 +157,5 @@ class Ros2Core(StreamedCore):
         """From the odometry; where a yaw rate cannot tell, what was asked for."""
         centre_rad = self.odometry.centre_rad()
         if centre_rad is None:
-            return steering_of(self.set_point.inner_rad, self._spec, self._similarity)
-        return centre_to_steering(centre_rad, self._spec.wheelbase_m, self._similarity)
+            centre_rad = self._spec.centre_rad(self.set_point.inner_rad)
+        return self._similarity.steering(centre_rad)

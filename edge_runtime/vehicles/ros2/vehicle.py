@@ -15,7 +15,7 @@ from edge_runtime import log
 from edge_runtime.config import Ros2Settings
 from edge_runtime.controller import ActionLimit
 from edge_runtime.vehicles.core import State
-from edge_runtime.vehicles.mapping import HunterSpec, Similarity, limits_of
+from edge_runtime.vehicles.mapping import Similarity
 from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.vehicles.ros2.core import Measured, Motion, Ros2Core
 from edge_runtime.vehicles.ros2.names import STEERING, check_settings, open_ros2_session
@@ -62,12 +62,12 @@ class Ros2Vehicle(StreamedVehicle):
 
     name: ClassVar[str] = "ros2"
 
-    def __init__(self, settings: Ros2Settings, spec: HunterSpec, similarity: Similarity) -> None:
+    def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         check_settings(settings)
-        self._settings, self._spec = settings, spec
+        self._settings, self._spec = settings, similarity.spec
         self._core: Ros2Core
-        super().__init__(Ros2Core(settings, spec, similarity))
-        self.limits: Dict[str, ActionLimit] = limits_of(spec, similarity)
+        super().__init__(Ros2Core(settings, similarity))
+        self.limits: Dict[str, ActionLimit] = similarity.limits()
         self._failing = False
         self._publish: List[Callable[[Motion], None]] = []
         self._session = open_ros2_session(settings.listen, settings.connect, "[ros2] listen")

@@ -43,8 +43,7 @@ def all_closed():
 
 
 def make_vehicle(scenario="left_turn", **changes):
-    similarity = similarity_to(CARS[scenario], SPEC.max_speed_mps)
-    made.append(Ros2Vehicle(Ros2Settings(**changes), SPEC, similarity))
+    made.append(Ros2Vehicle(Ros2Settings(**changes), similarity_to(CARS[scenario], SPEC)))
     return made[-1]
 
 
