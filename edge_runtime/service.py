@@ -80,9 +80,6 @@ def _watchdog_period_s(environment: Mapping[str, str]) -> Optional[float]:
     return timeout_us / 2e6 if timeout_us > 0 and pid == os.getpid() else None
 
 
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
-
-
 class Board(NamedTuple):
     """One look. `temperature_c`: the hottest sensor in degrees Celsius, None without any."""
 
