@@ -138,7 +138,7 @@ class ControlLoop:
                     self._link.send("health", self.health())
                     next_health_s = max(next_health_s + _HEALTH_PERIOD_S, now_s)
                 if alive_period_s and now_s >= next_alive_s and not self._is_hung(now_s):
-                    self._notifier.watchdog()
+                    self._notifier.tell("WATCHDOG=1")
                     next_alive_s = now_s + alive_period_s
                 self._sleep(min(next_health_s, max(next_alive_s, now_s + _RETRY_S)))
 
@@ -314,7 +314,7 @@ class ControlLoop:
             was, now = self._logged.mode.value, safety.mode.value
             log.event(level, "mode", was=was, now=now, reason=safety.reason)
             self._logged = safety
-            self._notifier.status(f"{safety.mode.value} {safety.reason}".rstrip())
+            self._notifier.tell(f"STATUS={safety.mode.value} {safety.reason}".rstrip())
         waits = self._controller.waits_for_rearm
         if waits and not self._logged_wait:
             log.event("warning", "waits_for_rearm", command=self._rearm_command)

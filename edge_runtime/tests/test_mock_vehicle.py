@@ -113,12 +113,11 @@ def test_it_stays_within_its_limits(commands):
 
 
 def test_the_registry():
-    assert make_vehicle("none") is None
     assert isinstance(make_vehicle("mock"), MockVehicle)
     assert vehicle_limits("none", VehicleSetup()) == {}
     assert vehicle_limits("mock", VehicleSetup()) == MockVehicle.limits
     for make in (make_vehicle, vehicle_limits):
-        with pytest.raises(UserError, match="choose from none, mock, hunter"):
+        with pytest.raises(UserError, match=r"choose from .*mock, hunter"):
             make("tank", VehicleSetup())
 
 

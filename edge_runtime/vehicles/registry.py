@@ -30,16 +30,14 @@ from edge_runtime.vehicles.mapping import (
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 
 
-def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Optional[Vehicle]:
-    """The driver of that name; None for "none". Nothing is sent before it is enabled.
+def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Vehicle:
+    """The driver of that name. Nothing is sent before it is enabled.
 
     Raises UserError for any other name, for a scenario that the vehicle cannot follow, and where
     what it hangs on cannot be opened.
     """
-    check_choice("vehicle", name, VEHICLE_NAMES)
+    check_choice("vehicle", name, VEHICLE_NAMES[1:])
     setup = setup or VehicleSetup()
-    if name == NONE:
-        return None
     if name == "mock":
         return _mock(setup)
     similarity = _similarity(name, setup)
