@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple, Type
+from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
 
 import msgspec
 
@@ -60,16 +60,6 @@ class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     odometry_angular: str = "yaw_rate"
 
 
-class VehicleSetup(NamedTuple):
-    """What a driver is made from: the policy's scenario, and the settings of all vehicles."""
-
-    scenario: str = ""
-    bus: str = DEFAULT_BUS
-    hunter: HunterSettings = HunterSettings()
-    similarity: SimilaritySettings = SimilaritySettings()
-    ros2: Ros2Settings = Ros2Settings()
-
-
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All settings of `run`. Relative paths start at the working directory."""
 
@@ -91,10 +81,6 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     hunter: HunterSettings = msgspec.field(default_factory=HunterSettings)
     similarity: SimilaritySettings = msgspec.field(default_factory=SimilaritySettings)
     ros2: Ros2Settings = msgspec.field(default_factory=Ros2Settings)
-
-    def vehicle_setup(self, scenario: str) -> VehicleSetup:
-        """What a driver is made from, for a policy of this scenario."""
-        return VehicleSetup(scenario, self.bus, self.hunter, self.similarity, self.ros2)
 
 
 # The settings that are flags as well: metavar and help.
@@ -133,6 +119,7 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     )
 
 
+_OF_VEHICLES = ("bus", "hunter", "similarity", "ros2")
 _TABLES: Dict[str, Type[msgspec.Struct]] = {
     "": Config,
     "hunter": HunterSettings,
@@ -195,11 +182,11 @@ def _check(config: Config) -> None:
     check_fits(check_endpoint(config.connect), config.tls is not None)
     check_vehicle_id(config.vehicle_id)
     check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
-    setup = config.vehicle_setup("")
-    if setup != VehicleSetup():
-        from edge_runtime.vehicles.registry import check_setup  # The defaults need no check.
+    defaults = Config()
+    if any(getattr(config, name) != getattr(defaults, name) for name in _OF_VEHICLES):
+        from edge_runtime.vehicles.registry import check_settings  # The defaults need no check.
 
-        check_setup(setup)
+        check_settings(config)
     check_choice("log_level", config.log_level, log.LEVELS)
     check_choice("log_format", config.log_format, log.FORMATS)
     if not 0 <= config.realtime_priority <= MAX_PRIORITY:

@@ -97,7 +97,7 @@ class _Runtime:
             if config.vehicle != NONE:
                 from edge_runtime.vehicles.registry import make_vehicle
 
-                vehicle = make_vehicle(config.vehicle, config.vehicle_setup(manifest.scenario))
+                vehicle = make_vehicle(config.vehicle, config, manifest.scenario)
                 undo.callback(vehicle.close)
             rows = limit_rows(manifest.action, vehicle.limits if vehicle else {})
             self._controller = Controller(

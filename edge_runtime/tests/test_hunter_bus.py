@@ -12,7 +12,7 @@ import can
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
 
-from edge_runtime.config import DEFAULT_BUS, CarSettings, SimilaritySettings, VehicleSetup
+from edge_runtime.config import DEFAULT_BUS, CarSettings, Config, SimilaritySettings
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import stream
@@ -330,20 +330,20 @@ def test_python_can_is_asked_for_where_it_is_missing(monkeypatch):
 
 
 def test_the_registry_makes_it_for_a_known_scenario_only(channel):
-    setup = VehicleSetup("left_turn", bus=f"virtual:{channel}")
-    vehicle = make_vehicle("hunter", setup)
+    bus = f"virtual:{channel}"
+    vehicle = make_vehicle("hunter", Config(bus=bus), "left_turn")
     assert isinstance(vehicle, HunterVehicle)
     vehicle.close()
-    assert vehicle.limits == vehicle_limits("hunter", setup)
+    assert vehicle.limits == vehicle_limits("hunter", Config(), "left_turn")
     for make in (make_vehicle, vehicle_limits):
         with pytest.raises(UserError, match="parking"):
-            make("hunter", setup._replace(scenario="parking"))
+            make("hunter", Config(bus=bus), "parking")
     car = CarSettings(
         throttle_mps2=1.0, brake_mps2=1.0, max_speed_mps=3.0, full_steering_rad=0.5,
         wheelbase_m=2.0,
     )  # fmt: skip
-    similarity = SimilaritySettings(scale=0.1, car=car)
-    vehicle = make_vehicle("hunter", setup._replace(scenario="parking", similarity=similarity))
+    config = Config(bus=bus, similarity=SimilaritySettings(scale=0.1, car=car))
+    vehicle = make_vehicle("hunter", config, "parking")
     assert isinstance(vehicle, HunterVehicle)
     assert vehicle._core._similarity.scale == 0.1
     vehicle.close()

@@ -43,7 +43,11 @@ def test_run_without_a_vehicle_loads_no_more_than_it_needs():
 
 
 def test_a_vehicle_loads_no_other_one():
-    making = "from edge_runtime.vehicles.registry import make_vehicle; make_vehicle('mock')"
+    making = """
+from edge_runtime.config import Config
+from edge_runtime.vehicles.registry import make_vehicle
+make_vehicle("mock", Config(), "left_turn")
+"""
     folders = {path.parent.name for path in loaded_by(making)}
     assert folders == {"edge_runtime", "vehicles"}
 

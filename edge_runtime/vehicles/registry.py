@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, Optional
+from typing import Dict
 
 import msgspec
 
@@ -10,10 +10,9 @@ from edge_runtime.config import (
     DEFAULT_BUS,
     NONE,
     VEHICLE_NAMES,
+    Config,
     HunterSettings,
     Ros2Settings,
-    SimilaritySettings,
-    VehicleSetup,
     check_choice,
 )
 from edge_runtime.controller import ActionLimit
@@ -30,27 +29,26 @@ from edge_runtime.vehicles.mapping import (
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 
 
-def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Vehicle:
-    """The driver of that name. Nothing is sent before it is enabled.
+def make_vehicle(name: str, config: Config, scenario: str) -> Vehicle:
+    """The driver of that name for a policy of that scenario. Nothing is sent before it is enabled.
 
     Raises UserError for any other name, for a scenario that the vehicle cannot follow, and where
     what it hangs on cannot be opened.
     """
     check_choice("vehicle", name, VEHICLE_NAMES[1:])
-    setup = setup or VehicleSetup()
     if name == "mock":
-        return _mock(setup)
-    similarity = _similarity(name, setup)
+        return _mock(config, scenario)
+    similarity = _similarity(name, config, scenario)
     if name == "hunter":
         from edge_runtime.vehicles.hunter.bus import HunterVehicle, parse_bus
 
-        return HunterVehicle(parse_bus(setup.bus), similarity, setup.hunter.profile)
+        return HunterVehicle(parse_bus(config.bus), similarity, config.hunter.profile)
     from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
 
-    return Ros2Vehicle(setup.ros2, similarity)
+    return Ros2Vehicle(config.ros2, similarity)
 
 
-def vehicle_limits(name: str, setup: VehicleSetup) -> Dict[str, ActionLimit]:
+def vehicle_limits(name: str, config: Config, scenario: str) -> Dict[str, ActionLimit]:
     """What the vehicle of that name lets each action be, without opening anything; "none": {}.
 
     Raises UserError for any other name, and for a scenario that the vehicle cannot follow.
@@ -60,55 +58,53 @@ def vehicle_limits(name: str, setup: VehicleSetup) -> Dict[str, ActionLimit]:
         return {}
     if name == "mock":
         return MockVehicle.limits
-    return _similarity(name, setup).limits()
+    return _similarity(name, config, scenario).limits()
 
 
-def _mock(setup: VehicleSetup) -> Vehicle:
+def _mock(config: Config, scenario: str) -> Vehicle:
     """As quick as the policy's car, where that is known."""
-    car = setup.similarity.car or CARS.get(setup.scenario)
+    car = config.similarity.car or CARS.get(scenario)
     if car is None:
         return MockVehicle()
-    limits = MockParameters(
-        throttle_mps2=car.throttle_mps2,
-        brake_mps2=car.brake_mps2,
-        max_speed_mps=car.max_speed_mps,
+    return MockVehicle(
+        MockParameters(
+            throttle_mps2=car.throttle_mps2,
+            brake_mps2=car.brake_mps2,
+            max_speed_mps=car.max_speed_mps,
+        )
     )
-    return MockVehicle(limits)
 
 
-def _similarity(name: str, setup: VehicleSetup) -> Similarity:
+def _similarity(name: str, config: Config, scenario: str) -> Similarity:
     """From the policy's car to the chassis of the vehicle of that name. Raises UserError."""
-    settings = setup.similarity
+    settings = config.similarity
     if settings.car is not None:
         car = ScenarioCar(**msgspec.structs.asdict(settings.car))
     else:
-        car = car_of(setup.scenario, name)
-    model = setup.ros2.model if name == "ros2" else setup.hunter.model
+        car = car_of(scenario, name)
+    model = config.ros2.model if name == "ros2" else config.hunter.model
     return similarity_to(car, SPECS[model], settings.scale)
 
 
-def check_setup(setup: VehicleSetup) -> None:
+def check_settings(config: Config) -> None:
     """Raise UserError for settings that are not valid, whichever vehicle is chosen.
 
     The defaults are valid (a test), and load nothing.
     """
-    if (setup.bus, setup.hunter) != (DEFAULT_BUS, HunterSettings()):
+    if (config.bus, config.hunter) != (DEFAULT_BUS, HunterSettings()):
         from edge_runtime.vehicles.hunter import bus, protocol
 
-        bus.parse_bus(setup.bus)
-        check_choice("hunter.model", setup.hunter.model, tuple(SPECS))
-        check_choice("hunter.profile", setup.hunter.profile, tuple(protocol.PROFILES))
-    _check_similarity(setup.similarity)
-    if setup.ros2 != Ros2Settings():
-        from edge_runtime.vehicles.ros2.names import check_settings
+        bus.parse_bus(config.bus)
+        check_choice("hunter.model", config.hunter.model, tuple(SPECS))
+        check_choice("hunter.profile", config.hunter.profile, tuple(protocol.PROFILES))
+    if config.ros2 != Ros2Settings():
+        from edge_runtime.vehicles.ros2 import names
 
-        check_settings(setup.ros2)
-
-
-def _check_similarity(settings: SimilaritySettings) -> None:
-    numbers = {} if settings.car is None else msgspec.structs.asdict(settings.car)
-    if settings.scale is not None:
-        numbers["scale"] = settings.scale
+        names.check_settings(config.ros2)
+    car, scale = config.similarity.car, config.similarity.scale
+    numbers = {} if car is None else msgspec.structs.asdict(car)
+    if scale is not None:
+        numbers["scale"] = scale
     for name, value in numbers.items():
         fits, words = 0.0 < value < float("inf"), "above 0"
         if name == "full_steering_rad":  # to the right, the full angle is below 0

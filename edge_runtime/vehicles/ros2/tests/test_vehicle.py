@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from edge_runtime.config import Ros2Settings, VehicleSetup, load_config
+from edge_runtime.config import Config, Ros2Settings, load_config
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import (
     PATIENCE_S,
@@ -78,7 +78,7 @@ def pair(request):
     endpoint = free_endpoint()
     if request.param == "we listen":
         vehicle = make_vehicle(listen=endpoint)
-        assert vehicle.limits == vehicle_limits("ros2", VehicleSetup("left_turn"))
+        assert vehicle.limits == vehicle_limits("ros2", Config(), "left_turn")
         vehicle.enable(time.monotonic())
         hunter = RosHunter(connect=endpoint)
     else:
