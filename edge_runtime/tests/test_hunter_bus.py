@@ -257,7 +257,7 @@ def test_random_frames_on_the_bus_never_move_it(chassis, vehicle):
         junk.shutdown()
     count = len(vehicle.feedback(time.monotonic()).faults)
     assert count <= 3
-    assert vehicle._stream.is_alive()
+    assert vehicle._stream._thread.is_alive()
     assert vehicle._listener.is_alive()
     assert set(chassis.speeds) == {0.0}
 
@@ -345,7 +345,7 @@ def test_the_registry_makes_it_for_a_known_scenario_only(channel):
     config = Config(bus=bus, similarity=SimilaritySettings(scale=0.1, car=car))
     vehicle = make_vehicle("hunter", config, "parking")
     assert isinstance(vehicle, HunterVehicle)
-    assert vehicle._core._similarity.scale == 0.1
+    assert vehicle._core.similarity.scale == 0.1
     vehicle.close()
 
 

@@ -172,7 +172,7 @@ class StreamedCore(abc.ABC):
         self.cause: Optional[Event] = None  # what stopped it
         self.words = ""  # the same for a person; empty where our own side asked for the stop
         self.set_point = SetPoint(similarity)
-        self._similarity, self._spec, self._heard = similarity, similarity.spec, heard
+        self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
         self._speed_watch = SpeedWatch(self._spec.max_speed_mps)
         self._wish: Optional[Wish] = None  # None: stand
         self._wished_s = self._ticked_s = -math.inf
@@ -215,7 +215,7 @@ class StreamedCore(abc.ABC):
             self_braking=self.state is not State.ENABLED,
             faults=self._faults(now_s),
             standing=self.standing(now_s),
-            scenario_speed_mps=speed_mps / self._similarity.scale,
+            scenario_speed_mps=speed_mps / self.similarity.scale,
             commanded_speed_mps=self.set_point.speed_mps,
         )
 
@@ -289,4 +289,4 @@ class StreamedCore(abc.ABC):
         """From the measured acceleration; the brake where it stands and is to stand."""
         if self._heard.stands and self.set_point.speed_mps == 0.0:
             return -1.0
-        return self._similarity.pedal(self._heard.acceleration_mps2())
+        return self.similarity.pedal(self._heard.acceleration_mps2())

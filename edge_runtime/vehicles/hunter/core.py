@@ -21,15 +21,7 @@ from edge_runtime.vehicles.core import (
     StreamedCore,
 )
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.protocol import (
-    LINK_LOST,
-    MotionStatus,
-    MotorSlow,
-    Sent,
-    SystemStatus,
-    motor_faults,
-    status_faults,
-)
+from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
 from edge_runtime.vehicles.mapping import HunterSpec, Similarity
 from edge_runtime.wire import CONTROL_PERIOD_S
 
@@ -69,7 +61,7 @@ class Reports(Speeds):
             self.motion, self.motion_s = message, now_s
             self.note(message.speed_mps, now_s)
         elif isinstance(message, MotorSlow):
-            self._motor_faults[can_id] = motor_faults(can_id, message)
+            self._motor_faults[can_id] = protocol.motor_faults(can_id, message)
 
     def is_known_to_stand(self, now_s: float) -> bool:
         """Whether it says now that it stands."""
@@ -79,7 +71,7 @@ class Reports(Speeds):
     def needs_clearing(self) -> bool:
         """Whether it shows an error; a lost link goes by itself, with the stream's first frame."""
         is_exception = self.status is not None and self.status.state == protocol.STATE_EXCEPTION
-        return is_exception or bool(set(self.errors()) - {LINK_LOST})
+        return is_exception or bool(set(self.errors()) - {protocol.LINK_LOST})
 
     @property
     def remote_drives(self) -> bool:
@@ -88,7 +80,7 @@ class Reports(Speeds):
 
     def errors(self) -> List[str]:
         """The errors that the chassis names, in words, without those of its operation."""
-        words = status_faults(self.status, self._profile) if self.status else []
+        words = protocol.status_faults(self.status, self._profile) if self.status else []
         for motor in self._motor_faults.values():
             words += motor
         return words
@@ -149,9 +141,8 @@ class Reports(Speeds):
         if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
             return Finding(Event.LYING, f"the chassis reports {speed_mps:.1f} m/s")
         if abs(inner_rad) > IMPOSSIBLE * self._spec.max_inner_steering_rad:
-            return Finding(
-                Event.LYING, f"the chassis reports a steering angle of {inner_rad:.2f} rad"
-            )
+            words = f"the chassis reports a steering angle of {inner_rad:.2f} rad"
+            return Finding(Event.LYING, words)
         return None
 
 
@@ -291,7 +282,7 @@ class HunterCore(StreamedCore):
     def _steering(self) -> float:
         motion = self.reports.motion
         inner_rad = motion.inner_steering_rad if motion else 0.0
-        return self._similarity.steering(self._spec.centre_rad(inner_rad))
+        return self.similarity.steering(self._spec.centre_rad(inner_rad))
 
 
 def _sent(frame: protocol.Frame, message: object) -> Sent:

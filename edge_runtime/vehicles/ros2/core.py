@@ -158,4 +158,4 @@ class Ros2Core(StreamedCore):
         centre_rad = self.odometry.centre_rad()
         if centre_rad is None:
             centre_rad = self._spec.centre_rad(self.set_point.inner_rad)
-        return self._similarity.steering(centre_rad)
+        return self.similarity.steering(centre_rad)

@@ -13,8 +13,6 @@ from typing import Callable, ClassVar, Dict, List
 
 from edge_runtime import log
 from edge_runtime.config import Ros2Settings
-from edge_runtime.controller import ActionLimit
-from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.mapping import Similarity
 from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.vehicles.ros2.core import Measured, Motion, Ros2Core
@@ -67,7 +65,6 @@ class Ros2Vehicle(StreamedVehicle):
         self._settings, self._spec = settings, similarity.spec
         self._core: Ros2Core
         super().__init__(Ros2Core(settings, similarity))
-        self.limits: Dict[str, ActionLimit] = similarity.limits()
         self._failing = False
         self._publish: List[Callable[[Motion], None]] = []
         self._session = open_ros2_session(settings.listen, settings.connect, "[ros2] listen")
@@ -79,26 +76,12 @@ class Ros2Vehicle(StreamedVehicle):
             raise
 
     @property
-    def state(self) -> State:
-        """Where its state machine stands."""
-        return self._core.state
-
-    @property
     def rejected(self) -> Dict[str, int]:
         """Odometry that could not be read or was not new, by reason."""
         counts = dict(self._node.rejected)
         if self._core.odometry.stale:
             counts["stale"] = self._core.odometry.stale
         return counts
-
-    def enable(self, now_s: float) -> None:
-        """Publish speed 0, and drive once odometry comes; `feedback` tells whether it does."""
-        if self._closed:
-            return
-        with self._lock:
-            self._core.enable(now_s)
-        self._stream.start()
-        self._stream.wake()
 
     def close(self) -> None:
         """Publish speed 0 until it stands, and leave."""
