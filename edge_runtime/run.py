@@ -20,14 +20,15 @@ from edge_runtime.cli import Command, examples
 from edge_runtime.config import NONE, Config, add_flags, add_trust, load_config
 from edge_runtime.controller import Controller, limit_rows
 from edge_runtime.link import Link, require_free, taken, wait_for_router
-from edge_runtime.loop import ControlLoop, Hold
+from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import load_policy
 from edge_runtime.policy_file import VERIFIED
 from edge_runtime.transport import is_tls, open_session
 from edge_runtime.util import UserError, ending_signals
 from edge_runtime.wire import key
 
-if TYPE_CHECKING:  # Loaded only where there is a certificate or a vehicle.
+if TYPE_CHECKING:  # Loaded only where they are used.
+    from edge_runtime.files import Hold
     from edge_runtime.tls import TlsFiles
     from edge_runtime.vehicles.base import Vehicle, VehicleRunner
 
@@ -103,6 +104,11 @@ class _Runtime:
             self._controller = Controller(
                 rows, vehicle is not None, config.armed_at_start, manifest.task
             )
+            hold: Optional[Hold] = None
+            if config.hold is not None:
+                from edge_runtime.files import Hold
+
+                hold = Hold(config.hold)
             alive = key(config.vehicle_id, "alive")
             self._has_router = require_free(self._open_client, alive, config.vehicle_id)
             self._session = connected(mode="peer")
@@ -120,7 +126,7 @@ class _Runtime:
                 self._link,
                 self._runner,
                 self._notifier,
-                Hold(config.hold),
+                hold,
                 rearm_command(config.connect, config.vehicle_id),
             )
             undo.pop_all()

@@ -10,8 +10,8 @@ import time
 import pytest
 
 from edge_runtime.commands import ask
+from edge_runtime.files import Hold
 from edge_runtime.link_probe import free_endpoint
-from edge_runtime.loop import Hold
 from edge_runtime.tests.harness import (
     BLACK,
     PATIENCE_S,
@@ -372,7 +372,6 @@ def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
 
 def test_without_a_lock_nothing_is_held(tmp_path):
     file = tmp_path / "hold"
-    assert not Hold(None).is_on()
     assert not Hold(str(file)).is_on()
     file.touch()
     assert not Hold(str(file)).is_on()

@@ -13,8 +13,7 @@ import pytest
 
 from edge_runtime.cli import ArgumentParser, run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
-from edge_runtime.files import check_writable, write_atomic, write_json_out
-from edge_runtime.loop import Hold
+from edge_runtime.files import Hold, check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.service import WINDOW, LatencyWindow
 from edge_runtime.tests.harness import run_command
