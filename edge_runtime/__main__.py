@@ -12,7 +12,7 @@ COMMANDS = {
         "edge_runtime.commands:CHECK",
         "say whether a policy may drive, and how fast it is",
     ),
-    "run": ("edge_runtime.run:RUN", "answer states with commands until a signal ends it"),
+    "run": ("edge_runtime.run", "answer states with commands until a signal ends it"),
     "status": ("edge_runtime.commands:STATUS", "print how a running edge runtime is"),
     "rearm": ("edge_runtime.commands:REARM", "let a vehicle drive again after a safe stop"),
 }

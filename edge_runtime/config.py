@@ -11,7 +11,6 @@ from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
 import msgspec
 
 from edge_runtime import log
-from edge_runtime.cli import add_public_key
 from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, check_fits
 from edge_runtime.util import PathLike, UserError, read_toml
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
@@ -110,6 +109,8 @@ def add_flags(parser: argparse.ArgumentParser, *names: str) -> None:
 
 def add_trust(parser: argparse.ArgumentParser) -> None:
     """The flags that say which policy may drive."""
+    from edge_runtime.cli import add_public_key  # Here: only a command line needs it.
+
     add_public_key(parser)
     parser.add_argument(
         "--allow-unsigned",

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Tuple
 import zenoh
 
 from edge_runtime import log, service
-from edge_runtime.cli import Command, examples
 from edge_runtime.config import NONE, Config, add_flags, add_trust, load_config
 from edge_runtime.controller import Controller, limit_rows
 from edge_runtime.link import Link, require_free, taken, wait_for_router
@@ -51,14 +50,23 @@ class _StopSignal:
         self.on_stop()
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+EXAMPLE = r"""examples:
+  python -m edge_runtime run --policy results/policies/left_turn.onnx \
+      --public-key results/policies/policy.pub
+  python -m edge_runtime run --policy my.onnx --vehicle hunter --bus socketcan:can0 \
+      --connect tls/10.0.0.2:7447 --tls certs/edge-hunter01 --vehicle-id hunter01
+  python -m edge_runtime run --config edge.toml --log-format json"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `run`."""
     text = "settings; flags on the command line win over it"
     parser.add_argument("--config", metavar="FILE.toml", help=text)
     add_flags(parser)
     add_trust(parser)
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Verify, connect, drive until a signal comes. Raises UserError before the network opens."""
     flags = {name: getattr(arguments, name, None) for name in Config.__struct_fields__}
     config = load_config(arguments.config, flags)
@@ -248,16 +256,3 @@ def why_no_state(
         if not session.info.routers_zid():  # it may have come meanwhile
             return refusal or f"{connect} gives no link yet"
     return f"{connect} is there, and has sent no state for vehicle id {vehicle_id} yet"
-
-
-RUN = Command(
-    examples(
-        "python -m edge_runtime run --policy results/policies/left_turn.onnx \\\n"
-        "    --public-key results/policies/policy.pub",
-        "python -m edge_runtime run --policy my.onnx --vehicle hunter --bus socketcan:can0 \\\n"
-        "    --connect tls/10.0.0.2:7447 --tls certs/edge-hunter01 --vehicle-id hunter01",
-        "python -m edge_runtime run --config edge.toml --log-format json",
-    ),
-    _add_arguments,
-    _run,
-)
