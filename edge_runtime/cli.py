@@ -64,7 +64,7 @@ class ArgumentParser(argparse.ArgumentParser):
         """
         given = sys.argv[1:] if args is None else list(args)
         before = ""
-        # Of a command, its own parser says it.
+        # A command's own parser says it for its arguments.
         for value in given if self._subparsers is None else ():
             if not value:
                 self.error(f"an empty value after {before}" if before else "an empty value")

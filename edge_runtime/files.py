@@ -1,6 +1,6 @@
-"""Files that are either whole or absent, never half-written, and held by who writes them.
+"""Files that are either whole or absent, never half-written, and locked by their writer.
 
-Who writes a file can hold the kernel's lock on it, which ends with the process, however it ends.
+The lock is the kernel's: it ends with the process, however that ends.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _umask() -> int:
 def lock_file(descriptor: int) -> None:
     """Hold a file that was just made, until the descriptor is closed.
 
-    Waits for one who looks at it in this moment. Without a word where the file system has no locks.
+    Waits while another process looks at it. Does nothing where the file system has no locks.
     """
     with contextlib.suppress(OSError):
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -133,9 +133,8 @@ class Hold:
     """No command while an installer tries this release: neither on the wire nor to the vehicle.
 
     The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
-    process, so an installer that dies leaves nobody silent. Once free, this process never asks
-    again. A file that is not there holds nothing; UserError for one that cannot be read:
-    nobody could say whether it holds.
+    process, so an installer that dies silences no runtime. Once free, this process never asks
+    again. A file that is not there holds nothing. Raises UserError for one that cannot be read.
     """
 
     def __init__(self, path: str) -> None:

@@ -14,8 +14,8 @@ from typing import Dict, NamedTuple, Optional, Set, Tuple
 from edge_runtime.wire import CONTROL_PERIOD_S, Reason, Rejection, State
 
 TAKEOVER_SILENCE_S = 2 * CONTROL_PERIOD_S
-# Of so many past sessions it is known where they stood: they may come back with newer states. Of
-# all before them only that they are over, by a hash of 8 bytes.
+# So many past sessions are remembered with their position: they may come back with newer states.
+# All sessions before them are known to be over, by a hash of 8 bytes.
 _REMEMBERED_SESSIONS = 16
 MAX_FORGOTTEN_SESSIONS = 100_000  # some 8 MB, and 5 h of one take-over after the other
 # One message from far ahead would make all that follow it old. So much may be lost on the way,

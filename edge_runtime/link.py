@@ -77,7 +77,7 @@ class Link:
             _reply(query, {**msgspec.to_builtins(health()), **about})
 
         def rearm_asked(query: zenoh.Query) -> None:
-            # `phil/**` asks what is there: a look at everything is nobody's permission to move.
+            # `phil/**` asks what is there: a look at everything is no permission to move.
             if str(query.key_expr) != rearm_key:
                 return
             refusal = rearm()

@@ -46,7 +46,7 @@ def close() -> None:
 
 
 class _Background(logging.Handler):
-    """Hands the lines to a thread; drops those for which nobody makes room."""
+    """Hands the lines to a thread; drops those for which there is no room."""
 
     def __init__(self, target: logging.Handler) -> None:
         super().__init__()

@@ -72,7 +72,7 @@ _Fields = List[Tuple[int, _Value]]
 
 def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None:
     """Raise UserError unless `signature` is the key owner's over exactly these bytes."""
-    # Here: who reads a manifest, and verifies nothing, need not wait for it.
+    # Here: reading a manifest alone need not wait for it.
     from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
     from cryptography.hazmat.primitives.serialization import load_pem_public_key
@@ -101,8 +101,8 @@ def check_trust(
 
     A signature is always verified where a public key is known; `allow_unsigned` lets through
     only what cannot be verified, never what fails to. With it, a key beside the policy comes before
-    that of the working directory. Without it, such a key counts for nothing: who brings a policy
-    could bring it, too.
+    that of the working directory. Without it, such a key counts for nothing: a person who
+    brings a policy could bring it, too.
     """
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     if not signature_path.exists():

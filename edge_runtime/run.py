@@ -237,7 +237,7 @@ class Waiting:
         threading.Thread(target=self._run, name="waiting", daemon=True).start()
 
     def stop(self) -> None:
-        """Say nothing more. Waits for nobody."""
+        """Say nothing more. Never waits."""
         self._ended.set()
 
     def _run(self) -> None:

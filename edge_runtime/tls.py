@@ -157,7 +157,7 @@ class Rights(NamedTuple):
     watches: Tuple[str, ...] = ()
     """Liveliness tokens of others."""
     all_vehicles: bool = False
-    """Of every vehicle, not of its own alone."""
+    """Its rights hold for every vehicle, not for its own alone."""
     listens: bool = False
     """Others connect to it: its certificate is a server's, too."""
 

@@ -79,7 +79,7 @@ def open_session(
     listens = [listen] if isinstance(listen, str) else list(listen or [])
     if listens and tls is not None and access is None:
         raise ValueError(
-            "who listens with TLS needs access control: every certificate could say all"
+            "a listener with TLS needs access control: every certificate could say all"
         )
     for endpoint in [*listens, *([] if connect is None else [connect])]:
         check_fits(check_endpoint(endpoint), tls is not None)

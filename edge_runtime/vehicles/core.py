@@ -1,7 +1,7 @@
 """The driver of a vehicle that must hear from it 50 times a second: pure, and shared by vehicles.
 
 A core is a state machine (LEADS_TO), what was heard of the vehicle, and what is asked of it. It has
-no clock, no thread and no bus: whoever holds it (stream.py, a test) serialises the calls, passes
+no clock, no thread and no bus: its holder (stream.py, a test) serialises the calls, passes
 monotonic seconds, and sends what `tick` returns. A vehicle adds what it hears and says.
 
 STOPPED is a latch of our own: a chassis takes commands again by itself when they resume after its
@@ -34,7 +34,7 @@ DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
 DEVIATES_S = CONTROL_PERIOD_S
 STANDS_MPS = 0.02
 IMPOSSIBLE = 1.3
-"""Times what the model can do: who reports more than that is not believed."""
+"""Times what the model can do: a vehicle that reports more than that is not believed."""
 _SLACK_S = 0.01
 
 
@@ -226,11 +226,11 @@ class StreamedCore(abc.ABC):
 
     @abc.abstractmethod
     def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or nobody here can do more about it."""
+        """Whether the vehicle is known to stand, or no more can be done about it."""
 
     @abc.abstractmethod
     def _obstacles(self, now_s: float) -> List[str]:
-        """In words what stands between the vehicle and our commands, whoever is to end it."""
+        """In words what stands between the vehicle and our commands."""
 
     @abc.abstractmethod
     def _why_not_confirmed(self, now_s: float) -> str:

@@ -96,7 +96,7 @@ class Reports(Speeds):
         return None
 
     def commander(self) -> Optional[Finding]:
-        """Who outranks us: the remote control, or the emergency stop."""
+        """What outranks us: the remote control, or the emergency stop."""
         if self.remote_drives:
             return Finding(Event.REMOTE, REMOTE_WORDS)
         if self.status is not None and self.status.state == protocol.STATE_ESTOP:
@@ -176,7 +176,7 @@ class HunterCore(StreamedCore):
         return parts
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
-        """A frame of the bus, whoever sent it; never raises."""
+        """A frame of the bus, from any sender; never raises."""
         if self.state is State.DISABLED:
             self.bus_works()  # nothing is sent then that it could take
         if self.is_command(can_id):
@@ -224,7 +224,7 @@ class HunterCore(StreamedCore):
         return any(can_id == frame.can_id for frame in protocol.COMMANDS)
 
     def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or nobody here can do more about it."""
+        """As in StreamedCore; no more can be done about a dead bus or a remote control."""
         blind = self.state is State.DISABLED or bool(self._bus_words) or self.reports.remote_drives
         return blind or self.reports.is_known_to_stand(now_s)
 

@@ -1,4 +1,4 @@
-"""ROS 2 on Zenoh without ROS 2: the standard messages that we speak, in CDR, and who speaks them.
+"""ROS 2 on Zenoh without ROS 2: the standard messages that we speak, in CDR, and a node.
 
 Field names, order and types are those of the packages' .msg files (common_interfaces and
 ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
