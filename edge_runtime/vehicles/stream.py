@@ -1,8 +1,9 @@
 """The shell of a vehicle that must hear from us 50 times a second: a thread, a lock, and its core.
 
 The stream sends what the core (core.py) asks for, and a lock is around every call of the core.
-The bus or network is called outside of the lock, so that no caller waits for it. A chassis takes a stream that pauses for a lost link: the deadlines are absolute, and the
-thread does nothing else. It inherits the priority that the runtime gave the process.
+The bus or network is called outside of the lock, so that no caller waits for it. A chassis takes a
+stream that pauses for a lost link: the deadlines are absolute, and the thread does nothing else. It
+inherits the priority that the runtime gave the process.
 """
 
 from __future__ import annotations
