@@ -37,7 +37,7 @@ from edge_runtime.vehicles.ros2.names import (
     namespace_of,
     open_ros2_session,
 )
-from edge_runtime.vehicles.ros2.node import Ros2Node, open_node
+from edge_runtime.vehicles.ros2.node import Ros2Node
 from edge_runtime.wire import (
     CONTROL_PERIOD_S,
     FRAMES_SHAPE,
@@ -141,7 +141,7 @@ def _run(arguments: Any, namespace: str, tls: TlsFiles | None) -> dict[str, Any]
             open_ros2_session(arguments.ros2_listen, arguments.ros2_connect)
         ) as session,
         open_feed(arguments.connect, arguments.vehicle_id, arguments.wait_s, tls) as feed,
-        open_node(session, namespace) as node,
+        contextlib.closing(Ros2Node(session, namespace)) as node,
     ):
         outlet = Outlet(node, Policies(status), arguments.max_rate_hz)
         print(f"ready vehicle_id={arguments.vehicle_id} namespace={namespace}", flush=True)

@@ -10,10 +10,16 @@ from hypothesis import strategies as st
 
 from edge_runtime.config import Ros2Settings
 from edge_runtime.vehicles.core import COMMAND_TIMEOUT_S, ENABLE_TIMEOUT_S, Event, State
-from edge_runtime.vehicles.ros2.core import ROS2_LEADS_TO, Measured, Motion, Ros2Core
 from edge_runtime.vehicles.ros2.names import STEERING, YAW_RATE
 from edge_runtime.vehicles.ros2.tests.ros_hunter import CONGESTION, LEFT_TURN, SPEC, TICK_S, Drive
-from edge_runtime.vehicles.ros2.vehicle import drive_of, twist_of
+from edge_runtime.vehicles.ros2.vehicle import (
+    ROS2_LEADS_TO,
+    Measured,
+    Motion,
+    Ros2Core,
+    drive_of,
+    twist_of,
+)
 
 
 def test_nothing_is_sent_before_enable():
