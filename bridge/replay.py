@@ -299,7 +299,7 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     was started anew. Its limits follow from ``config``. UserError where it lacks an action of the
     policy or cannot follow its scenario.
     """
-    limits = vehicle_limits(drive.vehicle, config.vehicle_setup(policy.manifest.scenario))
+    limits = vehicle_limits(drive.vehicle, config, policy.manifest.scenario)
     rows = limit_rows(policy.manifest.action, limits)
     return _Replay(drive, policy, rows, needs_rearm=drive.vehicle != NONE).run()
 

@@ -26,7 +26,7 @@ from edge_runtime.commands import ask
 from edge_runtime.files import write_json_out
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.mapping import CARS, ScenarioCar, Similarity
+from edge_runtime.vehicles.mapping import CARS, ScenarioCar
 from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.vehicles.ros2.names import (
     DEFAULT_ROS2_ENDPOINT,
@@ -35,7 +35,7 @@ from edge_runtime.vehicles.ros2.names import (
     namespace_of,
     open_ros2_session,
 )
-from edge_runtime.vehicles.ros2.node import Ros2Node, open_node
+from edge_runtime.vehicles.ros2.node import Ros2Node
 from edge_runtime.wire import (
     CONTROL_PERIOD_S,
     FRAMES_SHAPE,
@@ -122,7 +122,7 @@ def run(arguments: Any) -> int:
             open_ros2_session(arguments.ros2_listen, arguments.ros2_connect)
         ) as session,
         open_listener(connect, vehicle_id, arguments.wait_s, tls) as listener,
-        open_node(session, namespace) as node,
+        contextlib.closing(Ros2Node(session, namespace)) as node,
     ):
         status = functools.partial(ask, connect, vehicle_id, "status", tls)
         outlet = Outlet(node, Policies(status), arguments.max_rate_hz)
@@ -340,7 +340,7 @@ def odometry_of(feedback: Feedback, pose: DeadReckoning, curvature: float | None
 
 def _curvature(policy: Policy, values: Sequence[float], scale: float) -> float:
     steering = policy.action(values, "steering") or 0.0
-    return Similarity(policy.car, scale).vehicle_curvature(steering)
+    return policy.car.curvature(steering) / scale
 
 
 def _diagonal(x: float, y: float, yaw: float) -> list[float]:

@@ -59,27 +59,24 @@ class ArgumentParser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse, but an empty value is an error: no option here means anything by it.
 
-        A shell makes one of a variable that is not set; as a file's name it is the directory where
-        one stands.
+        An unset shell variable expands to an empty string, which as a path is the current
+        directory.
         """
         given = sys.argv[1:] if args is None else list(args)
-        if self._subparsers is None:  # else it is for the command's own parser to say
-            refuse_empty(given, self.error)
+        before = ""
+        # A command's own parser says it for its arguments.
+        for value in given if self._subparsers is None else ():
+            if not value:
+                self.error(f"an empty value after {before}" if before else "an empty value")
+            if value.startswith("--") and value.find("=") == len(value) - 1:
+                self.error(f"an empty value after {value[:-1]}")
+            before = value
         return super().parse_known_args(given, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print "prog: what is wrong (see prog --help)" and exit with status 2."""
         line = printable(" ".join(message.split()))
         self.exit(BAD_INPUT, f"{self.prog}: {line} (see {self.prog} --help)\n")
-
-
-def refuse_empty(arguments: List[str], error: Callable[[str], NoReturn]) -> None:
-    """Call ``error`` at the first argument that is empty, or has nothing behind its = (--out=)."""
-    for before, value in zip(["", *arguments], arguments):
-        if not value:
-            error(f"an empty value after {before}" if before else "an empty value")
-        if value.startswith("--") and value.find("=") == len(value) - 1:
-            error(f"an empty value after {value[:-1]}")
 
 
 def examples(*commands: str) -> str:

@@ -7,6 +7,8 @@ import itertools
 import json
 from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
 
+from edge_runtime.cli import Command, examples
+from edge_runtime.config import Config, add_flags, add_trust
 from edge_runtime.files import check_writable, write_json
 from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
 from edge_runtime.transport import check_endpoint, open_session
@@ -21,7 +23,13 @@ _TIMEOUT_S = 2.0
 _STRANGER = "what answers for {} is no edge runtime of this kind"
 
 
-def check(arguments: argparse.Namespace) -> int:
+def _add_check(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("policy", metavar="POLICY.onnx", help="the policy file")
+    parser.add_argument("--out", metavar="FILE.json", help="write the report here, too")
+    add_trust(parser)
+
+
+def _check(arguments: argparse.Namespace) -> int:
     """Print the report as JSON. Raises UserError where the policy may not drive."""
     if arguments.out is not None:
         check_writable(arguments.out)
@@ -66,7 +74,18 @@ def _measure_latency(policy: Policy) -> Dict[str, float]:
     return window.summary_ms()
 
 
-def status(arguments: argparse.Namespace) -> int:
+def _add_operator(parser: argparse.ArgumentParser) -> None:
+    add_flags(parser, "connect", "tls", "vehicle_id")
+    parser.set_defaults(connect=Config().connect, vehicle_id=Config().vehicle_id)
+
+
+def _add_status(parser: argparse.ArgumentParser) -> None:
+    _add_operator(parser)
+    parser.add_argument("--out", metavar="FILE.json", help="write all of it here, as JSON")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def _status(arguments: argparse.Namespace) -> int:
     """Print the runtime's status as a table, or as JSON."""
     if arguments.out is not None:
         check_writable(arguments.out)
@@ -81,7 +100,7 @@ def status(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def rearm(arguments: argparse.Namespace) -> int:
+def _rearm(arguments: argparse.Namespace) -> int:
     """Let the runtime drive again. Raises UserError where it refuses."""
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     if tls is not None:
@@ -165,3 +184,31 @@ def _quantiles(summary: Dict[str, float]) -> str:
 
 def _temperature(value_c: Any) -> str:
     return "no sensor" if value_c is None else f"{value_c:.0f} degC"
+
+
+CHECK = Command(
+    examples(
+        "python -m edge_runtime check results/policies/left_turn.onnx \\\n"
+        "    --public-key results/policies/policy.pub",
+        "python -m edge_runtime check my.onnx --allow-unsigned --out check.json",
+    ),
+    _add_check,
+    _check,
+)
+STATUS = Command(
+    examples(
+        "python -m edge_runtime status",
+        "python -m edge_runtime status --connect tcp/10.0.0.2:7447 --vehicle-id hunter01 --json",
+    ),
+    _add_status,
+    _status,
+)
+REARM = Command(
+    examples(
+        "python -m edge_runtime rearm",
+        "python -m edge_runtime rearm --connect tls/10.0.0.2:7447 \\\n"
+        "    --tls certs/operator-hunter01 --vehicle-id hunter01",
+    ),
+    _add_operator,
+    _rearm,
+)

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Type
+import argparse
+from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
 
 import msgspec
 
@@ -58,16 +59,6 @@ class Ros2Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     odometry_angular: str = "yaw_rate"
 
 
-class VehicleSetup(NamedTuple):
-    """What a driver is made from: the policy's scenario, and the settings of all vehicles."""
-
-    scenario: str = ""
-    bus: str = DEFAULT_BUS
-    hunter: HunterSettings = HunterSettings()
-    similarity: SimilaritySettings = SimilaritySettings()
-    ros2: Ros2Settings = Ros2Settings()
-
-
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All settings of `run`. Relative paths start at the working directory."""
 
@@ -90,11 +81,46 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     similarity: SimilaritySettings = msgspec.field(default_factory=SimilaritySettings)
     ros2: Ros2Settings = msgspec.field(default_factory=Ros2Settings)
 
-    def vehicle_setup(self, scenario: str) -> VehicleSetup:
-        """What a driver is made from, for a policy of this scenario."""
-        return VehicleSetup(scenario, self.bus, self.hunter, self.similarity, self.ros2)
+
+# The settings that are flags as well: metavar and help.
+_FLAGS: Dict[str, Tuple[str, str]] = {
+    "policy": ("POLICY.onnx", "the policy file"),
+    "connect": ("PROTOCOL/HOST:PORT", "where the simulator listens"),
+    "tls": (
+        "DIR",
+        "ca.pem, cert.pem, key.pem of this party (python -m deploy certs); endpoint tls/...",
+    ),
+    "vehicle_id": ("ID", "the vehicle's part of the Zenoh keys"),
+    "vehicle": ("|".join(VEHICLE_NAMES), "the vehicle to move besides"),
+    "bus": ("INTERFACE:CHANNEL", "with --vehicle hunter: its CAN bus, as python-can names it"),
+    "log_level": ("|".join(log.LEVELS), "least level that goes to stderr"),
+    "log_format": ("|".join(log.FORMATS), "a line of words, or a JSON object a line"),
+}
 
 
+def add_flags(parser: argparse.ArgumentParser, *names: str) -> None:
+    """The flags of these settings, or of all. One that is not given is None: the file has it."""
+    for name in names or _FLAGS:
+        metavar, text = _FLAGS[name]
+        default = getattr(Config(), name)
+        shown = f"{text} (default: {default})" if default else text
+        parser.add_argument(f"--{name.replace('_', '-')}", metavar=metavar, help=shown)
+
+
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """The flags that say which policy may drive."""
+    from edge_runtime.cli import add_public_key  # Here: only a command line needs it.
+
+    add_public_key(parser)
+    parser.add_argument(
+        "--allow-unsigned",
+        action="store_true",
+        default=None,
+        help="also take a policy whose origin cannot be verified",
+    )
+
+
+_OF_VEHICLES = ("bus", "hunter", "similarity", "ros2")
 _TABLES: Dict[str, Type[msgspec.Struct]] = {
     "": Config,
     "hunter": HunterSettings,
@@ -157,11 +183,11 @@ def _check(config: Config) -> None:
     check_fits(check_endpoint(config.connect), config.tls is not None)
     check_vehicle_id(config.vehicle_id)
     check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
-    setup = config.vehicle_setup("")
-    if setup != VehicleSetup():
-        from edge_runtime.vehicles.registry import check_setup  # The defaults need no check.
+    defaults = Config()
+    if any(getattr(config, name) != getattr(defaults, name) for name in _OF_VEHICLES):
+        from edge_runtime.vehicles.registry import check_settings  # The defaults need no check.
 
-        check_setup(setup)
+        check_settings(config)
     check_choice("log_level", config.log_level, log.LEVELS)
     check_choice("log_format", config.log_format, log.FORMATS)
     if not 0 <= config.realtime_priority <= MAX_PRIORITY:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class ActionLimit(NamedTuple):
-    """A vehicle's row for one action: its range, and the fastest change per second (inf: any)."""
+    """What a vehicle lets one action be: its range, and the fastest change (inf: at once)."""
 
     low: float
     high: float
@@ -30,7 +30,7 @@ class ActionLimit(NamedTuple):
 
 
 class LimitRow(NamedTuple):
-    """What one action may be: its range, and how fast it may change (inf: at once)."""
+    """What one action of the policy may be on this vehicle."""
 
     name: str
     low: float
@@ -44,22 +44,19 @@ def limit_rows(actions: Sequence[Action], limits: Dict[str, ActionLimit]) -> Lis
     An empty table (no vehicle) leaves the manifest's range and any speed of change.
     Raises UserError where a vehicle lacks an action of the policy.
     """
-    return [_row(action, limits) for action in actions]
-
-
-def _row(action: Action, limits: Dict[str, ActionLimit]) -> LimitRow:
-    if not limits:
-        return LimitRow(action.name, action.low, action.high, math.inf)
-    if action.name not in limits:
-        raise UserError(
-            f"the vehicle has no {action.name!r}, which the policy acts on;"
-            f" it has {', '.join(sorted(limits))}"
-        )
-    limit = limits[action.name]
-    low, high = max(action.low, limit.low), min(action.high, limit.high)
-    if low > high:
-        raise UserError(f"the policy's and the vehicle's range of {action.name!r} do not meet")
-    return LimitRow(action.name, low, high, limit.slew_per_s)
+    rows = []
+    for name, low, high in ((action.name, action.low, action.high) for action in actions):
+        if limits and name not in limits:
+            raise UserError(
+                f"the vehicle has no {name!r}, which the policy acts on;"
+                f" it has {', '.join(sorted(limits))}"
+            )
+        limit = limits[name] if limits else ActionLimit(low, high, math.inf)
+        row = LimitRow(name, max(low, limit.low), min(high, limit.high), limit.slew_per_s)
+        if row.low > row.high:
+            raise UserError(f"the policy's and the vehicle's range of {name!r} do not meet")
+        rows.append(row)
+    return rows
 
 
 def limit_action(
@@ -175,7 +172,9 @@ class Controller:
         self._begun_s = None
         if now_s - self._newest.arrived_s > CONTROL_PERIOD_S:
             self.deadline_misses += 1
-        wanted = self._read(output)
+        wanted: List[float] = []
+        if output is not None and (output.dtype, output.shape) == (np.float32, (len(self._rows),)):
+            wanted = output.tolist()
         self._apply(self._event_of(wanted))
         if self.safety.mode is Mode.SAFE_STOP:
             self._next_stop_s = now_s + CONTROL_PERIOD_S
@@ -248,14 +247,8 @@ class Controller:
             return None
         return self._stop_order(0, self._ordered_s)._replace(reason="runtime_ended")
 
-    def _read(self, output: Optional[np.ndarray]) -> List[float]:
-        """The numbers of an answer, one for each action; none where it has another form."""
-        if output is None or output.dtype != np.float32 or output.shape != (len(self._rows),):
-            return []
-        numbers: List[float] = output.tolist()
-        return numbers
-
     def _event_of(self, wanted: List[float]) -> Event:
+        """Which event an answer is; `wanted` is empty where it has another form."""
         assert self._newest is not None
         if self._task and self._newest.state.task not in (UNSET, self._task):
             return Event.OTHER_TASK

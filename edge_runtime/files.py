@@ -1,6 +1,6 @@
-"""Files that are either whole or absent, never half-written, and held by who writes them.
+"""Files that are either whole or absent, never half-written, and locked by their writer.
 
-Who writes a file can hold the kernel's lock on it, which ends with the process, however it ends.
+The lock is the kernel's: it ends with the process, however that ends.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import os
 import stat
 import tempfile
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, BinaryIO, Optional
 
-from edge_runtime.util import PathLike, UserError
+from edge_runtime.util import PathLike, UserError, open_regular
 
 
 def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
@@ -112,7 +112,7 @@ def _umask() -> int:
 def lock_file(descriptor: int) -> None:
     """Hold a file that was just made, until the descriptor is closed.
 
-    Waits for one who looks at it in this moment. Without a word where the file system has no locks.
+    Waits while another process looks at it. Does nothing where the file system has no locks.
     """
     with contextlib.suppress(OSError):
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -127,3 +127,37 @@ def try_to_lock_file(descriptor: int) -> bool:
     except OSError:  # No locks here: then nobody can hold one.
         pass
     return True
+
+
+class Hold:
+    """No command while an installer tries this release: neither on the wire nor to the vehicle.
+
+    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
+    process, so an installer that dies silences no runtime. Once free, this process never asks
+    again. A file that is not there holds nothing. Raises UserError for one that cannot be read.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._stream: Optional[BinaryIO] = None
+        try:
+            self._stream = open_regular(path)  # kept until it is free
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
+
+    def is_on(self) -> bool:
+        """Whether commands must stay here. Never waits."""
+        if self._stream is None:
+            return False
+        try:
+            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        self._stream.close()
+        self._stream = None
+        return False
+
+    def refusal(self) -> str:
+        """Why nobody may re-arm now; empty when free."""
+        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""

@@ -14,8 +14,8 @@ from typing import Dict, NamedTuple, Optional, Set, Tuple
 from edge_runtime.wire import CONTROL_PERIOD_S, Reason, Rejection, State
 
 TAKEOVER_SILENCE_S = 2 * CONTROL_PERIOD_S
-# Of so many past sessions it is known where they stood: they may come back with newer states. Of
-# all before them only that they are over, by a hash of 8 bytes.
+# So many past sessions are remembered with their position: they may come back with newer states.
+# All sessions before them are known to be over, by a hash of 8 bytes.
 _REMEMBERED_SESSIONS = 16
 MAX_FORGOTTEN_SESSIONS = 100_000  # some 8 MB, and 5 h of one take-over after the other
 # One message from far ahead would make all that follow it old. So much may be lost on the way,
@@ -52,9 +52,11 @@ class LatestState:
         rejection = self._judge(state, now_s)
         if rejection is not None:
             return self.reject(rejection)
-        self._session = state.session
-        self._heard_s = now_s
-        self._remember(state, now_s)
+        self._session, self._heard_s = state.session, now_s
+        self._lasts[state.session] = _Last((state.episode, state.step), now_s)
+        self._lasts.move_to_end(state.session)
+        while len(self._lasts) > _REMEMBERED_SESSIONS:
+            self._forgotten.add(hash(self._lasts.popitem(last=False)[0]))
         self.accepted += 1
         return None
 
@@ -69,13 +71,8 @@ class LatestState:
             # Even a stale message shows that this simulator is there.
             self._heard_s = now_s
         elif now_s - self._heard_s < TAKEOVER_SILENCE_S:
-            return Rejection(
-                Reason.FOREIGN_SESSION,
-                f"session {state.session!r} while {self._session!r} is not silent",
-            )
-        return self._judge_order(state, now_s)
-
-    def _judge_order(self, state: State, now_s: float) -> Optional[Rejection]:
+            words = f"session {state.session!r} while {self._session!r} is not silent"
+            return Rejection(Reason.FOREIGN_SESSION, words)
         last = self._lasts.get(state.session)
         if last is None:
             return self._judge_session(state.session)
@@ -93,12 +90,6 @@ class LatestState:
             words = f"there were {len(self._forgotten)} simulators before; start the runtime again"
             return Rejection(Reason.FOREIGN_SESSION, words)
         return None
-
-    def _remember(self, state: State, now_s: float) -> None:
-        self._lasts[state.session] = _Last((state.episode, state.step), now_s)
-        self._lasts.move_to_end(state.session)
-        while len(self._lasts) > _REMEMBERED_SESSIONS:
-            self._forgotten.add(hash(self._lasts.popitem(last=False)[0]))
 
 
 def _judge_skip(position: Position, last: _Last, now_s: float) -> Optional[Rejection]:

@@ -45,17 +45,18 @@ class Link:
         self._session = session
         self._manifest = manifest
         self._declared: List[Any] = []
-        self._publishers: Dict[str, Any] = {}
         self._presence: Optional[Presence] = None
         self._muted = False
-        for topic in ("command", "feedback", "health"):
+        self._publishers = {
             # DROP: a full queue must never hold the control loop, and the next message is better.
-            self._publishers[topic] = session.declare_publisher(
+            topic: session.declare_publisher(
                 key(vehicle_id, topic),
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.REAL_TIME,
                 express=True,
             )
+            for topic in ("command", "feedback", "health")
+        }
 
     def declare(
         self,
@@ -71,10 +72,12 @@ class Link:
             on_state(bytes(MAX_PAYLOAD_BYTES + 1) if is_huge else bytes(sample.payload))
 
         def status_asked(query: zenoh.Query) -> None:
-            _reply(query, self._status(health()))
+            manifest = msgspec.to_builtins(self._manifest)
+            about = {"version": __version__, "manifest": manifest}
+            _reply(query, {**msgspec.to_builtins(health()), **about})
 
         def rearm_asked(query: zenoh.Query) -> None:
-            # `phil/**` asks what is there: a look at everything is nobody's permission to move.
+            # `phil/**` asks what is there: a look at everything is no permission to move.
             if str(query.key_expr) != rearm_key:
                 return
             refusal = rearm()
@@ -120,10 +123,6 @@ class Link:
                 declared.undeclare()
         finally:
             self._session.close()
-
-    def _status(self, health: Health) -> Dict[str, Any]:
-        manifest = msgspec.to_builtins(self._manifest)
-        return {**msgspec.to_builtins(health), "version": __version__, "manifest": manifest}
 
 
 def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
@@ -211,7 +210,8 @@ class Presence:
         changed, self._routers = routers != self._routers, routers
         if not changed or not routers:
             return False
-        self._undeclare_tokens()
+        for token in self._tokens:
+            token.undeclare()
         self._declare()
         return True
 
@@ -235,7 +235,8 @@ class Presence:
         self._stopping.set()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(_JOIN_S)
-        self._undeclare_tokens()
+        for token in self._tokens:
+            token.undeclare()
 
     def _declare(self) -> None:
         # Wall clock, because two boards compare it; the rest tells two of one moment apart.
@@ -246,10 +247,6 @@ class Presence:
             self._session.liveliness().declare_token(key)
             for key in (self._key, f"{self._key}/{self.claim}")
         ]
-
-    def _undeclare_tokens(self) -> None:
-        for token in self._tokens:
-            token.undeclare()
 
     def _seen_routers(self) -> List[str]:
         return sorted(map(str, self._session.info.routers_zid()))

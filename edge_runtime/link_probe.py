@@ -102,13 +102,11 @@ def check_ports_are_free(endpoints: Sequence[str]) -> None:
             try:
                 probe.bind(target)
             except OSError as error:
-                raise UserError(_explain_bind(error, host, port)) from None
-
-
-def _explain_bind(error: OSError, host: str, port: int) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return f"port {port} on {host} is in use; choose another with --listen"
-    return f"cannot listen on port {port} of {host}: {error.strerror}"
+                if error.errno == errno.EADDRINUSE:
+                    words = f"port {port} on {host} is in use; choose another with --listen"
+                else:
+                    words = f"cannot listen on port {port} of {host}: {error.strerror}"
+                raise UserError(words) from None
 
 
 def free_endpoint(protocol: str = "tcp") -> str:

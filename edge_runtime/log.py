@@ -46,7 +46,7 @@ def close() -> None:
 
 
 class _Background(logging.Handler):
-    """Hands the lines to a thread; drops those for which nobody makes room."""
+    """Hands the lines to a thread; drops those for which there is no room."""
 
     def __init__(self, target: logging.Handler) -> None:
         super().__init__()
@@ -74,7 +74,9 @@ class _Background(logging.Handler):
 
 class _TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        pairs = "".join(f" {label}={_quoted(value)}" for label, value in _fields(record).items())
+        pairs = "".join(
+            f" {label}={_quoted(value)}" for label, value in getattr(record, "fields", {}).items()
+        )
         return f"{_time(record)} {record.levelname} {record.getMessage()}{pairs}"
 
 
@@ -83,11 +85,7 @@ class _JsonFormatter(logging.Formatter):
         level, event = record.levelname.lower(), record.getMessage()
         line = {"time": _time(record), "level": level, "event": event}
         # Twice, so that the line begins with them and no field can take their place.
-        return json.dumps({**line, **_fields(record), **line}, default=str)
-
-
-def _fields(record: logging.LogRecord) -> Dict[str, Any]:
-    return getattr(record, "fields", {})
+        return json.dumps({**line, **getattr(record, "fields", {}), **line}, default=str)
 
 
 def _time(record: logging.LogRecord) -> str:

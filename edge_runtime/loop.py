@@ -12,13 +12,12 @@ A command is sent under the lock, so that no late answer can follow a safe stop.
 
 from __future__ import annotations
 
-import fcntl
 import math
 import queue
 import threading
 import time
 import traceback
-from typing import TYPE_CHECKING, BinaryIO, Optional
+from typing import TYPE_CHECKING, Optional
 
 from edge_runtime import log
 from edge_runtime.controller import Controller, Order, Received
@@ -28,10 +27,10 @@ from edge_runtime.log import Flood
 from edge_runtime.policy import Policy, infer
 from edge_runtime.safety import MAX_INFERENCE_S, Event, Mode, Safety
 from edge_runtime.service import BoardWatch, LatencyWindow, Notifier
-from edge_runtime.util import UserError, open_regular
 from edge_runtime.wire import MAX_TEXT_CHARS, TOPICS, Command, Health, Rejection, decode_state
 
-if TYPE_CHECKING:  # Only who has a vehicle loads it.
+if TYPE_CHECKING:  # Loaded only where they are used.
+    from edge_runtime.files import Hold
     from edge_runtime.vehicles.base import VehicleRunner
 
 _HEALTH_PERIOD_S = 1.0 / TOPICS["health"].rate_hz
@@ -39,42 +38,6 @@ _JOIN_S = 0.5
 _RETRY_S = 0.1
 # A policy that computes so long will not end: only a new process helps.
 _HUNG_S = 2.0
-
-
-class Hold:
-    """No command while an installer tries this release: neither on the wire nor to the vehicle.
-
-    The installer holds a lock on the file `path` for as long as it judges. The lock ends with its
-    process, so an installer that dies leaves nobody silent. Once free, this process never asks
-    again. None, or a file that is not there, holds nothing; UserError for one that cannot be read:
-    nobody could say whether it holds.
-    """
-
-    def __init__(self, path: Optional[str] = None) -> None:
-        self._stream: Optional[BinaryIO] = None
-        if path is not None:
-            try:
-                self._stream = open_regular(path)  # kept until it is free
-            except FileNotFoundError:
-                return
-            except OSError as error:
-                raise UserError(f"hold {path} cannot be read: {error.strerror}") from None
-
-    def is_on(self) -> bool:
-        """Whether commands must stay here. Never waits."""
-        if self._stream is None:
-            return False
-        try:
-            fcntl.flock(self._stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        self._stream.close()
-        self._stream = None
-        return False
-
-    def refusal(self) -> str:
-        """Why nobody may re-arm now; empty when free."""
-        return "an installer tries this release; re-arm when it is done" if self.is_on() else ""
 
 
 class ControlLoop:
@@ -90,12 +53,9 @@ class ControlLoop:
         hold: Optional[Hold] = None,
         rearm_command: str = "",
     ) -> None:
-        self._policy = policy
-        self._controller = controller
-        self._link = link
-        self._vehicle = vehicle
-        self._notifier = notifier
-        self._hold = hold or Hold()
+        self._policy, self._controller, self._link = policy, controller, link
+        self._vehicle, self._notifier = vehicle, notifier
+        self._hold = hold
         self._rearm_command = rearm_command
         self._board = BoardWatch()
         self._latest = LatestState()
@@ -138,7 +98,7 @@ class ControlLoop:
                     self._link.send("health", self.health())
                     next_health_s = max(next_health_s + _HEALTH_PERIOD_S, now_s)
                 if alive_period_s and now_s >= next_alive_s and not self._is_hung(now_s):
-                    self._notifier.watchdog()
+                    self._notifier.tell("WATCHDOG=1")
                     next_alive_s = now_s + alive_period_s
                 self._sleep(min(next_health_s, max(next_alive_s, now_s + _RETRY_S)))
 
@@ -247,9 +207,7 @@ class ControlLoop:
         return self._busy_since_s is not None and now_s - self._busy_since_s > _HUNG_S
 
     def _look_at_vehicle(self, now_s: float) -> None:
-        if self._vehicle is None:
-            return
-        fault = self._vehicle.fault(now_s)
+        fault = self._vehicle.fault(now_s) if self._vehicle is not None else ""
         if fault != self._controller.vehicle_fault:
             log.event("warning" if fault else "info", "vehicle", fault=fault)
             self._controller.vehicle_fault = fault
@@ -265,7 +223,8 @@ class ControlLoop:
             if self._vehicle is not None:
                 # What stopped it and is over ends with `enable`; the next look says if it did.
                 self._controller.vehicle_fault = self._vehicle.standing_fault(now_s)
-            refusal = self._hold.refusal() or self._controller.rearm(now_s)
+            refusal = self._hold.refusal() if self._hold is not None else ""
+            refusal = refusal or self._controller.rearm(now_s)
             if not refusal and self._vehicle is not None:
                 self._vehicle.enable()
             log.event("info", "rearm", accepted=not refusal, detail=refusal)
@@ -285,7 +244,7 @@ class ControlLoop:
 
     def _send(self, order: Optional[Order]) -> None:
         self._log_transition()
-        if order is None or self._hold.is_on():
+        if order is None or (self._hold is not None and self._hold.is_on()):
             return
         state = order.answers.state
         command = Command(
@@ -314,7 +273,7 @@ class ControlLoop:
             was, now = self._logged.mode.value, safety.mode.value
             log.event(level, "mode", was=was, now=now, reason=safety.reason)
             self._logged = safety
-            self._notifier.status(f"{safety.mode.value} {safety.reason}".rstrip())
+            self._notifier.tell(f"STATUS={safety.mode.value} {safety.reason}".rstrip())
         waits = self._controller.waits_for_rearm
         if waits and not self._logged_wait:
             log.event("warning", "waits_for_rearm", command=self._rearm_command)

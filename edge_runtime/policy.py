@@ -13,14 +13,7 @@ import numpy as np
 import onnxruntime
 
 from edge_runtime import log
-from edge_runtime.policy_file import (
-    MANIFEST_KEY,
-    Manifest,
-    OnnxFile,
-    check_trust,
-    decode_manifest,
-    read_onnx,
-)
+from edge_runtime.policy_file import MANIFEST_KEY, Manifest, check_trust, decode_manifest, read_onnx
 from edge_runtime.util import PathLike, UserError, read_bytes
 from edge_runtime.wire import FRAMES_SHAPE
 
@@ -67,7 +60,7 @@ def load_policy(
     data = read_bytes(path, "policy file")
     trust = check_trust(path, data, public_key, allow_unsigned)
     try:
-        manifest = _read_manifest(read_onnx(data))
+        manifest = _read_manifest(data)
         session = _open(data)
         _check_tensor("input", session.get_inputs(), INPUT, "tensor(uint8)", FRAMES_SHAPE)
         actions = (len(manifest.action),)
@@ -84,7 +77,8 @@ def policy_id_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _read_manifest(model: OnnxFile) -> Manifest:
+def _read_manifest(data: bytes) -> Manifest:
+    model = read_onnx(data)
     if model.opset != OPSET or model.ir_version > MAX_IR_VERSION:
         raise UserError(
             f"it has opset {model.opset} and IR version {model.ir_version};"
@@ -114,8 +108,7 @@ def _check_tensor(what: str, found: List, name: str, kind: str, shape: Sequence[
 def _open(data: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     # One thread: so small a network gains nothing from more, and the board has other work.
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
     # Read as what was checked: bytes can be an ONNX file and one of onnxruntime's own format.
     options.add_session_config_entry("session.load_model_format", "ONNX")
@@ -129,8 +122,8 @@ def _open(data: bytes) -> onnxruntime.InferenceSession:
 
 def probe_frames() -> Iterator[np.ndarray]:
     """The pictures every policy must answer before it drives: black, grey, and seeded noise."""
-    for level in (0, 128):
-        yield np.full(FRAMES_SHAPE, level, dtype=np.uint8)
+    yield np.full(FRAMES_SHAPE, 0, dtype=np.uint8)
+    yield np.full(FRAMES_SHAPE, 128, dtype=np.uint8)
     yield np.random.RandomState(0).randint(0, 256, FRAMES_SHAPE).astype(np.uint8)
 
 

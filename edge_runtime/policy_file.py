@@ -8,19 +8,8 @@ sees, does, and where it comes from. Contract, section 4.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import (
-    Any,
-    Dict,
-    Iterator,
-    List,
-    NamedTuple,
-    Optional,
-    Sequence,
-    Tuple,
-    Union,
-)
+from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple, Union
 
 import msgspec
 
@@ -51,32 +40,24 @@ class OnnxFile(NamedTuple):
     metadata: Dict[str, str]
 
 
-class _Kind(NamedTuple):
-    """One kind of message: its plain fields, its messages by field, and what is refused by name."""
-
-    plain: Tuple[int, ...]
-    nested: Dict[int, str]
-    refused: Dict[int, str]
-
-
-# Field numbers of onnx.proto (ONNX 1.12 and later; they never change). A field that is not listed
-# could keep weights where nobody looks, or in a file that nobody has signed; onnxruntime would take
-# them.
+# Field numbers of onnx.proto (ONNX 1.12 and later; they never change), by kind of message: plain
+# fields, messages by field, and what is refused by name. A field that is not listed is refused,
+# too: it could keep weights where nobody looks, or in a file that nobody has signed.
 _SPARSE, _OUTSIDE = "sparse weights", "weights in another file (export it in one file)"
-_KINDS: Dict[str, _Kind] = {
-    "model": _Kind(
+_KINDS: Dict[str, Tuple[Tuple[int, ...], Dict[int, str], Dict[int, str]]] = {
+    "model": (
         (1, 2, 3, 4, 5, 6, 8, 14),
         {7: "graph"},
         {20: "graphs for training", 25: "functions of its own"},
     ),
-    "graph": _Kind((2, 10, 11, 12, 13, 14, 16), {1: "node", 5: "tensor"}, {15: _SPARSE}),
-    "node": _Kind((1, 2, 3, 4, 6, 7, 8, 9), {5: "attribute"}, {}),
-    "attribute": _Kind(
+    "graph": ((2, 10, 11, 12, 13, 14, 16), {1: "node", 5: "tensor"}, {15: _SPARSE}),
+    "node": ((1, 2, 3, 4, 6, 7, 8, 9), {5: "attribute"}, {}),
+    "attribute": (
         (1, 2, 3, 4, 7, 8, 9, 13, 14, 15, 20),
         {5: "tensor", 6: "graph", 10: "tensor", 11: "graph"},
         {22: _SPARSE, 23: _SPARSE},
     ),
-    "tensor": _Kind((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}, {13: _OUTSIDE}),
+    "tensor": ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}, {13: _OUTSIDE}),
 }
 _DATA_LOCATION = 14  # of a tensor: 0 is inside
 
@@ -91,7 +72,7 @@ _Fields = List[Tuple[int, _Value]]
 
 def verify(policy_bytes: bytes, signature: bytes, public_key_pem: bytes) -> None:
     """Raise UserError unless `signature` is the key owner's over exactly these bytes."""
-    # Here: who reads a manifest, and verifies nothing, need not wait for it.
+    # Here: reading a manifest alone need not wait for it.
     from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
     from cryptography.hazmat.primitives.serialization import load_pem_public_key
@@ -120,8 +101,8 @@ def check_trust(
 
     A signature is always verified where a public key is known; `allow_unsigned` lets through
     only what cannot be verified, never what fails to. With it, a key beside the policy comes before
-    that of the working directory. Without it, such a key counts for nothing: who brings a policy
-    could bring it, too.
+    that of the working directory. Without it, such a key counts for nothing: a person who
+    brings a policy could bring it, too.
     """
     signature_path = Path(f"{path}{SIGNATURE_SUFFIX}")
     if not signature_path.exists():
@@ -134,25 +115,26 @@ def check_trust(
     signature = read_bytes(signature_path, "signature")
     beside = Path(path).with_name(DEFAULT_PUBLIC_KEY.name)
     is_beside = allow_unsigned and public_key is None and beside.exists()
-    key_path = beside if is_beside else public_key
-    if key_path is None and DEFAULT_PUBLIC_KEY.exists():
-        key_path = DEFAULT_PUBLIC_KEY
-    if key_path is not None:
-        key_pem = read_bytes(key_path, "public key")
-        try:
-            verify(policy_bytes, signature, key_pem)
-        except UserError as error:
-            raise UserError(
-                f"signature {signature_path}, public key {key_path}: {error};"
-                " name the key of its signer with --public-key"
-            ) from None
-        return BESIDE if is_beside else VERIFIED
-    if allow_unsigned:
-        return UNVERIFIED
-    raise UserError(
-        f"no public key to verify {signature_path.name} with: name it with --public-key,"
-        f" or put it at {DEFAULT_PUBLIC_KEY}"
-    )
+    if is_beside:
+        public_key = beside
+    elif public_key is None and DEFAULT_PUBLIC_KEY.exists():
+        public_key = DEFAULT_PUBLIC_KEY
+    if public_key is None:
+        if allow_unsigned:
+            return UNVERIFIED
+        raise UserError(
+            f"no public key to verify {signature_path.name} with: name it with --public-key,"
+            f" or put it at {DEFAULT_PUBLIC_KEY}"
+        )
+    key_pem = read_bytes(public_key, "public key")
+    try:
+        verify(policy_bytes, signature, key_pem)
+    except UserError as error:
+        raise UserError(
+            f"signature {signature_path}, public key {public_key}: {error};"
+            " name the key of its signer with --public-key"
+        ) from None
+    return BESIDE if is_beside else VERIFIED
 
 
 def read_onnx(data: bytes) -> OnnxFile:
@@ -162,24 +144,21 @@ def read_onnx(data: bytes) -> OnnxFile:
     inside the file.
     """
     try:
-        return _read_model(_checked(memoryview(data), "model"))
+        model = _checked(memoryview(data), "model")
+        # A protobuf library would merge two graphs into one that was not looked at here.
+        graphs = sum(number == 7 for number, _ in model)
+        versions = [value for number, value in model if number == 1 and isinstance(value, int)]
+        if graphs != 1 or not versions:
+            raise ValueError(f"it holds {graphs} graphs, not one")
+        opsets = [dict(_fields(_bytes(value))) for number, value in model if number == 8]
+        entries = [dict(_fields(_bytes(value))) for number, value in model if number == 14]
+        known = [opset.get(2, 0) for opset in opsets if _text(opset.get(1)) in ("", "ai.onnx")]
+        numbers = [value for value in known if isinstance(value, int)]
+        if not numbers:
+            raise ValueError("it names no operator set")
+        metadata = {_text(entry.get(1)): _text(entry.get(2)) for entry in entries}
     except ValueError as error:
         raise UserError(f"not a whole ONNX file: {error}") from None
-
-
-def _read_model(fields: _Fields) -> OnnxFile:
-    # A protobuf library would merge two graphs into one that was not looked at here.
-    graphs = sum(number == 7 for number, _ in fields)
-    versions = [value for number, value in fields if number == 1 and isinstance(value, int)]
-    if graphs != 1 or not versions:
-        raise ValueError(f"it holds {graphs} graphs, not one")
-    opsets = [dict(_fields(_bytes(value))) for number, value in fields if number == 8]
-    entries = [dict(_fields(_bytes(value))) for number, value in fields if number == 14]
-    known = [opset.get(2, 0) for opset in opsets if _text(opset.get(1)) in ("", "ai.onnx")]
-    numbers = [value for value in known if isinstance(value, int)]
-    if not numbers:
-        raise ValueError("it names no operator set")
-    metadata = {_text(entry.get(1)): _text(entry.get(2)) for entry in entries}
     return OnnxFile(versions[-1], max(numbers), metadata)
 
 
@@ -211,14 +190,15 @@ def _fields(message: memoryview) -> Iterator[Tuple[int, _Value]]:
         number, wire_type = tag >> 3, tag & 7
         if number == 0:
             raise ValueError("a field has number 0")
-        length = _FIXED_BYTES.get(wire_type)
         if wire_type == _VARINT:
             value, position = _varint(message, position)
             yield number, value
             continue
         if wire_type == _BYTES:
             length, position = _varint(message, position)
-        if length is None:
+        elif wire_type in _FIXED_BYTES:
+            length = _FIXED_BYTES[wire_type]
+        else:
             raise ValueError(f"unknown wire type {wire_type}")
         if position + length > len(message):
             raise ValueError("it ends within a field")
@@ -304,11 +284,6 @@ def decode_manifest(text: str) -> Manifest:
         manifest = msgspec.json.decode(text.encode(), type=Manifest)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise UserError(f"the manifest in the policy file is not valid: {error}") from None
-    _check_manifest(manifest)
-    return manifest
-
-
-def _check_manifest(manifest: Manifest) -> None:
     if manifest.schema != MANIFEST_SCHEMA:
         raise UserError(
             f"the manifest has schema {manifest.schema}, this runtime reads {MANIFEST_SCHEMA}"
@@ -323,28 +298,27 @@ def _check_manifest(manifest: Manifest) -> None:
             "the manifest's observation is not the wire's:"
             f" {Observation()} is needed, {manifest.observation} was found"
         )
-    if not manifest.action:
-        raise UserError("the manifest names no action")
-    for action in manifest.action:
-        _check_action(action)
     names = [action.name for action in manifest.action]
+    if not names:
+        raise UserError("the manifest names no action")
     if len(set(names)) != len(names):
         raise UserError(f"the manifest names an action twice: {', '.join(names)}")
+    for action in manifest.action:
+        _check_action(action)
+    return manifest
 
 
 def _check_action(action: Action) -> None:
-    if action.name not in ACTION_NAMES:
+    name, low, high = action.name, action.low, action.high
+    if name not in ACTION_NAMES:
         raise UserError(
-            f"the runtime does not know how to stop the action {action.name!r} safely;"
+            f"the runtime does not know how to stop the action {name!r} safely;"
             f" it knows {', '.join(ACTION_NAMES)}"
         )
-    finite = math.isfinite(action.low) and math.isfinite(action.high)
-    if not (finite and -1.0 <= action.low < action.high <= 1.0):
+    if not -1.0 <= low < high <= 1.0:  # nor is NaN
+        raise UserError(f"the range of {name} is {low} to {high}; it must lie in -1 to 1")
+    if name == "pedal" and low != FULL_BRAKE:
         raise UserError(
-            f"the range of {action.name} is {action.low} to {action.high}; it must lie in -1 to 1"
-        )
-    if action.name == "pedal" and action.low != FULL_BRAKE:
-        raise UserError(
-            f"the range of pedal begins at {action.low}, not {FULL_BRAKE}: it could not brake"
+            f"the range of pedal begins at {low}, not {FULL_BRAKE}: it could not brake"
             " fully in a safe stop"
         )

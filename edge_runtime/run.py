@@ -16,16 +16,18 @@ from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Tuple
 import zenoh
 
 from edge_runtime import log, service
-from edge_runtime.config import NONE, Config, load_config
+from edge_runtime.config import NONE, Config, add_flags, add_trust, load_config
 from edge_runtime.controller import Controller, limit_rows
 from edge_runtime.link import Link, require_free, taken, wait_for_router
-from edge_runtime.loop import ControlLoop, Hold
-from edge_runtime.policy import Policy, load_policy
+from edge_runtime.loop import ControlLoop
+from edge_runtime.policy import load_policy
+from edge_runtime.policy_file import VERIFIED
 from edge_runtime.transport import is_tls, open_session
 from edge_runtime.util import UserError, ending_signals
 from edge_runtime.wire import key
 
-if TYPE_CHECKING:  # Only who has a certificate or a vehicle loads what these need.
+if TYPE_CHECKING:  # Loaded only where they are used.
+    from edge_runtime.files import Hold
     from edge_runtime.tls import TlsFiles
     from edge_runtime.vehicles.base import Vehicle, VehicleRunner
 
@@ -48,25 +50,37 @@ class _StopSignal:
         self.on_stop()
 
 
+EXAMPLE = r"""examples:
+  python -m edge_runtime run --policy results/policies/left_turn.onnx \
+      --public-key results/policies/policy.pub
+  python -m edge_runtime run --policy my.onnx --vehicle hunter --bus socketcan:can0 \
+      --connect tls/10.0.0.2:7447 --tls certs/edge-hunter01 --vehicle-id hunter01
+  python -m edge_runtime run --config edge.toml --log-format json"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `run`."""
+    text = "settings; flags on the command line win over it"
+    parser.add_argument("--config", metavar="FILE.toml", help=text)
+    add_flags(parser)
+    add_trust(parser)
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Verify, connect, drive until a signal comes. Raises UserError before the network opens."""
     flags = {name: getattr(arguments, name, None) for name in Config.__struct_fields__}
     config = load_config(arguments.config, flags)
     log.configure(config.log_level, config.log_format)
     try:
-        return _run(config)
+        stop = _StopSignal()
+        runtime = _Runtime(config)
+        stop.on_stop = runtime.loop.stop
+        if not runtime.drive(stop):
+            # The policy's thread hangs in native code, and would hold the interpreter's exit.
+            log.close()
+            os._exit(0)
     finally:
         log.close()
-
-
-def _run(config: Config) -> int:
-    stop = _StopSignal()
-    runtime = _Runtime(config)
-    stop.on_stop = runtime.loop.stop
-    if not runtime.drive(stop):
-        # The policy's thread hangs in native code, and would hold the interpreter's exit.
-        log.close()
-        os._exit(0)
     return 0
 
 
@@ -81,29 +95,46 @@ class _Runtime:
             realtime.configure(config.realtime_priority, config.cpus, config.lock_memory)
         self._config = config
         self._policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
-        # Both of its sessions hear only whom this vehicle's edge may hear.
+        manifest = self._policy.manifest
+        # Both of its sessions hear only what this vehicle's edge may hear.
         connected = partial(open_session, connect=config.connect, tls=tls, access=access)
         self._open_client = partial(connected, mode="client")
         self._notifier = service.Notifier()
         self._rival: Optional[UserError] = None
         with contextlib.ExitStack() as undo:
-            vehicle = _make_vehicle(config, self._policy)
-            if vehicle is not None:
+            vehicle: Optional[Vehicle] = None
+            if config.vehicle != NONE:
+                from edge_runtime.vehicles.registry import make_vehicle
+
+                vehicle = make_vehicle(config.vehicle, config, manifest.scenario)
                 undo.callback(vehicle.close)
-            self._controller = _make_controller(config, self._policy, vehicle)
+            rows = limit_rows(manifest.action, vehicle.limits if vehicle else {})
+            self._controller = Controller(
+                rows, vehicle is not None, config.armed_at_start, manifest.task
+            )
+            hold: Optional[Hold] = None
+            if config.hold is not None:
+                from edge_runtime.files import Hold
+
+                hold = Hold(config.hold)
             alive = key(config.vehicle_id, "alive")
             self._has_router = require_free(self._open_client, alive, config.vehicle_id)
             self._session = connected(mode="peer")
             undo.callback(self._session.close)  # An open one would hang the process at its exit.
-            self._link = Link(self._session, config.vehicle_id, self._policy.manifest)
-            self._runner = _make_runner(vehicle, self._policy, self._link)
+            self._link = Link(self._session, config.vehicle_id, manifest)
+            self._runner: Optional[VehicleRunner] = None
+            if vehicle is not None:
+                from edge_runtime.vehicles.base import VehicleRunner
+
+                names = [action.name for action in manifest.action]
+                self._runner = VehicleRunner(vehicle, names, partial(self._link.send, "feedback"))
             self.loop = ControlLoop(
                 self._policy,
                 self._controller,
                 self._link,
                 self._runner,
                 self._notifier,
-                Hold(config.hold),
+                hold,
                 rearm_command(config.connect, config.vehicle_id),
             )
             undo.pop_all()
@@ -115,21 +146,28 @@ class _Runtime:
 
     def drive(self, stop: _StopSignal) -> bool:
         """Until it is told to stop; False where a thread hangs. UserError where it gave way."""
+        config, policy = self._config, self._policy
         try:
             if self._runner is not None:
-                self._runner.start(self._config.armed_at_start)
+                self._runner.start(config.armed_at_start)
             self.loop.start()
             if self._has_router:
                 wait_for_router(self._session)
             self._link.appear(self._open_client, self._give_way)
-            self._say_ready()
+            if policy.trust != VERIFIED:
+                log.event("warning", "policy_not_verified", trust=policy.trust)
+            print(
+                f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
+                f" connect={config.connect} policy_id={policy.policy_id}",
+                flush=True,
+            )
             self._waiting.start(bool(self._session.info.routers_zid()))
-            self._notifier.ready(self._controller.safety.mode.value)
+            self._notifier.tell(f"READY=1\nSTATUS={self._controller.safety.mode.value}")
             if not stop.came:
                 self.loop.run()
         finally:
             self._waiting.stop()
-            self._notifier.stopping()
+            self._notifier.tell("STOPPING=1")
             ended = self.loop.close()
             if self._runner is not None:
                 self._runner.close()
@@ -153,16 +191,6 @@ class _Runtime:
         self._link.mute()
         self.loop.stop()
 
-    def _say_ready(self) -> None:
-        config, policy = self._config, self._policy
-        if policy.trust != "verified":
-            log.event("warning", "policy_not_verified", trust=policy.trust)
-        print(
-            f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
-            f" connect={config.connect} policy_id={policy.policy_id}",
-            flush=True,
-        )
-
 
 def _certificate(config: Config) -> Tuple[Optional[TlsFiles], Optional[Dict[str, Any]]]:
     """The files of --tls, and Zenoh's access control for their party; None each without it."""
@@ -174,29 +202,6 @@ def _certificate(config: Config) -> Tuple[Optional[TlsFiles], Optional[Dict[str,
     tls.check_name(files.name, tls.common_name(tls.EDGE, config.vehicle_id))
     log.event("info", "certificate", of=files.name, expires=f"{files.expires:%Y-%m-%dT%H:%MZ}")
     return files, tls.rules_for_edge(config.vehicle_id)
-
-
-def _make_vehicle(config: Config, policy: Policy) -> Optional[Vehicle]:
-    if config.vehicle == NONE:
-        return None
-    from edge_runtime.vehicles.registry import make_vehicle
-
-    return make_vehicle(config.vehicle, config.vehicle_setup(policy.manifest.scenario))
-
-
-def _make_controller(config: Config, policy: Policy, vehicle: Optional[Vehicle]) -> Controller:
-    manifest = policy.manifest
-    rows = limit_rows(manifest.action, vehicle.limits if vehicle else {})
-    return Controller(rows, vehicle is not None, config.armed_at_start, manifest.task)
-
-
-def _make_runner(vehicle: Optional[Vehicle], policy: Policy, link: Link) -> Optional[VehicleRunner]:
-    if vehicle is None:
-        return None
-    from edge_runtime.vehicles.base import VehicleRunner
-
-    names = [action.name for action in policy.manifest.action]
-    return VehicleRunner(vehicle, names, lambda feedback: link.send("feedback", feedback))
 
 
 def rearm_command(connect: str, vehicle_id: str) -> str:
@@ -232,7 +237,7 @@ class Waiting:
         threading.Thread(target=self._run, name="waiting", daemon=True).start()
 
     def stop(self) -> None:
-        """Say nothing more. Waits for nobody."""
+        """Say nothing more. Never waits."""
         self._ended.set()
 
     def _run(self) -> None:

@@ -128,20 +128,15 @@ def classify_fresh(safety: Safety, final: bool, needs_rearm: bool) -> Event:
 def advance(safety: Safety, event: Event) -> Safety:
     """The state after the event. Arrival times are noted by `note_arrival`."""
     mode = TRANSITIONS[safety.mode, event]
-    stopped = mode is Mode.SAFE_STOP and safety.mode is not Mode.SAFE_STOP
-    is_fault = event in FAULTS
-    reason = safety.reason if mode is Mode.SAFE_STOP else ""
-    if is_fault and mode is Mode.SAFE_STOP:
-        reason = event.value
+    stops, is_fault = mode is Mode.SAFE_STOP, event in FAULTS
+    reason = event.value if is_fault else safety.reason
     return safety._replace(
         mode=mode,
-        reason=reason,
-        fresh_in_a_row=_count_fresh(safety, event),
+        reason=reason if stops else "",
+        fresh_in_a_row=0 if is_fault else safety.fresh_in_a_row + int(event in FRESH_EVENTS),
         # A fault takes an unused permission back: it was given for another situation.
-        rearmed=mode is Mode.SAFE_STOP
-        and not is_fault
-        and (safety.rearmed or event is Event.REARM),
-        safe_stops=safety.safe_stops + int(stopped),
+        rearmed=stops and not is_fault and (safety.rearmed or event is Event.REARM),
+        safe_stops=safety.safe_stops + int(stops and safety.mode is not Mode.SAFE_STOP),
     )
 
 
@@ -153,9 +148,3 @@ def note_arrival(safety: Safety, session: str, arrived_s: float) -> Safety:
         permitted_s=arrived_s if drives else safety.permitted_s,
         session=session,
     )
-
-
-def _count_fresh(safety: Safety, event: Event) -> int:
-    if event in FAULTS:
-        return 0
-    return safety.fresh_in_a_row + int(event in FRESH_EVENTS)

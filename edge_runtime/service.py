@@ -41,23 +41,8 @@ class Notifier:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.setblocking(False)
 
-    def ready(self, status: str) -> None:
-        """The runtime listens to states."""
-        self._send(f"READY=1\nSTATUS={status}")
-
-    def status(self, status: str) -> None:
-        """A line for `systemctl status`."""
-        self._send(f"STATUS={status}")
-
-    def watchdog(self) -> None:
-        """The runtime works. Say it every `watchdog_period_s`, or systemd restarts the service."""
-        self._send("WATCHDOG=1")
-
-    def stopping(self) -> None:
-        """The runtime ends because it was asked to."""
-        self._send("STOPPING=1")
-
-    def _send(self, text: str) -> None:
+    def tell(self, text: str) -> None:
+        """Send a state of sd_notify(3), like `READY=1`; never waits."""
         if self._socket is None or self._address is None:
             return
         try:
@@ -78,9 +63,6 @@ def _watchdog_period_s(environment: Mapping[str, str]) -> Optional[float]:
     except ValueError:
         return None
     return timeout_us / 2e6 if timeout_us > 0 and pid == os.getpid() else None
-
-
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 class Board(NamedTuple):

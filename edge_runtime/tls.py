@@ -1,10 +1,10 @@
-"""Who a party is, and what it may say and hear: certificates, private keys, access rights.
+"""What a party is called, and what it may say and hear: certificates, private keys, rights.
 
 `ca.pem`, `cert.pem` and `key.pem` are read and held against one another before a session is opened,
 because Zenoh's own message for any fault in them is "Unable to connect". ROLES is the table of
 rights, by the common name of the certificate. Zenoh filters only in the process that holds the
-configuration. That is whoever listens, the simulator or the router, and each edge runtime for what
-comes to it. A refused message is dropped without a word to its sender.
+configuration. That is the simulator or router that listens, and each edge runtime for what comes to
+it. A refused message is dropped without a word to its sender.
 """
 
 from __future__ import annotations
@@ -17,6 +17,10 @@ from typing import TYPE_CHECKING, Any, Dict, List, NamedTuple, Optional, Sequenc
 from edge_runtime.util import PathLike, UserError, read_bytes
 from edge_runtime.wire import check_vehicle_id
 
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.x509 import Certificate
+
 CA_FILE, CERTIFICATE_FILE, KEY_FILE = "ca.pem", "cert.pem", "key.pem"
 
 # Nothing for others, and no writing for the group. A group may read: systemd hands a service its
@@ -25,28 +29,15 @@ _OPEN_MODE = 0o027
 
 
 class TlsFiles(NamedTuple):
-    """A party's files, checked. The directory is what `--tls` names."""
+    """A party's three files, checked, as paths."""
 
-    directory: Path
+    ca: str
+    certificate: str
+    key: str
     name: str
     """The certificate's common name, as in `edge-hunter01`: what access control goes by."""
     expires: datetime.datetime
     """UTC."""
-
-    @property
-    def ca(self) -> str:
-        """The authority whose certificates this party believes."""
-        return str(self.directory / CA_FILE)
-
-    @property
-    def certificate(self) -> str:
-        """The certificate that shows who this party is."""
-        return str(self.directory / CERTIFICATE_FILE)
-
-    @property
-    def key(self) -> str:
-        """The private key of that certificate."""
-        return str(self.directory / KEY_FILE)
 
     def zenoh_rows(self) -> Dict[str, Any]:
         """Zenoh's `transport/link/tls`: mutual, names verified, links closed when they expire."""
@@ -64,7 +55,7 @@ class TlsFiles(NamedTuple):
 
 def tls_for(directory: Optional[PathLike], *endpoints: Optional[str]) -> Optional[TlsFiles]:
     """The files of `--tls DIR`, None without it; UserError where endpoints do not go with that."""
-    from edge_runtime.transport import check_fits  # Here: who makes certificates opens no session.
+    from edge_runtime.transport import check_fits  # Here: `deploy certs` opens no session.
 
     for endpoint in endpoints:
         if endpoint is not None:
@@ -78,52 +69,45 @@ def load_tls(directory: PathLike) -> TlsFiles:
     Raises UserError for a file that is missing or no PEM, a key that others can read or that is
     another certificate's, a certificate of another authority, expired, or not valid yet.
     """
-    from cryptography import x509  # Only who uses TLS pays for it, in memory and at the start.
+    # Here: without TLS nothing pays for it, in memory and at the start.
+    from cryptography import x509
+    from cryptography.exceptions import InvalidSignature
 
     folder = Path(os.path.abspath(directory))  # Zenoh opens the files later.
     if not folder.is_dir():
         raise UserError(f"--tls {directory} is no directory; `python -m deploy certs` makes one")
-    ca = _certificate(folder / CA_FILE, x509)
-    certificate = _certificate(folder / CERTIFICATE_FILE, x509)
-    _check_key(folder / KEY_FILE, certificate)
-    _check_issuer(folder, certificate, ca)
-    for path, each in ((folder / CERTIFICATE_FILE, certificate), (folder / CA_FILE, ca)):
-        _check_dates(path, each)
+    ca_path, path, key_path = (folder / name for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE))
+    ca, certificate = (_read_certificate(each) for each in (ca_path, path))
+    key = read_private_key(key_path)
+    if key_path.stat().st_mode & _OPEN_MODE:
+        raise UserError(f"private key {key_path} is open to others; close it: chmod 600 {key_path}")
+    if key.public_key() != certificate.public_key():
+        raise UserError(f"private key {key_path} does not fit {CERTIFICATE_FILE} beside it")
+    try:
+        certificate.verify_directly_issued_by(ca)
+    except (ValueError, TypeError, InvalidSignature):
+        raise UserError(f"{path} was not issued by the authority in {CA_FILE} beside it") from None
+    _check_dates(path, certificate)
+    _check_dates(ca_path, ca)
     names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
     name = str(names[0].value) if names else ""
-    return TlsFiles(folder, name, _utc(certificate, "not_valid_after"))
+    paths = (str(ca_path), str(path), str(key_path))
+    return TlsFiles(*paths, name, certificate.not_valid_after_utc)
 
 
-def _certificate(path: Path, x509: Any) -> Any:
+def _read_certificate(path: Path) -> Certificate:
+    from cryptography.x509 import load_pem_x509_certificate
+
     data = read_bytes(path, "certificate")
     try:
-        return x509.load_pem_x509_certificate(data)
+        return load_pem_x509_certificate(data)
     except ValueError:
         raise UserError(f"{path} is not a certificate in PEM") from None
 
 
-def _check_key(path: Path, certificate: Any) -> None:
-    key = read_private_key(path)
-    if path.stat().st_mode & _OPEN_MODE:
-        raise UserError(f"private key {path} is open to others; close it: chmod 600 {path}")
-    if key.public_key() != certificate.public_key():
-        raise UserError(f"private key {path} does not fit {CERTIFICATE_FILE} beside it")
-
-
-def _check_issuer(folder: Path, certificate: Any, ca: Any) -> None:
-    from cryptography.exceptions import InvalidSignature
-
-    try:
-        certificate.verify_directly_issued_by(ca)
-    except (ValueError, TypeError, InvalidSignature):
-        raise UserError(
-            f"{folder / CERTIFICATE_FILE} was not issued by the authority in {CA_FILE} beside it"
-        ) from None
-
-
-def _check_dates(path: Path, certificate: Any) -> None:
+def _check_dates(path: Path, certificate: Certificate) -> None:
     now = datetime.datetime.now(datetime.timezone.utc)
-    begins, ends = _utc(certificate, "not_valid_before"), _utc(certificate, "not_valid_after")
+    begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     if now >= ends:
         raise UserError(f"{path} expired at {ends:%Y-%m-%d %H:%M} UTC; make a new one")
     if now < begins:
@@ -133,21 +117,8 @@ def _check_dates(path: Path, certificate: Any) -> None:
         )
 
 
-def _utc(certificate: Any, field: str) -> datetime.datetime:
-    """The date with its time zone; cryptography before 42 has it without one only."""
-    aware: Optional[datetime.datetime] = getattr(certificate, f"{field}_utc", None)
-    if aware is None:
-        aware = getattr(certificate, field).replace(tzinfo=datetime.timezone.utc)
-    return aware
-
-
-if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-
 def read_private_key(path: PathLike) -> Any:
-    """A private key of any kind, without a password. Raises UserError where the file holds none."""
-    # Only who has a key pays for these, in memory and at the start.
+    """A private key of any kind, without a password; UserError where the file holds none."""
     from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
@@ -186,7 +157,7 @@ class Rights(NamedTuple):
     watches: Tuple[str, ...] = ()
     """Liveliness tokens of others."""
     all_vehicles: bool = False
-    """Of every vehicle, not of its own alone."""
+    """Its rights hold for every vehicle, not for its own alone."""
     listens: bool = False
     """Others connect to it: its certificate is a server's, too."""
 
@@ -234,7 +205,7 @@ def common_name(role: str, vehicle_id: Optional[str] = None) -> str:
 
 
 def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
-    """Zenoh's `access_control` for who listens: the rights of every party of these vehicles.
+    """Zenoh's `access_control` for a listener: the rights of every party of these vehicles.
 
     All else is denied: other names, other keys, and `delete` for everybody.
     """
@@ -254,7 +225,12 @@ def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
     Without it, the simulator of another vehicle could pose as the one that this edge looks for:
     its certificate is a server's, too, and of the same authority.
     """
-    rules = [_turned(rule) for rule in _rules(EDGE, vehicle_id)]
+    # The same rules as the edge itself applies them: what it may send leaves here.
+    turn = {"ingress": "egress", "egress": "ingress"}
+    rules = [
+        {**rule, "flows": [turn[flow] for flow in rule["flows"]]}
+        for rule in _rules(EDGE, vehicle_id)
+    ]
     return _access_control({common_name(SIMULATOR, vehicle_id): rules, ROUTER: rules})
 
 
@@ -280,11 +256,6 @@ def _rules(role: str, vehicle_id: Optional[str]) -> List[Dict[str, Any]]:
             rows.append({"messages": from_it, "flows": ["ingress"], "key_exprs": keys})
             rows.append({"messages": to_it, "flows": ["egress"], "key_exprs": keys})
     return rows
-
-
-def _turned(rule: Dict[str, Any]) -> Dict[str, Any]:
-    """The same rule as the party itself applies it: what it may send leaves here."""
-    return {**rule, "flows": ["egress" if rule["flows"] == ["ingress"] else "ingress"]}
 
 
 def _access_control(rules_by_name: Dict[str, List[Dict[str, Any]]]) -> Dict[str, Any]:

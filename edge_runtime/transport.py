@@ -42,7 +42,7 @@ def check_endpoint(endpoint: str) -> str:
 
 
 def is_tls(endpoint: str) -> bool:
-    """Is it an endpoint of a protocol that asks for certificates?"""
+    """Whether the endpoint's protocol asks for certificates."""
     return endpoint.split("/", 1)[0] in TLS_PROTOCOLS
 
 
@@ -69,8 +69,8 @@ def open_session(
 ) -> zenoh.Session:
     """Open a session that listens, connects, or both. Close it before the process ends.
 
-    `tls` is what `tls_for` gave; `access` is Zenoh's `access_control`, of tls.py, and whoever
-    listens with TLS must have it.
+    `tls` is what `tls_for` gave; `access` is Zenoh's `access_control`, of tls.py; a session
+    that listens with TLS must have it.
     Raises UserError for a malformed endpoint, one that does not go with `tls`, a busy port, a
     link that either end refuses, and, in client mode, nobody there.
     """
@@ -79,7 +79,7 @@ def open_session(
     listens = [listen] if isinstance(listen, str) else list(listen or [])
     if listens and tls is not None and access is None:
         raise ValueError(
-            "who listens with TLS needs access control: every certificate could say all"
+            "a listener with TLS needs access control: every certificate could say all"
         )
     for endpoint in [*listens, *([] if connect is None else [connect])]:
         check_fits(check_endpoint(endpoint), tls is not None)
@@ -87,27 +87,26 @@ def open_session(
         from edge_runtime import link_probe  # No board listens.
 
         link_probe.check_ports_are_free(listens)
+    config = zenoh.Config()
+    for name, value in session_rows(listens, connect, mode, tls, access).items():
+        config.insert_json5(name, json.dumps(value))
     try:
-        session = zenoh.open(_config(session_rows(listens, connect, mode, tls, access)))
+        session = zenoh.open(config)
     except zenoh.ZError as error:
         if connect is None or listens:
             raise UserError(f"Zenoh cannot open {', '.join(listens) or connect}: {error}") from None
-        from edge_runtime import link_probe  # Only for who does not get a link.
+        from edge_runtime import link_probe  # Only where there is no link.
 
         raise UserError(link_probe.why_nobody_answers(connect, tls)) from None
     if connect is not None and tls is not None and not session.info.routers_zid():
-        _check_refusal(session, connect, tls)
+        from edge_runtime import link_probe  # As above.
+
+        # A peer goes on trying for ever, also where it will never be let in: say so now.
+        refusal = link_probe.why_refused(connect, tls)
+        if refusal and not session.info.routers_zid():
+            session.close()
+            raise UserError(refusal)
     return session
-
-
-def _check_refusal(session: zenoh.Session, connect: str, tls: TlsFiles) -> None:
-    """A peer goes on trying for ever, also where it will never be let in: say so now."""
-    from edge_runtime import link_probe  # As above.
-
-    refusal = link_probe.why_refused(connect, tls)
-    if refusal and not session.info.routers_zid():
-        session.close()
-        raise UserError(refusal)
 
 
 def session_rows(
@@ -139,13 +138,6 @@ def session_rows(
     if access is not None:
         rows["access_control"] = access
     return rows
-
-
-def _config(rows: Dict[str, Any]) -> zenoh.Config:
-    config = zenoh.Config()
-    for name, value in rows.items():
-        config.insert_json5(name, json.dumps(value))
-    return config
 
 
 def only_own(key: str, hear: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:

@@ -195,8 +195,6 @@ class _Envelope(msgspec.Struct):
 
 
 _M = TypeVar("_M", State, Command, Feedback, Health)
-# A vehicle that has not yet had a command reports step -1.
-_LEAST: Dict[Any, int] = {Feedback: -1}
 _ENVELOPE = msgspec.msgpack.Decoder(_Envelope)
 _DECODERS: Dict[Any, Any] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in (State, Command, Feedback, Health)
@@ -254,21 +252,15 @@ def _decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
         message: _M = _DECODERS[kind].decode(payload)
     except _DECODE_ERRORS as error:
         return Rejection(Reason.MALFORMED, str(error))
-    return _check_fields(message)
-
-
-def _check_fields(message: _M) -> Union[_M, Rejection]:
-    """Finite floats, short texts and no negative counts, for every field of every message."""
-    least = _LEAST.get(type(message), 0)
+    # Finite floats, short texts and no negative counts, for every field of every message.
+    least = -1 if kind is Feedback else 0  # before its first command a vehicle reports step -1
     for name, value in _leaves(message):
-        if isinstance(value, float):
-            if not math.isfinite(value):
-                return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
-        elif isinstance(value, str):
-            if len(value) > MAX_TEXT_CHARS:
-                detail = f"{name} is longer than {MAX_TEXT_CHARS} characters"
-                return Rejection(Reason.MALFORMED, detail)
-        elif isinstance(value, int) and value < least:
+        if isinstance(value, float) and not math.isfinite(value):
+            return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
+        if isinstance(value, str) and len(value) > MAX_TEXT_CHARS:
+            detail = f"{name} is longer than {MAX_TEXT_CHARS} characters"
+            return Rejection(Reason.MALFORMED, detail)
+        if isinstance(value, int) and value < least:
             return Rejection(Reason.MALFORMED, f"{name} is {value}, below the least value")
     return message
 

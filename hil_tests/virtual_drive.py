@@ -119,9 +119,8 @@ class VirtualHunter:
     """
 
     def __init__(self, scenario: str, parameters: Parameters) -> None:
-        spec = SPECS[MODEL]
-        similarity = similarity_to(car_of(scenario, NAME), spec.max_speed_mps)
-        self.core = HunterCore(spec, DEFAULT_PROFILE, similarity)
+        similarity = similarity_to(car_of(scenario, NAME), SPECS[MODEL])
+        self.core = HunterCore(similarity, DEFAULT_PROFILE)
         self.mock = MockHunter(parameters, 0.0, DEFAULT_PROFILE)
         self.now_ms = 0
 

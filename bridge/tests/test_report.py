@@ -25,7 +25,7 @@ from bridge.tests.harness import (
     start_simulate,
     wait_until_driving_steadily,
 )
-from edge_runtime.__main__ import dispatch
+from edge_runtime.__main__ import main as edge_main
 from edge_runtime.link_probe import free_endpoint
 
 RESULT = EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, 0.0, 123)
@@ -128,6 +128,6 @@ def test_a_car_that_waits_for_its_rearm_says_so_at_both_ends_with_the_command(tm
         told = run.process.stderr.readline()
         assert told == f"the vehicle stands until it is re-armed: {rearm}\n"
         assert f"waits_for_rearm command='{rearm}'" in log.read_text()
-        assert dispatch(shlex.split(rearm)[3:]) == 0
+        assert edge_main(shlex.split(rearm)[3:]) == 0
         wait_until_driving_steadily(log)
         assert log.read_text().count("waits_for_rearm") == 1

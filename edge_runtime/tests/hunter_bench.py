@@ -17,8 +17,7 @@ class Bench:
     """A core, a chassis that obeys at once and says what it is told to, and a clock."""
 
     def __init__(self, scenario="left_turn"):
-        similarity = similarity_to(CARS[scenario], SPEC.max_speed_mps)
-        self.core = HunterCore(SPEC, "v2", similarity)
+        self.core = HunterCore(similarity_to(CARS[scenario], SPEC), "v2")
         self.now_s = 100.0
         self.status = OK
         self.obeys = True

@@ -12,7 +12,7 @@ import can
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
 
-from edge_runtime.config import DEFAULT_BUS, CarSettings, SimilaritySettings, VehicleSetup
+from edge_runtime.config import DEFAULT_BUS, CarSettings, Config, SimilaritySettings
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import stream
@@ -31,7 +31,7 @@ from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 from edge_runtime.vehicles.registry import make_vehicle, vehicle_limits
 
 SPEC = SPECS["2.0"]
-LEFT_TURN = similarity_to(CARS["left_turn"], SPEC.max_speed_mps)
+LEFT_TURN = similarity_to(CARS["left_turn"], SPEC)
 _numbers = itertools.count()
 
 
@@ -99,9 +99,21 @@ def chassis(channel):
 
 @pytest.fixture
 def vehicle(channel):
-    vehicle = HunterVehicle(BusName("virtual", channel, None), SPEC, "v2", LEFT_TURN)
+    vehicle = HunterVehicle(BusName("virtual", channel, None), LEFT_TURN, "v2")
     yield vehicle
     vehicle.close()
+
+
+@pytest.fixture
+def enabled(chassis, vehicle):
+    enable(vehicle)
+    return vehicle
+
+
+@pytest.fixture
+def driving(chassis, enabled):
+    drive(enabled, lambda: chassis.speeds[-1] > 0.2, "speed")
+    return enabled
 
 
 def drive(vehicle, until, what):
@@ -114,8 +126,9 @@ def drive(vehicle, until, what):
     wait_until(step, what)
 
 
-def is_enabled(vehicle):
-    return vehicle.state is State.ENABLED
+def enable(vehicle):
+    vehicle.enable(time.monotonic())
+    wait_until(lambda: vehicle.state is State.ENABLED, "the confirmation")
 
 
 def test_the_stream_keeps_the_manuals_period():
@@ -125,8 +138,7 @@ def test_the_stream_keeps_the_manuals_period():
 def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     time.sleep(0.1)
     assert chassis.heard == []
-    vehicle.enable(time.monotonic())
-    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    enable(vehicle)
     drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed")
     report = vehicle.feedback(time.monotonic())
     assert report.speed_mps > 0.1
@@ -137,8 +149,7 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     count = len(chassis.speeds)
     wait_until(lambda: len(chassis.speeds) > count + 5, "the stream going on")
     assert set(chassis.speeds[count:]) == {0.0}
-    vehicle.enable(time.monotonic())
-    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    enable(vehicle)
     drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed again")
     vehicle.close()
     wait_until(lambda: chassis.heard[-1] == (0x421, b"\x00"), "control given back")
@@ -148,32 +159,25 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     vehicle.close()
 
 
-def test_commands_that_cease_end_in_a_latched_stop(chassis, vehicle):
-    vehicle.enable(time.monotonic())
-    wait_until(lambda: is_enabled(vehicle), "the confirmation")
-    drive(vehicle, lambda: chassis.speeds[-1] > 0.1, "speed")
-    wait_until(lambda: vehicle.state is State.STOPPED, "its own stop")
-    assert vehicle.feedback(time.monotonic()).faults == ["no command for 0.24 s"]
+def test_commands_that_cease_end_in_a_latched_stop(chassis, driving):
+    wait_until(lambda: driving.state is State.STOPPED, "its own stop")
+    assert driving.feedback(time.monotonic()).faults == ["no command for 0.24 s"]
     wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
 
 
-def test_its_own_stop_does_not_wait_for_the_next_period(chassis, vehicle, monkeypatch):
-    vehicle.enable(time.monotonic())
-    wait_until(lambda: is_enabled(vehicle), "the confirmation")
-    drive(vehicle, lambda: chassis.speeds[-1] > 0.1, "speed")
+def test_its_own_stop_does_not_wait_for_the_next_period(chassis, driving, monkeypatch):
     monkeypatch.setattr(stream, "PERIOD_S", 3.0)
     time.sleep(0.05)  # one more period of before
     commanded_s = time.monotonic()
-    vehicle.command({"pedal": 1.0}, commanded_s)
+    driving.command({"pedal": 1.0}, commanded_s)
     wait_until(lambda: chassis.speeds[-1] == 0.0, "its own stop")
     assert time.monotonic() - commanded_s < 1.5
 
 
 def test_the_remote_control_is_reported_and_the_chassis_that_comes_back_is_not_believed(
-    chassis, vehicle
+    chassis, enabled
 ):
-    vehicle.enable(time.monotonic())
-    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+    vehicle = enabled
     chassis.status = chassis.status._replace(mode=protocol.REMOTE_CONTROL)
     wait_until(lambda: vehicle.state is State.STOPPED, "its stop")
     report = vehicle.feedback(time.monotonic())
@@ -184,21 +188,18 @@ def test_the_remote_control_is_reported_and_the_chassis_that_comes_back_is_not_b
     assert set(chassis.speeds[-10:]) == {0.0}
 
 
-def test_a_frame_that_was_held_up_is_followed_at_once_by_one_of_now(chassis, vehicle, monkeypatch):
-    vehicle.enable(time.monotonic())
-    wait_until(lambda: is_enabled(vehicle), "the confirmation")
-    drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed")
+def test_a_frame_that_was_held_up_is_followed_at_once_by_one_of_now(driving, monkeypatch):
     sent: list = []
-    send = vehicle._bus.send
+    send = driving._bus.send
 
     def stopped_in_between(message, timeout=None):
-        if not sent and vehicle.state is State.ENABLED:
+        if not sent and driving.state is State.ENABLED:
             monkeypatch.setattr(stream, "PERIOD_S", 0.4)
             time.sleep(0.5)  # the whole process, as far as the frame can tell
         send(message, timeout=timeout)
         sent.append((time.monotonic(), told_by(message.arbitration_id, message.data).speed_mps))
 
-    monkeypatch.setattr(vehicle._bus, "send", stopped_in_between)
+    monkeypatch.setattr(driving._bus, "send", stopped_in_between)
     wait_until(lambda: len(sent) > 1, "the next frame")
     (held_s, held_mps), (next_s, next_mps) = sent[:2]
     assert held_mps > 0.2
@@ -241,9 +242,7 @@ def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle)
     wait_until(lambda: vehicle.feedback(time.monotonic()).speed_mps == 0.5, "what comes now")
 
 
-def test_random_frames_on_the_bus_never_move_it(chassis, vehicle):
-    vehicle.enable(time.monotonic())
-    wait_until(lambda: is_enabled(vehicle), "the confirmation")
+def test_random_frames_on_the_bus_never_move_it(chassis, enabled):
     junk = can.Bus(interface="virtual", channel=chassis.bus.channel_id)
     try:
         for number in range(2000):
@@ -255,10 +254,9 @@ def test_random_frames_on_the_bus_never_move_it(chassis, vehicle):
             junk.send(message, timeout=0.1)
     finally:
         junk.shutdown()
-    count = len(vehicle.feedback(time.monotonic()).faults)
-    assert count <= 3
-    assert vehicle._stream.is_alive()
-    assert vehicle._listener.is_alive()
+    assert len(enabled.feedback(time.monotonic()).faults) <= 3
+    assert enabled._stream._thread.is_alive()
+    assert enabled._listener.is_alive()
     assert set(chassis.speeds) == {0.0}
 
 
@@ -293,21 +291,39 @@ def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(ch
         ("udp_multicast:239.1.2.3:7", BusName("udp_multicast", "239.1.2.3", None, 7)),
         ("slcan:/dev/ttyACM0", BusName("slcan", "/dev/ttyACM0", 500_000)),
         ("slcan:/dev/ttyACM0:250000", BusName("slcan", "/dev/ttyACM0", 250_000)),
+        ("udp_multicast:", BusName("udp_multicast", GROUP, None, PORT)),
+        ("udp_multicast:239.1.2.3", BusName("udp_multicast", "239.1.2.3", None, PORT)),
     ],
 )
 def test_names_of_buses(text, name):
     assert parse_bus(text) == name
 
 
-@pytest.mark.parametrize("text", ["", "can0", "socketcan:", ":can0", "slcan:a:fast", "slcan:a:0"])
-def test_what_is_no_name_of_a_bus(text):
-    with pytest.raises(UserError, match="write it as INTERFACE:CHANNEL"):
+NO_BUS = "write it as INTERFACE:CHANNEL"
+NO_GROUP = "write it as udp_multicast:239"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        *(
+            (text, NO_BUS)
+            for text in ("", "can0", "socketcan:", ":can0", "slcan:a:fast", "slcan:a:0")
+        ),
+        ("socketcan:can0:500000", "'socketcan:can0:500000'.*ip link.*write socketcan:can0$"),
+        *(
+            (f"udp_multicast:{channel}", NO_GROUP)
+            for channel in (
+                "10.0.0.1", "239.1.2.3:0", "239.1.2.3:70000", "239.1.2:3", "ff15::1", "any",
+                "239.1.2.3:",
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_no_name_of_a_bus_is_refused_in_one_line(text, words):
+    with pytest.raises(UserError, match=words) as refused:
         parse_bus(text)
-
-
-def test_socketcan_has_its_bit_rate_from_elsewhere():
-    with pytest.raises(UserError, match=r"'socketcan:can0:500000'.*ip link.*write socketcan:can0$"):
-        parse_bus("socketcan:can0:500000")
+    assert "\n" not in str(refused.value)
 
 
 def test_buses_that_cannot_be_opened_are_one_line(caplog):
@@ -330,42 +346,23 @@ def test_python_can_is_asked_for_where_it_is_missing(monkeypatch):
 
 
 def test_the_registry_makes_it_for_a_known_scenario_only(channel):
-    setup = VehicleSetup("left_turn", bus=f"virtual:{channel}")
-    vehicle = make_vehicle("hunter", setup)
+    bus = f"virtual:{channel}"
+    vehicle = make_vehicle("hunter", Config(bus=bus), "left_turn")
     assert isinstance(vehicle, HunterVehicle)
     vehicle.close()
-    assert vehicle.limits == vehicle_limits("hunter", setup)
+    assert vehicle.limits == vehicle_limits("hunter", Config(), "left_turn")
     for make in (make_vehicle, vehicle_limits):
         with pytest.raises(UserError, match="parking"):
-            make("hunter", setup._replace(scenario="parking"))
+            make("hunter", Config(bus=bus), "parking")
     car = CarSettings(
         throttle_mps2=1.0, brake_mps2=1.0, max_speed_mps=3.0, full_steering_rad=0.5,
         wheelbase_m=2.0,
     )  # fmt: skip
-    similarity = SimilaritySettings(scale=0.1, car=car)
-    vehicle = make_vehicle("hunter", setup._replace(scenario="parking", similarity=similarity))
+    config = Config(bus=bus, similarity=SimilaritySettings(scale=0.1, car=car))
+    vehicle = make_vehicle("hunter", config, "parking")
     assert isinstance(vehicle, HunterVehicle)
-    assert vehicle._core._similarity.scale == 0.1
+    assert vehicle._core.similarity.scale == 0.1
     vehicle.close()
-
-
-@pytest.mark.parametrize(
-    ("channel", "group", "port"),
-    [("", GROUP, PORT), ("239.1.2.3", "239.1.2.3", PORT), ("239.1.2.3:7", "239.1.2.3", 7)],
-)
-def test_a_group_and_a_port_are_read(channel, group, port):
-    name = parse_bus(f"udp_multicast:{channel}")
-    assert (name.interface, name.channel, name.port) == ("udp_multicast", group, port)
-
-
-@pytest.mark.parametrize(
-    "channel",
-    ["10.0.0.1", "239.1.2.3:0", "239.1.2.3:70000", "239.1.2:3", "ff15::1", "any", "239.1.2.3:"],
-)
-def test_what_is_no_group_is_refused_in_one_line(channel):
-    with pytest.raises(UserError, match="write it as udp_multicast:239") as refused:
-        parse_bus(f"udp_multicast:{channel}")
-    assert "\n" not in str(refused.value)
 
 
 def free_udp_port():

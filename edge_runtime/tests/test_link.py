@@ -11,7 +11,6 @@ from typing import Any, List
 import pytest
 
 from edge_runtime import log, run
-from edge_runtime import run as waiting
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
 from edge_runtime.link_probe import free_endpoint, why_no_link
@@ -96,9 +95,8 @@ class Router:
 
 
 def test_the_younger_of_two_gives_way_at_the_second_look():
-    session: Any = FakeSession()
     router, calls = Router(), []
-    presence = make_presence(session, lambda: calls.append("way"), router.open)
+    presence = make_presence(FakeSession(), lambda: calls.append("way"), router.open)
     router.tokens = [f"k/{presence.claim}", "k/0000000000000001-elder"]
     presence.look()
     assert calls == []  # it may be the leftover of a lost connection
@@ -109,9 +107,8 @@ def test_the_younger_of_two_gives_way_at_the_second_look():
 
 
 def test_the_elder_of_two_goes_on_and_counts():
-    session: Any = FakeSession()
     router, calls = Router(), []
-    presence = make_presence(session, lambda: calls.append("way"), router.open)
+    presence = make_presence(FakeSession(), lambda: calls.append("way"), router.open)
     for claim in ("f" * 16, "f" * 16, "e" * 16, "f" * 16, "e" * 16, "e" * 16):
         router.tokens = [f"k/{presence.claim}", f"k/{claim}"]
         presence.look()
@@ -119,12 +116,10 @@ def test_the_elder_of_two_goes_on_and_counts():
 
 
 def test_nobody_there_is_nobody_else():
-    session: Any = FakeSession()
-
     def fail() -> Any:
         raise UserError("nobody answers")
 
-    presence = make_presence(session, open_client=fail)
+    presence = make_presence(FakeSession(), open_client=fail)
     presence.look()
     presence.look()
     assert presence.rivals == 0
@@ -132,10 +127,14 @@ def test_nobody_there_is_nobody_else():
     assert require_free(Router().open, "k", "hunter01")
 
 
-def test_a_muted_link_sends_nothing():
-    session: Any = FakeSession()
+def make_link(session: Any) -> Link:
     manifest: Any = None
-    link = Link(session, "hunter01", manifest)
+    return Link(session, "hunter01", manifest)
+
+
+def test_a_muted_link_sends_nothing():
+    session = FakeSession()
+    link = make_link(session)
     link.send("health", HEALTH)
     assert session.sent == 1
     link.mute()
@@ -145,7 +144,6 @@ def test_a_muted_link_sends_nothing():
 
 def test_only_a_query_by_its_own_name_re_arms():
     session: Any = FakeSession()
-    manifest: Any = None
     asked: dict = {}
     session.declare_subscriber = lambda key, handler: None
     session.declare_queryable = asked.__setitem__
@@ -155,7 +153,7 @@ def test_only_a_query_by_its_own_name_re_arms():
         calls.append("rearm")
         return ""
 
-    Link(session, "hunter01", manifest).declare(lambda payload: None, lambda: HEALTH, rearm)
+    make_link(session).declare(lambda payload: None, lambda: HEALTH, rearm)
     for selector in ("phil/**", "phil/*/rearm", "phil/hunter01/*", "phil/hunter01/re$*"):
         asked["phil/hunter01/rearm"](query_of(selector))
     assert calls == []  # somebody looked at everything that is there
@@ -168,11 +166,9 @@ def query_of(selector: str) -> Any:
 
 
 def test_the_session_is_closed_even_where_nothing_can_be_undeclared():
-    session: Any = FakeSession(fails=True)
-    manifest: Any = None
-    link = Link(session, "hunter01", manifest)
+    session = FakeSession(fails=True)
     with pytest.raises(OSError, match="gone"):
-        link.close()
+        make_link(session).close()
     assert session.events[-1] == "close"
 
 
@@ -264,7 +260,7 @@ def test_a_state_that_comes_during_the_look_is_not_waited_for(monkeypatch):
 
 def test_one_that_is_linked_has_time_for_its_first_state(monkeypatch):
     said = threading.Event()
-    monkeypatch.setattr(waiting.log, "event", lambda *_, **fields: said.set())
+    monkeypatch.setattr(log, "event", lambda *_, **fields: said.set())
     one = Waiting(lambda: False, lambda: "why")
     one.start(is_linked=True)
     assert not said.wait(0.3)

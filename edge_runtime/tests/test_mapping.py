@@ -9,38 +9,41 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import mapping
-from edge_runtime.vehicles.mapping import CARS, SPECS, car_of, inner_of, similarity_to, steering_of
+from edge_runtime.vehicles.mapping import CARS, LEAD_S, SPECS, car_of, similarity_to
 
-CONGESTION = similarity_to(CARS["congestion"], 1.5)
+HUNTER = SPECS["2.0"]
+MOST = HUNTER.max_speed_mps
+CONGESTION = similarity_to(CARS["congestion"], HUNTER)
+LEFT_TURN = similarity_to(CARS["left_turn"], HUNTER)
+unit = st.floats(-1, 1)
 
 
 def test_speeds_of_the_left_turn_on_the_hunter_by_hand():
-    similarity = similarity_to(car_of("left_turn", "hunter"), max_speed_mps=1.5)
-    assert similarity.scale == 0.25
-    assert similarity.vehicle_mps(6.0) == 1.5
-    assert similarity.scenario_mps(0.5) == 2.0
+    assert similarity_to(car_of("left_turn", "hunter"), HUNTER) == LEFT_TURN
+    assert LEFT_TURN.scale == 0.25
+    assert LEFT_TURN.follow_speed(0.0, 4.0, 100.0) == 1.0
 
 
 def test_curvature_by_hand():
     """Full left (-1): slip atan(tan(0.15) / 2), and a circle of 2.5 m / sin(slip), a quarter."""
     radius_m = 2.5 / math.sin(math.atan(0.5 * math.tan(0.15)))
-    assert CONGESTION.vehicle_curvature(-1.0) == pytest.approx(1 / (0.25 * radius_m))
-    assert CONGESTION.vehicle_curvature(1.0) < 0 == CONGESTION.vehicle_curvature(0.0)
+    assert CONGESTION.car.curvature(-1.0) == pytest.approx(1 / radius_m)
+    assert math.tan(CONGESTION.centre_rad(-1.0)) == pytest.approx(0.650 / (0.25 * radius_m))
+    assert CONGESTION.centre_rad(1.0) < 0 == CONGESTION.centre_rad(0.0)
 
 
 @pytest.mark.parametrize("scenario", CARS)
 @given(steering=st.floats(-1, 1), scale=st.floats(0.01, 2.0))
 def test_steering_there_and_back(scenario, steering, scale):
-    similarity = similarity_to(CARS[scenario], 1.5, scale)
+    similarity = similarity_to(CARS[scenario], HUNTER, scale)
     assert similarity.scale == scale
-    curvature = similarity.vehicle_curvature(steering)
-    assert similarity.steering(curvature) == pytest.approx(steering, abs=1e-9)
+    centre_rad = similarity.centre_rad(steering)
+    assert similarity.steering(centre_rad) == pytest.approx(steering, abs=1e-9)
 
 
 @given(curvature=st.floats(-1e6, 1e6))
 def test_no_curvature_is_too_much_for_the_inverse(curvature):
-    assert math.isfinite(CONGESTION.steering(curvature))
+    assert math.isfinite(CONGESTION.car.steering(curvature))
 
 
 def test_an_unknown_scenario_is_one_line_that_says_what_to_set():
@@ -48,15 +51,9 @@ def test_an_unknown_scenario_is_one_line_that_says_what_to_set():
         car_of("parking", "hunter")
 
 
-HUNTER = SPECS["2.0"]
-LEFT_TURN = similarity_to(CARS["left_turn"], HUNTER.max_speed_mps)
-MOST = HUNTER.max_speed_mps
-unit = st.floats(-1, 1)
-
-
-def pedal_to_speed(set_point, pedal, step_s=0.1, measured=None, similarity=LEFT_TURN):
+def pedal_to_speed(set_point, pedal, step_s=0.1, measured=None):
     measured = set_point if measured is None else measured
-    return mapping.pedal_to_speed(set_point, pedal, step_s, measured, MOST, similarity)
+    return LEFT_TURN.pedal_to_speed(set_point, pedal, step_s, measured)
 
 
 def test_pedals_by_hand():
@@ -76,7 +73,7 @@ def test_a_vehicle_that_is_held_up_does_not_wind_up():
     speed = 0.0
     for _ in range(100):
         speed = pedal_to_speed(speed, 1.0, measured=0.0)
-    assert speed == pytest.approx(0.75 * mapping.LEAD_S)
+    assert speed == pytest.approx(0.75 * LEAD_S)
     assert pedal_to_speed(0.0, 0.5, measured=1.0) == pytest.approx(1.0 - 0.375)
     assert pedal_to_speed(0.0, -0.5, measured=1.0) == 0.0  # a brake that does not bite
 
@@ -91,53 +88,50 @@ def test_no_pedal_leaves_the_range(steps):
 
 @given(unit)
 def test_pedal_to_acceleration_and_back(pedal):
-    acceleration = mapping.pedal_to_acceleration(pedal, LEFT_TURN)
-    assert mapping.acceleration_to_pedal(acceleration, LEFT_TURN) == pytest.approx(pedal)
-    assert abs(mapping.acceleration_to_pedal(100 * acceleration, LEFT_TURN)) <= 1.0
+    acceleration = LEFT_TURN.acceleration_mps2(pedal)
+    assert LEFT_TURN.pedal(acceleration) == pytest.approx(pedal)
+    assert abs(LEFT_TURN.pedal(100 * acceleration)) <= 1.0
 
 
 def test_without_a_pedal_it_follows_the_scenarios_car_within_its_accelerations():
     speed = 0.0
     for _ in range(100):
-        after = mapping.follow_speed(speed, 5.0, 0.02, MOST, CONGESTION)
+        after = CONGESTION.follow_speed(speed, 5.0, 0.02)
         assert after - speed <= 0.75 * 0.02 + 1e-12
         speed = after
     assert speed == pytest.approx(5.0 / 4)
-    assert mapping.follow_speed(speed, 0.0, 0.02, MOST, CONGESTION) == pytest.approx(speed - 0.02)
-    assert mapping.follow_speed(MOST, 100.0, 0.1, MOST, CONGESTION) == MOST
+    assert CONGESTION.follow_speed(speed, 0.0, 0.02) == pytest.approx(speed - 0.02)
+    assert CONGESTION.follow_speed(MOST, 100.0, 0.1) == MOST
 
 
 def test_ackermann_by_hand():
     """A circle of 2 m radius at the rear axle's middle: the inner wheel's is 1.6975 m."""
     centre = math.atan(0.650 / 2.0)
-    inner = mapping.centre_to_inner(centre, 0.650, 0.605, 0.576)
+    inner = HUNTER.inner_rad(centre)
     assert inner == pytest.approx(math.atan(0.650 / (2.0 - 0.3025)))
-    assert mapping.centre_to_inner(-centre, 0.650, 0.605, 0.576) == -inner
+    assert HUNTER.inner_rad(-centre) == -inner
 
 
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
 @given(share=unit)
 def test_inner_to_centre_and_back(spec, share):
     inner = share * spec.max_inner_steering_rad
-    centre = mapping.inner_to_centre(inner, spec.wheelbase_m, spec.track_m)
+    centre = spec.centre_rad(inner)
     assert abs(centre) <= abs(inner) + 1e-12
-    back = mapping.centre_to_inner(
-        centre, spec.wheelbase_m, spec.track_m, spec.max_inner_steering_rad
-    )
-    assert back == pytest.approx(inner, abs=1e-9)
+    assert spec.inner_rad(centre) == pytest.approx(inner, abs=1e-9)
 
 
 @given(st.floats(-1.5, 1.5))
 def test_the_inner_wheel_is_never_turned_too_far(centre):
-    assert abs(mapping.centre_to_inner(centre, 0.650, 0.605, 0.576)) <= 0.576 + 1e-9
+    assert abs(HUNTER.inner_rad(centre)) <= 0.576 + 1e-9
 
 
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
 @given(steering=unit)
 def test_all_the_way_from_the_action_to_the_inner_wheel_and_back(spec, steering):
-    similarity = similarity_to(CARS["congestion"], spec.max_speed_mps)
-    inner = inner_of(steering, spec, similarity)
-    assert steering_of(inner, spec, similarity) == pytest.approx(steering, abs=1e-9)
+    similarity = similarity_to(CARS["congestion"], spec)
+    inner = spec.inner_rad(similarity.centre_rad(steering))
+    assert similarity.steering(spec.centre_rad(inner)) == pytest.approx(steering, abs=1e-9)
     assert inner == 0 or (inner < 0) == (steering > 0)  # its action +1 turns right
 
 
@@ -145,6 +139,6 @@ def test_a_path_of_the_scenario_is_the_same_path_smaller():
     """The heading that a car and the robot gain on the same share of the way is the same."""
     angle = 0.15 * 0.7
     car_rad_per_m = math.sin(math.atan(0.5 * math.tan(angle))) / 2.5
-    centre = mapping.steering_to_centre(-0.7, HUNTER.wheelbase_m, CONGESTION)
+    centre = CONGESTION.centre_rad(-0.7)
     robot_rad_per_m = math.tan(centre) / HUNTER.wheelbase_m
     assert robot_rad_per_m * CONGESTION.scale == pytest.approx(car_rad_per_m)

@@ -10,8 +10,8 @@ import time
 import pytest
 
 from edge_runtime.commands import ask
+from edge_runtime.files import Hold
 from edge_runtime.link_probe import free_endpoint
-from edge_runtime.loop import Hold
 from edge_runtime.tests.harness import (
     BLACK,
     PATIENCE_S,
@@ -25,16 +25,7 @@ from edge_runtime.tests.harness import (
 from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
 
-UNWANTED = {
-    "torch",
-    "gymnasium",
-    "highway_env",
-    "rerun",
-    "rerun_sdk",
-    "onnx",
-    "trainer",
-    "bridge",
-}
+UNWANTED = {"torch", "gymnasium", "highway_env", "rerun", "rerun_sdk", "onnx", "trainer", "bridge"}
 WHITE_FRAMES = bytes([WHITE]) * FRAMES_BYTES
 
 
@@ -172,38 +163,31 @@ def test_between_episodes_silence_is_no_fault(edge_and_simulator):
     assert simulator.ask(make_state(0, episode=1)).mode == "drive"
 
 
-def test_an_output_that_is_not_finite_stops(edge_and_simulator):
-    _, simulator = edge_and_simulator("nan")
+@pytest.mark.parametrize(
+    ("kind", "options", "bad", "good", "reason"),
+    [
+        ("nan", {}, {"frames": WHITE_FRAMES}, {}, "output_not_finite"),
+        ("odd", {"odd_shape": (1, 0)}, {"frames": WHITE_FRAMES}, {}, "inference_failed"),
+        ("odd", {"odd_shape": ()}, {"frames": WHITE_FRAMES}, {}, "inference_failed"),
+        ("odd", {"odd_shape": (1, 1, 1)}, {"frames": WHITE_FRAMES}, {}, "inference_failed"),
+        (
+            "constant", {}, {"task": "congestion, steering -1 to 1"},
+            {"task": "left_turn, pedal -1 to 1"}, "other_task",
+        ),
+    ],
+)  # fmt: skip
+def test_a_state_that_cannot_be_driven_on_stops_and_good_ones_drive_again(
+    edge_and_simulator, kind, options, bad, good, reason
+):
+    edge, simulator = edge_and_simulator(kind, **options)
     assert simulator.ask(make_state(0)).mode == "drive"
-    command = simulator.ask(make_state(1, frames=WHITE_FRAMES))
-    assert (command.mode, command.reason) == ("safe_stop", "output_not_finite")
-    assert command.action == [-1.0]
-    for step in range(2, 10):
-        assert simulator.ask(make_state(step, frames=WHITE_FRAMES)).mode == "safe_stop"
-
-
-@pytest.mark.parametrize("shape", [(1, 0), (), (1, 1, 1)])
-def test_an_answer_of_the_wrong_shape_stops_and_is_no_last_word(edge_and_simulator, shape):
-    edge, simulator = edge_and_simulator("odd", odd_shape=shape)
-    assert simulator.ask(make_state(0)).mode == "drive"
-    for step in range(1, 4):
-        command = simulator.ask(make_state(step, frames=WHITE_FRAMES))
-        assert (command.mode, command.reason) == ("safe_stop", "inference_failed")
-        assert command.action == [-1.0]
-    assert "drive" in {command.mode for command in drive(simulator, range(4, 24))}
+    for step in range(1, 9):
+        command = simulator.ask(make_state(step, **bad))
+        assert (command.mode, command.reason, command.action) == ("safe_stop", reason, [-1.0])
+    assert "drive" in {command.mode for command in drive(simulator, range(9, 29), **good)}
     assert edge.end() == 0
+    assert f"reason={reason}" in edge.log
     assert "Traceback" not in edge.log
-
-
-def test_states_of_another_task_are_answered_with_a_safe_stop(edge_and_simulator):
-    edge, simulator = edge_and_simulator()
-    for step in range(3):
-        command = simulator.ask(make_state(step, task="congestion, steering -1 to 1"))
-        assert (command.mode, command.reason) == ("safe_stop", "other_task")
-    own = drive(simulator, range(3, 23), task="left_turn, pedal -1 to 1")
-    assert "drive" in {command.mode for command in own}
-    assert edge.end() == 0
-    assert "reason=other_task" in edge.log
 
 
 def test_an_inference_that_takes_too_long_stops_while_it_runs(edge_and_simulator):
@@ -372,7 +356,6 @@ def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
 
 def test_without_a_lock_nothing_is_held(tmp_path):
     file = tmp_path / "hold"
-    assert not Hold(None).is_on()
     assert not Hold(str(file)).is_on()
     file.touch()
     assert not Hold(str(file)).is_on()

@@ -314,7 +314,7 @@ def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):
 def test_without_systemd_nothing_is_said():
     for environment in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2"}):
         notifier = Notifier(environment)
-        notifier.ready("standby")
+        notifier.tell("READY=1")
         assert notifier.watchdog_period_s is None
 
 
@@ -323,10 +323,10 @@ def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
     end = Systemd(str(path))
     notifier = Notifier({"NOTIFY_SOCKET": str(path)})
     for _ in range(2000):  # more than the socket takes
-        notifier.watchdog()
+        notifier.tell("WATCHDOG=1")
     end.socket.close()
-    notifier.stopping()
-    notifier.stopping()
+    notifier.tell("STOPPING=1")
+    notifier.tell("STOPPING=1")
 
 
 @pytest.mark.parametrize(

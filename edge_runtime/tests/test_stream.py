@@ -93,7 +93,7 @@ def test_it_streams_until_the_condition_holds_and_never_longer_than_the_limit(st
     assert len(sent) > 5
     running.run_until(lambda: False, limit_s=0.05)
     running.stop()
-    assert not running.is_alive()
+    assert not running._thread.is_alive()
     began_s = time.monotonic()
     running.run_until(lambda: False, limit_s=60.0)
     assert time.monotonic() - began_s < 30.0

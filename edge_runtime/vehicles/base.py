@@ -139,10 +139,10 @@ class VehicleWatch:
         return STUCK if since_s is not None and now_s - since_s > DEVIATES_S else ""
 
     def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
-        numbers = [report.speed_mps, *report.action.values()]
-        if not all(map(math.isfinite, numbers)):
+        values = report.action.values()
+        if not all(map(math.isfinite, [report.speed_mps, *values])):
             return True
-        if any(abs(value) > 1.0 + _ROUNDING for value in report.action.values()):
+        if any(abs(value) > 1.0 + _ROUNDING for value in values):
             return True
         if self._believed is None:
             return False
@@ -153,7 +153,7 @@ class VehicleWatch:
 
     def _deviates(self, report: VehicleReport, now_s: float) -> bool:
         if not self._asked or report.self_braking or self._asked[0][0] > now_s - LAG_S:
-            return False  # It obeys nobody yet, or has had no time to.
+            return False  # it obeys no command yet, or has had no time to
         for name, value in report.action.items():
             if name == PEDAL and report.commanded_speed_mps is not None:
                 continue  # worked out from a speed, whose limits it cannot know: the driver judges
@@ -212,12 +212,12 @@ class VehicleRunner:
         return self._watch.silent_at_s
 
     def busy_s(self, now_s: float) -> float:
-        """For how long the driver has kept its thread; 0 while that waits. Waits for nobody."""
+        """For how long the driver has kept its thread; 0 while that waits. Never waits."""
         since_s = self._busy_since_s
         return 0.0 if since_s is None else now_s - since_s
 
     def fault(self, now_s: float) -> str:
-        """What is wrong with the vehicle, empty if nothing. Waits for nobody."""
+        """What is wrong with the vehicle, empty if nothing. Never waits."""
         with self._due:
             if self._enable_due:
                 return self._seen_fault(now_s)
@@ -225,7 +225,7 @@ class VehicleRunner:
         return self._seen_fault(now_s) or (seen.faults[0] if seen and seen.faults else "")
 
     def standing_fault(self, now_s: float) -> str:
-        """What enabling the vehicle now would not end, empty if nothing. Waits for nobody."""
+        """What enabling the vehicle now would not end, empty if nothing. Never waits."""
         seen = self._report_seen
         return self._seen_fault(now_s) or (seen.standing[0] if seen and seen.standing else "")
 
@@ -358,6 +358,9 @@ class VehicleRunner:
         return report
 
     def _feedback(self, report: VehicleReport, last: Optional[Command], fault: str) -> Feedback:
+        faults = report.faults
+        if fault and fault not in faults:
+            faults = [*faults, fault]
         return Feedback(
             vehicle=self._vehicle.name,
             session=last.session if last else "",
@@ -367,15 +370,9 @@ class VehicleRunner:
             action=[report.action.get(name, 0.0) for name in self._action_names],
             speed_mps=report.speed_mps,
             self_braking=report.self_braking,
-            faults=_texts(report.faults, fault),
+            faults=[text[:MAX_TEXT_CHARS] for text in faults],
             sent_ns=time.time_ns(),
             scenario_speed_mps=report.scenario_speed_mps,
             commanded_speed_mps=report.commanded_speed_mps,
             battery_v=report.battery_v,
         )
-
-
-def _texts(faults: Sequence[str], fault: str) -> List[str]:
-    """All faults once, none longer than the wire takes."""
-    every = [*faults, fault] if fault and fault not in faults else faults
-    return [text[:MAX_TEXT_CHARS] for text in every]

@@ -1,7 +1,7 @@
 """The driver of a vehicle that must hear from it 50 times a second: pure, and shared by vehicles.
 
 A core is a state machine (LEADS_TO), what was heard of the vehicle, and what is asked of it. It has
-no clock, no thread and no bus: whoever holds it (stream.py, a test) serialises the calls, passes
+no clock, no thread and no bus: its holder (stream.py, a test) serialises the calls, passes
 monotonic seconds, and sends what `tick` returns. A vehicle adds what it hears and says.
 
 STOPPED is a latch of our own: a chassis takes commands again by itself when they resume after its
@@ -18,14 +18,7 @@ from typing import ClassVar, Deque, Dict, List, NamedTuple, Optional, Tuple
 
 from edge_runtime.safety import SILENCE_S
 from edge_runtime.vehicles.base import VehicleReport
-from edge_runtime.vehicles.mapping import (
-    HunterSpec,
-    SetPoint,
-    Similarity,
-    Wish,
-    acceleration_to_pedal,
-    wish_of,
-)
+from edge_runtime.vehicles.mapping import SetPoint, Similarity, Wish, wish_of
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 # A beat later than the runtime's own silence rule, which then tells the reason; still within
@@ -41,7 +34,7 @@ DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
 DEVIATES_S = CONTROL_PERIOD_S
 STANDS_MPS = 0.02
 IMPOSSIBLE = 1.3
-"""Times what the model can do: who reports more than that is not believed."""
+"""Times what the model can do: a vehicle that reports more than that is not believed."""
 _SLACK_S = 0.01
 
 
@@ -174,13 +167,13 @@ class StreamedCore(abc.ABC):
 
     leads_to: ClassVar[Dict[Event, Dict[State, State]]] = LEADS_TO
 
-    def __init__(self, spec: HunterSpec, similarity: Similarity, heard: Speeds) -> None:
+    def __init__(self, similarity: Similarity, heard: Speeds) -> None:
         self.state = State.DISABLED
         self.cause: Optional[Event] = None  # what stopped it
         self.words = ""  # the same for a person; empty where our own side asked for the stop
-        self.set_point = SetPoint(spec, similarity)
-        self._spec, self._similarity, self._heard = spec, similarity, heard
-        self._speed_watch = SpeedWatch(spec.max_speed_mps)
+        self.set_point = SetPoint(similarity)
+        self.similarity, self._spec, self._heard = similarity, similarity.spec, heard
+        self._speed_watch = SpeedWatch(self._spec.max_speed_mps)
         self._wish: Optional[Wish] = None  # None: stand
         self._wished_s = self._ticked_s = -math.inf
         self._since_s = -math.inf  # when this state began
@@ -222,7 +215,7 @@ class StreamedCore(abc.ABC):
             self_braking=self.state is not State.ENABLED,
             faults=self._faults(now_s),
             standing=self.standing(now_s),
-            scenario_speed_mps=self._similarity.scenario_mps(speed_mps),
+            scenario_speed_mps=speed_mps / self.similarity.scale,
             commanded_speed_mps=self.set_point.speed_mps,
         )
 
@@ -233,11 +226,11 @@ class StreamedCore(abc.ABC):
 
     @abc.abstractmethod
     def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or nobody here can do more about it."""
+        """Whether the vehicle is known to stand, or no more can be done about it."""
 
     @abc.abstractmethod
     def _obstacles(self, now_s: float) -> List[str]:
-        """In words what stands between the vehicle and our commands, whoever is to end it."""
+        """In words what stands between the vehicle and our commands."""
 
     @abc.abstractmethod
     def _why_not_confirmed(self, now_s: float) -> str:
@@ -296,4 +289,4 @@ class StreamedCore(abc.ABC):
         """From the measured acceleration; the brake where it stands and is to stand."""
         if self._heard.stands and self.set_point.speed_mps == 0.0:
             return -1.0
-        return acceleration_to_pedal(self._heard.acceleration_mps2(), self._similarity)
+        return self.similarity.pedal(self._heard.acceleration_mps2())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Callable, Dict, Optional, Tuple
+from typing import Dict
 
 import msgspec
 
@@ -10,10 +10,9 @@ from edge_runtime.config import (
     DEFAULT_BUS,
     NONE,
     VEHICLE_NAMES,
+    Config,
     HunterSettings,
     Ros2Settings,
-    SimilaritySettings,
-    VehicleSetup,
     check_choice,
 )
 from edge_runtime.controller import ActionLimit
@@ -22,70 +21,34 @@ from edge_runtime.vehicles.base import Vehicle
 from edge_runtime.vehicles.mapping import (
     CARS,
     SPECS,
-    HunterSpec,
     ScenarioCar,
     Similarity,
     car_of,
-    limits_of,
     similarity_to,
 )
 from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 
 
-def _mock(setup: VehicleSetup) -> Vehicle:
-    """As quick as the policy's car, where that is known."""
-    car = setup.similarity.car or CARS.get(setup.scenario)
-    if car is None:
-        return MockVehicle()
-    limits = MockParameters(
-        throttle_mps2=car.throttle_mps2,
-        brake_mps2=car.brake_mps2,
-        max_speed_mps=car.max_speed_mps,
-    )
-    return MockVehicle(limits)
-
-
-def _robot(name: str, setup: VehicleSetup) -> Tuple[HunterSpec, Similarity]:
-    """The chassis behind a driver, and how it stands to the policy's car. Raises UserError."""
-    model = setup.ros2.model if name == "ros2" else setup.hunter.model
-    spec = SPECS[model]
-    return spec, make_similarity(setup, name, spec.max_speed_mps)
-
-
-def _hunter(setup: VehicleSetup) -> Vehicle:
-    from edge_runtime.vehicles.hunter.bus import HunterVehicle, parse_bus
-
-    spec, similarity = _robot("hunter", setup)
-    return HunterVehicle(parse_bus(setup.bus), spec, setup.hunter.profile, similarity)
-
-
-def _ros2(setup: VehicleSetup) -> Vehicle:
-    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
-
-    spec, similarity = _robot("ros2", setup)
-    return Ros2Vehicle(setup.ros2, spec, similarity)
-
-
-_MAKERS: Dict[str, Callable[[VehicleSetup], Vehicle]] = {
-    "mock": _mock,
-    "hunter": _hunter,
-    "ros2": _ros2,
-}
-
-
-def make_vehicle(name: str, setup: Optional[VehicleSetup] = None) -> Optional[Vehicle]:
-    """The driver of that name; None for "none". Nothing is sent before it is enabled.
+def make_vehicle(name: str, config: Config, scenario: str) -> Vehicle:
+    """The driver of that name for a policy of that scenario. Nothing is sent before it is enabled.
 
     Raises UserError for any other name, for a scenario that the vehicle cannot follow, and where
     what it hangs on cannot be opened.
     """
-    check_choice("vehicle", name, VEHICLE_NAMES)
-    if name == NONE:
-        return None
-    return _MAKERS[name](setup or VehicleSetup())
+    check_choice("vehicle", name, VEHICLE_NAMES[1:])
+    if name == "mock":
+        return _mock(config, scenario)
+    similarity = _similarity(name, config, scenario)
+    if name == "hunter":
+        from edge_runtime.vehicles.hunter.bus import HunterVehicle, parse_bus
+
+        return HunterVehicle(parse_bus(config.bus), similarity, config.hunter.profile)
+    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
+
+    return Ros2Vehicle(config.ros2, similarity)
 
 
-def vehicle_limits(name: str, setup: VehicleSetup) -> Dict[str, ActionLimit]:
+def vehicle_limits(name: str, config: Config, scenario: str) -> Dict[str, ActionLimit]:
     """What the vehicle of that name lets each action be, without opening anything; "none": {}.
 
     Raises UserError for any other name, and for a scenario that the vehicle cannot follow.
@@ -93,50 +56,59 @@ def vehicle_limits(name: str, setup: VehicleSetup) -> Dict[str, ActionLimit]:
     check_choice("vehicle", name, VEHICLE_NAMES)
     if name == NONE:
         return {}
-    if name == MockVehicle.name:
+    if name == "mock":
         return MockVehicle.limits
-    return limits_of(*_robot(name, setup))
+    return _similarity(name, config, scenario).limits()
 
 
-def check_setup(setup: VehicleSetup) -> None:
+def _mock(config: Config, scenario: str) -> Vehicle:
+    """As quick as the policy's car, where that is known."""
+    car = config.similarity.car or CARS.get(scenario)
+    if car is None:
+        return MockVehicle()
+    return MockVehicle(
+        MockParameters(
+            throttle_mps2=car.throttle_mps2,
+            brake_mps2=car.brake_mps2,
+            max_speed_mps=car.max_speed_mps,
+        )
+    )
+
+
+def _similarity(name: str, config: Config, scenario: str) -> Similarity:
+    """From the policy's car to the chassis of the vehicle of that name. Raises UserError."""
+    settings = config.similarity
+    if settings.car is not None:
+        car = ScenarioCar(**msgspec.structs.asdict(settings.car))
+    else:
+        car = car_of(scenario, name)
+    model = config.ros2.model if name == "ros2" else config.hunter.model
+    return similarity_to(car, SPECS[model], settings.scale)
+
+
+def check_settings(config: Config) -> None:
     """Raise UserError for settings that are not valid, whichever vehicle is chosen.
 
     The defaults are valid (a test), and load nothing.
     """
-    if (setup.bus, setup.hunter) != (DEFAULT_BUS, HunterSettings()):
+    if (config.bus, config.hunter) != (DEFAULT_BUS, HunterSettings()):
         from edge_runtime.vehicles.hunter import bus, protocol
 
-        bus.parse_bus(setup.bus)
-        check_choice("hunter.model", setup.hunter.model, tuple(SPECS))
-        check_choice("hunter.profile", setup.hunter.profile, tuple(protocol.PROFILES))
-    _check_similarity(setup.similarity)
-    if setup.ros2 != Ros2Settings():
-        from edge_runtime.vehicles.ros2.names import check_settings
+        bus.parse_bus(config.bus)
+        check_choice("hunter.model", config.hunter.model, tuple(SPECS))
+        check_choice("hunter.profile", config.hunter.profile, tuple(protocol.PROFILES))
+    if config.ros2 != Ros2Settings():
+        from edge_runtime.vehicles.ros2 import names
 
-        check_settings(setup.ros2)
-
-
-def _check_similarity(settings: SimilaritySettings) -> None:
-    numbers = {} if settings.car is None else msgspec.structs.asdict(settings.car)
-    if settings.scale is not None:
-        numbers["scale"] = settings.scale
+        names.check_settings(config.ros2)
+    car, scale = config.similarity.car, config.similarity.scale
+    numbers = {} if car is None else msgspec.structs.asdict(car)
+    if scale is not None:
+        numbers["scale"] = scale
     for name, value in numbers.items():
-        # To the right, the full angle is below 0.
-        size = abs(value) if name == "full_steering_rad" else value
-        if not 0.0 < size < float("inf") or (name == "full_steering_rad" and size >= 1.5):
-            raise UserError(f"similarity: {name} {value} is not valid: it must be {_range(name)}")
-
-
-def _range(name: str) -> str:
-    angle = name == "full_steering_rad"
-    return "above 0 and below 1.5 rad, or below 0 and above -1.5" if angle else "above 0"
-
-
-def make_similarity(setup: VehicleSetup, name: str, max_speed_mps: float) -> Similarity:
-    """From the policy's car to a vehicle of this name and top speed. Raises UserError."""
-    settings = setup.similarity
-    if settings.car is not None:
-        car = ScenarioCar(**msgspec.structs.asdict(settings.car))
-    else:
-        car = car_of(setup.scenario, name)
-    return similarity_to(car, max_speed_mps, settings.scale)
+        fits, words = 0.0 < value < float("inf"), "above 0"
+        if name == "full_steering_rad":  # to the right, the full angle is below 0
+            fits = 0.0 < abs(value) < 1.5
+            words = "above 0 and below 1.5 rad, or below 0 and above -1.5"
+        if not fits:
+            raise UserError(f"similarity: {name} {value} is not valid: it must be {words}")

@@ -1,9 +1,9 @@
 """The shell of a vehicle that must hear from us 50 times a second: a thread, a lock, and its core.
 
 The stream sends what the core (core.py) asks for, and a lock is around every call of the core.
-Whatever it is sent through is called outside of the lock, so that nobody waits for a bus or a
-network. A chassis takes a stream that pauses for a lost link: the deadlines are absolute, and the
-thread does nothing else. It inherits the priority that the runtime gave the process.
+The bus or network is called outside of the lock, so that no caller waits for it. A chassis takes a
+stream that pauses for a lost link: the deadlines are absolute, and the thread does nothing else. It
+inherits the priority that the runtime gave the process.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Callable, Dict, Optional
 from edge_runtime import log
 from edge_runtime.service import LatencyWindow
 from edge_runtime.vehicles.base import Vehicle, VehicleReport
-from edge_runtime.vehicles.core import STOP_TAKES_S, StreamedCore
+from edge_runtime.vehicles.core import STOP_TAKES_S, State, StreamedCore
 
 PERIOD_S = 0.02
 _JOIN_S = 0.5
@@ -27,10 +27,25 @@ class StreamedVehicle(Vehicle):
 
     def __init__(self, core: StreamedCore) -> None:
         self._core = core
+        self.limits = core.similarity.limits()
         self._lock = threading.Lock()
         self._closed = False
-        self._logged = ""
+        self._logged = ("", "")
         self._stream = Stream(f"{self.name}-stream", self._send_due, self._late_at_s)
+
+    @property
+    def state(self) -> State:
+        """Where its state machine stands."""
+        return self._core.state
+
+    def enable(self, now_s: float) -> None:
+        """Ask for control; `feedback` tells whether it came. Nothing once closed."""
+        if self._closed:
+            return
+        with self._lock:
+            self._core.enable(now_s)
+        self._stream.start()
+        self._stream.wake()
 
     def command(
         self, action: Dict[str, float], now_s: float, scenario_speed_mps: Optional[float] = None
@@ -49,7 +64,10 @@ class StreamedVehicle(Vehicle):
         """From the newest that was heard of the vehicle."""
         with self._lock:
             report = self._core.report(now_s)
-            self._log_state()
+            state, words = self._core.state.value, self._core.words
+        if (state, words) != self._logged:  # here, because the stream's thread must not wait
+            self._logged = (state, words)
+            log.event("warning" if words else "info", self.name, state=state, why=words)
         return report
 
     @abc.abstractmethod
@@ -74,14 +92,6 @@ class StreamedVehicle(Vehicle):
     def _late_at_s(self) -> float:
         with self._lock:
             return self._core.late_at_s
-
-    def _log_state(self) -> None:
-        """Each state once, when feedback is asked for: never from the stream's thread."""
-        state, words = self._core.state.value, self._core.words
-        line = f"{state} {words}".strip()
-        if line != self._logged:
-            self._logged = line
-            log.event("warning" if words else "info", self.name, state=state, why=words)
 
 
 class Stream:
@@ -108,14 +118,10 @@ class Stream:
         """Send now: somebody brakes."""
         self._wake.set()
 
-    def is_alive(self) -> bool:
-        """Whether its thread runs."""
-        return self._thread.is_alive()
-
     def run_until(self, condition: Callable[[], bool], limit_s: float) -> None:
         """Go on streaming until the condition holds, no longer than the limit."""
         end_s = time.monotonic() + limit_s
-        while self.is_alive() and time.monotonic() < end_s and not condition():
+        while self._thread.is_alive() and time.monotonic() < end_s and not condition():
             time.sleep(PERIOD_S)
 
     def stop(self) -> None:

@@ -138,7 +138,7 @@ def launch(package: str) -> None:
     """Put the faults in, then be the command."""
     SteppedClock().install()
     switch = Path(os.environ[DIRECTORY]) / VEHICLE
-    registry._MAKERS["mock"] = lambda setup: FaultyMockVehicle(switch)
+    registry._mock = lambda config, scenario: FaultyMockVehicle(switch)
     sys.argv = [package, *sys.argv[2:]]
     runpy.run_module(package, run_name="__main__", alter_sys=True)
 

@@ -1,18 +1,17 @@
 """Mutation operators that cosmic-ray does not have: it finds them by pyproject's entry point.
 
-`StatementRemover`: a statement that is not there. `TableTarget`: a row of the transition table
-that leads elsewhere. Neither changes an import, a docstring or a definition.
+`StatementRemover`: a statement that is not there. `TableTarget`: a cell of a transition table that
+leads elsewhere. Neither changes an import, a docstring or a definition.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
 from cosmic_ray.operators.operator import Example, Operator
 from parso.python.tree import Keyword, Name
-
-_MODES = ("_S", "_D", "_X")
 
 
 class StatementRemover(Operator):
@@ -39,24 +38,37 @@ class StatementRemover(Operator):
 
 
 class TableTarget(Operator):
-    """Sends a row of TRANSITIONS, `(_D, Event.X): _S,`, to each of the other two modes."""
+    """Sends a cell of a table of transitions to each of the other modes of its file.
+
+    The cells are `Event.X: (_S, _D, _X)` in safety.py and `Event.X: {_D: _G}` in vehicles/core.py.
+    """
 
     def mutation_positions(self, node: Any) -> Iterator[tuple]:
-        """Twice for each target, because there are two other modes."""
-        before = node.get_previous_leaf() if node.type == "name" else None
-        if before is not None and before.value == ":" and node.value in _MODES:
-            yield node.start_pos, node.end_pos
-            yield node.start_pos, node.end_pos
+        """Each cell, once for each other mode."""
+        is_cell = node.type == "name" and node.search_ancestor("dictorsetmaker") is not None
+        if is_cell and node.get_next_leaf().value != ":":
+            for _ in _other_modes(node):
+                yield node.start_pos, node.end_pos
 
     def mutate(self, node: Any, index: int) -> Any:
-        """The other mode, the first or the second."""
-        others = [mode for mode in _MODES if mode != node.value]
-        return Name(others[index], node.start_pos, prefix=node.prefix)
+        """That other mode."""
+        return Name(_other_modes(node)[index], node.start_pos, prefix=node.prefix)
 
     @classmethod
     def examples(cls) -> tuple:
         """For cosmic-ray's own tests."""
-        return (Example("{(_S, 1): _D}", "{(_S, 1): _S}"),)
+        modes = "_S, _D = Mode\n"
+        return (
+            Example(modes + "T = {1: (_D,)}", modes + "T = {1: (_S,)}"),
+            Example(modes + "T = {1: {_S: _D}}", modes + "T = {1: {_S: _S}}"),
+        )
+
+
+def _other_modes(node: Any) -> list[str]:
+    """The modes of the file, `_S, _D, _X = ...`, without this one; none where it is no mode."""
+    found = re.search(r"^(_[A-Z](?:, _[A-Z])+) = ", node.get_root_node().get_code(), re.M)
+    modes = found[1].split(", ") if found else []
+    return [mode for mode in modes if mode != node.value] if node.value in modes else []
 
 
 class Provider(dict):

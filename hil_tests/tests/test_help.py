@@ -54,9 +54,7 @@ def main_of(program):
     spec = importlib.util.find_spec(program)
     assert spec is not None
     is_package = spec.submodule_search_locations is not None
-    module = importlib.import_module(f"{program}.__main__" if is_package else program)
-    # The edge runtime's main is the entry point of an installed script, and takes no arguments.
-    return module.dispatch if program == "edge_runtime" else module.main
+    return importlib.import_module(f"{program}.__main__" if is_package else program).main
 
 
 def help_of(program, words, helps):

@@ -5,7 +5,7 @@ import math
 import pytest
 from highway_env.vehicle.kinematics import Vehicle
 
-from edge_runtime.vehicles.mapping import CARS, similarity_to
+from edge_runtime.vehicles.mapping import CARS
 from trainer.scenarios import SCENARIOS
 from trainer.scenarios.congestion import CongestionConfig
 from trainer.scenarios.environment import EgoVehicle
@@ -40,5 +40,5 @@ def test_the_curvature_is_the_bicycles_own():
     left_rad = -ego.heading  # its y axis points down: positive turns right
     way_m = math.hypot(*ego.position)
     assert way_m == pytest.approx(0.4)
-    curvature = similarity_to(CARS["congestion"], 6.0, scale=1.0).vehicle_curvature(action)
+    curvature = CARS["congestion"].curvature(action)
     assert left_rad / way_m == pytest.approx(curvature)

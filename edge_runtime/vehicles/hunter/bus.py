@@ -23,13 +23,12 @@ import time
 from typing import Any, ClassVar, Dict, NamedTuple, Optional
 
 from edge_runtime import log
-from edge_runtime.controller import ActionLimit
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import BITRATE, COMMANDS, Frame
-from edge_runtime.vehicles.mapping import HunterSpec, Similarity, limits_of
+from edge_runtime.vehicles.mapping import Similarity
 from edge_runtime.vehicles.stream import PERIOD_S, StreamedVehicle
 
 _LISTEN_S = 0.1
@@ -115,16 +114,12 @@ def open_bus(name: BusName) -> Any:
     except Exception as error:  # each backend raises what its library raises, NameError included
         raise UserError(_explain(name, error)) from None
     if name.interface == "udp_multicast":
-        _pin(name, bus)
+        try:
+            pin_to_loopback(bus, name.channel)
+        except OSError as error:
+            bus.shutdown()
+            raise UserError(_explain(name, error)) from None
     return bus
-
-
-def _pin(name: BusName, bus: Any) -> None:
-    try:
-        pin_to_loopback(bus, name.channel)
-    except OSError as error:
-        bus.shutdown()
-        raise UserError(_explain(name, error)) from None
 
 
 def pin_to_loopback(bus: Any, group: str) -> None:
@@ -139,18 +134,14 @@ def pin_to_loopback(bus: Any, group: str) -> None:
     sender = struct.pack("=4s4si", _ANY, _ANY, device)
     with socket.socket(fileno=os.dup(bus.fileno())) as same:
         same.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK.encode() + b"\0")
-        _join(same, member)
+        try:
+            same.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:  # python-can joined there: it is the only device
+                raise
         same.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, sender)
     while bus.recv(0.0) is not None:
         pass  # from before
-
-
-def _join(bus_socket: socket.socket, member: bytes) -> None:
-    try:
-        bus_socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
-    except OSError as error:
-        if error.errno != errno.EADDRINUSE:  # python-can joined there: it is the only device
-            raise
 
 
 def import_can() -> Any:
@@ -229,32 +220,21 @@ class HunterVehicle(StreamedVehicle):
 
     name: ClassVar[str] = "hunter"
 
-    def __init__(
-        self, bus: BusName, spec: HunterSpec, profile: str, similarity: Similarity
-    ) -> None:
+    def __init__(self, bus: BusName, similarity: Similarity, profile: str) -> None:
         self._bus: Any = open_bus(bus)
         self._gate = Gate(self._bus)
         self._ignores_commands = bus.hears_itself
         self._core: HunterCore
-        super().__init__(HunterCore(spec, profile, similarity))
-        self.limits: Dict[str, ActionLimit] = limits_of(spec, similarity)
+        super().__init__(HunterCore(similarity, profile))
         self._stopping = False
         self._listener = threading.Thread(target=self._listen, name="hunter-listener", daemon=True)
 
-    @property
-    def state(self) -> State:
-        """Where its state machine stands."""
-        return self._core.state
-
     def enable(self, now_s: float) -> None:
         """Ask the chassis for control; `feedback` tells whether it came. Nothing once closed."""
-        if self._closed:
-            return
-        with self._lock:
-            self._core.enable(now_s)
-            self._gate.open()
-        self._start()
-        self._stream.wake()
+        if not self._closed:
+            self._gate.open()  # the core gives no frame before it is enabled
+            self._start()
+        super().enable(now_s)
 
     def feedback(self, now_s: float) -> VehicleReport:
         """From the newest frames of the chassis, which it listens to before `enable`, too."""

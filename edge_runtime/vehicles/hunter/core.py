@@ -21,16 +21,8 @@ from edge_runtime.vehicles.core import (
     StreamedCore,
 )
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.protocol import (
-    LINK_LOST,
-    MotionStatus,
-    MotorSlow,
-    Sent,
-    SystemStatus,
-    motor_faults,
-    status_faults,
-)
-from edge_runtime.vehicles.mapping import HunterSpec, Similarity, steering_of
+from edge_runtime.vehicles.hunter.protocol import MotionStatus, MotorSlow, Sent, SystemStatus
+from edge_runtime.vehicles.mapping import HunterSpec, Similarity
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 MOTION_SILENCE_S = 2 * CONTROL_PERIOD_S  # ten frames of 0x221
@@ -69,7 +61,7 @@ class Reports(Speeds):
             self.motion, self.motion_s = message, now_s
             self.note(message.speed_mps, now_s)
         elif isinstance(message, MotorSlow):
-            self._motor_faults[can_id] = motor_faults(can_id, message)
+            self._motor_faults[can_id] = protocol.motor_faults(can_id, message)
 
     def is_known_to_stand(self, now_s: float) -> bool:
         """Whether it says now that it stands."""
@@ -79,7 +71,7 @@ class Reports(Speeds):
     def needs_clearing(self) -> bool:
         """Whether it shows an error; a lost link goes by itself, with the stream's first frame."""
         is_exception = self.status is not None and self.status.state == protocol.STATE_EXCEPTION
-        return is_exception or bool(set(self.errors()) - {LINK_LOST})
+        return is_exception or bool(set(self.errors()) - {protocol.LINK_LOST})
 
     @property
     def remote_drives(self) -> bool:
@@ -88,7 +80,7 @@ class Reports(Speeds):
 
     def errors(self) -> List[str]:
         """The errors that the chassis names, in words, without those of its operation."""
-        words = status_faults(self.status, self._profile) if self.status else []
+        words = protocol.status_faults(self.status, self._profile) if self.status else []
         for motor in self._motor_faults.values():
             words += motor
         return words
@@ -104,7 +96,7 @@ class Reports(Speeds):
         return None
 
     def commander(self) -> Optional[Finding]:
-        """Who outranks us: the remote control, or the emergency stop."""
+        """What outranks us: the remote control, or the emergency stop."""
         if self.remote_drives:
             return Finding(Event.REMOTE, REMOTE_WORDS)
         if self.status is not None and self.status.state == protocol.STATE_ESTOP:
@@ -149,18 +141,17 @@ class Reports(Speeds):
         if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
             return Finding(Event.LYING, f"the chassis reports {speed_mps:.1f} m/s")
         if abs(inner_rad) > IMPOSSIBLE * self._spec.max_inner_steering_rad:
-            return Finding(
-                Event.LYING, f"the chassis reports a steering angle of {inner_rad:.2f} rad"
-            )
+            words = f"the chassis reports a steering angle of {inner_rad:.2f} rad"
+            return Finding(Event.LYING, words)
         return None
 
 
 class HunterCore(StreamedCore):
     """The state machine, what was heard, and what is asked for."""
 
-    def __init__(self, spec: HunterSpec, profile: str, similarity: Similarity) -> None:
-        self.reports = Reports(spec, profile)
-        super().__init__(spec, similarity, self.reports)
+    def __init__(self, similarity: Similarity, profile: str) -> None:
+        self.reports = Reports(similarity.spec, profile)
+        super().__init__(similarity, self.reports)
         self._ask_s = math.inf  # when to ask the chassis for something next
         self._bus_words = ""  # empty while it works
         self._bus_failed_s: Optional[float] = None  # when the failures began
@@ -185,7 +176,7 @@ class HunterCore(StreamedCore):
         return parts
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
-        """A frame of the bus, whoever sent it; never raises."""
+        """A frame of the bus, from any sender; never raises."""
         if self.state is State.DISABLED:
             self.bus_works()  # nothing is sent then that it could take
         if self.is_command(can_id):
@@ -233,7 +224,7 @@ class HunterCore(StreamedCore):
         return any(can_id == frame.can_id for frame in protocol.COMMANDS)
 
     def is_at_rest(self, now_s: float) -> bool:
-        """Whether the vehicle is known to stand, or nobody here can do more about it."""
+        """As in StreamedCore; no more can be done about a dead bus or a remote control."""
         blind = self.state is State.DISABLED or bool(self._bus_words) or self.reports.remote_drives
         return blind or self.reports.is_known_to_stand(now_s)
 
@@ -291,7 +282,7 @@ class HunterCore(StreamedCore):
     def _steering(self) -> float:
         motion = self.reports.motion
         inner_rad = motion.inner_steering_rad if motion else 0.0
-        return steering_of(inner_rad, self._spec, self._similarity)
+        return self.similarity.steering(self._spec.centre_rad(inner_rad))
 
 
 def _sent(frame: protocol.Frame, message: object) -> Sent:

@@ -164,19 +164,15 @@ def encode(frame: Frame, message: Any) -> bytes:
     """
     data = bytearray(frame.length)
     for field, value in zip(frame.fields, message):
-        _packer(field).pack_into(data, field.offset, _count(field, value))
+        _PACKERS[field.code].pack_into(data, field.offset, _count(field, value))
     return bytes(data)
 
 
 def encode_motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> bytes:
     """0x111 within the limits of the model. Raises ValueError for what is not finite."""
-    return encode(
-        MOTION_COMMAND,
-        MotionCommand(
-            _clamp(speed_mps, spec.max_speed_mps),
-            _clamp(inner_steering_rad, spec.max_inner_steering_rad),
-        ),
-    )
+    speed_mps = _clamp(speed_mps, spec.max_speed_mps)
+    inner_rad = _clamp(inner_steering_rad, spec.max_inner_steering_rad)
+    return encode(MOTION_COMMAND, MotionCommand(speed_mps, inner_rad))
 
 
 def decode(can_id: int, data: bytes) -> Optional[Decoded]:
@@ -186,13 +182,9 @@ def decode(can_id: int, data: bytes) -> Optional[Decoded]:
         return None
     values: List[float] = []
     for field in frame.fields:
-        (count,) = _packer(field).unpack_from(data, field.offset)
+        (count,) = _PACKERS[field.code].unpack_from(data, field.offset)
         values.append(count if field.per_count is None else count * field.per_count)
     return Decoded(frame, frame.message(*values))
-
-
-def _packer(field: Field) -> struct.Struct:
-    return _PACKERS[field.code]
 
 
 _RANGES: Dict[str, Tuple[int, int]] = {

@@ -10,7 +10,7 @@ what not. No pycdr2 here: settings are checked where it is not installed, too.
 from __future__ import annotations
 
 import re
-from typing import Dict, NamedTuple, Optional
+from typing import Dict, Optional
 
 import zenoh
 
@@ -28,19 +28,6 @@ DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
 YAW_RATE, STEERING = "yaw_rate", "steering"
 _ANGULAR = (YAW_RATE, STEERING)
 
-
-class Qos(NamedTuple):
-    """What of a DDS quality of service stands in a token, with DDS's numbers."""
-
-    reliable: bool
-    transient_local: bool = False
-    depth: int = 10
-
-
-RELIABLE = Qos(reliable=True)
-"""For our publishers: a reader of either kind matches."""
-BEST_EFFORT = Qos(reliable=False)
-"""For our subscribers: a reliable reader would never hear a best-effort writer, as of sensors."""
 
 TYPES: Dict[str, str] = {
     "ackermann_msgs/msg/AckermannDriveStamped": (
@@ -88,16 +75,17 @@ def member_token(zid: str) -> str:
     return f"@/{zid}/@ros2_lv"
 
 
-def topic_token(zid: str, kind: str, topic_key: str, type_name: str, qos: Qos) -> str:
-    """The token of a PUBLISHER or SUBSCRIBER of a type in TYPES."""
-    chunks = (kind, topic_key.replace("/", _SLASH), type_name.replace("/", _SLASH))
-    return "/".join((member_token(zid), *chunks, _qos_chunk(qos, TYPES[type_name])))
+def topic_token(zid: str, role: str, topic_key: str, type_name: str) -> str:
+    """The token of a PUBLISHER or SUBSCRIBER of a type in TYPES.
 
-
-def _qos_chunk(qos: Qos, type_hash: str) -> str:
-    """`<keyed>:<reliability>:<durability>:<history>,<depth>:<user data>`; ours have no key."""
-    history = f"0,{qos.depth}"  # Keep last.
-    return f":{int(qos.reliable)}:{int(qos.transient_local)}:{history}:typehash=RIHS01_{type_hash};"
+    Its last part is `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's
+    numbers. We publish reliably, because a reader of either kind matches, and subscribe best
+    effort: a reliable reader would never hear a best-effort writer, as sensors are. No key, no
+    old messages for late readers, and the last ten kept.
+    """
+    names = (name.replace("/", _SLASH) for name in (topic_key, type_name))
+    qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[type_name]};"
+    return "/".join((member_token(zid), role, *names, qos))
 
 
 def check_ros2_endpoint(endpoint: Optional[str]) -> None:
@@ -136,10 +124,6 @@ def check_settings(settings: Ros2Settings) -> None:
         raise UserError("ros2 has both listen and connect: give one of them")
     for endpoint in (settings.listen, settings.connect):
         check_ros2_endpoint(endpoint)
-    _check_topics(settings)
-
-
-def _check_topics(settings: Ros2Settings) -> None:
     if not settings.twist_topic and not settings.ackermann_topic:
         raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
     if not settings.odometry_topic:

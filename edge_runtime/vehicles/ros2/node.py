@@ -1,4 +1,4 @@
-"""ROS 2 on Zenoh without ROS 2: the standard messages that we speak, in CDR, and who speaks them.
+"""ROS 2 on Zenoh without ROS 2: the standard messages that we speak, in CDR, and a node.
 
 Field names, order and types are those of the packages' .msg files (common_interfaces and
 ackermann_msgs, the same from Humble on); units as there: metres, seconds, radians, x forward, y to
@@ -10,7 +10,6 @@ The one file that imports pycdr2: a board without ROS 2 need not have it. No `fr
 annotations` here: pycdr2 reads the annotations, also on Python 3.8.
 """
 
-import contextlib
 import math
 import struct
 from dataclasses import dataclass, field
@@ -248,7 +247,7 @@ class Ros2Node:
             key, congestion_control=zenoh.CongestionControl.DROP
         )
         self._declared.append(publisher)
-        self._announce_topic(names.PUBLISHER, key, kind, names.RELIABLE)
+        self._announce_topic(names.PUBLISHER, key, kind)
         self.sent[key] = 0
 
         def publish(message: _M) -> None:
@@ -273,29 +272,18 @@ class Ros2Node:
                 take(message)
 
         self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
-        self._announce_topic(names.SUBSCRIBER, key, kind, names.BEST_EFFORT)
+        self._announce_topic(names.SUBSCRIBER, key, kind)
 
     def close(self) -> None:
         """Withdraw everything; safe to call twice."""
         while self._declared:
             self._declared.pop().undeclare()
 
-    def _announce_topic(self, role: str, key: str, kind: Any, qos: names.Qos) -> None:
-        type_name = str(kind.__idl_typename__)
-        self._announce(names.topic_token(self._zid, role, key, type_name, qos))
+    def _announce_topic(self, role: str, key: str, kind: Any) -> None:
+        self._announce(names.topic_token(self._zid, role, key, str(kind.__idl_typename__)))
 
     def _announce(self, token: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(token))
 
     def _count(self, reason: Reason) -> None:
         self.rejected[reason.value] = self.rejected.get(reason.value, 0) + 1
-
-
-@contextlib.contextmanager
-def open_node(session: zenoh.Session, namespace: str) -> Iterator[Ros2Node]:
-    """A node for the length of a block."""
-    node = Ros2Node(session, namespace)
-    try:
-        yield node
-    finally:
-        node.close()

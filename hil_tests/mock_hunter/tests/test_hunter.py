@@ -352,8 +352,7 @@ class Pair:
     """The driver's ticks, the chassis's frames and a policy's commands on one clock."""
 
     def __init__(self):
-        similarity = similarity_to(CARS["left_turn"], SPEC.max_speed_mps)
-        self.core = HunterCore(SPEC, "v2", similarity)
+        self.core = HunterCore(similarity_to(CARS["left_turn"], SPEC), "v2")
         self.now_s = 50.0
         self.mock = MockHunter(make_parameters("hunter-2.0"), self.now_s)
         self.pedal = 1.0

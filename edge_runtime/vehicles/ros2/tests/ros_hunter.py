@@ -16,8 +16,8 @@ from edge_runtime.config import Ros2Settings
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
-from edge_runtime.vehicles.ros2.core import Measured, Ros2Core
 from edge_runtime.vehicles.ros2.tests import second
+from edge_runtime.vehicles.ros2.vehicle import Measured, Ros2Core
 
 WHEELBASE_M, TRACK_M, MAX_INNER_RAD = 0.650, 0.605, 0.576
 PERIOD_S = 0.02
@@ -118,8 +118,8 @@ class RosHunter:
 
 
 SPEC = SPECS["2.0"]
-LEFT_TURN = similarity_to(CARS["left_turn"], SPEC.max_speed_mps)
-CONGESTION = similarity_to(CARS["congestion"], SPEC.max_speed_mps)
+LEFT_TURN = similarity_to(CARS["left_turn"], SPEC)
+CONGESTION = similarity_to(CARS["congestion"], SPEC)
 TICK_S = 0.02
 
 
@@ -127,7 +127,7 @@ class Drive:
     """A core with its time, and a vehicle that does at once what it is told (or not)."""
 
     def __init__(self, similarity=LEFT_TURN, **changes):
-        self.core = Ros2Core(Ros2Settings(**changes), SPEC, similarity)
+        self.core = Ros2Core(Ros2Settings(**changes), similarity)
         self.now_s = 100.0
         self.speed_mps = self.angular = 0.0
         self.sends_odometry = self.obeys = True

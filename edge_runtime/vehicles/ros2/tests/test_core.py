@@ -10,10 +10,16 @@ from hypothesis import strategies as st
 
 from edge_runtime.config import Ros2Settings
 from edge_runtime.vehicles.core import COMMAND_TIMEOUT_S, ENABLE_TIMEOUT_S, Event, State
-from edge_runtime.vehicles.ros2.core import ROS2_LEADS_TO, Measured, Motion, Ros2Core
 from edge_runtime.vehicles.ros2.names import STEERING, YAW_RATE
 from edge_runtime.vehicles.ros2.tests.ros_hunter import CONGESTION, LEFT_TURN, SPEC, TICK_S, Drive
-from edge_runtime.vehicles.ros2.vehicle import drive_of, twist_of
+from edge_runtime.vehicles.ros2.vehicle import (
+    ROS2_LEADS_TO,
+    Measured,
+    Motion,
+    Ros2Core,
+    drive_of,
+    twist_of,
+)
 
 
 def test_nothing_is_sent_before_enable():
@@ -59,9 +65,8 @@ def test_a_policy_without_a_pedal_has_the_cars_speed_and_its_own_steering():
     drive = Drive(CONGESTION).start()
     motion = drive.run(3.0, {"steering": -1.0}, scenario_speed_mps=4.0)
     assert motion.speed_mps == pytest.approx(1.0)
-    curvature = CONGESTION.vehicle_curvature(-1.0)
-    assert curvature > 0  # -1 turns left
-    assert motion.centre_rad == pytest.approx(math.atan(curvature * SPEC.wheelbase_m))
+    assert CONGESTION.centre_rad(-1.0) > 0  # -1 turns left
+    assert motion.centre_rad == pytest.approx(CONGESTION.centre_rad(-1.0))
 
 
 def stop_by_silence(drive):
@@ -146,7 +151,7 @@ def test_a_clock_set_back_counts_after_the_next_enable():
 
 
 def test_odometry_without_stamps_is_believed_by_its_arrival():
-    core = Ros2Core(Ros2Settings(), SPEC, LEFT_TURN)
+    core = Ros2Core(Ros2Settings(), LEFT_TURN)
     core.enable(0.0)
     for tick in range(20):
         core.hear(Measured(0, 0.1, 0.0), tick * TICK_S)
@@ -217,7 +222,7 @@ STEPS = st.one_of(
 @example([("enable",), ("hear", 0, 0.0, 0.0), ("command", 6e307, 0.0, None)])  # inf * 0 s
 @given(st.lists(STEPS, max_size=40))
 def test_whatever_comes_it_stays_in_its_limits_and_stopped_means_stopped(steps):
-    core, now_s, may_drive = Ros2Core(Ros2Settings(), SPEC, CONGESTION), 0.0, False
+    core, now_s, may_drive = Ros2Core(Ros2Settings(), CONGESTION), 0.0, False
     for name, *values in steps:
         if name == "enable":
             core.enable(now_s)

@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from threading import Thread
@@ -22,9 +23,8 @@ from edge_runtime.tests.harness import wait_until
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.ros2 import names, node
-from edge_runtime.vehicles.ros2 import node as cdr
 from edge_runtime.vehicles.ros2 import node as ros
-from edge_runtime.vehicles.ros2.node import open_node
+from edge_runtime.vehicles.ros2.node import Ros2Node
 from edge_runtime.vehicles.ros2.tests import second
 from edge_runtime.vehicles.ros2.tests.second import KINDS, MESSAGES
 from edge_runtime.wire import Reason, Rejection
@@ -76,7 +76,7 @@ def test_any_vehicle_id_gives_a_valid_namespace(vehicle_id):
 
 def test_a_publishers_token_by_the_letter():
     token = names.topic_token(
-        "a1b2", names.PUBLISHER, "hunter01/cmd_vel", "geometry_msgs/msg/Twist", names.RELIABLE
+        "a1b2", names.PUBLISHER, "hunter01/cmd_vel", "geometry_msgs/msg/Twist"
     )
     assert token == (
         "@/a1b2/@ros2_lv/MP/hunter01§cmd_vel/geometry_msgs§msg§Twist/:1:0:0,10:typehash="
@@ -87,7 +87,7 @@ def test_a_publishers_token_by_the_letter():
 @pytest.mark.parametrize("type_name", names.TYPES)
 @pytest.mark.parametrize("kind", [names.PUBLISHER, names.SUBSCRIBER])
 def test_a_token_parses_as_the_bridge_parses_it(type_name, kind):
-    token = names.topic_token("a1", kind, "x/y", type_name, names.BEST_EFFORT)
+    token = names.topic_token("a1", kind, "x/y", type_name)
     zenoh.KeyExpr(token)  # raises for what Zenoh would not declare
     found = BRIDGE_TOKEN.fullmatch(token)
     assert found is not None
@@ -96,7 +96,7 @@ def test_a_token_parses_as_the_bridge_parses_it(type_name, kind):
     assert key.replace("§", "/") == "x/y"
     assert kind_of_message.replace("§", "/") == type_name
     keyed, reliable, durable, history, user_data = qos.split(":")
-    assert (keyed, reliable, durable, history) == ("", "0", "0", "0,10")
+    assert (keyed, reliable, durable, history) == ("", str(int(kind == "MP")), "0", "0,10")
     assert re.fullmatch(r"typehash=RIHS01_[0-9a-f]{64};", user_data)
 
 
@@ -327,7 +327,7 @@ def test_what_we_publish_arrives_and_is_announced(sessions):
     heard = []
     listener = theirs.declare_subscriber("hunter01/cmd_vel", lambda s: heard.append(s))
     tokens, watcher = watch_tokens(theirs)
-    with open_node(ours, "/hunter01") as node:
+    with closing(Ros2Node(ours, "/hunter01")) as node:
         publish = node.publisher("cmd_vel", ros.Twist)
         wait_until(lambda: len(tokens) == 2, "the tokens of the node and its publisher")
         zid = str(ours.info.zid())
@@ -344,7 +344,7 @@ def test_what_we_publish_arrives_and_is_announced(sessions):
 
 def test_a_late_bridge_learns_of_us_too(sessions):
     ours, theirs = sessions
-    with open_node(ours, "/") as node:
+    with closing(Ros2Node(ours, "/")) as node:
         node.subscribe("odom", ros.Odometry, lambda _: None)
         tokens, watcher = watch_tokens(theirs)
         wait_until(lambda: any("/MS/odom/" in token for token in tokens), "the earlier token")
@@ -357,14 +357,14 @@ def test_we_hear_the_second_library_and_count_what_is_none(sessions):
     odometry = ros.Odometry(ros.Header(ros.Time(5, 6), "odom"), "base_link")
     odometry.twist.twist.linear.x = 0.75
     good = second.serialize("nav_msgs/msg/Odometry", asdict(odometry))
-    with open_node(ours, "/hunter01") as node:
+    with closing(Ros2Node(ours, "/hunter01")) as node:
         node.subscribe("odom", ros.Odometry, heard.append)
         wait_until(lambda: theirs.put("hunter01/odom", good) or heard, "the odometry")
         assert heard[0] == odometry
         theirs.put("hunter01/odom", b"")
         theirs.put("hunter01/odom", b"\0\7\0\0")
-        theirs.put("hunter01/odom", bytes(cdr.MAX_PAYLOAD_BYTES + 1))
-        theirs.put("hunter01/odom", cdr.encode(SLOW_TURN))
+        theirs.put("hunter01/odom", bytes(ros.MAX_PAYLOAD_BYTES + 1))
+        theirs.put("hunter01/odom", ros.encode(SLOW_TURN))
         wait_until(lambda: sum(node.rejected.values()) >= 4, "the rejections")
         assert node.rejected == {"malformed": 2, "schema": 1, "oversized": 1}
 

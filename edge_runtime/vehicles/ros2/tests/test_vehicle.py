@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from edge_runtime.config import Ros2Settings, VehicleSetup, load_config
+from edge_runtime.config import Config, Ros2Settings, load_config
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import (
     PATIENCE_S,
@@ -43,8 +43,7 @@ def all_closed():
 
 
 def make_vehicle(scenario="left_turn", **changes):
-    similarity = similarity_to(CARS[scenario], SPEC.max_speed_mps)
-    made.append(Ros2Vehicle(Ros2Settings(**changes), SPEC, similarity))
+    made.append(Ros2Vehicle(Ros2Settings(**changes), similarity_to(CARS[scenario], SPEC)))
     return made[-1]
 
 
@@ -79,7 +78,7 @@ def pair(request):
     endpoint = free_endpoint()
     if request.param == "we listen":
         vehicle = make_vehicle(listen=endpoint)
-        assert vehicle.limits == vehicle_limits("ros2", VehicleSetup("left_turn"))
+        assert vehicle.limits == vehicle_limits("ros2", Config(), "left_turn")
         vehicle.enable(time.monotonic())
         hunter = RosHunter(connect=endpoint)
     else:
@@ -89,6 +88,18 @@ def pair(request):
     yield vehicle, hunter
     vehicle.close()
     hunter.__exit__()
+
+
+@pytest.fixture
+def enabled():
+    """A vehicle that listens, and the Hunter whose odometry has confirmed it."""
+    endpoint = free_endpoint()
+    vehicle = make_vehicle(listen=endpoint)
+    vehicle.enable(time.monotonic())
+    with RosHunter(connect=endpoint) as hunter:
+        enable(vehicle)
+        yield vehicle, hunter
+        vehicle.close()
 
 
 def enable(vehicle):
@@ -167,34 +178,27 @@ def test_both_kinds_of_command_below_a_namespace_and_their_tokens():
         assert hunter.asked_mps == 0.0
 
 
-def test_silence_stops_it_and_only_an_enable_leads_out():
-    endpoint = free_endpoint()
-    vehicle = make_vehicle(listen=endpoint)
-    vehicle.enable(time.monotonic())
-    with RosHunter(connect=endpoint) as hunter:
-        enable(vehicle)
-        with Commands(vehicle, {"pedal": 1.0}):
-            for _ in range(4):
-                drive(vehicle, hunter, 0.3)
-                hunter.silent = True
-                wait_until(lambda: vehicle.state is State.STOPPED, "the stop")
-                faults = report(vehicle).faults
-                hunter.silent = False
-                if vehicle._core.cause is not Event.COMMAND_LATE:  # this machine paused itself
-                    break
-            assert vehicle._core.cause is Event.SILENT
-            assert faults[0] == "no fresh odometry on odom"
-            time.sleep(0.3)
-            assert vehicle.state is State.STOPPED
-            assert hunter.asked_mps == 0.0
+def test_silence_stops_it_and_only_an_enable_leads_out(enabled):
+    vehicle, hunter = enabled
+    with Commands(vehicle, {"pedal": 1.0}):
+        for _ in range(4):
             drive(vehicle, hunter, 0.3)
-        vehicle.close()
+            hunter.silent = True
+            wait_until(lambda: vehicle.state is State.STOPPED, "the stop")
+            faults = report(vehicle).faults
+            hunter.silent = False
+            if vehicle._core.cause is not Event.COMMAND_LATE:  # this machine paused itself
+                break
+        assert vehicle._core.cause is Event.SILENT
+        assert faults[0] == "no fresh odometry on odom"
+        time.sleep(0.3)
+        assert vehicle.state is State.STOPPED
+        assert hunter.asked_mps == 0.0
+        drive(vehicle, hunter, 0.3)
 
 
-def test_a_message_that_was_held_up_is_followed_at_once_by_one_of_now(monkeypatch):
-    endpoint = free_endpoint()
-    vehicle = make_vehicle(listen=endpoint)
-    vehicle.enable(time.monotonic())
+def test_a_message_that_was_held_up_is_followed_at_once_by_one_of_now(enabled, monkeypatch):
+    vehicle, _ = enabled
     sent: list = []
 
     def stopped_in_between(motion):
@@ -205,40 +209,28 @@ def test_a_message_that_was_held_up_is_followed_at_once_by_one_of_now(monkeypatc
             sent.append((time.monotonic(), motion.speed_mps))
 
     vehicle._publish.append(stopped_in_between)
-    with RosHunter(connect=endpoint):
-        enable(vehicle)
-        with Commands(vehicle, {"pedal": 1.0}):
-            wait_until(lambda: sent, "a message")
-        wait_until(lambda: len(sent) > 1, "the next message")
-    vehicle.close()
+    with Commands(vehicle, {"pedal": 1.0}):
+        wait_until(lambda: sent, "a message")
+    wait_until(lambda: len(sent) > 1, "the next message")
     assert sent[1][0] - sent[0][0] < 0.15
 
 
-def test_the_stream_goes_on_with_zeros_while_stopped():
+def test_the_stream_goes_on_with_zeros_while_stopped(enabled):
     """The chassis is never left to its own time-out, after which any frame gives control back."""
-    endpoint = free_endpoint()
-    vehicle = make_vehicle(listen=endpoint)
-    vehicle.enable(time.monotonic())
-    with RosHunter(connect=endpoint) as hunter:
-        enable(vehicle)
-        vehicle.brake(time.monotonic())
-        count = len(hunter.twists)
-        wait_until(lambda: len(hunter.twists) > count + 25, "half a second of messages")
-        assert {twist["linear"]["x"] for _, twist in hunter.twists} == {0.0}
-        vehicle.close()
+    vehicle, hunter = enabled
+    vehicle.brake(time.monotonic())
+    count = len(hunter.twists)
+    wait_until(lambda: len(hunter.twists) > count + 25, "half a second of messages")
+    assert {twist["linear"]["x"] for _, twist in hunter.twists} == {0.0}
 
 
-def test_at_the_end_zeros_go_out_until_it_stands():
-    endpoint = free_endpoint()
-    vehicle = make_vehicle(listen=endpoint)
-    vehicle.enable(time.monotonic())
-    with RosHunter(connect=endpoint) as hunter:
-        enable(vehicle)
-        with Commands(vehicle, {"pedal": 1.0}):
-            drive(vehicle, hunter, 0.5)
-        vehicle.close()
-        assert hunter.speed_mps < 0.1
-        assert [twist["linear"]["x"] for _, twist in hunter.twists[-5:]] == [0.0] * 5
+def test_at_the_end_zeros_go_out_until_it_stands(enabled):
+    vehicle, hunter = enabled
+    with Commands(vehicle, {"pedal": 1.0}):
+        drive(vehicle, hunter, 0.5)
+    vehicle.close()
+    assert hunter.speed_mps < 0.1
+    assert [twist["linear"]["x"] for _, twist in hunter.twists[-5:]] == [0.0] * 5
 
 
 def test_what_is_no_odometry_is_counted_and_confirms_nothing():
@@ -269,16 +261,6 @@ def test_it_closes_twice_and_without_having_been_enabled():
         if enables:
             vehicle.enable(time.monotonic())
         vehicle.close()
-        vehicle.close()
-
-
-def test_a_busy_port_is_told_by_the_settings_name():
-    endpoint = free_endpoint()
-    vehicle = make_vehicle(listen=endpoint)
-    try:
-        with pytest.raises(UserError, match=r"in use; choose another with \[ros2\] listen$"):
-            make_vehicle(listen=endpoint)
-    finally:
         vehicle.close()
 
 
@@ -374,23 +356,16 @@ def test_it_drives_stops_with_the_link_and_drives_again_only_after_a_rearm(polic
         assert edge.end() == 0
 
 
-@pytest.mark.parametrize(
-    ("table", "part"),
-    [
-        ('[ros2]\nconnect = "tls/127.0.0.1:7448"', "plain text"),
-        ('[ros2]\ntwist_angular = "degrees"', "ros2.twist_angular 'degrees'"),
-        (
-            "[ros2]\ntopic = 1",
-            "ros2: Object contains unknown field `topic`; known are model, listen,",
-        ),
-    ],
-)
-def test_wrong_settings_are_one_line(table, part, tmp_path):
+def test_wrong_settings_of_a_file_are_one_line(tmp_path):
     settings = tmp_path / "edge.toml"
-    settings.write_text(table)
-    with pytest.raises(UserError) as caught:
-        load_config(settings, {"policy": "any.onnx", "vehicle": "ros2"})
-    assert part in str(caught.value)
+    for table, part in (
+        ('connect = "tls/127.0.0.1:7448"', "plain text"),
+        ("topic = 1", "ros2: Object contains unknown field `topic`; known are model, listen,"),
+    ):
+        settings.write_text(f"[ros2]\n{table}")
+        with pytest.raises(UserError) as caught:
+            load_config(settings, {"policy": "any.onnx", "vehicle": "ros2"})
+        assert part in str(caught.value)
 
 
 def test_a_busy_port_is_one_line(policy, tmp_path):
@@ -402,4 +377,4 @@ def test_a_busy_port_is_one_line(policy, tmp_path):
         result = run_command("run", *flags, "--config", str(settings))
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
-    assert "in use" in line
+    assert line.endswith("in use; choose another with [ros2] listen")
