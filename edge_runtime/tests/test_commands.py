@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 import edge_runtime
 from edge_runtime import log
+from edge_runtime.__main__ import main
 from edge_runtime.cli import (
     ArgumentParser,
     not_negative,
@@ -30,7 +31,7 @@ from edge_runtime.cli import (
 from edge_runtime.commands import render_status
 from edge_runtime.config import Config, load_config
 from edge_runtime.link_probe import free_endpoint
-from edge_runtime.tests.harness import Simulator, run_command
+from edge_runtime.tests.harness import Simulator, exit_status, run_command
 from edge_runtime.tests.policies import write_policy
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
@@ -76,7 +77,6 @@ def test_policies_that_may_not_drive(tmp_path, command):
         (["fly"], ["fly", "--help"]),
         (["check"], ["POLICY.onnx"]),
         (["run"], ["--policy"]),
-        (["run", "--policy", "absent.onnx"], ["absent.onnx", "does not exist"]),
         (["run", "--policy", "p.onnx", "--vehicle", "tank"], ["tank", "none, mock, hunter"]),
         (["run", "--policy", "p.onnx", "--bus", "can0"], ["can0", "socketcan:can0"]),
         (["run", "--policy", "p.onnx", "--bus", "socketcan:can0"], ["--vehicle hunter", "none"]),
@@ -93,8 +93,17 @@ def test_policies_that_may_not_drive(tmp_path, command):
         (["rearm", "--connect", "tcp/127.0.0.1:1"], ["nobody answers"]),
     ],
 )
-def test_wrong_arguments(arguments, words, tmp_path):
-    fails_with_one_line(run_command(*arguments, cwd=tmp_path), *words)
+def test_wrong_arguments(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    status = exit_status(main, arguments)
+    fails_with_one_line(
+        subprocess.CompletedProcess(arguments, status, *capsys.readouterr()), *words
+    )
+
+
+def test_a_policy_that_is_not_there(tmp_path):
+    result = run_command("run", "--policy", "absent.onnx", cwd=tmp_path)
+    fails_with_one_line(result, "absent.onnx", "does not exist")
 
 
 def test_status_with_a_simulator_but_no_edge():

@@ -262,6 +262,15 @@ def test_it_closes_twice_and_without_having_been_enabled():
             vehicle.enable(time.monotonic())
         vehicle.close()
         vehicle.close()
+        vehicle.enable(time.monotonic())
+        assert vehicle.state is State.DISABLED
+
+
+def test_a_busy_port_is_told_by_the_settings_name():
+    endpoint = free_endpoint()
+    make_vehicle(listen=endpoint)
+    with pytest.raises(UserError, match=r"in use; choose another with \[ros2\] listen$"):
+        make_vehicle(listen=endpoint)
 
 
 @pytest.mark.parametrize(
