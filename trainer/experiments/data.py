@@ -24,7 +24,8 @@ from trainer.experiments.plan import (
     Unit,
     units_of,
 )
-from trainer.experiments.store import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
+from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS
+from trainer.experiments.store import Store
 
 Numbers = NDArray[np.float64]
 BySeed = dict[int, float]
@@ -34,6 +35,8 @@ GRID_STEPS = 500
 END_STEPS = 1_500
 """What ended within so many steps of the last one is the end of a training."""
 SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
+SECONDS = "seconds"
+"""What 10,000 steps of training took, validations apart."""
 TIME_S, LATERAL, LONGITUDINAL = "time_s", *TEST_COLUMNS[-2:]
 ARRIVED_ONLY = (TIME_S, LATERAL, LONGITUDINAL)
 """Compared over drives that reach the goal only: a car that crashes at once is quick and smooth."""
@@ -96,6 +99,12 @@ class Result:
     def budget(self) -> int:
         """Environment steps that were to be trained."""
         return int(self.record["config"]["steps"])
+
+    @property
+    def seconds(self) -> float:
+        """What 10,000 steps of the training took."""
+        record = self.record
+        return 1e4 * float(record["computed"]["training_s"]) / float(record["totals"]["steps"])
 
     def points(self, kind: str, metric: str) -> tuple[Numbers, Numbers]:
         """At which steps a metric was measured, and its values; in training once an episode."""
@@ -203,6 +212,8 @@ class Results:
                 for condition in ("nominal", "variant")
             )
             return {seed: nominal[seed] - variant[seed] for seed in nominal}
+        if quantity == SECONDS:
+            return {r.unit.seed: r.seconds for r in self.of(place, line)}
         return {r.unit.seed: r.end(kind, quantity) for r in self.of(place, line)}
 
     def _kept(self, scenario: str, line: Line, kind: str) -> BySeed:
@@ -271,17 +282,12 @@ def load(store: Store, seeds: int) -> Results:
     Raises:
         UserError: a record lacks what this project writes.
     """
-    records = {scenario: store.records(scenario) for scenario in SCENARIOS}
-    found, stale = {}, []
-    for unit in units_of(["all"], seeds):
-        record = records[unit.scenario].get(unit)
-        if record is None:
-            continue
-        if record["id"] != store.id(unit):
-            stale.append(unit)
-            continue
-        found[unit] = Result(unit, _checked(record, store.records_file(unit.scenario)))
-    return Results(found, seeds, stale)
+    found, stale = store.find(units_of(["all"], seeds))
+    results = {
+        unit: Result(unit, _checked(record, store.records_file(unit.scenario)))
+        for unit, record in found.items()
+    }
+    return Results(results, seeds, stale)
 
 
 def _checked(record: Mapping[str, Any], path: Any) -> Mapping[str, Any]:
