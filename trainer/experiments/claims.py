@@ -1,232 +1,374 @@
-"""The paper's claims and this project's bars: its words, its number, how it is judged."""
+"""The paper's claims: what is compared, over what, in which direction, and what we measured.
+
+A claim is about algorithms, so the numbers compared are one a training seed, paired by seed. It
+holds, or does not, where a 95 % interval lies on one side; else it is undecided.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import product
+from itertools import pairwise, permutations, product
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from trainer.experiments.data import (
     ALONE,
+    CHANGED,
     DISTANCE,
     DROPPED,
+    EVERYWHERE,
     KEPT,
     LATERAL,
     LONGITUDINAL,
-    LOST,
     PAPER_SCENES,
     REWARD,
+    SECONDS,
     SPREAD,
     SUCCESS,
     TIME_S,
     TRAINING,
     Line,
+    Place,
+    Result,
     Results,
-    Scene,
     words,
 )
-from trainer.experiments.judges import (
-    Finding,
-    Judge,
-    ahead,
-    ahead_in,
-    changed,
-    either,
-    level,
-    positive,
-    same_ranking,
-    sooner,
-    success_bar,
-    unlearned,
+from trainer.experiments.plan import FOUR, GUIDED, HUMAN_MODEL, ONE_FRAME, RANDOM, SCENARIOS
+from trainer.experiments.statistics import (
+    NOTHING,
+    Estimate,
+    Holds,
+    Numbers,
+    above,
+    all_of,
+    bootstrap,
+    mean_estimate,
+    within,
 )
-from trainer.experiments.plan import (
-    BIASED,
-    CONSTANT,
-    FOUR,
-    GUIDED,
-    HUMAN_MODEL,
-    RANDOM,
-    SCENARIOS,
-)
-from trainer.experiments.statistics import above, within
 
+UNITS = {
+    SUCCESS: (100.0, 1, " points"),
+    DISTANCE: (1.0, 2, " m"),
+    SPREAD: (1.0, 2, " m"),
+    REWARD: (1.0, 2, ""),
+    TIME_S: (1.0, 2, " s"),
+    SECONDS: (1.0, 1, " s"),
+    LATERAL: (1.0, 3, " m/s²"),
+    LONGITUDINAL: (1.0, 3, " m/s²"),
+    KEPT: (100.0, 1, " % kept"),
+    DROPPED: (100.0, 1, " points lost"),
+    CHANGED: (100.0, 1, " % change"),
+}
+"""Quantity -> factor, digits and unit as it is shown."""
+SHORT = {DISTANCE: "distance", REWARD: "reward", SUCCESS: "success"}
+SAME_LEVEL = 0.05
+"""What is on one level differs by no more than this share, or by so much success."""
+NEARLY = 0.02
+"""Share of the distance that poor guidance may change where the paper says nearly 50:50."""
+RESAMPLES = 2000
 OF_CURVES = ("fig7", "fig8", "fig11", "fig12", "fig13", "ablation")
 """Their claims speak of training curves, in which the human helps: judged of the policy alone,
 too."""
-NEARLY = 0.02
-"""Share of the distance that poor guidance may change where the paper says nearly 50:50."""
-LEFT, JAM = SCENARIOS
-LEFTS, JAMS = ([s for s in PAPER_SCENES if s.scenario == scenario] for scenario in SCENARIOS)
-BOTH = (REWARD, DISTANCE)
-PHIL, IA, HI, PER = map(Line, FOUR)
-BASELINES = (IA, HI, PER)
-HUMAN, FLOOR = Line(HUMAN_MODEL), Line(CONSTANT)
-TD, ADVANTAGE = Line("phil_td_only"), Line("phil_q_advantage_only")
-SMALL, LARGE = Line("phil_advantage_0.1"), Line("phil_advantage_100")
-RD2_PHIL, RD2 = Line("rd2_phil"), Line("rd2_td3")
-NO_CLONING, NO_SHAPING = Line("phil_without_cloning"), Line("phil_without_shaping")
-POOR_PHIL, POOR_IA, POOR_HI = (Line(name, RANDOM) for name in GUIDED)
-BIASED_PHIL, BIASED_IA = (Line(name, BIASED) for name in GUIDED[:2])
 
 
 class Claim(NamedTuple):
-    """A row: a claim of the paper."""
+    """A row: what the paper says, and the comparisons by which it is judged."""
 
     source: str
     """Experiment, and figure or table of the paper."""
     text: str
     paper: str
     """Its number or word."""
-    judge: Judge
+    test: Callable[[Results, str, Claim], Iterator[Comparison]]
+    """Makes the comparisons, with curves in training or of the policy alone. All must hold."""
+    places: Sequence[Place]
+    ours: Sequence[Line]
+    others: Sequence[Line | None] = (None,)
+    """None: not compared with another line, but with ``bar``."""
+    quantities: Sequence[str] = (DISTANCE,)
+    bar: float = 0.0
+    """What the difference is to be above or below, how near a level is, how many times as soon."""
 
 
+class Comparison(NamedTuple):
+    """One of those that a claim makes."""
+
+    text: str
+    holds: Holds
+    margin: float
+    """How far on the good side it is; nan where nothing is measured."""
+    complete: bool
+    """Whether all trainings are there."""
+
+
+class Finding(NamedTuple):
+    """What was measured about a claim."""
+
+    holds: Holds
+    ours: str
+    """The worst of the comparisons that decide, in words."""
+
+
+def judge(results: Results, claim: Claim, kind: str) -> Finding:
+    """Hold results against a claim; it is undecided where trainings are missing."""
+    made = list(claim.test(results, kind, claim))
+    holds = all_of([one.holds for one in made])
+    measured = [one for one in made if one.holds == holds and not np.isnan(one.margin)]
+    if not measured:
+        return Finding("undecided", "not measured")
+    worst = min(measured, key=lambda one: one.margin)
+    return Finding(holds if all(one.complete for one in made) else "undecided", worst.text)
+
+
+def judge_both(results: Results, claim: Claim) -> tuple[Finding, Finding | None]:
+    """As the paper does, with training curves; and of the policy alone, where it has curves."""
+    alone = judge(results, claim, ALONE) if claim.source in OF_CURVES else None
+    return judge(results, claim, TRAINING), alone
+
+
+def ahead(results: Results, kind: str, claim: Claim, sign: float = 1.0) -> Iterator[Comparison]:
+    """Whether each of ours is above (sign -1: below) each of the others in every place; with sign
+    0, whether it is on their level.
+    """
+    for place, quantity, first, second in product(
+        claim.places, claim.quantities, claim.ours, claim.others
+    ):
+        own = results.estimate(place, first, quantity, kind)
+        complete = results.complete(place, first, quantity)
+        one, over = own, ""
+        if second:
+            found = results.differences(place, first, second, quantity, kind)
+            one, over = mean_estimate(found.values()), f" over {second.name}"
+            complete = complete and results.complete(place, second, quantity)
+        if sign:
+            holds, margin = above(one.times(sign), sign * claim.bar), sign * one.value
+        else:
+            scale = 1.0 if quantity == SUCCESS else abs(own.value)
+            holds, margin = within(one, claim.bar or SAME_LEVEL * scale), -abs(one.value)
+        factor, digits, unit = UNITS[quantity]
+        text = f"{one.times(factor).text(digits)}{unit}: {first.name}{over}, "
+        yield Comparison(text + _where(claim, place, quantity), holds, margin, complete)
+
+
+behind, level = partial(ahead, sign=-1.0), partial(ahead, sign=0.0)
+
+
+def _where(claim: Claim, place: Place, quantity: str) -> str:
+    return words(place) + (f", {SHORT[quantity]}" if len(claim.quantities) > 1 else "")
+
+
+def sooner(
+    results: Results, kind: str, claim: Claim, common: bool = False, best: bool = False
+) -> Iterator[Comparison]:
+    """Whether each of ours gets more than so many times as soon where each of the others ends.
+
+    Args:
+        results: of the trainings.
+        kind: of the curves.
+        claim: with the times as its bar; others must be named.
+        common: the level is the lower end of the two, so that both can reach it.
+        best: only the best of the others counts.
+    """
+    for place, quantity in product(claim.places, claim.quantities):
+
+        def end(line: Line, place: Place = place, quantity: str = quantity) -> float:
+            value = results.estimate(place, line, quantity, kind).value
+            return -np.inf if np.isnan(value) else value
+
+        others = [line for line in claim.others if line]
+        everybody = [*claim.ours, *others]
+        complete = all(results.complete(place, line, quantity) for line in everybody)
+        for first, second in product(claim.ours, [max(others, key=end)] if best else others):
+            own, other = (results.of(str(place), line) for line in (first, second))
+            one, steps = sooner_by(own, other, kind, quantity, common)
+            text = f"{one.text(1)} times, {steps}: {first.name} before {second.name}, "
+            text += _where(claim, place, quantity)
+            times = claim.bar or 1.0
+            yield Comparison(text, above(one, times), one.value - times, complete)
+
+
+sooner_to_common, sooner_than_best = partial(sooner, common=True), partial(sooner, best=True)
+
+
+def sooner_by(
+    own: Sequence[Result], other: Sequence[Result], kind: str, quantity: str, common: bool = False
+) -> tuple[Estimate, str]:
+    """How many times as soon one line gets where another one ends, and both in steps.
+
+    A line that never gets there does so somewhere beyond the budget, so the ratio has bounds, and
+    its interval, a bootstrap over the seeds of both, reaches from the lower ones to the upper ones.
+    """
+    if not own or not other:
+        return NOTHING, ""
+    grid = own[0].grid
+    curves = [np.stack([r.curve(kind, quantity) for r in each]) for each in (own, other)]
+    ends = [np.array([r.end(kind, quantity) for r in each]) for each in (own, other)]
+
+    def reached(rows: Sequence[NDArray[np.int64]]) -> list[float]:
+        means = [end[row].mean() for end, row in zip(ends, rows, strict=True)]
+        goal = min(means) if common else means[1]
+        return [
+            first_reached(grid, curve[row].mean(axis=0), goal)
+            for curve, row in zip(curves, rows, strict=True)
+        ]
+
+    budget, random = float(grid[-1]), np.random.default_rng(0)
+    counts = [len(curve) for curve in curves]
+    drawn = [
+        reached([random.integers(count, size=count) for count in counts]) for _ in range(RESAMPLES)
+    ]
+    first, second = reached([np.arange(count) for count in counts])
+    lowest = bootstrap(
+        [min(its, budget) / ours for ours, its in drawn], min(second, budget) / first, min(counts)
+    )
+    highest = bootstrap([its / min(ours, budget) for ours, its in drawn], 0.0, min(counts))
+    said = [f"{steps:,.0f}" if np.isfinite(steps) else "never" for steps in (first, second)]
+    return lowest._replace(high=highest.high), f"{said[0]} against {said[1]} steps"
+
+
+def first_reached(grid: Numbers, curve: Numbers, least: float) -> float:
+    """Steps until a curve first reaches a level, between two points on a straight line."""
+    places = np.flatnonzero(curve >= least - 1e-9)
+    if not len(places):
+        return float("inf")
+    place = int(places[0])
+    if place == 0:
+        return float(grid[0])
+    return float(np.interp(least, curve[place - 1 : place + 1], grid[place - 1 : place + 1]))
+
+
+def same_ranking(results: Results, kind: str, claim: Claim) -> Iterator[Comparison]:
+    """Whether the lines end in one order with two frames and with one.
+
+    Yes where every neighbour is ahead in both, no where two have changed places for sure.
+    """
+    settings = (claim.ours, [Line(line.algorithm, ONE_FRAME) for line in claim.ours])
+    for place in claim.places:
+
+        def is_ahead(first: Line, second: Line, place: Place = place) -> Holds:
+            found = results.differences(place, first, second, DISTANCE, kind)
+            return above(mean_estimate(found.values()))
+
+        means = [[results.estimate(place, x, DISTANCE, kind).value for x in s] for s in settings]
+        orders = [list(np.argsort(np.negative(each), kind="stable")) for each in means]
+        swapped = any(
+            is_ahead(*two) == "yes" and is_ahead(*one) == "no"
+            for two, one in zip(*(permutations(lines, 2) for lines in settings), strict=True)
+        )
+        apart = all(
+            is_ahead(lines[i], lines[j]) == "yes"
+            for lines, order in zip(settings, orders, strict=True)
+            for i, j in pairwise(order)
+        )
+        shown = [" > ".join(claim.ours[i].name for i in order) for order in orders]
+        same: Holds = "yes" if apart and orders[0] == orders[1] else "undecided"
+        text = f"{words(place)}: two frames {shown[0]}, one {shown[1]}"
+        complete = all(results.complete(place, line, KEPT) for line in claim.ours)
+        yield Comparison(text, "no" if swapped else same, float(np.sum(means)), complete)
+
+
+LEFT, JAM = SCENARIOS
+LEFTS, JAMS = ([s for s in PAPER_SCENES if s.scenario == scenario] for scenario in SCENARIOS)
+BOTH = (REWARD, DISTANCE)
+PHIL, IA, HI, PER = map(Line, FOUR)
+BASELINES = (IA, HI, PER)
+HUMAN = Line(HUMAN_MODEL)
+TD, ADVANTAGE = Line("phil_td_only"), Line("phil_q_advantage_only")
+SMALL, LARGE = Line("phil_advantage_0.1"), Line("phil_advantage_100")
+RD2_PHIL, RD2 = Line("rd2_phil"), Line("rd2_td3")
+NO_CLONING, NO_SHAPING = Line("phil_without_cloning"), Line("phil_without_shaping")
+POOR_PHIL, POOR_IA, POOR_HI = (Line(name, RANDOM) for name in GUIDED)
 CLAIMS: tuple[Claim, ...] = (
     Claim("fig7", "left turn: PHIL-TD3 learns the best asymptotic policy", "best",
-          ahead([LEFT], [PHIL], BASELINES, BOTH)),
+          ahead, [LEFT], [PHIL], BASELINES, BOTH),
     Claim("fig7", "left turn: PHIL-TD3, IA-TD3 and HI-TD3 end above vanilla TD3", "higher",
-          ahead([LEFT], [PHIL, IA, HI], [PER], BOTH)),
+          ahead, [LEFT], [PHIL, IA, HI], [PER], BOTH),
     Claim("fig7", "left turn: they get there in a much shorter time", "much shorter",
-          sooner([LEFT], [PHIL, IA, HI], [PER], BOTH)),
+          sooner, [LEFT], [PHIL, IA, HI], [PER], BOTH),
     Claim("fig7", "left turn: HI-TD3 is the slowest of the guided", "slowest",
-          sooner([LEFT], [PHIL, IA], [HI], BOTH, common=True)),
+          sooner_to_common, [LEFT], [PHIL, IA], [HI], BOTH),
     Claim("fig7", "left turn: PHIL-TD3 reaches the best baseline's reward seven times as soon",
-          "over 700 %", sooner([LEFT], [PHIL], BASELINES, [REWARD], times=7.0, best=True)),
+          "over 700 %", sooner_than_best, [LEFT], [PHIL], BASELINES, [REWARD], 7.0),
     Claim("fig7", "congestion: PHIL-TD3 and IA-TD3 have comparable rewards", "comparable",
-          level([JAM], [PHIL], [IA], [REWARD])),
+          level, [JAM], [PHIL], [IA], [REWARD]),
     Claim("fig7", "congestion: their rewards are above those of HI-TD3 and vanilla TD3", "better",
-          ahead([JAM], [PHIL, IA], [HI, PER], [REWARD])),
+          ahead, [JAM], [PHIL, IA], [HI, PER], [REWARD]),
     Claim("fig7", "congestion: PHIL-TD3 survives furthest", "highest",
-          ahead([JAM], [PHIL], BASELINES)),
+          ahead, [JAM], [PHIL], BASELINES),
     Claim("fig7", "congestion: IA-TD3 and HI-TD3 survive comparably far", "comparable",
-          level([JAM], [IA], [HI])),
+          level, [JAM], [IA], [HI]),
     Claim("fig7", "congestion: IA-TD3 learns faster than HI-TD3", "faster",
-          sooner([JAM], [IA], [HI], common=True)),
+          sooner_to_common, [JAM], [IA], [HI]),
     Claim("fig7", "congestion: PHIL-TD3 reaches the best baseline's distance 2.2 times as soon",
-          "over 120 %", sooner([JAM], [PHIL], BASELINES, times=2.2, best=True)),
+          "over 120 %", sooner_than_best, [JAM], [PHIL], BASELINES, [DISTANCE], 2.2),
     Claim("fig8", "one frame instead of two does not change the ranking", "same",
-          same_ranking(SCENARIOS, [PHIL, IA, HI, PER])),
+          same_ranking, SCENARIOS, [PHIL, IA, HI, PER]),
     Claim("fig8", "PHIL-TD3 and IA-TD3 lose less by it than HI-TD3 and vanilla TD3", "less",
-          ahead(SCENARIOS, [PHIL, IA], [HI, PER], [KEPT])),
+          ahead, SCENARIOS, [PHIL, IA], [HI, PER], [KEPT]),
     Claim("fig8", "HI-TD3 and vanilla TD3 lose significantly by it", "significantly",
-          positive(SCENARIOS, [HI, PER], LOST)),
+          behind, SCENARIOS, [HI, PER], quantities=[KEPT], bar=1.0),
     Claim("fig9", "PHIL-TD3 has the highest success rate in the three left turns", "highest",
-          ahead(LEFTS, [PHIL], BASELINES, [SUCCESS])),
+          ahead, LEFTS, [PHIL], BASELINES, [SUCCESS]),
     Claim("fig9", "PHIL-TD3 has the highest success rate in the three congestions", "highest",
-          ahead(JAMS, [PHIL], BASELINES, [SUCCESS])),
+          ahead, JAMS, [PHIL], BASELINES, [SUCCESS]),
     Claim("fig9", "PHIL-TD3 survives furthest in the three left turns", "furthest",
-          ahead(LEFTS, [PHIL], BASELINES)),
+          ahead, LEFTS, [PHIL], BASELINES),
     Claim("fig9", "PHIL-TD3 survives furthest in the three congestions",
           "furthest; but in table II's variant IA-TD3 78.39 m, PHIL-TD3 77.29 m",
-          ahead(JAMS, [PHIL], BASELINES)),
+          ahead, JAMS, [PHIL], BASELINES),
     Claim("fig9", "PHIL-TD3's distance varies least from drive to drive", "lowest variance",
-          ahead(PAPER_SCENES, [PHIL], BASELINES, [SPREAD], sign=-1.0)),
+          behind, PAPER_SCENES, [PHIL], BASELINES, [SPREAD]),
     Claim("fig9", "vanilla TD3 is competitive with IA-TD3 and HI-TD3 in success", "competitive",
-          level(PAPER_SCENES, [PER], [IA, HI], [SUCCESS])),
+          level, PAPER_SCENES, [PER], [IA, HI], [SUCCESS]),
     Claim("fig9", "the variant scenes significantly degrade the three baselines", "significantly",
-          positive(SCENARIOS, BASELINES, DROPPED)),
+          ahead, SCENARIOS, BASELINES, quantities=[DROPPED]),
     Claim("fig10", "left turn: PHIL-TD3 takes the least time", "least",
-          ahead(LEFTS, [PHIL], BASELINES, [TIME_S], sign=-1.0)),
+          behind, LEFTS, [PHIL], BASELINES, [TIME_S]),
     Claim("fig10", "congestion, nominal and noise: the guided are smoother than vanilla TD3",
-          "smoother", ahead(JAMS[:2], [PHIL, IA, HI], [PER], [LATERAL], sign=-1.0)),
+          "smoother", behind, JAMS[:2], [PHIL, IA, HI], [PER], [LATERAL]),
     Claim("fig10", "congestion, variant: PHIL-TD3 is the smoothest", "smoothest",
-          ahead(JAMS[2:], [PHIL], BASELINES, [LATERAL], sign=-1.0)),
+          behind, JAMS[2:], [PHIL], BASELINES, [LATERAL]),
     Claim("table1", "left turn: PHIL-TD3 survives further than the human model",
-          "21.28 to 20.70, 21.27 to 20.88, 21.29 to 20.90 m", ahead(LEFTS, [PHIL], [HUMAN])),
+          "21.28 to 20.70, 21.27 to 20.88, 21.29 to 20.90 m", ahead, LEFTS, [PHIL], [HUMAN]),
     Claim("table2", "congestion: PHIL-TD3 survives further than the human model",
-          "80.15 to 80.11, 79.26 to 77.66, 77.29 to 75.15 m", ahead(JAMS, [PHIL], [HUMAN])),
+          "80.15 to 80.11, 79.26 to 77.66, 77.29 to 75.15 m", ahead, JAMS, [PHIL], [HUMAN]),
     Claim("fig11", "TD error alone learns faster than the Q advantage alone", "faster",
-          sooner(SCENARIOS, [TD], [ADVANTAGE], BOTH, common=True)),
+          sooner_to_common, SCENARIOS, [TD], [ADVANTAGE], BOTH),
     Claim("fig11", "the Q advantage alone ends significantly above TD error alone", "above",
-          ahead(SCENARIOS, [ADVANTAGE], [TD], BOTH)),
+          ahead, SCENARIOS, [ADVANTAGE], [TD], BOTH),
     Claim("fig11", "both together (PHIL-TD3) end highest", "most favourable",
-          ahead(SCENARIOS, [PHIL], [TD, ADVANTAGE], BOTH)),
+          ahead, SCENARIOS, [PHIL], [TD, ADVANTAGE], BOTH),
     Claim("fig12", "weight 0.1 on the Q advantage converges faster than 1", "faster",
-          sooner(SCENARIOS, [SMALL], [PHIL], BOTH, common=True)),
-    Claim("fig12", "weight 0.1 ends below 1", "below", ahead(SCENARIOS, [PHIL], [SMALL], BOTH)),
+          sooner_to_common, SCENARIOS, [SMALL], [PHIL], BOTH),
+    Claim("fig12", "weight 0.1 ends below 1", "below", ahead, SCENARIOS, [PHIL], [SMALL], BOTH),
     Claim("fig12", "weight 100 ends on the level of 1", "same level",
-          level(SCENARIOS, [PHIL], [LARGE], BOTH)),
+          level, SCENARIOS, [PHIL], [LARGE], BOTH),
     Claim("fig13", "one buffer (PHIL-TD3) learns faster than two (RD2-PHIL)", "faster",
-          sooner(SCENARIOS, [PHIL], [RD2_PHIL], BOTH, common=True)),
+          sooner_to_common, SCENARIOS, [PHIL], [RD2_PHIL], BOTH),
     Claim("fig13", "RD2-TD3, without TDQA, ends lowest", "least favourable",
-          ahead(SCENARIOS, [RD2], [PHIL, RD2_PHIL], BOTH, sign=-1.0)),
+          behind, SCENARIOS, [RD2], [PHIL, RD2_PHIL], BOTH),
     Claim("ablation", "behaviour cloning is effective", "effective",
-          ahead(SCENARIOS, [PHIL], [NO_CLONING], BOTH)),
+          ahead, SCENARIOS, [PHIL], [NO_CLONING], BOTH),
     Claim("ablation", "the priority of human demonstrations is effective", "effective",
-          ahead(SCENARIOS, [PHIL], [IA], BOTH)),
+          ahead, SCENARIOS, [PHIL], [IA], BOTH),
     Claim("ablation", "intervention-based shaping is effective", "effective",
-          ahead(SCENARIOS, [PHIL], [NO_SHAPING], BOTH)),
+          ahead, SCENARIOS, [PHIL], [NO_SHAPING], BOTH),
     Claim("fig14", "poor guidance hardly changes PHIL-TD3's distance in any of six scenes",
-          "nearly 50:50", changed(PHIL, partial(within, reach=NEARLY),
-                                  groups=[(scene,) for scene in PAPER_SCENES])),
+          "nearly 50:50", level, PAPER_SCENES, [PHIL], quantities=[CHANGED], bar=NEARLY),
     Claim("fig14", "poor guidance degrades IA-TD3", "-2.1 %",
-          changed(IA, lambda one: above(one.times(-1.0)))),
+          behind, [EVERYWHERE], [IA], quantities=[CHANGED]),
     Claim("fig14", "poor guidance does not degrade HI-TD3", "+3.6 %",
-          changed(HI, partial(above, least=-NEARLY))),
+          ahead, [EVERYWHERE], [HI], quantities=[CHANGED], bar=-NEARLY),
     Claim("fig14", "PHIL-TD3 is more robust to poor guidance than IA-TD3", "more",
-          changed(PHIL, above, than=IA)),
+          ahead, [EVERYWHERE], [PHIL], [IA], [CHANGED]),
     Claim("fig15", "left turn: PHIL-TD3 is the smoothest after poor guidance", "smoothest",
-          ahead(LEFTS, [POOR_PHIL], [POOR_IA, POOR_HI], [LONGITUDINAL], sign=-1.0)),
+          behind, LEFTS, [POOR_PHIL], [POOR_IA, POOR_HI], [LONGITUDINAL]),
     Claim("fig15", "congestion: PHIL-TD3 is the smoothest after poor guidance", "smoothest",
-          ahead(JAMS, [POOR_PHIL], [POOR_IA, POOR_HI], [LATERAL], sign=-1.0)),
+          behind, JAMS, [POOR_PHIL], [POOR_IA, POOR_HI], [LATERAL]),
+    Claim("time", "PHIL-TD3 and IA-TD3 take a similar time to train", "similar, 1.03 times",
+          level, [LEFT], [PHIL], [IA], [SECONDS]),
 )  # fmt: skip
-"""All that the paper says of its results, save of the time, which is measured apart."""
-
-
-BARS: tuple[tuple[str, Judge], ...] = (
-    *(
-        (f"{line.name}, {words(place)}: success at least 85 %",
-         success_bar(Scene(place, "nominal"), line, 0.85))
-        for line, place in product((PER, HI), SCENARIOS)
-    ),
-    *(
-        (f"{line.name}, {words(place)}: above the best constant action",
-         ahead([Scene(place, "nominal")], [line], [FLOOR], [SUCCESS]))
-        for line, place in product((PER, HI), SCENARIOS)
-    ),
-    *(
-        (f"PHIL-TD3, {scene.label}: success at least {100 * least:.0f} %",
-         success_bar(scene, PHIL, least))
-        for scene, least in zip(PAPER_SCENES, (0.99, 0.98, 0.96) * 2, strict=True)
-    ),
-    ("PHIL-TD3 ahead of its human in success or distance in at least four of six scenes",
-     ahead_in(PHIL, HUMAN, 4)),
-    *(
-        (f"{words(place)}: PHIL-TD3 alone at 90 % {how_soon}",
-         sooner([place], [PHIL], [other], [SUCCESS], times, least=0.9, by_mean=True))
-        for place in SCENARIOS
-        for how_soon, other, times in (
-            ("in at most a third of vanilla TD3's steps", PER, 3.0),
-            ("in no more steps than IA-TD3", IA, 1.0),
-        )
-    ),
-    ("with biased guidance PHIL-TD3 ends ahead of IA-TD3 in at least one scenario",
-     either(*(ahead([place], [BIASED_PHIL], [BIASED_IA], [SUCCESS]) for place in SCENARIOS))),
-    *(
-        (f"PHIL-TD3, {words(place)}: ends at most 2 points below its best", unlearned(place, PHIL))
-        for place in SCENARIOS
-    ),
-)  # fmt: skip
-"""What this project asks of itself: words, and how they are judged. Of the policy alone."""
-
-
-class Judged(NamedTuple):
-    """A claim with what was measured."""
-
-    claim: Claim
-    found: Finding
-    alone: Finding | None
-    """The same of the policy alone, where the claim is about training curves."""
-
-
-def judge(results: Results) -> Iterator[Judged]:
-    """Every claim of the paper."""
-    for claim in CLAIMS:
-        alone = claim.judge(results, ALONE) if claim.source in OF_CURVES else None
-        yield Judged(claim, claim.judge(results, TRAINING), alone)
-
-
-def judge_bars(results: Results) -> Iterator[tuple[str, Finding]]:
-    """Every bar."""
-    for text, bar in BARS:
-        yield text, bar(results, ALONE)
+"""All that the paper says of its results."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 
 from edge_runtime.cli import examples, not_negative, whole_number
-from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.evaluate import cores
 from trainer.experiments.plan import (
@@ -17,15 +15,13 @@ from trainer.experiments.plan import (
     PLAN,
     QUICK,
     SCENARIOS,
-    TIME,
     obstacle,
     units_of,
 )
 from trainer.experiments.ray_runner import run_on_ray
 from trainer.experiments.report import write_report
 from trainer.experiments.run import Task, run_units, say
-from trainer.experiments.store import DONE, FAILED, FINISHED, Store
-from trainer.experiments.timing import TIME_FILE, measure
+from trainer.experiments.store import FAILED, FINISHED, Store
 from trainer.options import add_time_limit, deadline_s
 
 EXAMPLE = examples(
@@ -45,10 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         nargs="+",
         metavar="NAME",
-        choices=[*EXPERIMENTS, TIME, ALL, STATUS, REPORT],
-        help=f"compute what {', '.join(EXPERIMENTS)} or {ALL} of them need; {TIME}: measure the "
-        f"training time; {STATUS}: what is done, running and missing; {REPORT}: draw the figures "
-        "and judge the claims from what is done",
+        choices=[*EXPERIMENTS, ALL, STATUS, REPORT],
+        help=f"compute what {', '.join(EXPERIMENTS)} or {ALL} of them need; {STATUS}: how much is "
+        f"done; {REPORT}: draw the figures and judge the claims from what is done",
     )
     what.add_argument(
         "--seeds",
@@ -93,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compute, say how things stand, or report; returns the exit status."""
+    """Compute, say how much is done, or report; returns the exit status."""
     names = list(dict.fromkeys(arguments.names))
     if len(names) > 1 and {STATUS, REPORT} & set(names):
         raise UserError(f"{STATUS} and {REPORT} stand alone")
@@ -107,33 +102,22 @@ def run(arguments: argparse.Namespace) -> int:
     if names == [REPORT]:
         print(f"wrote {write_report(store, arguments.seeds)}")
         return 0
-    computed = [name for name in names if name != TIME]
-    status = _compute(arguments, store, computed) if computed else 0
-    if TIME in names:
-        measured = json.dumps(measure(store))
-        write_atomic(store.results / TIME_FILE, f"{measured}\n".encode())
-    return status
-
-
-def _compute(arguments: argparse.Namespace, store: Store, names: list[str]) -> int:
     wanted = units_of(names, arguments.seeds, arguments.scenario)
     if not wanted:
         raise UserError(f"{', '.join(names)}: nothing to compute in {arguments.scenario}")
-    obstacles = {unit: obstacle(unit, store.humans) for unit in wanted}
-    possible = [unit for unit in wanted if not obstacles[unit]]
-    if len(possible) < len(wanted):
-        missing = sorted({text for text in obstacles.values() if text})
-        say(f"{len(wanted) - len(possible)} units left out: {'; '.join(missing)}")
-    states = store.states(possible)
-    # The clock that the processes have, too.
-    stop_at_s = deadline_s(arguments, time.time)
-    left = [Task(unit, store, stop_at_s) for unit in possible if states[unit] != DONE]
+    possible = [unit for unit in wanted if not obstacle(unit, humans)]
+    reasons = {reason for unit in wanted if (reason := obstacle(unit, humans))}
+    if reasons:
+        say(f"{len(wanted) - len(possible)} units left out: {'; '.join(sorted(reasons))}")
+    done, _ = store.find(possible)
+    stop_at_s = deadline_s(arguments, time.time)  # the clock that the processes have, too
+    left = [Task(unit, store, stop_at_s) for unit in possible if unit not in done]
     if left and arguments.ray:
         ends = run_on_ray(left, arguments.ray)
     else:
         ends = run_units(left, arguments.jobs or cores())
     said = "".join(f", {count} {end}" for end, count in ends.items())
-    print(f"{len(possible) - len(left)} of {len(wanted)} units were done{said}")
+    print(f"{len(done)} of {len(wanted)} units were done{said}")
     if ends[FINISHED] < len(left):
         print("the same command goes on")
     return 1 if ends[FAILED] else 0

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,14 +20,16 @@ from trainer.experiments.plan import (
     NORMAL,
     ONE_FRAME,
     PAPER_TESTS,
+    RANDOM,
     SCENARIOS,
     TESTED_ONLY,
     Unit,
     units_of,
 )
-from trainer.experiments.store import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS, Store
+from trainer.experiments.run import TEST_COLUMNS, TRAINING_COLUMNS, VALIDATION_COLUMNS
+from trainer.experiments.statistics import Estimate, Numbers, mean_estimate
+from trainer.experiments.store import Store
 
-Numbers = NDArray[np.float64]
 BySeed = dict[int, float]
 """Training seed -> a number of that training."""
 GRID_STEPS = 500
@@ -37,10 +40,12 @@ SUCCESS, DISTANCE, REWARD = "success", "distance_m", "reward"
 TIME_S, LATERAL, LONGITUDINAL = "time_s", *TEST_COLUMNS[-2:]
 ARRIVED_ONLY = (TIME_S, LATERAL, LONGITUDINAL)
 """Compared over drives that reach the goal only: a car that crashes at once is quick and smooth."""
-SPREAD = "spread_m"
-"""Standard deviation of the surviving distance from drive to drive."""
-KEPT, LOST, DROPPED = "kept with one frame", "lost with one frame", "dropped in the variant"
-"""Shares of the final distance, one frame against two; success, nominal minus variant scene."""
+SPREAD, SECONDS = "spread_m", "seconds"
+"""Standard deviation of the surviving distance from drive to drive; what 10,000 training steps
+took, validations apart."""
+KEPT, DROPPED, CHANGED = "kept", "dropped", "changed"
+"""Share of the final distance that is left with one frame instead of two; success in the nominal
+scene minus that in the variant; relative change of the distance by random poor guidance."""
 TRAINING, ALONE = "in training", "alone"
 """A curve of the training episodes, in which the human helps (the paper's), or of the policy alone,
 on validation seeds."""
@@ -74,6 +79,8 @@ class Scene(NamedTuple):
 
 Place = str | Scene
 """A scenario, for its trainings, or a scene of the tests."""
+EVERYWHERE = "mean of the scenes"
+"""A place, too: the paper's six scenes together."""
 
 
 def words(place: Place) -> str:
@@ -93,9 +100,10 @@ class Result:
     record: Mapping[str, Any]
 
     @cached_property
-    def budget(self) -> int:
-        """Environment steps that were to be trained."""
-        return int(self.record["config"]["steps"])
+    def grid(self) -> Numbers:
+        """The multiples of ``GRID_STEPS`` up to the budget of steps, or the budget alone."""
+        budget = int(self.record["config"]["steps"])
+        return np.arange(min(GRID_STEPS, budget), budget + 1, GRID_STEPS, dtype=float)
 
     def points(self, kind: str, metric: str) -> tuple[Numbers, Numbers]:
         """At which steps a metric was measured, and its values; in training once an episode."""
@@ -111,17 +119,16 @@ class Result:
         return np.asarray(columns["end_step"], float), values
 
     def curve(self, kind: str, metric: str) -> Numbers:
-        """A metric at each multiple of ``GRID_STEPS`` up to the budget.
+        """A metric at each point of the grid.
 
-        In training it is the mean of the episodes since the multiple before, or of the next one
+        In training it is the mean of the episodes since the point before, or of the next one
         where none ended there.
         """
         steps, values = self.points(kind, metric)
-        grid = grid_of(self.budget)
         if kind == ALONE:
-            return np.interp(grid, steps, values)
+            return np.interp(self.grid, steps, values)
         means = []
-        for end in grid:
+        for end in self.grid:
             inside = (steps > end - GRID_STEPS) & (steps <= end)
             next_one = min(int(np.searchsorted(steps, end)), len(values) - 1)
             means.append(values[inside].mean() if inside.any() else values[next_one])
@@ -145,28 +152,33 @@ class Result:
         values = np.asarray(self.record["tests"][condition][quantity], float)
         return self._cut(values) if quantity == DISTANCE else values
 
+    def mean(self, condition: str, quantity: str) -> float:
+        """A quantity's mean over the test drives; nan where none arrives that could count."""
+        if quantity == SPREAD:
+            return float(self.drives(condition, DISTANCE).std())
+        values = self.drives(condition, quantity)
+        if quantity in ARRIVED_ONLY:
+            values = values[self.reached(condition)]
+        return float(values.mean()) if len(values) else float("nan")
+
+    @property
+    def seconds(self) -> float:
+        """What 10,000 steps of the training took."""
+        return 1e4 * self.record["computed"]["training_s"] / self.record["totals"]["steps"]
+
     def _cut(self, distances_m: Numbers) -> Numbers:
         return np.minimum(distances_m, FULL_PATH_M[self.unit.scenario])
 
 
-def grid_of(budget: int) -> Numbers:
-    """The multiples of ``GRID_STEPS`` up to a budget, or the budget alone."""
-    return np.arange(min(GRID_STEPS, budget), budget + 1, GRID_STEPS, dtype=float)
-
-
+@dataclass(frozen=True)
 class Results:
-    """The results of a plan, of so many seeds.
+    """The results of a plan."""
 
-    Args:
-        found: unit -> its result.
-        seeds: how many seeds are wanted.
-        stale: units whose record is of other settings, and left out.
-    """
-
-    def __init__(
-        self, found: Mapping[Unit, Result], seeds: int, stale: Iterable[Unit] = ()
-    ) -> None:
-        self.found, self.seeds, self.stale = dict(found), seeds, tuple(stale)
+    found: Mapping[Unit, Result]
+    seeds: int
+    """How many are wanted."""
+    stale: Collection[Unit] = ()
+    """Units whose record is of other settings, and left out."""
 
     def of(self, scenario: str, line: Line) -> list[Result]:
         """What there is of a line in a scenario, by seed."""
@@ -174,27 +186,26 @@ class Results:
         units = [Unit(scenario, *line, seed) for seed in numbers]
         return [self.found[unit] for unit in units if unit in self.found]
 
-    def complete(self, scenario: str, line: Line) -> bool:
-        """Whether no seed is missing."""
+    def complete(self, place: Place, line: Line, quantity: str) -> bool:
+        """Whether no seed of what such a number is made of is missing."""
+        scenario = place.scenario if isinstance(place, Scene) else place
+        scenarios = SCENARIOS if scenario == EVERYWHERE else (scenario,)
+        other = {KEPT: ONE_FRAME, CHANGED: RANDOM}.get(quantity, line.setting)
         wanted = 1 if line.algorithm in TESTED_ONLY else self.seeds
-        return len(self.of(scenario, line)) == wanted
-
-    def budget(self, scenario: str) -> int:
-        """The longest training in a scenario; 0 without any."""
-        trained = (r for r in self.found.values() if r.unit.trained)
-        return max((r.budget for r in trained if r.unit.scenario == scenario), default=0)
+        needed = product(scenarios, (line, Line(line.algorithm, other)))
+        return all(len(self.of(*each)) == wanted for each in needed)
 
     def numbers(self, place: Place, line: Line, quantity: str, kind: str = ALONE) -> BySeed:
         """One number a training: where it ends in a scenario, or its test drives' mean in a scene.
 
         ``kind`` is that of the curves in a scenario.
         """
-        if quantity == LOST:
-            kept = self.numbers(place, line, KEPT, kind)
-            return {seed: 1.0 - share for seed, share in kept.items()}
+        if quantity == CHANGED:
+            scenes = [place] if isinstance(place, Scene) else PAPER_SCENES
+            return self._changed(scenes, line)
         if isinstance(place, Scene):
             found = self.of(place.scenario, line)
-            return {r.unit.seed: _amount(r, place.condition, quantity) for r in found}
+            return {r.unit.seed: r.mean(place.condition, quantity) for r in found}
         if quantity == KEPT:
             return self._kept(place, line, kind)
         if quantity == DROPPED:
@@ -203,7 +214,13 @@ class Results:
                 for condition in ("nominal", "variant")
             )
             return {seed: nominal[seed] - variant[seed] for seed in nominal}
+        if quantity == SECONDS:
+            return {r.unit.seed: r.seconds for r in self.of(place, line)}
         return {r.unit.seed: r.end(kind, quantity) for r in self.of(place, line)}
+
+    def estimate(self, place: Place, line: Line, quantity: str, kind: str = ALONE) -> Estimate:
+        """Mean and interval of the seeds' numbers."""
+        return mean_estimate(self.numbers(place, line, quantity, kind).values())
 
     def _kept(self, scenario: str, line: Line, kind: str) -> BySeed:
         """Each seed's part in the ratio of the final distances, one frame over two.
@@ -220,6 +237,16 @@ class Results:
         ratio = float(np.mean([one[seed] for seed in seeds])) / mean
         return {seed: ratio + (one[seed] - ratio * two[seed]) / mean for seed in seeds}
 
+    def _changed(self, scenes: Sequence[Scene], line: Line) -> BySeed:
+        """Each seed's change of the distance by poor guidance, mean of the scenes."""
+        by_seed: dict[int, list[float]] = {}
+        for scene in scenes:
+            lines = line, Line(line.algorithm, RANDOM)
+            good, poor = (self.numbers(scene, one, DISTANCE) for one in lines)
+            for seed in good.keys() & poor.keys():
+                by_seed.setdefault(seed, []).append(poor[seed] / good[seed] - 1.0)
+        return {seed: float(np.mean(values)) for seed, values in by_seed.items()}
+
     def pooled(self, scene: Scene, line: Line, quantity: str, paper: bool = False) -> Numbers:
         """A quantity of all drives of all seeds; of those with the paper's seeds alone."""
         count = PAPER_TESTS if paper else None
@@ -229,40 +256,25 @@ class Results:
     def differences(
         self, place: Place, first: Line, second: Line, quantity: str, kind: str = ALONE
     ) -> BySeed:
-        """First minus second, paired by training seed; arguments as for ``numbers``.
+        """First minus second, paired by training seed; what is not trained pairs with every seed.
 
         What is compared of arrivals only is the mean over the test drives in which both arrive.
         """
-
-        def partner(seed: int) -> int:
-            return 0 if second.algorithm in TESTED_ONLY else seed
-
-        if quantity not in ARRIVED_ONLY:
+        if not (quantity in ARRIVED_ONLY and isinstance(place, Scene)):
             own, other = (self.numbers(place, line, quantity, kind) for line in (first, second))
-            return {
-                seed: own[seed] - other[partner(seed)] for seed in own if partner(seed) in other
-            }
-        assert isinstance(place, Scene)
+            pairs = {seed: other.get(seed, other.get(0)) for seed in own}
+            return {seed: own[seed] - its for seed, its in pairs.items() if its is not None}
         theirs = {result.unit.seed: result for result in self.of(place.scenario, second)}
         found = {}
         for result in self.of(place.scenario, first):
-            its = theirs.get(partner(result.unit.seed))
-            if its is None:
+            rival = theirs.get(result.unit.seed, theirs.get(0))
+            if rival is None:
                 continue
-            both = result.reached(place.condition) & its.reached(place.condition)
+            both = result.reached(place.condition) & rival.reached(place.condition)
             if both.any():
-                pair = (r.drives(place.condition, quantity)[both] for r in (result, its))
-                found[result.unit.seed] = float(np.subtract(*pair).mean())
+                values = (r.drives(place.condition, quantity)[both] for r in (result, rival))
+                found[result.unit.seed] = float(np.subtract(*values).mean())
         return found
-
-
-def _amount(result: Result, condition: str, quantity: str) -> float:
-    if quantity == SPREAD:
-        return float(result.drives(condition, DISTANCE).std())
-    values = result.drives(condition, quantity)
-    if quantity in ARRIVED_ONLY:
-        values = values[result.reached(condition)]
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def load(store: Store, seeds: int) -> Results:
@@ -271,30 +283,22 @@ def load(store: Store, seeds: int) -> Results:
     Raises:
         UserError: a record lacks what this project writes.
     """
-    records = {scenario: store.records(scenario) for scenario in SCENARIOS}
-    found, stale = {}, []
-    for unit in units_of(["all"], seeds):
-        record = records[unit.scenario].get(unit)
-        if record is None:
-            continue
-        if record["id"] != store.id(unit):
-            stale.append(unit)
-            continue
-        found[unit] = Result(unit, _checked(record, store.records_file(unit.scenario)))
-    return Results(found, seeds, stale)
+    found, stale = store.find(units_of(["all"], seeds))
+    for unit, record in found.items():
+        _check(unit, record, f"{store.records_file(unit.scenario)}: the record of {unit}")
+    return Results({unit: Result(unit, found[unit]) for unit in found}, seeds, stale)
 
 
-def _checked(record: Mapping[str, Any], path: Any) -> Mapping[str, Any]:
-    """The record, whose columns are there and of one length."""
-    unit = Unit(**record["unit"])
-    tables: dict[str, tuple[Any, tuple[str, ...]]]
+def _check(unit: Unit, record: Mapping[str, Any], named: str) -> None:
+    """Refuse a record whose columns are not there, or not of one length."""
+    tables: dict[str, tuple[Any, Collection[str]]]
     tables = {name: (record["tests"].get(name), TEST_COLUMNS) for name in CONDITIONS}
     if unit.trained:
-        tables["training"] = record.get("training"), tuple(TRAINING_COLUMNS)
-        tables["validation"] = record.get("validation"), tuple(VALIDATION_COLUMNS)
+        tables["training"] = record.get("training"), TRAINING_COLUMNS
+        tables["validation"] = record.get("validation"), VALIDATION_COLUMNS
     for name, (columns, wanted) in tables.items():
         if not isinstance(columns, dict) or not set(wanted) <= set(columns):
-            raise UserError(f"{path}: the record of {unit} lacks columns of {name}")
-        if len({len(columns[column]) for column in wanted}) != 1 or not columns[wanted[0]]:
-            raise UserError(f"{path}: the record of {unit} is cut off in {name}")
-    return record
+            raise UserError(f"{named} lacks columns of {name}")
+        lengths = {len(columns[column]) for column in wanted}
+        if len(lengths) != 1 or lengths == {0}:
+            raise UserError(f"{named} is cut off in {name}")

@@ -108,7 +108,6 @@ class Experiment(NamedTuple):
     scenarios: tuple[str, ...] = SCENARIOS
 
 
-TIME = "time"
 EXPERIMENTS: Mapping[str, Experiment] = {
     "fig7": Experiment("learning curves", FOUR),
     "fig8": Experiment("normal and tough setting", FOUR, (NORMAL, ONE_FRAME)),
@@ -122,6 +121,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "table1": Experiment("beside the human, left turn", (*GUIDED, HUMAN_MODEL), scenarios=LEFT),
     "table2": Experiment("beside the human, congestion", (*GUIDED, HUMAN_MODEL), scenarios=JAM),
     "ablation": Experiment("PHIL-TD3 without each of its parts", ("phil_td3", "ia_td3", *PARTS)),
+    "time": Experiment("training time", FOUR, scenarios=LEFT),
     "printed": Experiment("the settings as the paper prints them", FOUR, (NORMAL, PRINTED)),
     "floor": Experiment("the best constant action", (CONSTANT,)),
 }
@@ -148,8 +148,6 @@ class Plan:
     """Validation drives of each constant action in the search for the best one."""
     search_points: int = 21
     """Actions on each of the two grids of that search."""
-    timed_steps: int = 10_000
-    """Training steps of each algorithm whose time is taken."""
     learner: Mapping[str, Any] = field(default_factory=dict)
     """Hyper-parameters changed for every algorithm alike."""
 
@@ -164,7 +162,6 @@ QUICK = Plan(
     checkpoint_every=1,
     search_runs=2,
     search_points=3,
-    timed_steps=200,
     learner={"batch_size": 4, "warmup_steps": 16},
 )
 """A look at everything in a minute or two; its numbers mean nothing."""

@@ -1,7 +1,7 @@
 """The same units on a Ray cluster: no node needs a disk that it shares with another.
 
 A task takes along what there is of a unit, its checkpoint and its human, and brings back what it
-made; whoever asked keeps it.
+made; the caller keeps it.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import torch
+from typing import Any
 
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError
@@ -28,43 +26,34 @@ WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)
 """What a unit goes on from."""
 RETRIES = 3
 """How often a unit is begun again when the node under it dies."""
-
-
-class Parcel(NamedTuple):
-    """A task on its way to a node, or back from it with its record."""
-
-    task: Task
-    human: bytes | None
-    working: dict[str, bytes]
-    record: dict[str, Any] | None = None
+Files = dict[str, bytes]
+Parcel = tuple[Task, Files, Files]
+"""A task on its way to a node: with its human model, and with what it goes on from."""
 
 
 def pack(task: Task) -> Parcel:
     """A task with all that a node needs for it."""
-    model = task.store.humans / task.unit.scenario / MODEL_FILE
-    human = model.read_bytes() if task.unit.needs_human else None
-    return Parcel(task, human, _read(task.store.run_dir(task.unit)))
+    human = task.store.humans / task.unit.scenario
+    return task, read(human, [MODEL_FILE]), read(task.store.run_dir(task.unit), WORKING_FILES)
 
 
-def compute_parcel(parcel: Parcel) -> Parcel:
-    """Unpack, compute and pack again; runs on a node."""
-    torch.set_num_threads(1)
+def compute_parcel(parcel: Parcel) -> tuple[dict[str, Any] | None, Files]:
+    """Compute a unit on a node: its record, None where time ran out, and its working files."""
+    task, human, working = parcel
     with tempfile.TemporaryDirectory() as directory:
-        root, unit = Path(directory), parcel.task.unit
-        store = replace(parcel.task.store, results=root, runs=root, humans=root / "humans")
-        if parcel.human is not None:
-            _write(store.humans / unit.scenario, {MODEL_FILE: parcel.human})
-        run_dir = store.run_dir(unit)
-        _write(run_dir, parcel.working)
-        record = make_record(replace(parcel.task, store=store), run_dir, lambda steps: None)
-        return parcel._replace(working=_read(run_dir), record=record)
+        root = Path(directory)
+        store = replace(task.store, results=root, runs=root, humans=root / "humans")
+        write(store.humans / task.unit.scenario, human)
+        run_dir = store.run_dir(task.unit)
+        write(run_dir, working)
+        record = make_record(replace(task, store=store), run_dir)
+        return record, read(run_dir, WORKING_FILES)
 
 
-def keep(parcel: Parcel) -> str:
+def keep(task: Task, record: dict[str, Any] | None, working: Files) -> str:
     """Keep what a node made; how the unit ended."""
-    store, unit = parcel.task.store, parcel.task.unit
-    _write(store.run_dir(unit), parcel.working)
-    return store.keep(unit, parcel.record)
+    write(task.store.run_dir(task.unit), working)
+    return task.store.keep(task.unit, record)
 
 
 def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
@@ -85,7 +74,7 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
         for task in tasks:
             if not locks.enter_context(task.store.lock(task.unit, PATIENCE_S)):
                 ends[BUSY] += 1
-            elif task.store.record(task.unit):  # made elsewhere since it was asked for
+            elif task.unit in task.store.find([task.unit])[0]:  # made elsewhere in the meantime
                 ends[FINISHED] += 1
             else:
                 waiting[remote.remote(pack(task))] = task
@@ -93,7 +82,7 @@ def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
             (ready, *_), _ = ray.wait(list(waiting))
             task = waiting.pop(ready)
             try:
-                end = keep(ray.get(ready)._replace(task=task))
+                end = keep(task, *ray.get(ready))
             except ray.exceptions.RayError as error:
                 cause = getattr(error, "cause", None) or error
                 last = str(cause).strip().splitlines()[-1:]  # a MemoryError says nothing
@@ -111,11 +100,12 @@ def _connected(address: str) -> Any:
     except ImportError:
         raise UserError("--ray needs Ray: python -m pip install '.[ray]'") from None
     if not ray.is_initialized():
+        import bridge
         import edge_runtime
         import trainer
 
         # Nodes need the libraries; our own code is sent to them.
-        modules = {"py_modules": [edge_runtime, trainer]}
+        modules = {"py_modules": [edge_runtime, bridge, trainer]}
         try:
             ray.init(address=address, runtime_env=modules, log_to_driver=False)
         except (ConnectionError, ValueError, RuntimeError) as error:
@@ -123,12 +113,14 @@ def _connected(address: str) -> Any:
     return ray
 
 
-def _read(run_dir: Path) -> dict[str, bytes]:
-    paths = [run_dir / name for name in WORKING_FILES]
+def read(directory: Path, names: Sequence[str]) -> Files:
+    """Those of the files that are there."""
+    paths = [directory / name for name in names]
     return {path.name: path.read_bytes() for path in paths if path.is_file()}
 
 
-def _write(directory: Path, files: dict[str, bytes]) -> None:
+def write(directory: Path, files: Files) -> None:
+    """Write the files, each whole or not at all."""
     make_directory(directory)
     for name, data in files.items():
         write_atomic(directory / name, data)

@@ -1,8 +1,7 @@
-"""One page that holds the results against the paper: claims, bars, tables and figures."""
+"""One page that holds the results against the paper: a summary, and a part for each experiment."""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -11,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from edge_runtime.files import write_atomic
-from edge_runtime.util import UserError, read_bytes
-from trainer.experiments.claims import Judged, judge, judge_bars
+from edge_runtime.util import UserError
+from trainer.experiments.claims import CLAIMS, Claim, Finding, judge_both
 from trainer.experiments.data import (
-    ALONE,
     DISTANCE,
     PAPER_SCENES,
     SCENES,
+    SECONDS,
     SUCCESS,
     Line,
     Results,
@@ -25,21 +24,18 @@ from trainer.experiments.data import (
     words,
 )
 from trainer.experiments.figures import FIGURES, write_figure
-from trainer.experiments.judges import SAME_LEVEL, Finding, steps_to
 from trainer.experiments.plan import (
     CONSTANT,
     EXPERIMENTS,
+    FOUR,
     HUMAN_MODEL,
     LINES,
     PAPER_TESTS,
     SCENARIOS,
     SETTINGS,
-    TIME,
     units_of,
 )
-from trainer.experiments.statistics import Estimate, mean_estimate, within
 from trainer.experiments.store import Store
-from trainer.experiments.timing import PAPER_S, TIME_FILE, Turns, ratio, seconds
 
 COMMAND = "python -m trainer experiment"
 PAPER_TABLES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -57,10 +53,14 @@ PAPER_TABLES: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 """Tables I and II of the paper: surviving distance, m, by scene."""
+PAPER_S = dict(zip(FOUR, (360.70, 348.71, 328.93, 329.39), strict=True))
+"""The paper's table of time efficiency: seconds for 10,000 steps."""
 EVERY_LINE = [Line(name, setting) for _, setting, names in LINES for name in names]
 """Every line that is computed, in the order of work."""
 COSTS = ("episodes", "steps", "updates", "human_steps", "takeovers")
-"""Of a record's totals, those that the page shows as they are."""
+"""What the page shows of a record's totals."""
+Judged = tuple[Claim, Finding, Finding | None]
+"""A claim with what was measured, and with the same of the policy alone."""
 
 
 def write_report(store: Store, seeds: int) -> Path:
@@ -80,64 +80,66 @@ def write_report(store: Store, seeds: int) -> Path:
 
 
 def _page(results: Results, store: Store) -> Iterator[str]:
-    judged, bars = list(judge(results)), list(judge_bars(results))
-    yield from _introduction(results, judged, bars)
-    yield from _section(
-        "The paper's claims", "report",
-        "A verdict is yes or no where a 95 % interval of the difference, paired by training seed, "
-        "lies on one side of the bar; else it is undecided. What decides is the worst of the "
-        "comparisons that a claim makes. Learning curves are judged twice: as the paper does, on "
-        "training episodes in which the human helps, and by the policy alone on validation drives.",
-    )  # fmt: skip
-    yield from table(
-        ("", "claim", "the paper", "what decides", "holds", "policy alone", "holds"),
-        (
-            (f"[{claim.source}](#{_anchor(claim.source)})", claim.text, claim.paper, found.ours,
-             found.holds, *((alone.ours, alone.holds) if alone else ("", "")))
-            for claim, found, alone in judged
-        ),
-    )  # fmt: skip
-    yield from _time_lines(store.results / TIME_FILE)
-    yield from _section(
-        "This project's bars", "report",
-        "Of the policy alone: means of the seeds decide about shares and steps, 95 % intervals "
-        "about which one is ahead.",
-    )  # fmt: skip
-    yield from table(("bar", "measured", "met"), ((t, f.ours, f.holds) for t, f in bars))
-    yield from _tests(results)
-    for name, scenario in zip(PAPER_TABLES, SCENARIOS, strict=True):
-        yield from _paper_table(results, name, scenario)
+    judged = [(claim, *judge_both(results, claim)) for claim in CLAIMS]
+    yield from _summary(results, store, judged)
+    for name, experiment in EXPERIMENTS.items():
+        title = f"{name}: {experiment.title}"
+        yield from (f"## {title}", "", f"`{COMMAND} {name}`", "")
+        if name in FIGURES:
+            yield from (f"![{title}]({name}.png)", "")
+        if name in PAPER_TABLES:
+            yield from _distances(results, name)
+        if name == "fig9":
+            yield from _tests(results)
+        if name == "time":
+            yield from _times(results)
+        if name == "floor":
+            yield from _floor(results)
+        rows = [
+            (claim.text, claim.paper, f.ours, f.holds, *((a.ours, a.holds) if a else ("", "")))
+            for claim, f, a in judged
+            if claim.source == name
+        ]
+        if rows:
+            head = ("claim", "the paper", "what decides", "holds", "policy alone", "holds")
+            yield from table(head, rows)
     yield from _costs(results)
-    for name in FIGURES:
-        title = EXPERIMENTS[name].title
-        yield from _section(f"{name}: {title}", name, f"![{title}]({name}.png)")
 
 
-def _introduction(
-    results: Results, judged: Sequence[Judged], bars: Sequence[tuple[str, Finding]]
-) -> Iterator[str]:
-    wanted = units_of(["all"], results.seeds)
-    holds, met = Counter(one.found.holds for one in judged), Counter(f.holds for _, f in bars)
-    budgets = " and ".join(f"{results.budget(name):,} in the {words(name)}" for name in SCENARIOS)
+def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterator[str]:
+    wanted = len(units_of(["all"], results.seeds))
+    steps = " and ".join(f"{store.plan.steps[name]:,} in the {words(name)}" for name in SCENARIOS)
     yield from (
         "# The paper's experiments, run again",
         "",
         f"`{COMMAND} all --seeds {results.seeds}` computes what is missing, `{COMMAND} report` "
         "writes this page and its figures from `left_turn.jsonl` and `congestion.jsonl`, one line "
-        f"a training. {len(results.found)} of {len(wanted)} trainings and tests are there.",
+        f"a training. {len(results.found)} of {wanted} trainings and tests are there.",
         "",
-        f"Every algorithm has the same budget of environment steps: {budgets}. The policy is "
-        "validated alone every 500 steps; the best validated actor drives 250 test drives in each "
-        f"scene, of which the first {PAPER_TESTS} have the paper's seeds.",
+        f"Every algorithm has the same budget of environment steps: {steps}. The policy is "
+        f"validated alone every {store.plan.evaluate_every_steps} steps; the best validated actor "
+        f"drives {store.plan.test_runs} test drives in each scene, of which the first "
+        f"{PAPER_TESTS} have the paper's seeds.",
         "",
-        f"Of the paper's {len(judged)} claims {holds['yes']} hold, {holds['no']} do not, and "
-        f"{holds['undecided']} are undecided. Of this project's {len(bars)} bars {met['yes']} are "
-        f"met, {met['no']} are not, {met['undecided']} are undecided.",
+        "A claim holds or does not where a 95 % interval of the difference, paired by training "
+        "seed, lies on one side; else it is undecided. What decides is the worst of the "
+        "comparisons that it makes. Learning curves are judged twice: as the paper does, on "
+        "training episodes in which the human helps, and by the policy alone on validation drives.",
         "",
     )
     if results.stale:
         yield f"{len(results.stale)} records are of other settings than today's and left out."
         yield ""
+    counts: Counter[tuple[str, str]] = Counter(
+        (claim.source, found.holds) for claim, found, _ in judged
+    )
+    answers = ("yes", "no", "undecided")
+    rows = [
+        (f"[{name}](#{_anchor(name)})", one.title, *(counts[name, answer] for answer in answers))
+        for name, one in EXPERIMENTS.items()
+    ]
+    totals = (sum(counts[name, answer] for name in EXPERIMENTS) for answer in answers)
+    yield from table(("", "about", *answers), [*rows, ("all", "", *totals)])
     yield from table(
         ("setting", "meaning", "algorithms"),
         (
@@ -148,73 +150,52 @@ def _introduction(
     )
 
 
-def _anchor(source: str) -> str:
-    """The link to the section of an experiment, as GitHub makes it."""
-    title = f"{source} {EXPERIMENTS[source].title}".lower().replace(",", "")
-    return title.replace(" ", "-")
+def _anchor(name: str) -> str:
+    """The link to the part of an experiment, as GitHub makes it."""
+    return f"{name} {EXPERIMENTS[name].title}".lower().replace(",", "").replace(" ", "-")
 
 
-def _time_lines(path: Path) -> Iterator[str]:
-    """The paper's table of time efficiency beside ours, and what it says of them."""
-    if not path.is_file():
-        yield from _section("Training time", TIME, "Not measured.")
-        return
-    yield from _section("Training time", TIME)
-    turns = _turns(path)
-    yield from table(
-        ("seconds for 10,000 steps", *(Line(name).name for name in PAPER_S)),
-        (
-            ("the paper", *(f"{each:.0f}" for each in PAPER_S.values())),
-            ("ours", *(f"{seconds(turns[name]):.0f}" for name in PAPER_S)),
-        ),
-    )
-    found = ratio(turns["phil_td3"], turns["ia_td3"])
-    value, low, high = (each - 1.0 for each in found[:3])
-    holds = within(Estimate(value, low, high, found.size), SAME_LEVEL)
+def _times(results: Results) -> Iterator[str]:
+    """The paper's table of time efficiency beside ours."""
     yield (
-        f'"Similar", says the paper of PHIL-TD3 and IA-TD3 (1.03 times): {found.text(3)} times, '
-        f"so within 5 %: {holds}."
+        "Seconds for 10,000 steps without validations, mean of the seeds. Trainings share their "
+        "machine with others; `python -m trainer bench` measures the time of a step undisturbed."
     )
     yield ""
-
-
-def _turns(path: Path) -> dict[str, Turns]:
-    try:
-        measured = json.loads(read_bytes(path, "measurement"))["turns"]
-        return {name: [(int(n), float(s)) for n, s in measured[name]] for name in PAPER_S}
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is no measurement of this project") from None
+    ours = (results.estimate(SCENARIOS[0], Line(name), SECONDS).text(0) for name in PAPER_S)
+    paper = (f"{seconds:.0f}" for seconds in PAPER_S.values())
+    names = (Line(name).name for name in PAPER_S)
+    yield from table(("", *names), [("the paper", *paper), ("ours", *ours)])
 
 
 def _tests(results: Results) -> Iterator[str]:
     """Success of every policy in every scene."""
-    yield from _section(
-        "Test drives", "fig9 fig14 printed floor",
+    yield (
         "Success in %, mean of the seeds, with its 95 % interval; in brackets that of the "
-        f"paper's {PAPER_TESTS} seeds alone.",
-    )  # fmt: skip
+        f"paper's {PAPER_TESTS} seeds alone."
+    )
+    yield ""
     rows = []
     for line in EVERY_LINE:
         cells = []
         for scene in SCENES:
-            found = mean_estimate(results.numbers(scene, line, SUCCESS).values())
+            share = results.estimate(scene, line, SUCCESS).as_share()
             paper = results.pooled(scene, line, SUCCESS, paper=True)
-            shown = f"{found.as_share()} ({100 * paper.mean():.0f})" if len(paper) else "–"
-            cells.append(shown)
+            cells.append(f"{share} ({100 * paper.mean():.0f})" if len(paper) else "–")
         if set(cells) != {"–"}:
             rows.append((line.name, *cells))
     yield from table(("", *(scene.label for scene in SCENES)), rows)
 
 
-def _paper_table(results: Results, name: str, scenario: str) -> Iterator[str]:
+def _distances(results: Results, name: str) -> Iterator[str]:
     """A table of the paper with our numbers beside its own."""
-    yield from _section(
-        f"{name}: {EXPERIMENTS[name].title}", name,
+    yield (
         "Surviving distance, m, mean and standard deviation over the drives with the paper's "
         f"{PAPER_TESTS} seeds, of all trainings: ours (the paper's). Distances end at the goal, at "
-        "21 and 80 m; the paper counts what was driven beyond it.",
-    )  # fmt: skip
-    scenes = [scene for scene in PAPER_SCENES if scene.scenario == scenario]
+        "21 and 80 m; the paper counts what was driven beyond it."
+    )
+    yield ""
+    scenes = [scene for scene in PAPER_SCENES if scene.scenario in EXPERIMENTS[name].scenarios]
     rows = []
     for algorithm, numbers in PAPER_TABLES[name].items():
         cells = []
@@ -226,44 +207,30 @@ def _paper_table(results: Results, name: str, scenario: str) -> Iterator[str]:
     yield from table(("", *(scene.label for scene in scenes)), rows)
 
 
-def _costs(results: Results) -> Iterator[str]:
-    """What each training cost, and where the policy alone ends."""
-    yield from _section(
-        "What the trainings cost", "all",
-        "Means of the seeds. Alone: validation drives of the policy without help.",
-    )  # fmt: skip
-    rows = []
-    for scenario in SCENARIOS:
-        for line in EVERY_LINE:
-            found = results.of(scenario, line)
-            if not found or not found[0].unit.trained:
-                continue
-            totals = [result.record["totals"] for result in found]
-            costs = [f"{np.mean([each[key] for each in totals]):,.0f}" for key in COSTS]
-            failures = np.mean([sum(each["failures"].values()) for each in totals])
-            reached = steps_to(found, 0.9)
-            best = np.mean([each["validation"]["best"] for each in totals])
-            end = np.mean([*results.numbers(scenario, line, SUCCESS, ALONE).values()])
-            rows.append((
-                words(scenario), line.name, str(len(found)), *costs, f"{failures:.0f}",
-                f"{reached:,.0f}" if np.isfinite(reached) else "never",
-                f"{100 * best:.0f} %", f"{100 * end:.0f} %",
-            ))  # fmt: skip
-    yield from table(
-        ("", "", "seeds", "episodes", "steps", "updates", "human steps", "take-overs", "failures",
-         "steps to 90 % alone", "best alone", "end alone"), rows)  # fmt: skip
+def _floor(results: Results) -> Iterator[str]:
     for scenario in SCENARIOS:
         for result in results.of(scenario, Line(CONSTANT)):
             action, tried = result.record["action"], len(result.record["success_of"])
-            best = f"{action:g}, the best of {tried} on validation drives."
-            yield from (f"Best constant action in the {words(scenario)}: {best}", "")
+            yield f"Best in the {words(scenario)}: {action:g}, of {tried} on validation drives."
+            yield ""
 
 
-def _section(title: str, names: str, text: str = "") -> Iterator[str]:
-    """A heading, the command that computes what is below it, and a paragraph."""
-    yield from (f"## {title}", "", f"`{COMMAND} {names}`", "")
-    if text:
-        yield from (text, "")
+def _costs(results: Results) -> Iterator[str]:
+    """What each training cost, and how well the policy alone drove in its validations."""
+    yield from ("## What the trainings cost", "", "Means of the seeds.", "")
+    rows = []
+    for scenario in SCENARIOS:
+        for line in EVERY_LINE:
+            found = [result for result in results.of(scenario, line) if result.unit.trained]
+            if found:
+                totals = [result.record["totals"] for result in found]
+                costs = [f"{np.mean([each[key] for each in totals]):,.0f}" for key in COSTS]
+                best = np.mean([each["validation"]["best"] for each in totals])
+                end = results.estimate(scenario, line, SUCCESS).value
+                shares = f"{100 * best:.0f} %", f"{100 * end:.0f} %"
+                rows.append((words(scenario), line.name, str(len(found)), *costs, *shares))
+    costs = [name.replace("_", " ") for name in COSTS]
+    yield from table(("", "", "seeds", *costs, "best alone", "end alone"), rows)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterator[str]:

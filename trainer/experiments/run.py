@@ -6,17 +6,17 @@ Whatever is killed goes on from its last checkpoint, to the same bits.
 from __future__ import annotations
 
 import math
-import multiprocessing.connection
+import multiprocessing
 import os
 import sys
 import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from multiprocessing.connection import wait
+from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from typing import Any
 
@@ -39,29 +39,49 @@ from trainer.drivers import (
 from trainer.drivers import CONSTANT as CONSTANT_DRIVER
 from trainer.evaluate import die_with_parent, drive_together, interrupts_blocked
 from trainer.experiments.plan import CONSTANT, Plan, Unit, deciding, run_config, testing
-from trainer.experiments.store import (
-    BUSY,
-    FAILED,
-    FINISHED,
-    STOPPED,
-    TEST_COLUMNS,
-    TRAINING_COLUMNS,
-    VALIDATION_COLUMNS,
-    Store,
-)
+from trainer.experiments.store import BUSY, FAILED, FINISHED, STOPPED, Store
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import multiplies_bfloat16
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
 from trainer.util import ProgressBar, holder, processor_model, source_revision
 
-PARTS = ("environment_s", "acting_s", "storing_s", "waiting_s")
+TRAINING_COLUMNS = {
+    "end_step": "total_steps",
+    "return": "episode_return",
+    "distance_m": "distance_m",
+    "outcome": "outcome",
+    "human_steps": "human_steps",
+    "takeovers": "interventions",
+}
+"""Column of a record -> column of a run's metrics, a value an episode."""
+VALIDATION_COLUMNS = {
+    "at_step": "total_steps",
+    "success": "validation_success",
+    "distance_m": "validation_distance_m",
+    "reward": "validation_reward",
+}
+"""The same, a value a validation."""
+TEST_COLUMNS = (
+    "outcome",
+    "distance_m",
+    "time_s",
+    "reward",
+    "lateral_acceleration_mps2",
+    "longitudinal_acceleration_mps2",
+)
+"""What is kept of each test drive; the seeds are 0, 1, ..."""
+TIMES = ("environment_s", "acting_s", "storing_s", "waiting_s")
 """Columns of the metrics that add up to the time that a training took."""
 DIGITS = 5
 PATIENCE_S = 1.0
 """How long a unit may be held before it counts as another process's work."""
 NICENESS = 5
 """So that a machine on which somebody works stays usable."""
+EXITS = (FINISHED, FAILED, STOPPED, BUSY)
+"""Exit status of a unit's process -> how the unit ended."""
+POLL_S = 1.0
+"""Between two looks at how far the processes are."""
 OnSteps = Callable[[int], object]
 """Told how many environment steps of the unit are done."""
 
@@ -81,17 +101,24 @@ def compute(task: Task, on_steps: OnSteps = lambda steps: None) -> str:
     unit, store = task.unit, task.store
     with store.lock(unit, PATIENCE_S) as free:
         if not free:
+            say(f"left to {holder(store.lock_file(unit))}: {unit}")
             return BUSY
-        if store.record(unit):
+        if unit in store.find([unit])[0]:
             return FINISHED
         return store.keep(unit, make_record(task, store.run_dir(unit), on_steps))
 
 
-def make_record(task: Task, run_dir: Path, on_steps: OnSteps) -> dict[str, Any] | None:
-    """Train and test a unit; its record, or None where time ran out."""
+def make_record(
+    task: Task, run_dir: Path, on_steps: OnSteps = lambda steps: None
+) -> dict[str, Any] | None:
+    """Train and test a unit; its record, or None where time ran out.
+
+    torch works on one thread: the last bits must not depend on the machine's cores.
+    """
     unit, store = task.unit, task.store
     if time.time() > task.stop_at_s:
         return None
+    torch.set_num_threads(1)
     began_s = time.monotonic()
     record: dict[str, Any] = {
         "id": store.id(unit),
@@ -104,10 +131,13 @@ def make_record(task: Task, run_dir: Path, on_steps: OnSteps) -> dict[str, Any] 
         if not _train(task, run_dir, on_steps):
             return None
         rows = read_metrics(run_dir)
-        record.update(_training(rows, run_dir))
-        seconds["training_s"] = round(
-            sum(float(row[name] or 0.0) for row in rows for name in PARTS)
-        )
+        validated = [row for row in rows if row["validation_success"] not in ("", "nan")]
+        tested = load_actor(run_dir)[1]["episode"]  # counted from 1: after so many episodes
+        record["training"] = _columns(rows, TRAINING_COLUMNS)
+        record["validation"] = _columns(validated, VALIDATION_COLUMNS)
+        record["totals"] = totals(rows)
+        record["tested_actor_at_step"] = int(rows[tested - 1]["total_steps"])
+        seconds["training_s"] = round(sum(float(row[key] or 0.0) for row in rows for key in TIMES))
         policy = str(run_dir)
     elif unit.algorithm == CONSTANT:
         record["action"], record["success_of"] = best_constant(unit.scenario, store.plan)
@@ -166,18 +196,6 @@ def _trained(run_dir: Path, steps: int) -> bool:
     return rows[-1]["validation_success"] not in ("", "nan") and (run_dir / BEST_FILE).is_file()
 
 
-def _training(rows: Sequence[dict[str, str]], run_dir: Path) -> dict[str, Any]:
-    """What a record keeps of a training."""
-    validated = [row for row in rows if row["validation_success"] not in ("", "nan")]
-    tested = load_actor(run_dir)[1]["episode"]  # counted from 1: after so many episodes
-    return {
-        "training": _columns(rows, TRAINING_COLUMNS),
-        "validation": _columns(validated, VALIDATION_COLUMNS),
-        "totals": totals(rows),
-        "tested_actor_at_step": int(rows[tested - 1]["total_steps"]),
-    }
-
-
 def _columns(rows: Sequence[dict[str, str]], names: dict[str, str]) -> dict[str, list[Any]]:
     return {ours: [_value(row[theirs]) for row in rows] for ours, theirs in names.items()}
 
@@ -199,25 +217,13 @@ def drive_tests(scenario: str, policy: str, plan: Plan) -> dict[str, dict[str, l
     """The test drives of a policy: condition -> column -> a value a drive."""
     tests = {}
     driver: Any = load_driver(policy, make_environment(scenario))[0]
-    with one_thread():
-        for condition in CONDITIONS:
-            envs = [make_environment(scenario, condition) for _ in range(plan.together)]
-            drives = drive_together(envs, driver.act_together, range(plan.test_runs), condition)
-            tests[condition] = {
-                name: [rounded(getattr(drive, name)) for drive in drives] for name in TEST_COLUMNS
-            }
+    for condition in CONDITIONS:
+        envs = [make_environment(scenario, condition) for _ in range(plan.together)]
+        drives = drive_together(envs, driver.act_together, range(plan.test_runs), condition)
+        tests[condition] = {
+            name: [rounded(getattr(drive, name)) for drive in drives] for name in TEST_COLUMNS
+        }
     return tests
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch on one thread: the last bits must not depend on the machine's cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
@@ -247,34 +253,36 @@ def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
 def run_units(tasks: Sequence[Task], jobs: int) -> Counter[str]:
     """Compute units in so many processes at a time; how many ended in which way.
 
-    Each failure is one line; none takes another unit with it.
+    Each failure is one line; none takes another unit with it, as one in an executor's pool would.
     """
+    context = multiprocessing.get_context("spawn")
     ends: Counter[str] = Counter()
-    waiting, working = deque(tasks), dict[Any, Worker]()
+    waiting, working, gone_by = deque(tasks), dict[Any, tuple[Any, Task, Any]](), 0
     with ProgressBar("steps", sum(map(_steps, tasks)) or 1) as bar:
         try:
             while waiting or working:
                 while waiting and len(working) < jobs:
-                    task = waiting.popleft()
-                    if time.time() > task.stop_at_s:
-                        ends[STOPPED] += 1
-                    else:
-                        worker = Worker(task)
-                        working[worker.receiver] = worker
-                for receiver in multiprocessing.connection.wait([*working]):
-                    worker = working[receiver]
-                    before, over = worker.steps, worker.hear()
-                    if over:
-                        del working[receiver]
-                        ends[worker.end] += 1
-                    figures = {
-                        "units": f"{ends[FINISHED]}/{len(tasks)}",
-                        "at": str(worker.task.unit),
-                    }
-                    bar.advance(figures, worker.steps - before)
+                    # Without a lock: a process that is killed would take that along.
+                    task, steps = waiting.popleft(), RawValue("L", 0)
+                    process = context.Process(target=_work, args=(task, steps), daemon=True)
+                    with interrupts_blocked():
+                        process.start()
+                    working[process.sentinel] = process, task, steps
+                for sentinel in wait([*working], POLL_S):
+                    process, task, _ = working.pop(sentinel)
+                    process.join()
+                    if process.exitcode not in range(len(EXITS)):
+                        say(f"failed: {task.unit}: its process died ({process.exitcode})")
+                        ends[FAILED] += 1
+                        continue
+                    end = EXITS[process.exitcode]
+                    ends[end] += 1
+                    gone_by += _steps(task) if end == FINISHED else 0
+                at = gone_by + sum(min(now.value, _steps(one)) for _, one, now in working.values())
+                bar.advance({"units": f"{ends[FINISHED]}/{len(tasks)}"}, at - bar.done)
         finally:
-            for worker in working.values():
-                worker.process.kill()
+            for process, _, _ in working.values():
+                process.kill()
     return ends
 
 
@@ -283,57 +291,24 @@ def _steps(task: Task) -> int:
     return task.store.plan.steps[task.unit.scenario] if task.unit.trained else 0
 
 
-class Worker:
-    """A process that computes one unit, and what it has told."""
-
-    def __init__(self, task: Task) -> None:
-        self.task, self.steps, self.end, self.why = task, 0, FAILED, ""
-        context = multiprocessing.get_context("spawn")
-        self.receiver, sender = context.Pipe(duplex=False)
-        self.process = context.Process(target=_work, args=(task, sender), daemon=True)
-        with interrupts_blocked():
-            self.process.start()
-        sender.close()  # so that the end of the process is the end of the pipe
-
-    def hear(self) -> bool:
-        """Take what it tells next; whether it has ended, which is then said."""
-        try:
-            told = self.receiver.recv()
-        except (EOFError, OSError):
-            self.process.join()
-            self._say_end()
-            return True
-        if isinstance(told, int):
-            self.steps = min(told, _steps(self.task))
-        else:
-            self.end, self.why = told
-        return False
-
-    def _say_end(self) -> None:
-        unit = self.task.unit
-        if self.end == FAILED:
-            say(f"failed: {unit}: {self.why or f'its process died ({self.process.exitcode})'}")
-        elif self.end == BUSY:
-            say(f"left to {holder(self.task.store.lock_file(unit))}: {unit}")
-        elif self.end == FINISHED:
-            self.steps = _steps(self.task)
-
-
 def say(line: str) -> None:
     """One line on stderr, beside the progress bar."""
     print(" ".join(line.split()), file=sys.stderr, flush=True)
 
 
-def _work(task: Task, sender: Connection) -> None:
-    """A process's life: it sends how many steps are done, then how it ended and why it failed."""
+def _work(task: Task, steps: Any) -> None:
+    """A process's life: it tells how many steps are done, and by its exit status how it ended."""
     os.nice(NICENESS)
-    torch.set_num_threads(1)
     threading.Thread(target=die_with_parent, daemon=True).start()
+    end, why = FAILED, ""
     try:
-        sender.send((compute(task, sender.send), ""))
+        end = compute(task, lambda done: setattr(steps, "value", done))
     except UserError as error:
-        sender.send((FAILED, str(error)))
+        why = str(error)
     except BaseException as error:
         path = task.store.run_dir(task.unit) / "error.txt"
         write_atomic(path, traceback.format_exc().encode())
-        sender.send((FAILED, f"{type(error).__name__}: {error} ({path})"))
+        why = f"{type(error).__name__}: {error} ({path})"
+    if end == FAILED:
+        say(f"failed: {task.unit}: {why}")
+    sys.exit(EXITS.index(end))

@@ -1,4 +1,4 @@
-"""Means, intervals, tests and the words of a verdict."""
+"""Means, intervals and the verdicts that they allow."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ Holds = Literal["yes", "no", "undecided"]
 CONFIDENCE = 0.95
 TAIL = 0.5 * (1.0 - CONFIDENCE)
 """Outside each end of an interval."""
-RESAMPLES = 2000
 
 
 class Estimate(NamedTuple):
@@ -61,8 +60,7 @@ def mean_estimate(values: Iterable[float]) -> Estimate:
     mean = float(numbers.mean())
     if len(numbers) == 1:
         return Estimate(mean, float("-inf"), float("inf"), 1)
-    error = float(numbers.std(ddof=1)) / len(numbers) ** 0.5
-    reach = float(stats.t.ppf(1.0 - TAIL, len(numbers) - 1)) * error
+    reach = float(stats.t.ppf(1.0 - TAIL, len(numbers) - 1) * stats.sem(numbers))
     return Estimate(mean, mean - reach, mean + reach, len(numbers))
 
 
@@ -101,19 +99,3 @@ def bootstrap(values: Sequence[float], point: float, size: int) -> Estimate:
         return Estimate(point, float("-inf"), float("inf"), size)
     ends = np.quantile(values, (TAIL, 1.0 - TAIL), method="inverted_cdf")
     return Estimate(point, float(ends[0]), float(ends[1]), size)
-
-
-def paired_t(first: Numbers, second: Numbers) -> float:
-    """P value of the paired t-test (two-sided); 1 where the pairs do not differ or are too few."""
-    difference = first - second
-    if len(difference) < 2 or np.all(difference == 0.0):
-        return 1.0
-    if np.all(difference == difference[0]):
-        return 0.0  # scipy divides by a spread of zero
-    return float(stats.ttest_rel(first, second).pvalue)
-
-
-def stars(p_value: float) -> str:
-    """The usual marks of significance."""
-    marks = ((0.001, "***"), (0.01, "**"), (0.05, "*"))
-    return next((mark for limit, mark in marks if p_value < limit), "n.s.")

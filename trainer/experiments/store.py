@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,46 +26,11 @@ from trainer.experiments.plan import (
     unit_id,
     units_of,
 )
-from trainer.training.metrics import METRICS_FILE
 from trainer.util import held
 
-TRAINING_COLUMNS = {
-    "end_step": "total_steps",
-    "return": "episode_return",
-    "distance_m": "distance_m",
-    "outcome": "outcome",
-    "human_steps": "human_steps",
-    "takeovers": "interventions",
-}
-"""Column of a record -> column of a run's metrics, a value an episode."""
-VALIDATION_COLUMNS = {
-    "at_step": "total_steps",
-    "success": "validation_success",
-    "distance_m": "validation_distance_m",
-    "reward": "validation_reward",
-}
-"""The same, a value a validation."""
-TEST_COLUMNS = (
-    "outcome",
-    "distance_m",
-    "time_s",
-    "reward",
-    "lateral_acceleration_mps2",
-    "longitudinal_acceleration_mps2",
-)
-"""What is kept of each test drive; the seeds are 0, 1, ..."""
 FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
 """How work on a unit ends: with its record; at a checkpoint, for lack of time; at once, since
 another process has it; with an error."""
-DONE, STALE, RUNNING, BEGUN, MISSING, IMPOSSIBLE = (
-    "done",
-    "of other settings",
-    "running",
-    "begun",
-    "missing",
-    "without its human",
-)
-"""What a unit can be."""
 WRITING_PATIENCE_S = 60.0
 """How long one waits for a file of records, into which another process writes a megabyte."""
 
@@ -125,10 +90,19 @@ class Store:
                 raise UserError(f"{path}, line {number}, is no record of a unit: {error}") from None
         return found
 
-    def record(self, unit: Unit) -> dict[str, Any] | None:
-        """A unit's record, where there is one and it is of the same settings."""
-        record = self.records(unit.scenario).get(unit)
-        return record if record and record["id"] == self.id(unit) else None
+    def find(self, units: Iterable[Unit]) -> tuple[dict[Unit, dict[str, Any]], list[Unit]]:
+        """The records of these units, and those units whose record is of other settings."""
+        records = {scenario: self.records(scenario) for scenario in SCENARIOS}
+        found, stale = {}, []
+        for unit in units:
+            record = records[unit.scenario].get(unit)
+            if record is None:
+                continue
+            if obstacle(unit, self.humans) or record["id"] != self.id(unit):
+                stale.append(unit)
+            else:
+                found[unit] = record
+        return found, stale
 
     def put(self, unit: Unit, record: dict[str, Any]) -> None:
         """Add a record, in place of an older one of the unit: whole or not at all."""
@@ -153,32 +127,12 @@ class Store:
         (self.run_dir(unit) / CHECKPOINT_FILE).unlink(missing_ok=True)
         return FINISHED
 
-    def states(self, units: Sequence[Unit]) -> dict[Unit, str]:
-        """The state of each unit: done, of other settings, running, begun, missing, ..."""
-        records = {scenario: self.records(scenario) for scenario in SCENARIOS}
-        return {unit: self._state(unit, records[unit.scenario].get(unit)) for unit in units}
-
-    def _state(self, unit: Unit, record: dict[str, Any] | None) -> str:
-        if obstacle(unit, self.humans):
-            return IMPOSSIBLE
-        if record and record["id"] == self.id(unit):
-            return DONE
-        if self.lock_file(unit).exists():
-            with self.lock(unit) as free:
-                if not free:
-                    return RUNNING
-        if (self.run_dir(unit) / METRICS_FILE).exists():
-            return BEGUN
-        return STALE if record else MISSING
-
-    def status_lines(self, seeds_wanted: int) -> Iterator[str]:
-        """A line for each algorithm and setting: how many of its units are in which state."""
-        states = self.states(units_of(["all"], seeds_wanted))
-        groups: dict[tuple[str, ...], Counter[str]] = {}
-        for unit, state in states.items():
-            line = (unit.setting, unit.algorithm, unit.scenario)
-            groups.setdefault(line, Counter())[state] += 1
-        for (setting, algorithm, scenario), counts in groups.items():
-            said = ", ".join(f"{count} {state}" for state, count in counts.items())
-            yield f"{setting:10} {algorithm:24} {scenario:11} {said}"
-        yield f"{list(states.values()).count(DONE)} of {len(states)} units done"
+    def status_lines(self, seeds: int) -> Iterator[str]:
+        """A line for each algorithm and setting: how many of its units are done."""
+        units = units_of(["all"], seeds)
+        found, stale = self.find(units)
+        done = Counter(unit[:3] for unit in found)
+        for line, count in Counter(unit[:3] for unit in units).items():
+            scenario, algorithm, setting = line
+            yield f"{setting:10} {algorithm:24} {scenario:11} {done[line]} of {count} done"
+        yield f"{len(found)} of {len(units)} units done; {len(stale)} records of other settings"

@@ -54,8 +54,7 @@ class Soon(float):
 
 def without_times(store: Store, unit: Unit) -> dict[str, Any]:
     """What must be the same in a unit's record however often it was stopped."""
-    record = store.record(unit)
-    assert record is not None
+    record = store.find([unit])[0][unit]
     return {name: value for name, value in record.items() if name != "computed"}
 
 
@@ -75,7 +74,8 @@ def synthetic(unit: Unit, runs: int = 60) -> dict[str, Any]:
             "lateral_acceleration_mps2": (1.5 - skill + random.gamma(2.0, 0.1, runs)).tolist(),
             "longitudinal_acceleration_mps2": (2 - skill + random.gamma(2.0, 0.1, runs)).tolist(),
         }
-    record = {"id": "", "unit": unit._asdict(), "tests": tests}
+    computed = {"training_s": 300 + unit.seed}
+    record = {"id": "", "unit": unit._asdict(), "tests": tests, "computed": computed}
     if unit.algorithm == CONSTANT:
         return {**record, "action": 0.1, "success_of": {"0": 0.2, "0.1": 0.3}}
     if not unit.trained:

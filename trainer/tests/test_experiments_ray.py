@@ -6,7 +6,7 @@ import pytest
 
 from trainer.experiments.ray_runner import compute_parcel, keep, pack, run_on_ray
 from trainer.experiments.run import Task, compute
-from trainer.experiments.store import DONE, FAILED, FINISHED, STOPPED
+from trainer.experiments.store import FAILED, FINISHED, STOPPED
 from trainer.tests.experiments import UNIT, Soon, store_in, without_times
 
 UNITS = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]
@@ -15,10 +15,10 @@ UNITS = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]
 def test_a_parcel_goes_on_elsewhere_and_brings_back_the_same_record(tmp_path):
     store, other = store_in(tmp_path / "ours"), store_in(tmp_path / "theirs")
     task = Task(UNIT, store, stop_at_s=Soon(1e18))
-    assert keep(compute_parcel(pack(task))) == STOPPED
+    assert keep(task, *compute_parcel(pack(task))) == STOPPED
     task = replace(task, stop_at_s=float("inf"))
-    assert "checkpoint.pt" in pack(task).working
-    assert keep(compute_parcel(pack(task))._replace(task=task)) == FINISHED
+    assert "checkpoint.pt" in pack(task)[2]
+    assert keep(task, *compute_parcel(pack(task))) == FINISHED
     assert compute(Task(UNIT, other)) == FINISHED
     assert without_times(store, UNIT) == without_times(other, UNIT)
 
@@ -45,4 +45,4 @@ def test_a_cluster_computes_all_units_but_the_one_that_fails(cluster, tmp_path):
     (run_dir / "checkpoint.pt").write_bytes(b"no checkpoint")
     ends = run_on_ray([Task(unit, store) for unit in UNITS], cluster.address)
     assert ends == {FAILED: 1, FINISHED: 2}
-    assert list(store.states(UNITS[1:]).values()) == [DONE, DONE]
+    assert list(store.find(UNITS)[0]) == UNITS[1:]

@@ -1,7 +1,6 @@
 """Records out of the air, judged, drawn and reported; and the command around it."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,21 +10,26 @@ from hypothesis import strategies as st
 from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError
 from trainer.__main__ import main
-from trainer.experiments import judges
-from trainer.experiments.claims import BARS, CLAIMS, HI, IA, PER, PHIL, judge, judge_bars
-from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, grid_of, load
-from trainer.experiments.judges import ahead, first_reached, level, sooner, sooner_by
+from trainer.experiments import claims
+from trainer.experiments.claims import (
+    CLAIMS,
+    HI,
+    IA,
+    PER,
+    PHIL,
+    Claim,
+    ahead,
+    first_reached,
+    judge,
+    judge_both,
+    level,
+    sooner,
+    sooner_by,
+)
+from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, load
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import table, write_report
-from trainer.experiments.statistics import (
-    Estimate,
-    above,
-    all_of,
-    mean_estimate,
-    paired_t,
-    within,
-)
-from trainer.experiments.timing import ratio, seconds
+from trainer.experiments.statistics import Estimate, above, all_of, mean_estimate, within
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
 
 SEEDS = 3
@@ -39,7 +43,13 @@ def everything():
 
 @pytest.fixture(autouse=True)
 def few_resamples(monkeypatch):
-    monkeypatch.setattr(judges, "RESAMPLES", 200)
+    monkeypatch.setattr(claims, "RESAMPLES", 200)
+
+
+def finding(results, test, ours, others, bar=0.0):
+    """Of success in the left turn."""
+    claim = Claim("fig7", "", "", test, ["left_turn"], [ours], others, [SUCCESS], bar)
+    return judge(results, claim, ALONE)
 
 
 class TestStatistics:
@@ -70,12 +80,6 @@ class TestStatistics:
         assert all_of(["no", "undecided"]) == "no"
         assert all_of([]) == "undecided"
 
-    def test_the_paired_t_test(self):
-        assert paired_t(np.zeros(3), np.zeros(3)) == 1.0
-        assert paired_t(np.ones(3), np.zeros(3)) == 0.0
-        first = np.array([1.0, 2.0, 4.0])
-        assert paired_t(first, np.zeros(3)) == pytest.approx(0.1181, abs=1e-4)
-
 
 class TestData:
     def test_curves_lie_on_multiples_of_500_steps(self, everything):
@@ -103,26 +107,23 @@ class TestData:
         assert found[1] == pytest.approx(times[both].mean())
 
 
-class TestJudges:
+class TestClaims:
     def test_who_is_ahead_and_who_is_not(self, everything):
-        def judged(judge, ours, *others):
-            return judge(["left_turn"], [ours], others, [SUCCESS])(everything, ALONE)
-
-        assert judged(ahead, PHIL, IA, HI, PER).holds == "yes"
-        found = judged(ahead, PER, HI)
+        assert finding(everything, ahead, PHIL, [IA, HI, PER]).holds == "yes"
+        found = finding(everything, ahead, PER, [HI])
         assert found.holds == "no"
         assert "vanilla TD3 over HI-TD3" in found.ours
-        assert judged(level, PHIL, PHIL).holds == "yes"
-        assert judged(level, PHIL, PER).holds == "no"
+        assert finding(everything, level, PHIL, [PHIL]).holds == "yes"
+        assert finding(everything, level, PHIL, [PER]).holds == "no"
+        assert finding(everything, ahead, PHIL, [None], bar=0.5).holds == "yes"
 
     def test_missing_trainings_leave_it_open(self):
         results = results_of([unit for unit in units_of(["fig7"], SEEDS) if unit != UNIT], SEEDS)
         for other, holds in ((PER, "undecided"), (IA, "yes")):
-            judge = ahead(["left_turn"], [PHIL], [other], [SUCCESS])
-            assert judge(results, ALONE).holds == holds
+            assert finding(results, ahead, PHIL, [other]).holds == holds
 
     def test_how_much_sooner(self):
-        """Straight lines, so that the steps can be worked out by hand."""
+        """Straight lines, so that the steps can be worked out by hand: the other ends at 0.875."""
         units = [Unit("left_turn", name, NORMAL, 1) for name in ("phil_td3", "per_td3")]
         results = results_of(units, 1)
         for unit, end in zip(units, (2_000, 6_000), strict=True):
@@ -130,24 +131,25 @@ class TestJudges:
             columns["at_step"] = list(range(500, 6_001, 500))
             columns["success"] = [min(step / end, 1.0) for step in columns["at_step"]]
         own, other = (results.of("left_turn", line) for line in (PHIL, PER))
-        found, said = sooner_by(own, other, ALONE, SUCCESS, least=0.9)
-        assert (found.value, said) == (pytest.approx(3.0), "1,800 against 5,400 steps")
-        for result in other:
-            result.record["validation"]["success"] = [0.0] * 12
-        found, said = sooner_by(own, other, ALONE, SUCCESS, least=0.9)
-        assert found.value == pytest.approx(6_000 / 1_800), "a lower bound"
-        assert said == "1,800 against never steps"
-        for ours, its, times, holds in (
-            (PHIL, PER, 4.0, "undecided"),
-            (PHIL, PER, 3.0, "yes"),
-            (PER, PHIL, 1.0, "no"),
-        ):
-            bar = sooner(["left_turn"], [ours], [its], [SUCCESS], times, least=0.9, by_mean=True)
-            assert bar(results, ALONE).holds == holds
+        for first, second in ((own, other), (own, own)):
+            level_at = second[0].end(ALONE, SUCCESS)
+            found, said = sooner_by(first, second, ALONE, SUCCESS)
+            steps = (2_000 * level_at, (6_000 if second is other else 2_000) * level_at)
+            assert found.value == pytest.approx(steps[1] / steps[0])
+            assert said == f"{steps[0]:,.0f} against {steps[1]:,.0f} steps"
+        found, said = sooner_by(other, own, ALONE, SUCCESS)
+        assert found.value == pytest.approx(2_000 / 6_000)
+        other[0].record["validation"]["success"] = [0.1] * 12
+        assert sooner_by(other, own, ALONE, SUCCESS)[1] == "never against 2,000 steps"
+        assert sooner_by(other, own, ALONE, SUCCESS, common=True)[1] == "500 against 500 steps"
+
+    def test_it_takes_several_seeds_to_be_sooner(self, everything):
+        assert finding(everything, sooner, PHIL, [PER]).holds == "yes"
+        assert finding(everything, sooner, PHIL, [PER], bar=50.0).holds == "no"
 
     @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12), st.floats(0.0, 1.0))
     def test_a_level_is_reached_where_the_curve_crosses_it(self, values, least):
-        grid, curve = grid_of(500 * len(values)), np.array(values)
+        grid, curve = 500.0 * np.arange(1, len(values) + 1), np.array(values)
         steps = first_reached(grid, curve, least)
         if np.isinf(steps):
             assert curve.max() < least
@@ -156,19 +158,16 @@ class TestJudges:
             assert (curve[grid < steps] <= least).all()
             assert steps <= first_reached(grid, curve, min(least + 0.1, 1.0))
 
-    def test_every_claim_and_bar_is_judged(self, everything):
-        judged, bars = list(judge(everything)), list(judge_bars(everything))
-        assert (len(judged), len(bars)) == (len(CLAIMS), len(BARS))
-        findings = [one.found for one in judged] + [one.alone for one in judged if one.alone]
-        for found in [*findings, *(bar for _, bar in bars)]:
-            assert found.holds in ("yes", "no", "undecided")
-            assert found.ours not in ("", "not measured")
-        assert {one.claim.source for one in judged} <= set(EXPERIMENTS)
+    def test_every_claim_is_judged(self, everything):
+        for claim in CLAIMS:
+            assert claim.source in EXPERIMENTS
+            for found in filter(None, judge_both(everything, claim)):
+                assert found.holds in ("yes", "no", "undecided")
+                assert found.ours not in ("", "not measured")
 
     def test_nothing_is_said_of_nothing(self):
         results = results_of([], SEEDS)
-        assert {one.found.holds for one in judge(results)} == {"undecided"}
-        assert {found.holds for _, found in judge_bars(results)} == {"undecided"}
+        assert {judge_both(results, claim)[0].holds for claim in CLAIMS} == {"undecided"}
 
 
 @pytest.fixture
@@ -185,8 +184,8 @@ def test_the_report_is_made_of_the_records_alone(store):
     page = write_report(store, 2).read_text()
     for name in re.findall(r"\((\w+\.png)\)", page):
         assert (store.results / name).stat().st_size > 1000
-    rows = [line for line in page.splitlines() if line.startswith("| [fig7]")]
-    assert len(rows) == sum(claim.source == "fig7" for claim in CLAIMS)
+    rows = [line for line in page.splitlines() if line.startswith("| left turn: PHIL-TD3")]
+    assert len(rows) == sum(claim.text.startswith("left turn: PHIL-TD3") for claim in CLAIMS)
     assert any("| yes |" in row for row in rows)
     anchors = {f"#{re.sub('[^a-z0-9 -]', '', line[3:].lower()).replace(' ', '-')}"
                for line in page.splitlines() if line.startswith("## ")}  # fmt: skip
@@ -199,8 +198,8 @@ def test_records_of_other_settings_are_left_out(store):
     unit = Unit("left_turn", "ia_td3", NORMAL, 2)
     store.put(unit, {**synthetic(unit), "id": "of another time"})
     results = load(store, 2)
-    assert results.stale == (unit,)
-    assert not results.complete("left_turn", IA)
+    assert results.stale == [unit]
+    assert not results.complete("left_turn", IA, DISTANCE)
 
 
 def test_records_that_lack_something_are_refused(store):
@@ -215,13 +214,6 @@ def test_records_that_lack_something_are_refused(store):
 def test_a_table_keeps_its_columns():
     lines = list(table(("a", "b"), [("x|y", 1)]))
     assert {line.count("|") for line in lines[:-1]} == {3}
-
-
-def test_the_time_of_a_step():
-    slow, quick = [(10, 2.0), (20, 4.0)], [(10, 1.0), (20, 2.0)]
-    assert seconds(slow) == pytest.approx(2_000.0)
-    found = ratio(slow, quick)
-    assert (found.value, found.low, found.high) == pytest.approx((2.0, 2.0, 2.0))
 
 
 class TestCommand:
@@ -255,10 +247,10 @@ class TestCommand:
         ]
         status, said = self.said(capsys, "status", "--seeds", 2, *places)
         assert status == 0
-        lines = said.out.splitlines()
         # They are of another plan: done for it, and of other settings for the command's.
-        assert any("of other settings" in line for line in lines)
-        assert lines[-1].startswith("0 of ")
+        last = said.out.splitlines()[-1]
+        assert last.startswith("0 of ")
+        assert "; 10 records of other settings" in last
 
     def test_without_its_human_a_unit_is_left_out(self, capsys, tmp_path):
         status, said = self.said(
@@ -277,4 +269,4 @@ def test_stopping_soon_leaves_it_to_the_same_command(tmp_path, capsys):
                  "--runs", str(store.runs)]  # fmt: skip
     assert main(arguments) == 0
     assert "the same command goes on" in capsys.readouterr().out
-    assert replace(store, runs=store.runs / "quick").records("left_turn") == {}
+    assert not (store.runs / "quick/results/left_turn.jsonl").exists()

@@ -32,7 +32,7 @@ from trainer.experiments.plan import (
     units_of,
 )
 from trainer.experiments.run import Task, compute, run_units
-from trainer.experiments.store import BEGUN, BUSY, DONE, FAILED, FINISHED, RUNNING, STOPPED
+from trainer.experiments.store import BUSY, FAILED, FINISHED, STOPPED
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
@@ -51,8 +51,7 @@ def straight(tmp_path_factory):
 
 
 def test_a_unit_ends_as_a_record_and_an_actor(straight):
-    record = straight.record(UNIT)
-    assert record["id"] == straight.id(UNIT)
+    record = straight.find([UNIT])[0][UNIT]
     assert set(record["tests"]) == set(CONDITIONS)
     for columns in record["tests"].values():
         assert {len(values) for values in columns.values()} == {TINY.test_runs}
@@ -74,7 +73,6 @@ def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
     assert compute(Task(UNIT, store, stop_at_s=1.0)) == STOPPED, "time was over before it began"
     ends = [compute(Task(UNIT, store, stop_at_s=Soon(1e18))) for _ in range(2)]
     assert ends == [STOPPED, STOPPED]
-    assert store.states([UNIT])[UNIT] == BEGUN
     assert compute(Task(UNIT, store)) == FINISHED
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
@@ -108,7 +106,7 @@ def test_two_processes_share_one_file_of_records(tmp_path):
     ends = run_units([Task(unit, store) for unit in units], 2)
     assert ends == {FINISHED: 3}
     assert list(store.records("left_turn")) == sorted(units)
-    assert set(store.states(units).values()) == {DONE}
+    assert set(store.find(units)[0]) == set(units)
 
 
 def test_a_unit_that_another_process_has_is_left_to_it(straight, tmp_path, monkeypatch):
@@ -117,7 +115,6 @@ def test_a_unit_that_another_process_has_is_left_to_it(straight, tmp_path, monke
     with store.lock(UNIT) as mine:
         assert mine
         assert compute(Task(UNIT, store)) == BUSY
-        assert store.states([UNIT])[UNIT] == RUNNING
 
 
 def test_a_unit_that_is_done_is_not_trained_again(straight, tmp_path, monkeypatch):
@@ -129,19 +126,19 @@ def test_tests_that_change_are_driven_with_the_actor_that_was_kept(straight, tmp
     monkeypatch.setattr(TrainingRun, "train", lambda *_: pytest.fail("trained again"))
     more = replace(straight, plan=replace(TINY, test_runs=5), results=tmp_path)
     assert compute(Task(UNIT, more)) == FINISHED
-    ours, theirs = more.record(UNIT), straight.record(UNIT)
+    ours, theirs = (each.find([UNIT])[0][UNIT] for each in (more, straight))
     assert ours["id"] != theirs["id"]
     assert ours["training"] == theirs["training"]
     for condition in CONDITIONS:
         assert len(ours["tests"][condition]["outcome"]) == 5
 
 
-def test_a_failure_is_one_units_failure(tmp_path, capsys):
+def test_a_failure_is_one_units_failure(tmp_path, capfd):
     store = store_in(tmp_path)
     write_human(store).write_bytes(b"no human")
     ends = run_units([Task(GUIDED, store)], 1)
     assert ends == {FAILED: 1}
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if "failed" in line]
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "failed" in line]
     assert str(GUIDED) in line
 
 
