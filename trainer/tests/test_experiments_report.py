@@ -149,7 +149,8 @@ class TestClaims:
 
     @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12), st.floats(0.0, 1.0))
     def test_a_level_is_reached_where_the_curve_crosses_it(self, values, least):
-        grid, curve = 500.0 * np.arange(1, len(values) + 1), np.array(values)
+        grid = 500.0 * np.arange(1, len(values) + 1, dtype=np.float64)
+        curve = np.array(values, np.float64)
         steps = first_reached(grid, curve, least)
         if np.isinf(steps):
             assert curve.max() < least
