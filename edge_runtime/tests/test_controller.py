@@ -368,3 +368,5 @@ def test_a_vehicle_without_the_policys_action_is_refused():
         limit_rows([STEERING], SLOW)
     with pytest.raises(UserError, match="do not meet"):
         limit_rows([PEDAL], {"pedal": ActionLimit(2.0, 3.0, 1.0)})
+    (row,) = limit_rows([PEDAL], {"pedal": ActionLimit(1.0, 3.0, 1.0)})
+    assert (row.low, row.high) == (1.0, 1.0)  # they meet in one point

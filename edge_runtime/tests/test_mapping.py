@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.mapping import CARS, LEAD_S, SPECS, car_of, similarity_to
+from edge_runtime.vehicles.mapping import (
+    CARS,
+    LEAD_S,
+    SPECS,
+    SetPoint,
+    car_of,
+    similarity_to,
+    wish_of,
+)
 
 HUNTER = SPECS["2.0"]
 MOST = HUNTER.max_speed_mps
@@ -142,3 +150,22 @@ def test_a_path_of_the_scenario_is_the_same_path_smaller():
     centre = CONGESTION.centre_rad(-0.7)
     robot_rad_per_m = math.tan(centre) / HUNTER.wheelbase_m
     assert robot_rad_per_m * CONGESTION.scale == pytest.approx(car_rad_per_m)
+
+
+@given(st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.1, 0.3)), max_size=40))
+def test_a_set_point_stays_within_the_limits_and_turns_no_faster_than_its_rate(steps):
+    set_point = SetPoint(CONGESTION)
+    full_rad = HUNTER.inner_rad(CONGESTION.centre_rad(-1.0))
+    for pedal, steering, step_s in steps:
+        before_rad = set_point.inner_rad
+        set_point.follow(wish_of({"pedal": pedal, "steering": steering}, None), step_s, 1.0)
+        counted_s = min(max(step_s, 0.0), 0.1)
+        most_rad = HUNTER.max_steering_rate_radps * counted_s
+        assert abs(set_point.inner_rad - before_rad) <= most_rad + 1e-12
+        assert abs(set_point.inner_rad) <= full_rad + 1e-12
+        assert 0.0 <= set_point.speed_mps <= MOST
+
+
+@pytest.mark.parametrize(("asked", "taken"), [(5.0, 1.0), (-5.0, -1.0), (0.25, 0.25)])
+def test_a_wish_is_within_the_actions_range(asked, taken):
+    assert wish_of({"pedal": asked, "steering": -asked}, None) == (taken, None, -taken)

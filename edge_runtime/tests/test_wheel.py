@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import edge_runtime
+from edge_runtime.__main__ import script
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state
 
@@ -60,7 +61,8 @@ def find_python38():
 
 
 def test_the_wheel_holds_only_the_runtime(wheel):
-    names = zipfile.ZipFile(wheel).namelist()
+    archive = zipfile.ZipFile(wheel)
+    names = archive.namelist()
     assert wheel.name.endswith("-py3-none-any.whl")
     assert {name.split("/")[0].split("-")[0] for name in names} == {
         "edge_runtime",
@@ -70,6 +72,8 @@ def test_the_wheel_holds_only_the_runtime(wheel):
     assert {"edge_runtime/__main__.py", "edge_runtime/vehicles/mock.py"} <= set(names)
     assert "edge_runtime/config.example.toml" in names
     assert "edge_runtime/py.typed" in names
+    (scripts,) = (name for name in names if name.endswith("entry_points.txt"))
+    assert f"phil-edge = {script.__module__}:{script.__name__}" in archive.read(scripts).decode()
 
 
 @pytest.mark.timeout(600)
