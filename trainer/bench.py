@@ -7,31 +7,40 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
+import gymnasium
 import numpy as np
+import torch
+from highway_env.envs.common.observation import GrayscaleObservation
 from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from torch import nn
 
 from edge_runtime.cli import examples
 from edge_runtime.files import check_writable, write_json_out
-from trainer.bench_peers import HighwayPicture, check_varies, filled, gather, make_sb3_model
 from trainer.drivers import make_environment
+from trainer.export import real_observations
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import multiplies_bfloat16
 from trainer.learner.replay import ReplayBuffer
 from trainer.learner.td3 import TD3Learner
 from trainer.options import add_threads, set_threads
 from trainer.scenarios import SCENARIOS
+from trainer.scenarios.picture import COLUMNS, ROWS
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
@@ -54,11 +63,16 @@ ENVIRONMENT_BARS = {"left_turn": 10.0, "congestion": 8.0}
 TRANSITIONS = 1000
 """In each learner's buffer, not the paper's 100,000: drawing from a full one costs no more."""
 PARTS = ("environment", "acting", "storing", "learning", "waiting")
+HUMAN_SHARE = 0.2
+"""About what a guided run's buffer holds; the Q advantage is computed for these only."""
+FEATURES = 1792
+GREY_WEIGHTS = [0.2989, 0.5870, 0.1140]
+"""Red, green and blue in the grey value, as in highway-env's documentation."""
 FILE_WIDTH = 120
-Contender = Callable[[], Sequence[float]]
-"""Works for a moment and gives the time of each piece of its work."""
-Rounds = list[list[float]]
-"""The times that one contender gave, round by round."""
+Work = Callable[[], object]
+"""A contender's piece of work: an update, or a step."""
+Times = dict[str, list[float]]
+"""Contender -> seconds of a piece of its work, round by round."""
 Tick = Callable[[str], None]
 """Told what was done, once a round."""
 
@@ -67,15 +81,11 @@ Tick = Callable[[str], None]
 class Effort:
     """Counts. More of them give the same figures with less noise."""
 
-    batch_size: int = LearnerConfig.batch_size
-    """Transitions in a minibatch of every learner (table A5)."""
-    rounds: int = 20
-    """Of the learners, and of each scenario."""
+    batch_size: int = LearnerConfig.batch_size  # in a minibatch of every learner (table A5)
+    rounds: int = 20  # of the learners, and of each scenario
     updates_per_round: int = 5
-    steps_per_round: int = 200
-    """About three episodes."""
-    training_episodes: int = 10
-    """Counted ones: those before the first update come on top."""
+    steps_per_round: int = 200  # about three episodes
+    training_episodes: int = 10  # counted ones; those before the first update come on top
 
     @property
     def ticks(self) -> int:
@@ -127,48 +137,28 @@ def measure(effort: Effort, tick: Tick) -> dict[str, Any]:
 
 
 def take_turns(
-    contenders: Mapping[str, Contender], rounds: int, tick: Tick = lambda done: None
-) -> dict[str, Rounds]:
-    """Each contender once a round, after one round that is not counted.
+    contenders: Mapping[str, Work], rounds: int, pieces: int, tick: Tick = lambda done: None
+) -> Times:
+    """So many pieces of each contender's work a round, after one round that is not counted.
 
     The one that begins a round ends the next: none is always measured first.
     """
     names = list(contenders)
-    times: dict[str, Rounds] = {name: [] for name in names}
-    for name in names:
-        contenders[name]()
-    for number in range(rounds):
-        first = number % len(names)
+    times: Times = {name: [] for name in names}
+    for number in range(-1, rounds):
+        first = max(number, 0) % len(names)
         for name in names[first:] + names[:first]:
-            times[name].append(list(contenders[name]()))
-        tick(" and ".join(names))
-    return times
+            began_s = time.perf_counter()
+            for _ in range(pieces):
+                contenders[name]()
+            times[name].append((time.perf_counter() - began_s) / pieces)
+        if number >= 0:
+            tick(" and ".join(names))
+    return {name: each[1:] for name, each in times.items()}
 
 
-def median(rounds: Rounds) -> float:
-    """Of all the times."""
-    return float(np.median([time for times in rounds for time in times]))
-
-
-def compare(ours: Rounds, peer: Rounds) -> dict[str, float]:
-    """How many times as long the peer takes in the same rounds; above 1 we are faster.
-
-    The median of the rounds' own ratios is beside that of all times: what slows one whole round
-    down cancels out of it.
-    """
-    each = [median([theirs]) / median([own]) for own, theirs in zip(ours, peer, strict=True)]
-    return {"of_medians": median(peer) / median(ours), "median_of_rounds": float(np.median(each))}
-
-
-def timed_ms(work: Callable[[], object]) -> float:
-    """How long a call takes, ms."""
-    began_s = time.perf_counter()
-    work()
-    return 1e3 * (time.perf_counter() - began_s)
-
-
-def updates(learner: TD3Learner, replay: ReplayBuffer, batch_size: int, count: int) -> Contender:
-    """Whole updates of a learner of ours, ms each: drawing, update, new priorities."""
+def whole_update(learner: TD3Learner, replay: ReplayBuffer, batch_size: int) -> Work:
+    """An update of a learner of ours: drawing, learning, new priorities."""
     random = np.random.default_rng(0)
 
     def update() -> None:
@@ -176,7 +166,7 @@ def updates(learner: TD3Learner, replay: ReplayBuffer, batch_size: int, count: i
         losses = learner.update(batch, 0.0)
         replay.update_priorities(batch.indices, losses.priorities)
 
-    return lambda: [timed_ms(update) for _ in range(count)]
+    return update
 
 
 def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
@@ -185,82 +175,59 @@ def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
     Ours in float32 is beside them where the processor has bfloat16; elsewhere ours is just that.
     """
     config, experience = LearnerConfig(batch_size=effort.batch_size), gather(TRANSITIONS)
-    count = effort.updates_per_round
-    precision = config.precision if multiplies_bfloat16("cpu") else "float32"
-    configs = {OURS: config}
-    if precision != "float32":
-        configs[FLOAT32] = replace(config, precision="float32")
-    contenders: dict[str, Contender] = {
-        name: updates(TD3Learner(own, PHIL, seed=0), filled(experience), own.batch_size, count)
-        for name, own in configs.items()
-    }
+    precisions = {OURS: config.precision, FLOAT32: "float32"}
+    if not multiplies_bfloat16("cpu") or config.precision == "float32":
+        precisions = {OURS: "float32"}
+    contenders: dict[str, Work] = {}
+    for name, precision in precisions.items():
+        learner = TD3Learner(replace(config, precision=precision), PHIL, seed=0)
+        contenders[name] = whole_update(learner, filled(experience), config.batch_size)
     with contextlib.suppress(ImportError):
         model = make_sb3_model(experience)
-        train = partial(model.train, gradient_steps=1, batch_size=config.batch_size)
-        contenders[SB3] = lambda: [timed_ms(train) for _ in range(count)]
-    found = figures(take_turns(contenders, effort.rounds, tick), "ms_per_update")
-    more = {"batch_size": config.batch_size, "precision": precision}
+        contenders[SB3] = partial(model.train, gradient_steps=1, batch_size=config.batch_size)
+    times = take_turns(contenders, effort.rounds, effort.updates_per_round, tick)
+    found = figures(times, "ms_per_update", lambda seconds: 1e3 * seconds)
+    more = {"batch_size": config.batch_size, "precision": precisions[OURS]}
     return {**more, **found, "updates_per_s": 1e3 / found["ms_per_update"]}
 
 
-def figures(
-    times: dict[str, Rounds], name: str, of: Callable[[float], float] = float
-) -> dict[str, Any]:
-    """A figure ``of`` the median time of ours and of each peer, and each peer's ratio to ours."""
-    ours = times[OURS]
-    peers = {
-        peer: {name: of(median(rounds)), "ratio": compare(ours, rounds)}
-        for peer, rounds in times.items()
-        if peer != OURS
-    }
-    return {name: of(median(ours)), "peers": peers}
+def figures(times: Times, name: str, of: Callable[[float], float]) -> dict[str, Any]:
+    """A figure ``of`` the median time of ours and of each peer, and how many times as long each
+    peer takes.
+    """
+    medians = {each: float(np.median(times[each])) for each in times}
+    ours = medians.pop(OURS)
+    peers = {peer: {name: of(its), "ratio": its / ours} for peer, its in medians.items()}
+    return {name: of(ours), "peers": peers}
 
 
-class Drive:
-    """Drives on where it stopped, episode after episode.
+def driving(step: Callable[[NDArray[np.float32]], bool], reset: Callable[..., Any]) -> Work:
+    """A step under an action at random, and so on episode after episode.
 
     Args:
         step: takes an action [1] and says whether the episode ended.
-        reset: starts the episode with a seed.
+        reset: starts the episode with ``seed``.
     """
+    random, seeds = np.random.default_rng(0), count()  # All contenders drive the same episodes.
+    reset(seed=next(seeds))
 
-    def __init__(
-        self, step: Callable[[NDArray[np.float32]], bool], reset: Callable[[int], Any]
-    ) -> None:
-        self._step, self._reset = step, reset
-        self._random = np.random.default_rng(0)  # All contenders drive the same episodes.
-        self.episodes = 0
-        reset(0)
+    def drive() -> None:
+        if step(random.uniform(-1, 1, 1).astype(np.float32)):
+            reset(seed=next(seeds))
 
-    def run(self, steps: int) -> list[float]:
-        """Seconds a step, resets included, under actions at random."""
-        actions = self._random.uniform(-1, 1, (steps, 1)).astype(np.float32)
-        began_s = time.perf_counter()
-        for action in actions:
-            if self._step(action):
-                self.episodes += 1
-                self._reset(self.episodes)
-        return [(time.perf_counter() - began_s) / steps]
-
-
-def our_drive(scenario: str) -> Drive:
-    """The scenario as it is."""
-    env = make_environment(scenario)
-    return Drive(lambda action: any(env.step(action)[2:4]), lambda seed: env.reset(seed=seed))
-
-
-def highway_drive(scenario: str) -> Drive:
-    """The same traffic in highway-env's picture."""
-    picture = HighwayPicture(make_environment(scenario))
-    check_varies(picture)
-    return Drive(lambda action: picture.step(action)[1], lambda seed: picture.reset(seed=seed))
+    return drive
 
 
 def measure_environment(scenario: str, effort: Effort, tick: Tick) -> dict[str, Any]:
-    """The scenario's steps a second with observation, and its peer's."""
-    drives = {OURS: our_drive(scenario), HIGHWAY: highway_drive(scenario)}
-    contenders = {name: partial(each.run, effort.steps_per_round) for name, each in drives.items()}
-    return figures(take_turns(contenders, effort.rounds, tick), "steps_per_s", lambda s: 1.0 / s)
+    """The scenario's steps a second with observation, and those of highway-env's picture of it."""
+    env, picture = make_environment(scenario), HighwayPicture(make_environment(scenario))
+    check_varies(picture)
+    contenders = {
+        OURS: driving(lambda action: any(env.step(action)[2:4]), env.reset),
+        HIGHWAY: driving(lambda action: picture.step(action)[1], picture.reset),
+    }
+    times = take_turns(contenders, effort.rounds, effort.steps_per_round, tick)
+    return figures(times, "steps_per_s", lambda seconds: 1.0 / seconds)
 
 
 def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
@@ -287,19 +254,8 @@ def training_figures(episodes: Sequence[EpisodeMetrics], whole_s: float) -> dict
     """Seconds for 10,000 steps, scaled up: the whole by the clock on the wall, and its parts."""
     steps = sum(episode.steps for episode in episodes)
     parts_s = {name: sum(getattr(each, f"{name}_s") for each in episodes) for name in PARTS}
-    seconds = {"total": whole_s, **parts_s}
-    scaled = {name: 1e4 / steps * value for name, value in seconds.items()}
+    scaled = {name: 1e4 / steps * value for name, value in {"total": whole_s, **parts_s}.items()}
     return {"episodes": len(episodes), "steps": steps, "s_per_10k_steps": scaled}
-
-
-class Row(NamedTuple):
-    """One line."""
-
-    what: str
-    ours: str
-    peer: str = ""
-    ratio: str = ""
-    bar: str = ""
 
 
 def show(report: dict[str, Any]) -> None:
@@ -307,7 +263,7 @@ def show(report: dict[str, Any]) -> None:
     machine = report["machine"]
     title = f"{machine['processor']}, {machine['cores']} cores, threads: {report['threads']}"
     table = Table(title=title, box=box.SIMPLE, title_justify="left")
-    for name in Row._fields:
+    for name in ("what", "ours", "peer", "ratio", "bar"):
         number = name in ("ours", "ratio")
         table.add_column(name, no_wrap=number, justify="right" if number else "left")
     for row in rows(report):
@@ -317,26 +273,180 @@ def show(report: dict[str, Any]) -> None:
     Console(markup=False, highlight=False, width=width).print(table)
 
 
-def rows(report: dict[str, Any]) -> Iterator[Row]:
-    """The lines of what was measured."""
+def rows(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """The lines of what was measured: ours beside each peer's, and whether the bar is met."""
     learner, seconds = report["learner"], report["training"]["s_per_10k_steps"]
     what = f"PHIL-TD3 update, batch {learner['batch_size']}, ms"
-    yield from _beside(what, learner, "ms_per_update", {SB3: SB3_BAR})
-    if SB3 not in learner["peers"]:
-        yield Row(what, f"{learner['ms_per_update']:.1f}", f"{PEERS[SB3]} is not installed")
+    measured = [(what, learner, "ms_per_update", {SB3: SB3_BAR})]
     for scenario, found in report["environment"].items():
         bars = {HIGHWAY: ENVIRONMENT_BARS[scenario]}
-        yield from _beside(f"{scenario} with observation, steps/s", found, "steps_per_s", bars)
-    yield Row("training, s per 10,000 steps", f"{seconds['total']:.1f}")
+        measured.append((f"{scenario} with observation, steps/s", found, "steps_per_s", bars))
+    for text, found, key, bars in measured:
+        ours = f"{found[key]:.1f}"
+        for name, peer in found["peers"].items():
+            ratio, bar = peer["ratio"], ""
+            if name in bars:
+                bar = f"≥ {bars[name]:g}  {'met' if ratio >= bars[name] else 'MISSED'}"
+            yield text, ours, f"{peer[key]:.1f}  {PEERS[name]}", f"{ratio:.2f}", bar
+        for name in bars.keys() - found["peers"]:
+            yield text, ours, f"{PEERS[name]} is not installed", "", ""
+    yield "training, s per 10,000 steps", f"{seconds['total']:.1f}"
     for name in PARTS:
-        yield Row(f"  of it {name}", f"{seconds[name]:.1f}")
+        yield f"  of it {name}", f"{seconds[name]:.1f}"
 
 
-def _beside(what: str, found: dict[str, Any], key: str, bars: dict[str, float]) -> Iterator[Row]:
-    """Ours beside each peer's, and whether the ratio is as high as it is to be."""
-    for name, peer in found["peers"].items():
-        ratio, bar = peer["ratio"]["of_medians"], ""
-        if name in bars:
-            bar = f"≥ {bars[name]:g}  {'met' if ratio >= bars[name] else 'MISSED'}"
-        theirs = f"{peer[key]:.1f}  {PEERS[name]}"
-        yield Row(what, f"{found[key]:.1f}", theirs, f"{ratio:.2f}", bar)
+class Experience(NamedTuple):
+    """``n`` transitions of one long drive: real observations, invented rewards."""
+
+    frames: NDArray[np.uint8]  # [n + 1, 2, 45, 80]
+    actions: NDArray[np.float32]  # [n, 1]
+    rewards: NDArray[np.float32]  # [n]
+    human: NDArray[np.bool_]  # [n]
+
+
+def gather(size: int, seed: int = 0) -> Experience:
+    """Drive the left turn at random for so many steps."""
+    random = np.random.default_rng(seed)
+    return Experience(
+        frames=real_observations("left_turn", size + 1, seed),
+        actions=random.uniform(-1, 1, (size, 1)).astype(np.float32),
+        rewards=random.normal(size=size).astype(np.float32),
+        human=random.random(size) < HUMAN_SHARE,
+    )
+
+
+def filled(experience: Experience) -> ReplayBuffer:
+    """A buffer of ours that holds all of it."""
+    replay = ReplayBuffer(len(experience.actions))
+    replay.start_episode(experience.frames[0])
+    for action, reward, frames, human in zip(
+        experience.actions, experience.rewards, experience.frames[1:], experience.human, strict=True
+    ):
+        replay.add(action, float(reward), frames, False, bool(human))
+    return replay
+
+
+def make_sb3_model(experience: Experience) -> Any:
+    """Stable-Baselines3's TD3 with the networks of tables A2 and A3, its replay filled.
+
+    It does less than the paper asks for: both critics share one features extractor, the replay is
+    uniform, and there is no Q advantage and no behaviour cloning.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    from stable_baselines3 import TD3
+    from stable_baselines3.common.logger import Logger
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+    class Trunk(BaseFeaturesExtractor):
+        """The paper's two convolutions; the library normalises the pictures before."""
+
+        def __init__(self, space: gymnasium.Space[Any]) -> None:
+            super().__init__(space, FEATURES)
+            first, second = nn.Conv2d(2, 6, 6), nn.Conv2d(6, 16, 6)
+            pooled = [first, nn.ReLU(), nn.MaxPool2d(2), second, nn.ReLU(), nn.MaxPool2d(2)]
+            self.layers = nn.Sequential(*pooled, nn.Flatten())
+
+        def forward(self, images: torch.Tensor) -> torch.Tensor:
+            """Features [batch, 1792] of float images [batch, 2, 45, 80] in [0, 1]."""
+            return self.layers(images)
+
+    size = len(experience.actions)
+    model = TD3(
+        "CnnPolicy",
+        gymnasium.make(SCENARIOS["left_turn"]),
+        learning_rate=2e-4,
+        gamma=0.95,
+        tau=1e-3,
+        buffer_size=size,
+        policy_delay=1,
+        policy_kwargs={"features_extractor_class": Trunk, "net_arch": [256, 128, 64]},
+        device="cpu",
+        seed=0,
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    assert model.replay_buffer is not None
+    for i in range(size):
+        before, after = experience.frames[i, None], experience.frames[i + 1, None]
+        action, reward = experience.actions[i, None], experience.rewards[i, None]
+        model.replay_buffer.add(before, after, action, reward, np.zeros(1), [{}])
+    return model
+
+
+class HighwayPicture:
+    """A scenario of ours whose frames highway-env's GrayscaleObservation draws.
+
+    All else is the scenario's: cars and their motion, reward, frames, the ground in view. Left
+    out, in highway-env's favour: its own traffic step, and a new viewer at each reset. The
+    environment has no wrappers, and must not be used elsewhere.
+    """
+
+    action_type = observation_type = None
+    """As much of a highway-env environment as its viewer looks at, with ``config`` and ``road``."""
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        env._frame = lambda ego, cars: 0
+        self.config = {
+            "scaling": 1.0 / env.rasteriser.metres_per_pixel,
+            "centering_position": [0.5, 0.5],
+            "render_agent": True,
+            "simulation_frequency": 10,
+            # Into a surface in memory, and nothing copied to a screen.
+            "offscreen_rendering": True,
+        }
+        env.reset(seed=0)
+        # SDL's "dummy" driver exists on every machine and needs no screen; but highway-env's
+        # viewer takes it for a wish not to draw at all.
+        with patch.dict(os.environ, {"SDL_VIDEODRIVER": "dummy"}):
+            self._drawn = GrayscaleObservation(
+                self, observation_shape=(COLUMNS, ROWS), stack_size=2, weights=GREY_WEIGHTS
+            )
+        self._drawn.viewer.enabled = True
+
+    def reset(self, *, seed: int) -> NDArray[np.uint8]:
+        """Start an episode: the observation, uint8 [2, 80, 45] (highway-env has columns first)."""
+        self.env.reset(seed=seed)
+        self._drawn.obs[:] = self.observe()[-1]
+        return self._drawn.obs.copy()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.uint8], bool]:
+        """One control interval: the observation, and whether the episode ended."""
+        _, _, terminated, truncated, _ = self.env.step(action)
+        return self.observe(), terminated or truncated
+
+    def observe(self) -> NDArray[np.uint8]:
+        """Draw what our rasteriser looks at."""
+        view = self.env.rasteriser
+        middle_m = 0.5 * view.metres_per_pixel * np.array([COLUMNS, ROWS])
+        position = np.array(self.env.view_corner_m) + middle_m
+        self._drawn.observer_vehicle = SimpleNamespace(position=position)
+        observation: NDArray[np.uint8] = self._drawn.observe()
+        return observation
+
+    @property
+    def road(self) -> Any:
+        """Our road, with the ego car among the others: ours stands outside ``road.vehicles``."""
+        return SimpleNamespace(
+            network=self.env.road.network,
+            vehicles=[*self.env.traffic, self.env.ego],
+            objects=[],
+            record_history=False,
+        )
+
+
+def check_varies(picture: HighwayPicture) -> None:
+    """Drive one episode and look at every observation.
+
+    Raises:
+        RuntimeError: they are all alike. A viewer of highway-env 1.12 that is not enabled draws
+            nothing, without a warning, and would look fast.
+    """
+    first, ended = picture.reset(seed=0), False
+    moves = False
+    while not ended:
+        observation, ended = picture.step(np.zeros(picture.env.action_space.shape, np.float32))
+        moves = moves or not np.array_equal(observation[-1], first[-1])
+    if not (moves and first.min() < first.max()):
+        raise RuntimeError("highway-env draws the same picture all over: the figures are void")
