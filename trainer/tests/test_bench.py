@@ -45,7 +45,9 @@ TINY = replace(
 
 
 def test_contenders_take_turns_and_none_is_always_first(monkeypatch):
-    clock, calls, ticks = count(), [], []
+    clock = count()
+    calls: list[str] = []
+    ticks: list[int] = []
     monkeypatch.setattr(bench.time, "perf_counter", lambda: float(next(clock)))
     contenders = {name: partial(calls.append, name) for name in "abc"}
     times = take_turns(contenders, 4, 2, ticks.append)
@@ -209,9 +211,13 @@ def test_both_drives_meet_the_same_traffic(scenario):
         (lambda action: any(env.step(action)[2:4]), env.reset),
         (lambda action: picture.step(action)[1], picture.reset),
     ):
-        seen = []
-        drive = driving(lambda action, step=step, seen=seen: seen.append(step(action)) or seen[-1],
-                        reset)  # fmt: skip
+        seen: list[bool] = []
+
+        def watched(action: object, step: Any = step, seen: list[bool] = seen) -> bool:
+            seen.append(step(action))
+            return seen[-1]
+
+        drive = driving(watched, reset)
         for _ in range(150):
             drive()
         ends.append(seen)
