@@ -239,8 +239,7 @@ def run_config(unit: Unit, plan: Plan, humans: Path) -> RunConfig:
 
 ID_LENGTH = 12
 NOT_DECIDING = ("device", "threads", "checkpoint_every", "human")
-"""Fields of a run's config that do not decide its result: the human does, but by the model's
-contents and not by where it lies."""
+"""Fields of a run's config that do not decide its result; the human model's contents do."""
 
 
 def obstacle(unit: Unit, humans: Path) -> str | None:

@@ -7,8 +7,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.experiments.claims import CLAIMS, Claim, Finding, judge_both
@@ -57,8 +55,6 @@ PAPER_S = dict(zip(FOUR, (360.70, 348.71, 328.93, 329.39), strict=True))
 """The paper's table of time efficiency: seconds for 10,000 steps."""
 EVERY_LINE = [Line(name, setting) for _, setting, names in LINES for name in names]
 """Every line that is computed, in the order of work."""
-COSTS = ("episodes", "steps", "updates", "human_steps", "takeovers")
-"""What the page shows of a record's totals."""
 Judged = tuple[Claim, Finding, Finding | None]
 """A claim with what was measured, and with the same of the policy alone."""
 
@@ -89,12 +85,8 @@ def _page(results: Results, store: Store) -> Iterator[str]:
             yield from (f"![{title}]({name}.png)", "")
         if name in PAPER_TABLES:
             yield from _distances(results, name)
-        if name == "fig9":
-            yield from _tests(results)
-        if name == "time":
-            yield from _times(results)
-        if name == "floor":
-            yield from _floor(results)
+        elif name in MORE:
+            yield from MORE[name](results)
         rows = [
             (claim.text, claim.paper, f.ours, f.holds, *((a.ours, a.holds) if a else ("", "")))
             for claim, f, a in judged
@@ -103,7 +95,6 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         if rows:
             head = ("claim", "the paper", "what decides", "holds", "policy alone", "holds")
             yield from table(head, rows)
-    yield from _costs(results)
 
 
 def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterator[str]:
@@ -215,22 +206,8 @@ def _floor(results: Results) -> Iterator[str]:
             yield ""
 
 
-def _costs(results: Results) -> Iterator[str]:
-    """What each training cost, and how well the policy alone drove in its validations."""
-    yield from ("## What the trainings cost", "", "Means of the seeds.", "")
-    rows = []
-    for scenario in SCENARIOS:
-        for line in EVERY_LINE:
-            found = [result for result in results.of(scenario, line) if result.unit.trained]
-            if found:
-                totals = [result.record["totals"] for result in found]
-                costs = [f"{np.mean([each[key] for each in totals]):,.0f}" for key in COSTS]
-                best = np.mean([each["validation"]["best"] for each in totals])
-                end = results.estimate(scenario, line, SUCCESS).value
-                shares = f"{100 * best:.0f} %", f"{100 * end:.0f} %"
-                rows.append((words(scenario), line.name, str(len(found)), *costs, *shares))
-    costs = [name.replace("_", " ") for name in COSTS]
-    yield from table(("", "", "seeds", *costs, "best alone", "end alone"), rows)
+MORE = {"fig9": _tests, "time": _times, "floor": _floor}
+"""Experiment -> its tables beside its claims."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterator[str]:

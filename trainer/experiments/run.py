@@ -14,6 +14,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from multiprocessing.sharedctypes import RawValue
@@ -73,6 +74,7 @@ TEST_COLUMNS = (
 """What is kept of each test drive; the seeds are 0, 1, ..."""
 TIMES = ("environment_s", "acting_s", "storing_s", "waiting_s")
 """Columns of the metrics that add up to the time that a training took."""
+NOT_VALIDATED = ("", "nan")
 DIGITS = 5
 PATIENCE_S = 1.0
 """How long a unit may be held before it counts as another process's work."""
@@ -131,7 +133,7 @@ def make_record(
         if not _train(task, run_dir, on_steps):
             return None
         rows = read_metrics(run_dir)
-        validated = [row for row in rows if row["validation_success"] not in ("", "nan")]
+        validated = [row for row in rows if row["validation_success"] not in NOT_VALIDATED]
         tested = load_actor(run_dir)[1]["episode"]  # counted from 1: after so many episodes
         record["training"] = _columns(rows, TRAINING_COLUMNS)
         record["validation"] = _columns(validated, VALIDATION_COLUMNS)
@@ -171,8 +173,11 @@ def _train(task: Task, run_dir: Path, on_steps: OnSteps) -> bool:
     ``TrainingRun.train``: that one validates once more when it stops, as no unbroken run does.
     """
     config = run_config(task.unit, task.store.plan, task.store.humans)
-    if _trained(run_dir, config.steps):
-        return True
+    rows = read_metrics(run_dir)
+    over = rows and int(rows[-1]["total_steps"]) >= config.steps
+    validated = over and rows[-1]["validation_success"] not in NOT_VALIDATED
+    if validated and (run_dir / BEST_FILE).is_file():
+        return True  # trained before; the checkpoint may be gone already
     run = TrainingRun(config, run_dir, resume=(run_dir / CHECKPOINT_FILE).is_file())
 
     def after(metrics: EpisodeMetrics) -> None:
@@ -181,31 +186,20 @@ def _train(task: Task, run_dir: Path, on_steps: OnSteps) -> bool:
         if at_checkpoint and not run.over and time.time() > task.stop_at_s:
             raise _OutOfTimeError
 
-    try:
+    with suppress(_OutOfTimeError):
         run.train(after)
-    except _OutOfTimeError:
-        return False
-    return True
-
-
-def _trained(run_dir: Path, steps: int) -> bool:
-    """Whether training ended before; its checkpoint may be gone already."""
-    rows = read_metrics(run_dir)
-    if not rows or int(rows[-1]["total_steps"]) < steps:
-        return False
-    return rows[-1]["validation_success"] not in ("", "nan") and (run_dir / BEST_FILE).is_file()
+        return True
+    return False
 
 
 def _columns(rows: Sequence[dict[str, str]], names: dict[str, str]) -> dict[str, list[Any]]:
-    return {ours: [_value(row[theirs]) for row in rows] for ours, theirs in names.items()}
+    def value(text: str) -> Any:
+        try:
+            return int(text) if text.lstrip("-").isdigit() else rounded(float(text))
+        except ValueError:
+            return text  # an outcome
 
-
-def _value(text: str) -> Any:
-    """A cell of the metrics as JSON has it: whole numbers whole, others with five digits."""
-    try:
-        return int(text) if text.lstrip("-").isdigit() else rounded(float(text))
-    except ValueError:
-        return text  # an outcome
+    return {ours: [value(row[theirs]) for row in rows] for ours, theirs in names.items()}
 
 
 def rounded(value: Any) -> Any:
