@@ -47,7 +47,7 @@ TINY = replace(
 def test_contenders_take_turns_and_none_is_always_first(monkeypatch):
     clock = count()
     calls: list[str] = []
-    ticks: list[int] = []
+    ticks: list[str] = []
     monkeypatch.setattr(bench.time, "perf_counter", lambda: float(next(clock)))
     contenders = {name: partial(calls.append, name) for name in "abc"}
     times = take_turns(contenders, 4, 2, ticks.append)
