@@ -29,7 +29,14 @@ from trainer.experiments.claims import (
 from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, load
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import table, write_report
-from trainer.experiments.statistics import Estimate, above, all_of, mean_estimate, within
+from trainer.experiments.statistics import (
+    Estimate,
+    Holds,
+    above,
+    all_of,
+    mean_estimate,
+    within,
+)
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
 
 SEEDS = 3
@@ -78,7 +85,7 @@ class TestStatistics:
         [("yy", "yes"), ("yu", "undecided"), ("nu", "no"), ("", "undecided")],
     )
     def test_all_of_several(self, answers, holds):
-        said = {"y": "yes", "n": "no", "u": "undecided"}
+        said: dict[str, Holds] = {"y": "yes", "n": "no", "u": "undecided"}
         assert all_of([said[answer] for answer in answers]) == holds
 
 
