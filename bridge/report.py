@@ -8,7 +8,7 @@ rest is for ``bridge simulate``. Pure: numbers in, a dict or a line of text out 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -182,11 +182,13 @@ def make_report(
     }
 
 
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table in Markdown, without a newline at its end; a ``|`` in a cell becomes a ``/``."""
-    cells = [header, ["---"] * len(header), *rows]
-    lines = (" | ".join(str(cell).replace("|", "/") for cell in row) for row in cells)
-    return "\n".join(f"| {line} |" for line in lines)
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterator[str]:
+    """The lines of a table in Markdown and an empty one; a ``|`` in a cell becomes a ``/``."""
+    yield f"| {' | '.join(head)} |"
+    yield "|---" * len(head) + "|"
+    for row in rows:
+        yield f"| {' | '.join(str(cell).replace('|', '/') for cell in row)} |"
+    yield ""
 
 
 def summary_line(report: Mapping[str, Any]) -> str:

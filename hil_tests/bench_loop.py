@@ -20,6 +20,7 @@ from typing import Any, Self
 import numpy as np
 import zenoh
 
+from bridge.report import markdown_table
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, positive
 from edge_runtime.files import check_writable, write_json_out
@@ -29,7 +30,6 @@ from edge_runtime.transport import open_session
 from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 from hil_tests.sweep import simulate
-from trainer.experiments.report import table
 from trainer.util import ProgressBar, processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
         f"\n{machine['processor']}, {machine['cores']} cores, load {machine['load_before']:.1f} "
         f"before and {machine['load_after']:.1f} after\n"
     )
-    print("\n".join(table(HEAD, rows(report))))
+    print("\n".join(markdown_table(HEAD, rows(report))))
     return 0
 
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from bridge.report import markdown_table
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
 from hil_tests.sweep import LOOPS, VEHICLE
-from trainer.experiments.report import table
 
 Found = Mapping[str, Any]
 """A part of a report's JSON."""
@@ -58,7 +58,7 @@ def render_faults(report: Found) -> str:
         f"{report['crashes']} crashes and {report['unsafe_commands']} unsafe commands "
         "over the whole campaign."
     )
-    return "\n".join([*table(head, rows), end])
+    return "\n".join([*markdown_table(head, rows), end])
 
 
 def fault_verdict(row: Found) -> str:
@@ -121,7 +121,7 @@ def render_latency(latency: Found) -> str:
             cells = (tell(latency["rows"][spec]) for tell in _OF_A_ROW.values())
             rows.append((f"{value:g} {axis['unit']}", *cells))
         title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
-        lines += [title, "", *table(("value", *_OF_A_ROW), rows)]
+        lines += [title, "", *markdown_table(("value", *_OF_A_ROW), rows)]
     return "\n".join(lines)
 
 
@@ -155,7 +155,7 @@ def render_comparison(comparison: Found) -> str:
             f"Where both reach the goal ({longer['seeds']} seeds), the drive takes "
             f"{_interval(longer['longer_s'])} s longer with the vehicle.",
             "",
-            *table(("", "policy in the loop", "vehicle in the loop"), rows),
+            *markdown_table(("", "policy in the loop", "vehicle in the loop"), rows),
         ]
     )
 
@@ -195,7 +195,7 @@ def render_sweep(sweep: Found) -> str:
             f"Success of {sweep['runs']} episodes, and in brackets the lag of the speed that the "
             "drives showed, ms; a star where the driver stopped the vehicle, which did not follow:",
             "",
-            *table(("time constant \\ dead time, ms", *map(str, deads)), rows),
+            *markdown_table(("time constant \\ dead time, ms", *map(str, deads)), rows),
         ]
     )
 

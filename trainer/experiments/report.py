@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
+from bridge.report import markdown_table
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
 from trainer.experiments.claims import CLAIMS, Claim, Finding, judge_both
@@ -94,7 +94,7 @@ def _page(results: Results, store: Store) -> Iterator[str]:
         ]
         if rows:
             head = ("claim", "the paper", "what decides", "holds", "policy alone", "holds")
-            yield from table(head, rows)
+            yield from markdown_table(head, rows)
 
 
 def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterator[str]:
@@ -130,8 +130,8 @@ def _summary(results: Results, store: Store, judged: Sequence[Judged]) -> Iterat
         for name, one in EXPERIMENTS.items()
     ]
     totals = (sum(counts[name, answer] for name in EXPERIMENTS) for answer in answers)
-    yield from table(("", "about", *answers), [*rows, ("all", "", *totals)])
-    yield from table(
+    yield from markdown_table(("", "about", *answers), [*rows, ("all", "", *totals)])
+    yield from markdown_table(
         ("setting", "meaning", "algorithms"),
         (
             (name, SETTINGS[name].meaning, ", ".join(Line(a).name for a in algorithms))
@@ -156,7 +156,7 @@ def _times(results: Results) -> Iterator[str]:
     ours = (results.estimate(SCENARIOS[0], Line(name), SECONDS).text(0) for name in PAPER_S)
     paper = (f"{seconds:.0f}" for seconds in PAPER_S.values())
     names = (Line(name).name for name in PAPER_S)
-    yield from table(("", *names), [("the paper", *paper), ("ours", *ours)])
+    yield from markdown_table(("", *names), [("the paper", *paper), ("ours", *ours)])
 
 
 def _tests(results: Results) -> Iterator[str]:
@@ -175,7 +175,7 @@ def _tests(results: Results) -> Iterator[str]:
             cells.append(f"{share} ({100 * paper.mean():.0f})" if len(paper) else "–")
         if set(cells) != {"–"}:
             rows.append((line.name, *cells))
-    yield from table(("", *(scene.label for scene in SCENES)), rows)
+    yield from markdown_table(("", *(scene.label for scene in SCENES)), rows)
 
 
 def _distances(results: Results, name: str) -> Iterator[str]:
@@ -195,7 +195,7 @@ def _distances(results: Results, name: str) -> Iterator[str]:
             shown = f"{ours.mean():.2f}±{ours.std():.2f}" if len(ours) else "–"
             cells.append(f"{shown} ({number})")
         rows.append((Line(algorithm).name, *cells))
-    yield from table(("", *(scene.label for scene in scenes)), rows)
+    yield from markdown_table(("", *(scene.label for scene in scenes)), rows)
 
 
 def _floor(results: Results) -> Iterator[str]:
@@ -208,12 +208,3 @@ def _floor(results: Results) -> Iterator[str]:
 
 MORE = {"fig9": _tests, "time": _times, "floor": _floor}
 """Experiment -> its tables beside its claims."""
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> Iterator[str]:
-    """A Markdown table and an empty line."""
-    yield f"| {' | '.join(head)} |"
-    yield "|---" * len(head) + "|"
-    for row in rows:
-        yield f"| {' | '.join(str(cell).replace('|', '/') for cell in row)} |"
-    yield ""

@@ -28,7 +28,7 @@ from trainer.experiments.claims import (
 )
 from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, load
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
-from trainer.experiments.report import table, write_report
+from trainer.experiments.report import write_report
 from trainer.experiments.statistics import (
     Estimate,
     Holds,
@@ -218,11 +218,6 @@ def test_records_that_lack_something_are_refused(store):
     store.put(unit, record)
     with pytest.raises(UserError, match="lacks columns of validation"):
         load(store, 2)
-
-
-def test_a_table_keeps_its_columns():
-    lines = list(table(("a", "b"), [("x|y", 1)]))
-    assert {line.count("|") for line in lines[:-1]} == {3}
 
 
 class TestCommand:
