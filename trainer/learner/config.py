@@ -139,6 +139,10 @@ class LearnerConfig:
     """Bound of the initial weights with which the action joins the picture in the critics' first
     connected layer; 0: that of one more feature among 1,792 (0.02), as the paper's networks begin.
     There the action hardly counts in the value at first, and the actor's gradient is noise."""
+    critic_norm: bool = True
+    """Layer normalisation in the critics (RLPD; Ball et al., 2023). Beside a good human there are
+    few failures to learn from, and without it the critics promise most for actions that nobody
+    has tried: the actor follows, and unlearns what it was shown."""
     picture_shift: int = 3
     """Pixels by which the pictures of a minibatch are shifted at random, up, down and aside, at
     most (DrQ; Kostrikov et al., 2020); the paper has none. What counts is where cars are to one
@@ -210,6 +214,7 @@ PRINTED_LEARNER = LearnerConfig(
     split_loss=True,
     penalty_on=HUMANS_ACTION,
     action_bound=0.0,
+    critic_norm=False,
     picture_shift=0,
     saturation_weight=0.0,
 )

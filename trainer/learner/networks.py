@@ -94,13 +94,19 @@ class Picture(nn.Module):
 
 
 class Head(nn.Module):
-    """The connected layers after the first one, which ends before its activation."""
+    """The connected layers after the first one, which ends before its activation.
 
-    def __init__(self, outputs: int) -> None:
+    Args:
+        outputs: of the last layer.
+        normalised: whether each hidden layer is normalised before its activation.
+    """
+
+    def __init__(self, outputs: int, normalised: bool = False) -> None:
         super().__init__()
         layers: list[nn.Module] = [nn.ReLU()]
         for inputs, width in pairwise(HIDDEN):
-            layers += [nn.Linear(inputs, width), nn.ReLU()]
+            norm = [nn.LayerNorm(width)] if normalised else []
+            layers += [nn.Linear(inputs, width), *norm, nn.ReLU()]
         self.hidden = nn.Sequential(*layers)
         self.output = nn.Linear(HIDDEN[-1], outputs)
 
@@ -137,17 +143,24 @@ class Critic(nn.Module):
         action_size: length of an action.
         frames: how many of the newest frames it sees.
         action_bound: of the action's initial weights; None: as one more feature among 1,792.
+        normalised: whether the picture's share of the first connected layer, and each hidden layer,
+            is normalised to mean 0 and variance 1 (layer normalisation).
     """
 
     def __init__(
-        self, action_size: int = 1, frames: int = 2, action_bound: float | None = None
+        self,
+        action_size: int = 1,
+        frames: int = 2,
+        action_bound: float | None = None,
+        normalised: bool = False,
     ) -> None:
         super().__init__()
         self.picture = Picture(frames, more_inputs=action_size)
         self.action = nn.Linear(action_size, HIDDEN[0], bias=False)
         bound = action_bound or (FEATURES + action_size) ** -0.5
         nn.init.uniform_(self.action.weight, -bound, bound)
-        self.head = Head(1)
+        self.norm = nn.LayerNorm(HIDDEN[0]) if normalised else nn.Identity()
+        self.head = Head(1, normalised)
 
     def embed(self, frames: Tensor) -> Tensor:
         """float32 [batch, 256] from frames uint8 [batch, 2, 45, 80], whatever the action."""
@@ -155,7 +168,7 @@ class Critic(nn.Module):
 
     def value(self, embedded: Tensor, action: Tensor) -> Tensor:
         """Q, shape [batch], from an embedded picture [batch, 256] and actions [batch, n]."""
-        return self.head(embedded + self.action(action)).squeeze(1)
+        return self.head(self.norm(embedded) + self.action(action)).squeeze(1)
 
     def forward(self, frames: Tensor, action: Tensor) -> Tensor:
         """Q, shape [batch], from frames uint8 [batch, 2, 45, 80] and actions [batch, n]."""
@@ -163,14 +176,18 @@ class Critic(nn.Module):
 
 
 class CriticPair(nn.Module):
-    """The two critics of TD3, whose smaller value is believed."""
+    """The two critics of TD3, whose smaller value is believed. Arguments as ``Critic``'s."""
 
     def __init__(
-        self, action_size: int = 1, frames: int = 2, action_bound: float | None = None
+        self,
+        action_size: int = 1,
+        frames: int = 2,
+        action_bound: float | None = None,
+        normalised: bool = False,
     ) -> None:
         super().__init__()
-        self.first = Critic(action_size, frames, action_bound)
-        self.second = Critic(action_size, frames, action_bound)
+        self.first = Critic(action_size, frames, action_bound, normalised)
+        self.second = Critic(action_size, frames, action_bound, normalised)
 
     @property
     def pair(self) -> tuple[Critic, Critic]:

@@ -63,7 +63,9 @@ class TD3Learner:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames).to(self.device)
-            critics = CriticPair(action_size, config.frames, config.action_bound or None)
+            critics = CriticPair(
+                action_size, config.frames, config.action_bound or None, config.critic_norm
+            )
             self.critics = critics.to(self.device)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)

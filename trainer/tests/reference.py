@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import Identity
 from torch.nn.functional import conv2d, linear, max_pool2d, relu
 
 from trainer.learner import equations
@@ -42,7 +43,13 @@ def policy_action(actor: Actor, frames: Tensor) -> Tensor:
 
 
 def value(critic: Critic, frames: Tensor, actions: Tensor) -> Tensor:
-    """Q(s, a) (table A2), [batch]: one matrix for the features with the action beside them."""
+    """Q(s, a) (table A2), [batch]: one matrix for the features with the action beside them.
+
+    Unless the features' share is normalised, for which it must be known alone.
+    """
+    if not isinstance(critic.norm, Identity):
+        share = critic.norm(critic.picture.layer(picture_features(critic.picture, frames)))
+        return critic.head(share + linear(actions, critic.action.weight))[:, 0]
     joined = torch.cat([picture_features(critic.picture, frames), actions], dim=1)
     weight = torch.cat([critic.picture.layer.weight, critic.action.weight], dim=1)
     return critic.head(linear(joined, weight, critic.picture.layer.bias))[:, 0]
@@ -58,7 +65,9 @@ class ReferenceLearner:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames)
-            self.critics = CriticPair(action_size, config.frames, config.action_bound or None)
+            self.critics = CriticPair(
+                action_size, config.frames, config.action_bound or None, config.critic_norm
+            )
         self.target_actor = copy.deepcopy(self.actor)
         self.target_critics = copy.deepcopy(self.critics)
         self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), config.actor_learning_rate)

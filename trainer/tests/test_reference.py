@@ -53,6 +53,7 @@ def test_every_algorithm(name):
         {"target_noise": 0.0},
         {"penalty_on": "human"},
         {"intervention_penalty": -3.0},
+        {"critic_norm": False},
     ],
     ids=lambda change: "-".join(change),
 )
