@@ -15,10 +15,9 @@ from can.interfaces.udp_multicast.utils import pack_message
 from edge_runtime.config import DEFAULT_BUS, CarSettings, Config, SimilaritySettings
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import stream
+from edge_runtime.vehicles import make_vehicle, stream, vehicle_limits
 from edge_runtime.vehicles.core import State
-from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.bus import (
+from edge_runtime.vehicles.hunter import (
     GROUP,
     PORT,
     BusName,
@@ -26,9 +25,9 @@ from edge_runtime.vehicles.hunter.bus import (
     HunterVehicle,
     open_bus,
     parse_bus,
+    protocol,
 )
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
-from edge_runtime.vehicles.registry import make_vehicle, vehicle_limits
 
 SPEC = SPECS["2.0"]
 LEFT_TURN = similarity_to(CARS["left_turn"], SPEC)

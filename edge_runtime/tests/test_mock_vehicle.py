@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from edge_runtime.config import CarSettings, Config, SimilaritySettings
 from edge_runtime.util import UserError
+from edge_runtime.vehicles import make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mapping import CARS
 from edge_runtime.vehicles.mock import MockParameters, MockState, MockVehicle, advance
-from edge_runtime.vehicles.registry import make_vehicle, vehicle_limits
 
 
 def enabled(**parameters):

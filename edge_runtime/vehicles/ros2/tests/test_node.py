@@ -373,7 +373,7 @@ def test_without_pycdr2_one_line_says_what_to_install():
     code = (
         "import sys; sys.modules['pycdr2'] = None\n"
         "from edge_runtime.util import UserError\n"
-        "import edge_runtime.vehicles.registry\n"
+        "import edge_runtime.vehicles\n"
         "try: import edge_runtime.vehicles.ros2.node\n"
         "except UserError as error: print(error)\n"
     )

@@ -19,10 +19,9 @@ from edge_runtime.tests.harness import (
 )
 from edge_runtime.tests.policies import write_policy
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import stream
+from edge_runtime.vehicles import stream, vehicle_limits
 from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
-from edge_runtime.vehicles.registry import vehicle_limits
 from edge_runtime.vehicles.ros2.tests import second
 from edge_runtime.vehicles.ros2.tests.ros_hunter import RosHunter
 from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
