@@ -24,6 +24,11 @@ LEAD_S = 0.5
 _LONGEST_STEP_S = CONTROL_PERIOD_S  # after a pause of the process the pedal was not held for it
 
 
+def clamp(value: float, most: float) -> float:
+    """The value within -`most` to `most`."""
+    return min(max(value, -most), most)
+
+
 class HunterSpec(NamedTuple):
     """A model's limits and geometry. Angles are those of the inner front wheel, as it is told.
 
@@ -89,7 +94,7 @@ class ScenarioCar(NamedTuple):
 
     def steering(self, curvature: float) -> float:
         """The steering action of a path; not clamped. Inverse of the above."""
-        slip_rad = math.asin(_clamp(0.5 * self.wheelbase_m * curvature, 1.0))
+        slip_rad = math.asin(clamp(0.5 * self.wheelbase_m * curvature, 1.0))
         return math.atan(2.0 * math.tan(slip_rad)) / self.full_steering_rad
 
 
@@ -128,7 +133,7 @@ class Similarity(NamedTuple):
     def pedal(self, acceleration_mps2: float) -> float:
         """The pedal that gives the robot this acceleration, within -1 to 1."""
         full_mps2 = self.car.throttle_mps2 if acceleration_mps2 > 0 else self.car.brake_mps2
-        return _clamp(acceleration_mps2 / self.scale / full_mps2, 1.0)
+        return clamp(acceleration_mps2 / self.scale / full_mps2, 1.0)
 
     def pedal_to_speed(
         self, speed_mps: float, pedal: float, step_s: float, measured_mps: float
@@ -161,7 +166,7 @@ class Similarity(NamedTuple):
     def steering(self, centre_rad: float) -> float:
         """The steering whose path the robot drives, within -1 to 1."""
         curvature = math.tan(centre_rad) / self.spec.wheelbase_m
-        return _clamp(self.car.steering(curvature * self.scale), 1.0)
+        return clamp(self.car.steering(curvature * self.scale), 1.0)
 
     def limits(self) -> Dict[str, ActionLimit]:
         """Ranges and slew rates of the actions. A pedal is integrated: any leap of it is a ramp."""
@@ -198,7 +203,7 @@ def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wi
         raise ValueError(f"a command that lacks an action: {action}, {scenario_speed_mps} m/s")
     # A pedal of 1e308 times a step of 0 s is no number.
     pedal, steering = (
-        None if value is None else _clamp(value, 1.0) for value in (wish.pedal, wish.steering)
+        None if value is None else clamp(value, 1.0) for value in (wish.pedal, wish.steering)
     )
     return Wish(pedal, scenario_speed_mps, steering)
 
@@ -229,8 +234,4 @@ class SetPoint:
         if wish.steering is not None:
             wanted_rad = spec.inner_rad(similarity.centre_rad(wish.steering))
             most_rad = spec.max_steering_rate_radps * step_s
-            self.inner_rad += _clamp(wanted_rad - self.inner_rad, most_rad)
-
-
-def _clamp(value: float, most: float) -> float:
-    return min(max(value, -most), most)
+            self.inner_rad += clamp(wanted_rad - self.inner_rad, most_rad)

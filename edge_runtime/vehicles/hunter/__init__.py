@@ -11,6 +11,7 @@ without a CAN vehicle need not have it. Two threads are around the core (core.py
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import ipaddress
 import logging
@@ -42,10 +43,7 @@ _ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
 GROUP, PORT = "239.74.163.2", 43113  # python-can's own
 # Two buses need two ports: Linux hands what comes for any group to every socket of its port.
 MULTICAST_BUS = f"udp_multicast:{GROUP}:{PORT}"
-# Pinned to the loopback device as well: no neighbour hears it either way.
-_OPTIONS: Dict[str, Dict[str, Any]] = {"udp_multicast": {"hop_limit": 0, "fd": False}}
 _LOOPBACK = "lo"
-_ANY = bytes(4)
 _GROUP_AND_PORT = re.compile(r"([0-9.]+)(?::([0-9]{1,5}))?")
 
 
@@ -57,68 +55,45 @@ class BusName(NamedTuple):
     bitrate: Optional[int]
     port: Optional[int] = None  # of udp_multicast
 
-    @property
-    def hears_itself(self) -> bool:
-        """Whether our own frames come back: then a command need not be somebody else's."""
-        return self.interface == "udp_multicast"
-
 
 def parse_bus(text: str) -> BusName:
     """The bus of INTERFACE:CHANNEL[:BITRATE]. Raises UserError for anything else."""
     interface, _, channel = text.partition(":")
-    if interface == "udp_multicast":
-        return _parse_multicast(text, channel)
-    if interface == "socketcan" and ":" in channel:
-        raise UserError(
-            f"bus {text!r} has its bit rate from `ip link`:"
-            f" write {interface}:{channel.partition(':')[0]}"
-        )
-    if interface in _WITHOUT_BITRATE:
-        if interface and channel:
-            return BusName(interface, channel, None)
-    elif interface and channel:
-        channel, _, rate = channel.partition(":")
-        if channel and (not rate or (rate.isdecimal() and int(rate) > 0)):
-            return BusName(interface, channel, int(rate) if rate else BITRATE)
-    raise UserError(f"bus {text!r} is no CAN bus: write it as {_SYNTAX}")
-
-
-def _parse_multicast(text: str, channel: str) -> BusName:
-    """GROUP and PORT of an IPv4 group, GROUP:PORT or nothing."""
-    found = _GROUP_AND_PORT.fullmatch(channel or GROUP)
-    group, port = (found[1], int(found[2] or PORT)) if found else ("", 0)
-    if not (_is_group(group) and 1 <= port <= 65535):
+    if interface == "udp_multicast":  # GROUP:PORT, an IPv4 group, or nothing
+        found = _GROUP_AND_PORT.fullmatch(channel or GROUP)
+        with contextlib.suppress(ValueError):  # no address
+            port = int(found[2] or PORT) if found else 0
+            if found and ipaddress.IPv4Address(found[1]).is_multicast and 1 <= port <= 65535:
+                return BusName(interface, found[1], None, port)
         raise UserError(
             f"bus {text!r} is no IPv4 multicast group and port: write it as {MULTICAST_BUS}"
         )
-    return BusName("udp_multicast", group, None, port)
-
-
-def _is_group(text: str) -> bool:
-    try:
-        return ipaddress.IPv4Address(text).is_multicast
-    except ValueError:
-        return False
+    name, colon, rate = channel.partition(":")
+    if interface == "socketcan" and colon:
+        raise UserError(f"bus {text!r} has its bit rate from `ip link`: write {interface}:{name}")
+    if interface in _WITHOUT_BITRATE and channel:
+        return BusName(interface, channel, None)
+    if interface and name and (not rate or (rate.isdecimal() and int(rate) > 0)):
+        return BusName(interface, name, int(rate or BITRATE))
+    raise UserError(f"bus {text!r} is no CAN bus: write it as {_SYNTAX}")
 
 
 def open_bus(name: BusName) -> Any:
     """An open python-can bus; nothing is sent. Raises UserError, one line that says what to do."""
     can = import_can()
-    options = dict(_OPTIONS.get(name.interface, {}))
-    if name.bitrate is not None:
-        options["bitrate"] = name.bitrate
+    options: Dict[str, Any] = {} if name.bitrate is None else {"bitrate": name.bitrate}
     if name.port is not None:
-        options["port"] = name.port
+        # Pinned to the loopback device as well: no neighbour hears it either way.
+        options = {"port": name.port, "hop_limit": 0, "fd": False}
+    bus = None
     try:
         bus = can.Bus(interface=name.interface, channel=name.channel, **options)
-    except Exception as error:  # each backend raises what its library raises, NameError included
-        raise UserError(_explain(name, error)) from None
-    if name.interface == "udp_multicast":
-        try:
+        if name.port is not None:
             pin_to_loopback(bus, name.channel)
-        except OSError as error:
+    except Exception as error:  # each backend raises what its library raises, NameError included
+        if bus is not None:
             bus.shutdown()
-            raise UserError(_explain(name, error)) from None
+        raise UserError(_explain(name, error)) from None
     return bus
 
 
@@ -130,8 +105,8 @@ def pin_to_loopback(bus: Any, group: str) -> None:
     5.7 or newer), only a route for multicast, which any machine with a network has.
     """
     device = socket.if_nametoindex(_LOOPBACK)
-    member = struct.pack("=4s4si", socket.inet_aton(group), _ANY, device)  # struct ip_mreqn
-    sender = struct.pack("=4s4si", _ANY, _ANY, device)
+    member = struct.pack("=4s4xi", socket.inet_aton(group), device)  # struct ip_mreqn
+    sender = struct.pack("=8xi", device)
     with socket.socket(fileno=os.dup(bus.fileno())) as same:
         same.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK.encode() + b"\0")
         try:
@@ -161,22 +136,23 @@ def import_can() -> Any:
 def _explain(name: BusName, error: Exception) -> str:
     where = f"the CAN bus {name.interface}:{name.channel} cannot be opened"
     cause = " ".join(str(error).split()) or type(error).__name__
+    if name.interface != "socketcan" and "Unknown interface" in cause:
+        return f"{where}: choose from {', '.join(sorted(import_can().VALID_INTERFACES))}"
     number = getattr(error, "errno", None) or getattr(error, "error_code", None)
-    if name.interface == "socketcan":
-        if isinstance(error, PermissionError) or number == 1:
-            return f"{where}: {cause}; this user may not open a CAN socket"
-        if number == 97:
-            return f"{where}: {cause}; this kernel has no SocketCAN (modprobe can_raw)"
-        return (
-            f"{where}: {cause}; bring it up with"
-            f" `ip link set {name.channel} up type can bitrate {BITRATE}`, `ip link` lists them"
-        )
-    if "Unknown interface" in cause:
-        can = import_can()
-        return f"{where}: choose from {', '.join(sorted(can.VALID_INTERFACES))}"
+    advice = f"python-can's manual says what its {name.interface} needs"
     if name.interface == "udp_multicast":
-        return f"{where}: {cause}; it needs msgpack, and a route for multicast (`ip route`)"
-    return f"{where}: {cause}; python-can's manual says what its {name.interface} needs"
+        advice = "it needs msgpack, and a route for multicast (`ip route`)"
+    elif name.interface == "socketcan":
+        advice = {
+            errno.EPERM: "this user may not open a CAN socket",
+            errno.EACCES: "this user may not open a CAN socket",
+            errno.EAFNOSUPPORT: "this kernel has no SocketCAN (modprobe can_raw)",
+        }.get(
+            number,
+            f"bring it up with `ip link set {name.channel} up type can bitrate {BITRATE}`,"
+            " `ip link` lists them",
+        )
+    return f"{where}: {cause}; {advice}"
 
 
 class Gate:
@@ -210,11 +186,6 @@ class Gate:
         self._bus.send(message, timeout=0.0)
 
 
-def is_bus_off(message: Any) -> bool:
-    """Whether a received message is the controller's word that it has left the bus."""
-    return bool(message.is_error_frame and message.arbitration_id & _ERROR_BUS_OFF)
-
-
 class HunterVehicle(StreamedVehicle):
     """Opens its bus when made (UserError where it cannot), and sends nothing before `enable`."""
 
@@ -223,7 +194,8 @@ class HunterVehicle(StreamedVehicle):
     def __init__(self, bus: BusName, similarity: Similarity, profile: str) -> None:
         self._bus: Any = open_bus(bus)
         self._gate = Gate(self._bus)
-        self._ignores_commands = bus.hears_itself
+        # Our own frames come back there: a command need not be somebody else's.
+        self._ignores_commands = bus.interface == "udp_multicast"
         self._core: HunterCore
         super().__init__(HunterCore(similarity, profile))
         self._stopping = False
@@ -231,22 +203,17 @@ class HunterVehicle(StreamedVehicle):
 
     def enable(self, now_s: float) -> None:
         """Ask the chassis for control; `feedback` tells whether it came. Nothing once closed."""
-        if not self._closed:
-            self._gate.open()  # the core gives no frame before it is enabled
-            self._start()
+        self._gate.open()  # the core gives no frame before it is enabled
         super().enable(now_s)
 
     def feedback(self, now_s: float) -> VehicleReport:
         """From the newest frames of the chassis, which it listens to before `enable`, too."""
-        self._start()
+        if not self._closed:
+            self._start()
         return super().feedback(now_s)
 
-    def close(self) -> None:
-        """Stand, lock the brake, give control back, and leave the bus."""
-        if self._closed:
-            return
-        self._closed = True
-        self._end_stream()
+    def _leave(self) -> None:
+        """Lock the brake, give control back, and leave the bus."""
         self._stopping = True
         if self._listener.ident is not None:
             self._listener.join(_JOIN_S)
@@ -258,12 +225,9 @@ class HunterVehicle(StreamedVehicle):
         except Exception as error:  # the chassis stops by itself, and the bus must be freed
             log.event("warning", "hunter_not_parked", detail=error)
         self._bus.shutdown()
-        self._log_gaps()
 
     def _start(self) -> None:
-        if self._closed:
-            return
-        self._stream.start()
+        super()._start()
         if self._listener.ident is None:
             self._listener.start()
 
@@ -304,7 +268,7 @@ class HunterVehicle(StreamedVehicle):
 
     def _hear(self, message: Any) -> None:
         if message.is_error_frame:
-            if is_bus_off(message):
+            if message.arbitration_id & _ERROR_BUS_OFF:
                 self._note_bus("bus-off", fatal=True)
             return
         if message.is_extended_id or message.is_remote_frame or message.is_fd:

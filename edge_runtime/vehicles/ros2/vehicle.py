@@ -229,16 +229,10 @@ class Ros2Vehicle(StreamedVehicle):
             counts["stale"] = self._core.odometry.stale
         return counts
 
-    def close(self) -> None:
-        """Publish speed 0 until it stands, and leave."""
-        if self._closed:
-            return
-        self._closed = True
-        self._end_stream()
+    def _leave(self) -> None:
         try:
             if self.rejected:
                 log.event("info", "ros2_odometry_rejected", **self.rejected)
-            self._log_gaps()
             self._node.close()
         finally:
             with self._lock:
