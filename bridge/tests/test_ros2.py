@@ -41,7 +41,7 @@ from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import CARS
-from edge_runtime.vehicles.ros2 import names
+from edge_runtime.vehicles.ros2 import topic_key
 from edge_runtime.vehicles.ros2.tests import second
 from edge_runtime.wire import encode
 
@@ -145,7 +145,7 @@ class FakeNode:
         self.published = defaultdict(list)
 
     def publisher(self, topic, _kind):
-        names.key("/x", topic)
+        topic_key("/x", topic)
         return self.published[topic].append
 
 

@@ -16,7 +16,7 @@ from edge_runtime.config import DEFAULT_BUS, HunterSettings, Ros2Settings
 from edge_runtime.vehicles.hunter import parse_bus
 from edge_runtime.vehicles.hunter.protocol import PROFILES
 from edge_runtime.vehicles.mapping import SPECS
-from edge_runtime.vehicles.ros2.names import check_settings
+from edge_runtime.vehicles.ros2 import check_settings
 
 ROOT = Path(edge_runtime.__file__).parent
 # Only who asks for them loads them.

@@ -46,7 +46,7 @@ def make_vehicle(name: str, config: Config, scenario: str) -> Vehicle:
         from edge_runtime.vehicles.hunter import HunterVehicle, parse_bus
 
         return HunterVehicle(parse_bus(config.bus), similarity, config.hunter.profile)
-    from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
+    from edge_runtime.vehicles.ros2 import Ros2Vehicle
 
     return Ros2Vehicle(config.ros2, similarity)
 
@@ -101,9 +101,9 @@ def check_settings(config: Config) -> None:
         check_choice("hunter.model", config.hunter.model, tuple(SPECS))
         check_choice("hunter.profile", config.hunter.profile, tuple(protocol.PROFILES))
     if config.ros2 != Ros2Settings():
-        from edge_runtime.vehicles.ros2 import names
+        from edge_runtime.vehicles import ros2
 
-        names.check_settings(config.ros2)
+        ros2.check_settings(config.ros2)
     car, scale = config.similarity.car, config.similarity.scale
     numbers = {} if car is None else msgspec.structs.asdict(car)
     if scale is not None:

@@ -138,7 +138,7 @@ def _explain(name: BusName, error: Exception) -> str:
     cause = " ".join(str(error).split()) or type(error).__name__
     if name.interface != "socketcan" and "Unknown interface" in cause:
         return f"{where}: choose from {', '.join(sorted(import_can().VALID_INTERFACES))}"
-    number = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    number: Any = getattr(error, "errno", None) or getattr(error, "error_code", None)
     advice = f"python-can's manual says what its {name.interface} needs"
     if name.interface == "udp_multicast":
         advice = "it needs msgpack, and a route for multicast (`ip route`)"

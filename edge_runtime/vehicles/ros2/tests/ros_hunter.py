@@ -16,8 +16,8 @@ from edge_runtime.config import Ros2Settings
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
+from edge_runtime.vehicles.ros2 import Measured, Ros2Core
 from edge_runtime.vehicles.ros2.tests import second
-from edge_runtime.vehicles.ros2.vehicle import Measured, Ros2Core
 
 WHEELBASE_M, TRACK_M, MAX_INNER_RAD = 0.650, 0.605, 0.576
 PERIOD_S = 0.02

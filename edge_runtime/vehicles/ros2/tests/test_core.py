@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 
 from edge_runtime.config import Ros2Settings
 from edge_runtime.vehicles.core import COMMAND_TIMEOUT_S, ENABLE_TIMEOUT_S, Event, State
-from edge_runtime.vehicles.ros2.names import STEERING, YAW_RATE
-from edge_runtime.vehicles.ros2.tests.ros_hunter import CONGESTION, LEFT_TURN, SPEC, TICK_S, Drive
-from edge_runtime.vehicles.ros2.vehicle import (
+from edge_runtime.vehicles.ros2 import (
     ROS2_LEADS_TO,
+    STEERING,
+    YAW_RATE,
     Measured,
     Motion,
     Ros2Core,
-    drive_of,
-    twist_of,
 )
+from edge_runtime.vehicles.ros2.node import drive_of, twist_of
+from edge_runtime.vehicles.ros2.tests.ros_hunter import CONGESTION, LEFT_TURN, SPEC, TICK_S, Drive
 
 
 def test_nothing_is_sent_before_enable():
@@ -144,7 +144,7 @@ def test_a_clock_set_back_counts_after_the_next_enable():
     drive = Drive().start()
     drive.now_s += 0.02
     drive.core.hear(Measured(5, 0.0, 0.0), drive.now_s)
-    assert drive.core.odometry.stale == 1
+    assert drive.core.stale == 1
     drive.core.enable(drive.now_s)
     drive.core.hear(Measured(6, 0.0, 0.0), drive.now_s)
     assert drive.core.state is State.ENABLED

@@ -22,7 +22,7 @@ from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.ros2 import names, node
+from edge_runtime.vehicles import ros2
 from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.vehicles.ros2.node import Ros2Node
 from edge_runtime.vehicles.ros2.tests import second
@@ -45,7 +45,7 @@ BRIDGE_TOKEN = re.compile(r"@/([^/]+)/@ros2_lv/(MP|MS)/([^/]+)/([^/]+)/([^/]+)")
     ],
 )
 def test_a_key_is_the_name_without_the_first_slash(namespace, topic, key):
-    assert names.key(namespace, topic) == key
+    assert ros2.topic_key(namespace, topic) == key
 
 
 @pytest.mark.parametrize(
@@ -53,41 +53,39 @@ def test_a_key_is_the_name_without_the_first_slash(namespace, topic, key):
 )
 def test_what_is_no_ros_name_is_refused_in_one_line(name):
     with pytest.raises(UserError) as caught:
-        names.key("/", name)
+        ros2.topic_key("/", name)
     assert "\n" not in str(caught.value)
 
 
 def test_the_root_is_no_topic():
     with pytest.raises(UserError, match="names nothing"):
-        names.key("/hunter01", "/")
+        ros2.topic_key("/hunter01", "/")
 
 
 @pytest.mark.parametrize(
     ("vehicle_id", "namespace"), [("hunter01", "/hunter01"), ("a-b", "/a_b"), ("7up", "/v7up")]
 )
 def test_every_vehicle_id_gives_a_namespace(vehicle_id, namespace):
-    assert names.namespace_of(vehicle_id) == namespace
+    assert ros2.namespace_of(vehicle_id) == namespace
 
 
 @given(st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True))
 def test_any_vehicle_id_gives_a_valid_namespace(vehicle_id):
-    names.check_ros_name(names.namespace_of(vehicle_id))
+    ros2.check_ros_name(ros2.namespace_of(vehicle_id))
 
 
 def test_a_publishers_token_by_the_letter():
-    token = names.topic_token(
-        "a1b2", names.PUBLISHER, "hunter01/cmd_vel", "geometry_msgs/msg/Twist"
-    )
+    token = ros.topic_token("a1b2", ros.PUBLISHER, "hunter01/cmd_vel", "geometry_msgs/msg/Twist")
     assert token == (
         "@/a1b2/@ros2_lv/MP/hunter01§cmd_vel/geometry_msgs§msg§Twist/:1:0:0,10:typehash="
         "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a;"
     )
 
 
-@pytest.mark.parametrize("type_name", names.TYPES)
-@pytest.mark.parametrize("kind", [names.PUBLISHER, names.SUBSCRIBER])
+@pytest.mark.parametrize("type_name", ros.TYPES)
+@pytest.mark.parametrize("kind", [ros.PUBLISHER, ros.SUBSCRIBER])
 def test_a_token_parses_as_the_bridge_parses_it(type_name, kind):
-    token = names.topic_token("a1", kind, "x/y", type_name)
+    token = ros.topic_token("a1", kind, "x/y", type_name)
     zenoh.KeyExpr(token)  # raises for what Zenoh would not declare
     found = BRIDGE_TOKEN.fullmatch(token)
     assert found is not None
@@ -100,9 +98,9 @@ def test_a_token_parses_as_the_bridge_parses_it(type_name, kind):
     assert re.fullmatch(r"typehash=RIHS01_[0-9a-f]{64};", user_data)
 
 
-@pytest.mark.parametrize("type_name", names.TYPES)
+@pytest.mark.parametrize("type_name", ros.TYPES)
 def test_the_hashes_are_the_second_librarys(type_name):
-    assert second.STORE.hash_rihs01(type_name) == f"RIHS01_{names.TYPES[type_name]}"
+    assert second.STORE.hash_rihs01(type_name) == f"RIHS01_{ros.TYPES[type_name]}"
 
 
 TWIST = ros.Twist(ros.Vector3(1.5, 0.0, -0.25), ros.Vector3(0.0, 0.0, 0.5))
@@ -116,7 +114,7 @@ def type_name(kind):
 
 
 def test_a_twist_is_a_header_and_six_doubles():
-    assert node.encode(TWIST) == b"\x00\x01\x00\x00" + struct.pack(
+    assert ros.encode(TWIST) == b"\x00\x01\x00\x00" + struct.pack(
         "<6d", 1.5, 0.0, -0.25, 0.0, 0.0, 0.5
     )
 
@@ -124,28 +122,28 @@ def test_a_twist_is_a_header_and_six_doubles():
 def test_a_stamped_drive_aligns_after_its_text():
     # sec, nanosec, 4 bytes with the ending zero, no padding; then five floats.
     by_hand = struct.pack("<iII4s5f", 7, 9, 4, b"abc\0", 0.5, 0.0, 1.25, 0.0, 0.0)
-    assert node.encode(DRIVE) == b"\x00\x01\x00\x00" + by_hand
+    assert ros.encode(DRIVE) == b"\x00\x01\x00\x00" + by_hand
     longer = ros.AckermannDriveStamped(ros.Header(ros.Time(), "abcd"), DRIVE.drive)
     by_hand = struct.pack("<iII8s5f", 0, 0, 5, b"abcd", 0.5, 0.0, 1.25, 0.0, 0.0)
-    assert node.encode(longer) == b"\x00\x01\x00\x00" + by_hand
+    assert ros.encode(longer) == b"\x00\x01\x00\x00" + by_hand
 
 
 @given(MESSAGES)
 def test_the_second_library_reads_what_we_write(message):
-    read = second.deserialize(type_name(type(message)), node.encode(message))
+    read = second.deserialize(type_name(type(message)), ros.encode(message))
     assert read == asdict(message)
 
 
 @given(MESSAGES)
 def test_we_read_what_the_second_library_writes(message):
     name, fields = type_name(type(message)), asdict(message)
-    assert node.decode(second.serialize(name, fields), type(message)) == message
-    assert node.decode(second.serialize_big_endian(name, fields), type(message)) == message
+    assert ros.decode(second.serialize(name, fields), type(message)) == message
+    assert ros.decode(second.serialize_big_endian(name, fields), type(message)) == message
 
 
 @given(MESSAGES)
 def test_both_write_the_same_bytes(message):
-    ours = node.encode(message)
+    ours = ros.encode(message)
     theirs = second.serialize(type_name(type(message)), asdict(message))
     # rosbags fills the message up to 4 bytes, as a DDS writer does.
     assert theirs.rstrip(b"\0") == ours.rstrip(b"\0")
@@ -155,24 +153,24 @@ def test_both_write_the_same_bytes(message):
 @settings(max_examples=500)
 @given(st.binary(max_size=1200), KINDS)
 def test_random_bytes_never_raise(payload, kind):
-    assert isinstance(node.decode(payload, kind), (kind, Rejection))
+    assert isinstance(ros.decode(payload, kind), (kind, Rejection))
 
 
 @settings(max_examples=500)
 @given(st.sampled_from([b"\0\0\0\0", b"\0\1\0\0"]), st.binary(max_size=1200), KINDS)
 def test_random_bytes_after_a_good_header_never_raise(header, body, kind):
-    assert isinstance(node.decode(header + body, kind), (kind, Rejection))
+    assert isinstance(ros.decode(header + body, kind), (kind, Rejection))
 
 
 @settings(max_examples=300)
 @given(MESSAGES, st.data())
 def test_a_message_that_is_cut_off_or_damaged_never_raises(message, data):
-    payload = bytearray(node.encode(message))
+    payload = bytearray(ros.encode(message))
     kind = type(message)
     cut = data.draw(st.integers(0, len(payload) - 1))
-    assert isinstance(node.decode(bytes(payload[:cut]), kind), Rejection)
+    assert isinstance(ros.decode(bytes(payload[:cut]), kind), Rejection)
     payload[data.draw(st.integers(0, len(payload) - 1))] ^= data.draw(st.integers(1, 255))
-    assert isinstance(node.decode(bytes(payload), kind), (kind, Rejection))
+    assert isinstance(ros.decode(bytes(payload), kind), (kind, Rejection))
 
 
 @pytest.mark.parametrize(
@@ -181,17 +179,17 @@ def test_a_message_that_is_cut_off_or_damaged_never_raises(message, data):
         (b"", ros.Twist, Reason.MALFORMED),
         (b"\0\1\0", ros.Twist, Reason.MALFORMED),
         (b"\0\7\0\0" + bytes(48), ros.Twist, Reason.SCHEMA),  # XCDR version 2
-        (node.encode(TWIST), ros.Odometry, Reason.MALFORMED),
-        (node.encode(ros.Odometry()), ros.Twist, Reason.MALFORMED),
+        (ros.encode(TWIST), ros.Odometry, Reason.MALFORMED),
+        (ros.encode(ros.Odometry()), ros.Twist, Reason.MALFORMED),
         (b"\0\1\0\0" + struct.pack("<6d", *[0.0] * 5, float("nan")), ros.Twist, Reason.NOT_FINITE),
         (b"\0\1\0\0" + struct.pack("<6d", float("inf"), *[0.0] * 5), ros.Twist, Reason.NOT_FINITE),
-        (b"\0\1\0\0" + bytes(node.MAX_PAYLOAD_BYTES), ros.Image, Reason.OVERSIZED),
+        (b"\0\1\0\0" + bytes(ros.MAX_PAYLOAD_BYTES), ros.Image, Reason.OVERSIZED),
         (b"\0\1\0\0" + struct.pack("<iII", 0, 0, 2**32 - 1), ros.Odometry, Reason.MALFORMED),
         (b"\0\1\0\0" + struct.pack("<iII2s", 0, 0, 3, b"\xff\xff"), ros.Odometry, Reason.MALFORMED),
     ],
 )
 def test_what_is_no_message_says_why(payload, kind, reason):
-    rejection = node.decode(payload, kind)
+    rejection = ros.decode(payload, kind)
     assert isinstance(rejection, Rejection)
     assert rejection.reason == reason
 
@@ -199,7 +197,7 @@ def test_what_is_no_message_says_why(payload, kind, reason):
 def test_a_nan_in_a_covariance_is_not_finite():
     odometry = ros.Odometry()
     odometry.twist.covariance[3] = float("nan")
-    assert node.decode(node.encode(odometry), ros.Odometry) == Rejection(
+    assert ros.decode(ros.encode(odometry), ros.Odometry) == Rejection(
         Reason.NOT_FINITE, "twist.covariance is nan"
     )
 
@@ -207,17 +205,17 @@ def test_a_nan_in_a_covariance_is_not_finite():
 def test_an_image_of_the_policy_goes_through_whole():
     pixels = bytes(range(256)) * 14 + bytes(16)
     image = ros.Image(ros.Header(), 45, 80, "mono8", 0, 80, pixels)
-    assert second.deserialize(type_name(ros.Image), node.encode(image))["data"] == pixels
+    assert second.deserialize(type_name(ros.Image), ros.encode(image))["data"] == pixels
 
 
 def test_a_message_that_dds_has_filled_up_is_read():
     """As Cyclone DDS writes it: up to 4 bytes, and how many were added in the header."""
     image = ros.Image(height=1, width=3, step=3, data=b"abc")
-    plain = node.encode(image)
+    plain = ros.encode(image)
     padding = -len(plain) % 4
     assert padding == 1
-    assert node.decode(b"\0\1\0\1" + plain[4:] + b"\0", ros.Image) == image
-    too_much = node.decode(plain + bytes(4), ros.Image)
+    assert ros.decode(b"\0\1\0\1" + plain[4:] + b"\0", ros.Image) == image
+    too_much = ros.decode(plain + bytes(4), ros.Image)
     assert isinstance(too_much, Rejection)
 
 
@@ -227,8 +225,8 @@ def test_threads_do_not_share_a_buffer():
 
     def go(number):
         message = ros.Image(data=bytes([number]) * 3000)
-        expected = node.encode(message)
-        wrong.extend(1 for _ in range(300) if node.encode(message) != expected)
+        expected = ros.encode(message)
+        wrong.extend(1 for _ in range(300) if ros.encode(message) != expected)
 
     threads = [Thread(target=go, args=(number,)) for number in range(4)]
     for thread in threads:
@@ -281,9 +279,9 @@ def through_dds(tmp_path_factory):
 )
 @given(message=MESSAGES)
 def test_dds_takes_any_message_and_gives_it_back(through_dds, message):
-    ours, kind = node.encode(message), type(message)
+    ours, kind = ros.encode(message), type(message)
     theirs, type_name = through_dds(ours, kind)
-    assert node.decode(theirs, kind) == message
+    assert ros.decode(theirs, kind) == message
     # Filled up to 4 bytes; how many that are stands in the header's last two bits.
     padding = -len(ours) % 4
     assert theirs == ours[:3] + bytes([padding]) + ours[4:] + bytes(padding)
@@ -293,7 +291,7 @@ def test_dds_takes_any_message_and_gives_it_back(through_dds, message):
 
 @needs_cyclone
 def test_dds_refuses_another_type(through_dds):
-    assert through_dds(node.encode(ros.Twist()), ros.Odometry) is None
+    assert through_dds(ros.encode(ros.Twist()), ros.Odometry) is None
 
 
 SLOW_TURN = ros.Twist(ros.Vector3(0.5), ros.Vector3(0.0, 0.0, -0.25))

@@ -22,9 +22,9 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles import stream, vehicle_limits
 from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
+from edge_runtime.vehicles.ros2 import Ros2Vehicle
 from edge_runtime.vehicles.ros2.tests import second
 from edge_runtime.vehicles.ros2.tests.ros_hunter import RosHunter
-from edge_runtime.vehicles.ros2.vehicle import Ros2Vehicle
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 SPEC = SPECS["2.0"]
