@@ -5,7 +5,6 @@ from __future__ import annotations
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
-from edge_runtime.vehicles.hunter.protocol import Sent
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 
 SPEC = SPECS["2.0"]
@@ -41,7 +40,7 @@ class Bench:
 
     def _answer(self, parts):
         for frame, data in parts:
-            message = told_by(Sent(frame, data))
+            message = protocol.decode(frame.can_id, data)
             if isinstance(message, protocol.MotionCommand) and self.obeys:
                 self.speed_mps, self.inner_rad = message
         if not self.hears:
@@ -73,13 +72,15 @@ class Bench:
         return self.core.report(self.now_s).faults
 
     def motions(self, since=0):
-        return [told_by(part) for _, part in self.sent[since:] if part.frame.can_id == 0x111]
+        return [told for _, told in self.motions_at(since)]
 
-
-def told_by(part):
-    decoded = protocol.decode(part.frame.can_id, part.data)
-    assert decoded is not None
-    return decoded.message
+    def motions_at(self, since=0):
+        """Each 0x111 with its time."""
+        return [
+            (time_s, protocol.decode(0x111, part.data))
+            for time_s, part in self.sent[since:]
+            if part.frame.can_id == 0x111
+        ]
 
 
 def sent_ids(bench):

@@ -34,12 +34,6 @@ LEFT_TURN = similarity_to(CARS["left_turn"], SPEC)
 _numbers = itertools.count()
 
 
-def told_by(can_id, data):
-    decoded = protocol.decode(can_id, data)
-    assert decoded is not None
-    return decoded.message
-
-
 class Chassis:
     """Answers as a chassis that obeys at once; keeps every frame that it heard."""
 
@@ -58,8 +52,7 @@ class Chassis:
             if message is None:
                 continue
             self.heard.append((message.arbitration_id, bytes(message.data)))
-            decoded = protocol.decode(*self.heard[-1])
-            told = decoded.message if decoded is not None else None
+            told = protocol.decode(*self.heard[-1])
             if isinstance(told, protocol.ModeCommand):
                 self.status = self.status._replace(mode=told.mode)
             elif isinstance(told, protocol.BrakeCommand):
@@ -76,7 +69,9 @@ class Chassis:
 
     @property
     def speeds(self):
-        return [told_by(*heard).speed_mps for heard in list(self.heard) if heard[0] == 0x111]
+        return [
+            protocol.decode(*heard).speed_mps for heard in list(self.heard) if heard[0] == 0x111
+        ]
 
     def close(self):
         self._stopping = True
@@ -196,7 +191,8 @@ def test_a_frame_that_was_held_up_is_followed_at_once_by_one_of_now(driving, mon
             monkeypatch.setattr(stream, "PERIOD_S", 0.4)
             time.sleep(0.5)  # the whole process, as far as the frame can tell
         send(message, timeout=timeout)
-        sent.append((time.monotonic(), told_by(message.arbitration_id, message.data).speed_mps))
+        told = protocol.decode(message.arbitration_id, message.data)
+        sent.append((time.monotonic(), told.speed_mps))
 
     monkeypatch.setattr(driving._bus, "send", stopped_in_between)
     wait_until(lambda: len(sent) > 1, "the next frame")

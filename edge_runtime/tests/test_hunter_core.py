@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import edge_runtime
 from edge_runtime.tests.harness import render_table
-from edge_runtime.tests.hunter_bench import OK, STREAM_S, Bench, sent_ids, told_by
+from edge_runtime.tests.hunter_bench import OK, STREAM_S, Bench, sent_ids
 from edge_runtime.vehicles import core as rules
 from edge_runtime.vehicles.core import LEADS_TO, Event, Finding, State
 from edge_runtime.vehicles.hunter import protocol
@@ -262,11 +262,7 @@ def test_without_a_fresh_command_it_stops_within_the_promise_and_latches():
     count = len(bench.sent)
     bench.step(100)
     assert bench.core.late_at_s == float("inf")
-    stopped_s = next(
-        time_s
-        for time_s, part in bench.sent[count:]
-        if part.frame.can_id == 0x111 and told_by(part).speed_mps == 0
-    )
+    stopped_s = next(time_s for time_s, told in bench.motions_at(count) if told.speed_mps == 0)
     assert 0.2 < stopped_s - last_s <= 0.25 + 0.02
     assert bench.words == ["no command for 0.24 s"]
     bench.step(50, {"pedal": 1.0})

@@ -229,20 +229,25 @@ class StreamedCore(abc.ABC):
         """Whether the vehicle is known to stand, or no more can be done about it."""
 
     @abc.abstractmethod
-    def _obstacles(self, now_s: float) -> List[str]:
-        """In words what stands between the vehicle and our commands."""
+    def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
+        """SILENT where feedback is missing that was due since `since_s`."""
 
     @abc.abstractmethod
     def _why_not_confirmed(self, now_s: float) -> str:
         """In words why the vehicle did not confirm an `enable` in time."""
 
     @abc.abstractmethod
-    def _wrong(self, now_s: float) -> Optional[Finding]:
-        """What is wrong with the newest feedback while ENABLED."""
-
-    @abc.abstractmethod
     def _steering(self) -> float:
         """The steering in -1 to 1 that the vehicle reports."""
+
+    def _lie(self) -> Optional[Finding]:
+        """LYING where the newest feedback cannot be, and it was not refused when it came."""
+        return None
+
+    def _obstacles(self, now_s: float) -> List[str]:
+        """In words what stands between the vehicle and our commands."""
+        silence = self._silence(-math.inf, now_s)
+        return [silence.words] if silence else []
 
     def _apply(self, finding: Finding, now_s: float) -> None:
         after = self.leads_to[finding.event].get(self.state, self.state)
@@ -261,7 +266,7 @@ class StreamedCore(abc.ABC):
             self._apply(Finding(Event.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
         if self.state is not State.ENABLED:
             return
-        found = self._wrong(now_s)
+        found = self._silence(self._since_s, now_s) or self._lie()
         if found is None and self._wish is not None and now_s - self._wished_s > COMMAND_TIMEOUT_S:
             found = Finding(Event.COMMAND_LATE, f"no command for {COMMAND_TIMEOUT_S:.2f} s")
         asked_mps, measured_mps = self.set_point.speed_mps, self._heard.speed_mps

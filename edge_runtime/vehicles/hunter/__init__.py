@@ -28,7 +28,7 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter.core import HunterCore
-from edge_runtime.vehicles.hunter.protocol import BITRATE, COMMANDS, Frame
+from edge_runtime.vehicles.hunter.protocol import BITRATE, COMMAND_IDS, COMMANDS, Frame
 from edge_runtime.vehicles.mapping import Similarity
 from edge_runtime.vehicles.stream import PERIOD_S, StreamedVehicle
 
@@ -273,7 +273,7 @@ class HunterVehicle(StreamedVehicle):
             return
         if message.is_extended_id or message.is_remote_frame or message.is_fd:
             return  # no frame of this protocol
-        if self._ignores_commands and self._core.is_command(message.arbitration_id):
+        if self._ignores_commands and message.arbitration_id in COMMAND_IDS:
             return
         with self._lock:
             was = self._core.state

@@ -124,6 +124,7 @@ STEER_MOTOR_SLOW, REAR_RIGHT_SLOW, REAR_LEFT_SLOW = MOTORS_SLOW
 
 COMMANDS: Tuple[Frame, ...] = (MOTION_COMMAND, BRAKE_COMMAND, MODE_COMMAND, CLEAR_COMMAND)
 FEEDBACK: Tuple[Frame, ...] = (SYSTEM_STATUS, MOTION_STATUS, *MOTORS_FAST, *MOTORS_SLOW)
+COMMAND_IDS = {frame.can_id for frame in COMMANDS}  # only we should send these
 FRAMES: Dict[int, Frame] = {frame.can_id: frame for frame in COMMANDS + FEEDBACK}
 MOTOR_OF_SLOW = {frame.can_id: motor for frame, motor in zip(MOTORS_SLOW, _MOTORS)}
 
@@ -133,13 +134,6 @@ class Sent(NamedTuple):
 
     frame: Frame
     data: bytes
-
-
-class Decoded(NamedTuple):
-    """A frame that was understood: its row and its message."""
-
-    frame: Frame
-    message: Any
 
 
 def encode(frame: Frame, message: Any) -> bytes:
@@ -164,7 +158,7 @@ def encode_motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec)
     return encode(MOTION_COMMAND, MotionCommand(speed_mps, inner_rad))
 
 
-def decode(can_id: int, data: bytes) -> Optional[Decoded]:
+def decode(can_id: int, data: bytes) -> Any:
     """The message of a frame; None for an identifier or a length that is not in the table."""
     frame = FRAMES.get(can_id)
     if frame is None or len(data) != frame.length:
@@ -173,7 +167,7 @@ def decode(can_id: int, data: bytes) -> Optional[Decoded]:
     for field in frame.fields:
         (count,) = _PACKERS[field.code].unpack_from(data, field.offset)
         values.append(count if field.per_count is None else count * field.per_count)
-    return Decoded(frame, frame.message(*values))
+    return frame.message(*values)
 
 
 _RANGES: Dict[str, Tuple[int, int]] = {

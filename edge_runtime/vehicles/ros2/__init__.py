@@ -198,24 +198,16 @@ class Ros2Core(StreamedCore):
 
     def is_at_rest(self, now_s: float) -> bool:
         """Whether the vehicle is known to stand, or nothing was ever asked of it."""
-        is_fresh = not self._silence(-math.inf, now_s)
+        is_fresh = self._silence(-math.inf, now_s) is None
         return self.state is State.DISABLED or (is_fresh and self._heard.stands)
-
-    def _obstacles(self, now_s: float) -> List[str]:
-        silence = self._silence(-math.inf, now_s)
-        return [silence] if silence else []
 
     def _why_not_confirmed(self, now_s: float) -> str:
         return f"no odometry on {self._topic} within {ENABLE_TIMEOUT_S:.0f} s"
 
-    def _wrong(self, now_s: float) -> Optional[Finding]:
-        silence = self._silence(self._since_s, now_s)
-        return Finding(Event.SILENT, silence) if silence else None
-
-    def _silence(self, since_s: float, now_s: float) -> str:
+    def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
         if now_s - max(self._newest_s, since_s) <= ODOMETRY_SILENCE_S:
-            return ""
-        return f"no fresh odometry on {self._topic}"
+            return None
+        return Finding(Event.SILENT, f"no fresh odometry on {self._topic}")
 
     def _steering(self) -> float:
         """From the odometry; what was asked for where a yaw rate tells nothing: it hardly moves."""
