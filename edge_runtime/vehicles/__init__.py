@@ -80,13 +80,10 @@ def _mock(config: Config, scenario: str) -> Vehicle:
 
 def _similarity(name: str, config: Config, scenario: str) -> Similarity:
     """From the policy's car to the chassis of the vehicle of that name. Raises UserError."""
-    settings = config.similarity
-    if settings.car is not None:
-        car = ScenarioCar(**msgspec.structs.asdict(settings.car))
-    else:
-        car = car_of(scenario, name)
+    given = config.similarity.car
+    car = ScenarioCar(**msgspec.structs.asdict(given)) if given else car_of(scenario, name)
     model = config.ros2.model if name == "ros2" else config.hunter.model
-    return similarity_to(car, SPECS[model], settings.scale)
+    return similarity_to(car, SPECS[model], config.similarity.scale)
 
 
 def check_settings(config: Config) -> None:

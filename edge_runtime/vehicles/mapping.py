@@ -171,10 +171,9 @@ class Similarity(NamedTuple):
     def limits(self) -> Dict[str, ActionLimit]:
         """Ranges and slew rates of the actions. A pedal is integrated: any leap of it is a ramp."""
         full_rad = abs(self.spec.inner_rad(self.centre_rad(1.0)))
-        steering_slew_per_s = self.spec.max_steering_rate_radps / full_rad
         return {
             "pedal": ActionLimit(-1.0, 1.0, math.inf),
-            "steering": ActionLimit(-1.0, 1.0, steering_slew_per_s),
+            "steering": ActionLimit(-1.0, 1.0, self.spec.max_steering_rate_radps / full_rad),
         }
 
 
@@ -196,16 +195,14 @@ def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wi
 
     Raises ValueError for what is not finite, and for what leaves out how fast to drive.
     """
-    wish = Wish(action.get("pedal"), scenario_speed_mps, action.get("steering"))
-    if not all(math.isfinite(value) for value in wish if value is not None):
+    given = [*action.values(), 0.0 if scenario_speed_mps is None else scenario_speed_mps]
+    if not all(map(math.isfinite, given)):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
-    if not action or (wish.pedal is None and scenario_speed_mps is None):
+    if not action or ("pedal" not in action and scenario_speed_mps is None):
         raise ValueError(f"a command that lacks an action: {action}, {scenario_speed_mps} m/s")
     # A pedal of 1e308 times a step of 0 s is no number.
-    pedal, steering = (
-        None if value is None else clamp(value, 1.0) for value in (wish.pedal, wish.steering)
-    )
-    return Wish(pedal, scenario_speed_mps, steering)
+    within = {name: clamp(value, 1.0) for name, value in action.items()}
+    return Wish(within.get("pedal"), scenario_speed_mps, within.get("steering"))
 
 
 class SetPoint:
@@ -222,15 +219,13 @@ class SetPoint:
 
     def follow(self, wish: Wish, step_s: float, measured_mps: float) -> None:
         """One step of time towards what is wished for."""
-        similarity, spec = self._similarity, self._similarity.spec
+        similarity, spec, speed_mps = self._similarity, self._similarity.spec, self.speed_mps
         step_s = min(max(step_s, 0.0), _LONGEST_STEP_S)
         if wish.pedal is not None:
-            self.speed_mps = similarity.pedal_to_speed(
-                self.speed_mps, wish.pedal, step_s, measured_mps
-            )
+            speed_mps = similarity.pedal_to_speed(speed_mps, wish.pedal, step_s, measured_mps)
         else:
-            scenario_mps = wish.scenario_speed_mps or 0.0
-            self.speed_mps = similarity.follow_speed(self.speed_mps, scenario_mps, step_s)
+            speed_mps = similarity.follow_speed(speed_mps, wish.scenario_speed_mps or 0.0, step_s)
+        self.speed_mps = speed_mps
         if wish.steering is not None:
             wanted_rad = spec.inner_rad(similarity.centre_rad(wish.steering))
             most_rad = spec.max_steering_rate_radps * step_s

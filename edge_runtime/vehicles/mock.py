@@ -23,7 +23,7 @@ _LONGEST_GAP_S = 10.0
 class MockParameters(NamedTuple):
     """The actuators and the body of the mock. Rates are in full pedal or steering per second.
 
-    The body's numbers are the car's of this repository's scenarios (similarity.CARS).
+    The body's numbers are the car's of this repository's scenarios (mapping.CARS).
     """
 
     dead_time_s: float = 0.02
@@ -50,9 +50,9 @@ def advance(
     full_mps2 = parameters.throttle_mps2 if position > 0.0 else parameters.brake_mps2
     speed_mps = state.speed_mps + position * full_mps2 * step_s
     return MockState(
-        pedal=position,
-        steering=_follow(state.steering, steering, step_s, parameters),
-        speed_mps=min(max(speed_mps, 0.0), parameters.max_speed_mps),
+        position,
+        _follow(state.steering, steering, step_s, parameters),
+        min(max(speed_mps, 0.0), parameters.max_speed_mps),
     )
 
 
@@ -79,7 +79,7 @@ class MockVehicle(Vehicle):
         self._state = MockState()
         self._now_s: Optional[float] = None
         self._commanded_s = -math.inf
-        self._on_the_way: Deque[Tuple[float, float, float]] = deque()
+        self._on_the_way: Deque[Tuple[float, Tuple[float, float]]] = deque()
         self._target = (-1.0, 0.0)
         self._latched = True  # until it is enabled
 
@@ -98,10 +98,8 @@ class MockVehicle(Vehicle):
         if self._latched:
             return
         self._commanded_s = now_s
-        effective_s = now_s + self._parameters.dead_time_s
-        self._on_the_way.append(
-            (effective_s, action.get("pedal", 0.0), action.get("steering", 0.0))
-        )
+        target = (action.get("pedal", 0.0), action.get("steering", 0.0))
+        self._on_the_way.append((now_s + self._parameters.dead_time_s, target))
 
     def brake(self, now_s: float, latch: bool = True) -> None:
         """Full brake without the dead time of the command's way."""
@@ -130,9 +128,8 @@ class MockVehicle(Vehicle):
         return now_s - self._commanded_s > COMMAND_TIMEOUT_S
 
     def _integrate(self, until_s: float) -> None:
-        if self._now_s is None:
-            self._now_s = until_s
-        self._now_s = max(self._now_s, until_s - _LONGEST_GAP_S)
+        begin_s = until_s if self._now_s is None else self._now_s
+        self._now_s = max(begin_s, until_s - _LONGEST_GAP_S)
         while until_s - self._now_s > 1e-9:
             step_s = min(_INTEGRATION_STEP_S, until_s - self._now_s)
             pedal, steering = self._target_at(self._now_s + step_s)
@@ -141,8 +138,7 @@ class MockVehicle(Vehicle):
 
     def _target_at(self, now_s: float) -> Tuple[float, float]:
         while self._on_the_way and self._on_the_way[0][0] <= now_s:
-            _, pedal, steering = self._on_the_way.popleft()
-            self._target = (pedal, steering)
+            _, self._target = self._on_the_way.popleft()
         if self._is_left_alone(now_s):
             self._target = (-1.0, self._target[1])
         return self._target
