@@ -10,7 +10,7 @@ from edge_runtime.config import CarSettings, Config, SimilaritySettings
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mapping import CARS
-from edge_runtime.vehicles.mock import MockParameters, MockState, MockVehicle, advance
+from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 
 
 def enabled(**parameters):
@@ -20,10 +20,14 @@ def enabled(**parameters):
 
 
 def test_first_order_lag_by_hand():
-    parameters = MockParameters(time_constant_s=0.1, slew_per_s=1e9)
-    after = advance(MockState(pedal=0.0), 1.0, 0.0, 0.1, parameters)
-    assert after.pedal == pytest.approx(1 - math.exp(-1))
-    assert after.speed_mps == pytest.approx((1 - math.exp(-1)) * 3.0 * 0.1)
+    """From full brake to full throttle in one time constant; and the speed, 5 ms by 5 ms."""
+    vehicle = enabled(dead_time_s=0.0, time_constant_s=0.1, slew_per_s=1e9)
+    vehicle.command({"pedal": 1.0, "steering": 1.0}, 0.0)
+    after = vehicle.feedback(0.1)
+    assert after.action["pedal"] == pytest.approx(1 - 2 * math.exp(-1))
+    assert after.action["steering"] == pytest.approx(1 - math.exp(-1))
+    pedals = [1 - 2 * math.exp(-0.05 * step) for step in range(1, 21)]
+    assert after.speed_mps == pytest.approx(sum(max(0.0, 3.0 * pedal) for pedal in pedals) * 0.005)
 
 
 @pytest.mark.parametrize("scenario", [*CARS, "another"])
@@ -58,8 +62,9 @@ def test_a_car_of_the_settings_is_its_car():
 
 
 def test_the_rate_limit_by_hand():
-    parameters = MockParameters(time_constant_s=1e-9, slew_per_s=2.0)
-    assert advance(MockState(pedal=0.0), 1.0, 0.0, 0.1, parameters).pedal == pytest.approx(0.2)
+    vehicle = enabled(dead_time_s=0.0, time_constant_s=1e-9, slew_per_s=2.0)
+    vehicle.command({"pedal": 1.0}, 0.0)
+    assert vehicle.feedback(0.1).action["pedal"] == pytest.approx(-1.0 + 0.2)
 
 
 def test_the_dead_time_passes_before_anything_moves():

@@ -106,6 +106,8 @@ periods = st.floats(0.005, 0.1)
 def test_before_the_first_it_stands():
     speeds = Speeds()
     assert (speeds.speed_mps, speeds.stands, speeds.acceleration_mps2()) == (0.0, True, 0.0)
+    speeds.note(3.0, 0.0)
+    assert not speeds.stands
 
 
 @given(accelerations, periods, st.integers(2, 60), st.floats(-1.0, 1.0))
@@ -127,14 +129,6 @@ def test_what_is_older_than_a_control_period_counts_no_more(earlier, period_s):
     assert speeds.acceleration_mps2() == 0.0
     speeds.note(1.1, later_s + 0.1)
     assert speeds.acceleration_mps2() == pytest.approx(1.0)
-
-
-def test_what_is_forgotten_is_as_before_the_first():
-    speeds = Speeds()
-    speeds.note(3.0, 0.0)
-    assert not speeds.stands
-    speeds.forget()
-    assert (speeds.speed_mps, speeds.stands) == (0.0, True)
 
 
 def test_two_reports_in_one_moment_are_no_acceleration():

@@ -110,10 +110,6 @@ class Speeds:
         while self._noted[0][0] < now_s - CONTROL_PERIOD_S - _SLACK_S:
             self._noted.popleft()
 
-    def forget(self) -> None:
-        """As before the first one."""
-        self._noted.clear()
-
     @property
     def speed_mps(self) -> float:
         """The newest one, 0 before the first."""
@@ -139,11 +135,6 @@ class SpeedWatch:
         self._tolerance_mps = DEVIATION * max_speed_mps
         self._asked: Deque[Tuple[float, float]] = deque()
         self._deviates_since_s: Optional[float] = None
-
-    def begin(self) -> None:
-        """Forget what was asked before: it has a new chance to follow."""
-        self._asked.clear()
-        self._deviates_since_s = None
 
     def is_stuck(self, asked_mps: float, measured_mps: float, now_s: float) -> bool:
         """Note what is asked and measured now, and judge."""
@@ -181,8 +172,8 @@ class StreamedCore(abc.ABC):
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the vehicle confirms it."""
         self._wish = None
-        self.set_point.stand()
-        self._speed_watch.begin()
+        self.set_point.speed_mps = 0.0
+        self._speed_watch = SpeedWatch(self._spec.max_speed_mps)  # a new chance to follow
         self._apply(Finding(Event.ENABLE, ""), now_s)
         self._since_s = now_s
 
@@ -197,7 +188,7 @@ class StreamedCore(abc.ABC):
     def brake(self, now_s: float, latch: bool = True) -> None:
         """Speed 0 at the next tick, until the next command or (latched) the next `enable`."""
         self._wish = None
-        self.set_point.stand()
+        self.set_point.speed_mps = 0.0
         if latch:
             self._apply(Finding(Event.BRAKE, ""), now_s)
 
@@ -256,7 +247,7 @@ class StreamedCore(abc.ABC):
         self.cause, self.words = None, ""
         if after is State.STOPPED:
             self._wish = None
-            self.set_point.stand()
+            self.set_point.speed_mps = 0.0
             self.cause, self.words = finding
         self.state, self._since_s = after, now_s
 
@@ -282,7 +273,7 @@ class StreamedCore(abc.ABC):
         if self.state is State.ENABLED and self._wish is not None:
             self.set_point.follow(self._wish, step_s, self._heard.speed_mps)
         else:
-            self.set_point.stand()
+            self.set_point.speed_mps = 0.0
 
     def _faults(self, now_s: float) -> List[str]:
         if self.state is not State.STOPPED:

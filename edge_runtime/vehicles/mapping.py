@@ -206,16 +206,12 @@ def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wi
 
 
 class SetPoint:
-    """`speed_mps` and `inner_rad` are within the model's limits at all times."""
+    """What is asked of the vehicle now, within the model's limits."""
 
     def __init__(self, similarity: Similarity) -> None:
         self.speed_mps = 0.0
         self.inner_rad = 0.0
         self._similarity = similarity
-
-    def stand(self) -> None:
-        """Speed 0 at once, the angle held."""
-        self.speed_mps = 0.0
 
     def follow(self, wish: Wish, step_s: float, measured_mps: float) -> None:
         """One step of time towards what is wished for."""

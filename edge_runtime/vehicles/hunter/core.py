@@ -170,7 +170,7 @@ class HunterCore(StreamedCore):
         """The last frames: stand, park, give control back. None where it was never taken."""
         if self.state is State.DISABLED:
             return []
-        self.set_point.stand()
+        self.set_point.speed_mps = 0.0
         self._apply(Finding(Event.CLOSE, ""), now_s)
         park = [] if self.reports.remote_drives else [_LOCK]
         return [self._motion(), *park, _GIVE_BACK]

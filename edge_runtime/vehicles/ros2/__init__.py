@@ -133,14 +133,6 @@ def check_settings(settings: Ros2Settings) -> None:
         raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")
 
 
-class Measured(NamedTuple):
-    """One odometry message: `stamp_ns` by its sender's clock, `angular` as the settings say."""
-
-    stamp_ns: int
-    speed_mps: float
-    angular: float
-
-
 class Motion(NamedTuple):
     """What the vehicle is told: `centre_rad` of the front wheels, positive to the left."""
 
@@ -156,34 +148,35 @@ class Ros2Core(StreamedCore):
     def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
         super().__init__(similarity, Speeds())
         self.stale = 0  # odometry that was repeated or came late: it shows nobody alive
-        self._newest: Optional[Measured] = None
+        self._stamp_ns = 0  # of the newest, by its sender's clock
+        self._angular: Optional[float] = None  # of the newest, as the settings say
         self._newest_s = -math.inf
         self._topic = settings.odometry_topic
         self._is_angle = settings.odometry_angular == STEERING
 
     def enable(self, now_s: float) -> None:
         """Drive again as soon as fresh odometry shows that the vehicle is there."""
-        self._newest = None  # whatever comes next: a clock on the other side may have been set back
-        self._heard.forget()
+        self._stamp_ns = 0  # whatever comes next counts: the sender's clock may have been set back
+        self._angular = None
+        self._heard = Speeds()
         super().enable(now_s)
 
     def close(self, now_s: float) -> None:
         """Nothing more is sent."""
         self._apply(Finding(Event.CLOSE, ""), now_s)
 
-    def hear(self, measured: Measured, now_s: float) -> None:
+    def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
         """Finite odometry; it counts where it is newer than the last by its own stamp.
 
         A sender that leaves its stamps at 0 is believed by the time of arrival alone.
         """
-        if self._newest is not None and 0 < measured.stamp_ns <= self._newest.stamp_ns:
+        if 0 < stamp_ns <= self._stamp_ns:
             self.stale += 1
             return
-        self._newest, self._newest_s = measured, now_s
-        self._heard.note(measured.speed_mps, now_s)
-        if abs(measured.speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
-            words = f"the odometry says {measured.speed_mps:.2f} m/s"
-            self._apply(Finding(Event.LYING, words), now_s)
+        self._stamp_ns, self._angular, self._newest_s = stamp_ns, angular, now_s
+        self._heard.note(speed_mps, now_s)
+        if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
+            self._apply(Finding(Event.LYING, f"the odometry says {speed_mps:.2f} m/s"), now_s)
         else:
             self._apply(Finding(Event.CONFIRMED, ""), now_s)
 
@@ -211,13 +204,13 @@ class Ros2Core(StreamedCore):
 
     def _steering(self) -> float:
         """From the odometry; what was asked for where a yaw rate tells nothing: it hardly moves."""
-        newest, speed_mps = self._newest, self._heard.speed_mps
-        if newest is None or (not self._is_angle and abs(speed_mps) < STEERS_FROM_MPS):
+        angular, speed_mps = self._angular, self._heard.speed_mps
+        if angular is None or (not self._is_angle and abs(speed_mps) < STEERS_FROM_MPS):
             centre_rad = self._spec.centre_rad(self.set_point.inner_rad)
         elif self._is_angle:
-            centre_rad = newest.angular
+            centre_rad = angular
         else:
-            centre_rad = math.atan(self._spec.wheelbase_m * newest.angular / speed_mps)
+            centre_rad = math.atan(self._spec.wheelbase_m * angular / speed_mps)
         return self.similarity.steering(centre_rad)
 
 
@@ -277,7 +270,7 @@ class Ros2Vehicle(StreamedVehicle):
         stamp, twist = odometry.header.stamp, odometry.twist.twist
         stamp_ns = stamp.sec * 10**9 + stamp.nanosec
         with self._lock:
-            self._core.hear(Measured(stamp_ns, twist.linear.x, twist.angular.z), time.monotonic())
+            self._core.hear(stamp_ns, twist.linear.x, twist.angular.z, time.monotonic())
 
     def _send_due(self) -> bool:
         with self._lock:

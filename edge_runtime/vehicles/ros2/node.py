@@ -181,11 +181,10 @@ def stamp_of(time_ns: int) -> Time:
     return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
 
 
-RosMessage = Union[AckermannDriveStamped, Twist, Odometry, Image]
 _M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry, Image)
 
 
-def encode(message: RosMessage) -> bytes:
+def encode(message: IdlStruct) -> bytes:
     """The header and the message in little-endian CDR.
 
     Raises struct.error for a number that its field cannot hold.
@@ -255,8 +254,8 @@ def member_token(zid: str) -> str:
     return f"@/{zid}/@ros2_lv"
 
 
-def topic_token(zid: str, role: str, key: str, type_name: str) -> str:
-    """The token of a PUBLISHER or SUBSCRIBER of a type in TYPES, as zenoh-bridge-ros2dds has it.
+def topic_token(zid: str, role: str, key: str, kind: Any) -> str:
+    """The token of a PUBLISHER or SUBSCRIBER of a message, as zenoh-bridge-ros2dds has it.
 
     It makes every bridge (1.1 or later) create the reader or writer on its DDS side; without it a
     bridge would carry only what a ROS node beside it already wants. Its last part is
@@ -265,8 +264,8 @@ def topic_token(zid: str, role: str, key: str, type_name: str) -> str:
     reader would never hear a best-effort writer, as sensors are. No key, no old messages for late
     readers, and the last ten kept.
     """
-    names = (name.replace("/", _SLASH) for name in (key, type_name))
-    qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[type_name]};"
+    names = (name.replace("/", _SLASH) for name in (key, kind.__idl_typename__))
+    qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind.__idl_typename__]};"
     return "/".join((member_token(zid), role, *names, qos))
 
 
@@ -293,7 +292,7 @@ class Ros2Node:
             key, congestion_control=zenoh.CongestionControl.DROP
         )
         self._declared.append(publisher)
-        self._announce_topic(PUBLISHER, key, kind)
+        self._announce(topic_token(self._zid, PUBLISHER, key, kind))
         self.sent[key] = 0
 
         def publish(message: _M) -> None:
@@ -307,29 +306,21 @@ class Ros2Node:
         key = topic_key(self._namespace, topic)
 
         def hear(sample: zenoh.Sample) -> None:
-            # Something huge is not copied to be counted.
-            if len(sample.payload) > MAX_PAYLOAD_BYTES:
-                self._count(Reason.OVERSIZED)
-                return
-            message = decode(sample.payload.to_bytes(), kind)
+            message: Union[_M, Rejection] = Rejection(Reason.OVERSIZED, "")
+            if len(sample.payload) <= MAX_PAYLOAD_BYTES:  # something huge is not even copied
+                message = decode(sample.payload.to_bytes(), kind)
             if isinstance(message, Rejection):
-                self._count(message.reason)
+                self.rejected[message.reason.value] = self.rejected.get(message.reason.value, 0) + 1
             else:
                 take(message)
 
         self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
-        self._announce_topic(SUBSCRIBER, key, kind)
+        self._announce(topic_token(self._zid, SUBSCRIBER, key, kind))
 
     def close(self) -> None:
         """Withdraw everything; safe to call twice."""
         while self._declared:
             self._declared.pop().undeclare()
 
-    def _announce_topic(self, role: str, key: str, kind: Any) -> None:
-        self._announce(topic_token(self._zid, role, key, str(kind.__idl_typename__)))
-
     def _announce(self, token: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(token))
-
-    def _count(self, reason: Reason) -> None:
-        self.rejected[reason.value] = self.rejected.get(reason.value, 0) + 1

@@ -16,7 +16,7 @@ from edge_runtime.config import Ros2Settings
 from edge_runtime.transport import open_session
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
-from edge_runtime.vehicles.ros2 import Measured, Ros2Core
+from edge_runtime.vehicles.ros2 import Ros2Core
 from edge_runtime.vehicles.ros2.tests import second
 
 WHEELBASE_M, TRACK_M, MAX_INNER_RAD = 0.650, 0.605, 0.576
@@ -139,7 +139,7 @@ class Drive:
             self.now_s += TICK_S
             if self.sends_odometry:
                 stamp_ns = round(self.now_s * 1e9)
-                self.core.hear(Measured(stamp_ns, self.speed_mps, self.angular), self.now_s)
+                self.core.hear(stamp_ns, self.speed_mps, self.angular, self.now_s)
             if action is not None and tick % 5 == 0:
                 self.core.command(action, self.now_s, scenario_speed_mps)
             self.motion = self.core.tick(self.now_s)

@@ -14,7 +14,6 @@ from edge_runtime.vehicles.ros2 import (
     ROS2_LEADS_TO,
     STEERING,
     YAW_RATE,
-    Measured,
     Motion,
     Ros2Core,
 )
@@ -98,7 +97,7 @@ def stop_by_stale_odometry(drive):
     drive.sends_odometry = False
     for _ in range(15):
         drive.now_s += TICK_S
-        drive.core.hear(Measured(round(100 * 1e9), 0.5, 0.0), drive.now_s)  # an old one, repeated
+        drive.core.hear(round(100 * 1e9), 0.5, 0.0, drive.now_s)  # an old one, repeated
         drive.core.command({"pedal": 1.0}, drive.now_s)
         drive.motion = drive.core.tick(drive.now_s)
 
@@ -143,10 +142,10 @@ def test_the_brake_at_an_episodes_end_does_not_latch():
 def test_a_clock_set_back_counts_after_the_next_enable():
     drive = Drive().start()
     drive.now_s += 0.02
-    drive.core.hear(Measured(5, 0.0, 0.0), drive.now_s)
+    drive.core.hear(5, 0.0, 0.0, drive.now_s)
     assert drive.core.stale == 1
     drive.core.enable(drive.now_s)
-    drive.core.hear(Measured(6, 0.0, 0.0), drive.now_s)
+    drive.core.hear(6, 0.0, 0.0, drive.now_s)
     assert drive.core.state is State.ENABLED
 
 
@@ -154,7 +153,7 @@ def test_odometry_without_stamps_is_believed_by_its_arrival():
     core = Ros2Core(Ros2Settings(), LEFT_TURN)
     core.enable(0.0)
     for tick in range(20):
-        core.hear(Measured(0, 0.1, 0.0), tick * TICK_S)
+        core.hear(0, 0.1, 0.0, tick * TICK_S)
         core.tick(tick * TICK_S)
     assert core.state is State.ENABLED
 
@@ -231,7 +230,7 @@ def test_whatever_comes_it_stays_in_its_limits_and_stopped_means_stopped(steps):
         elif name == "command":
             core.command({"pedal": values[0], "steering": values[1]}, now_s, values[2])
         elif name == "hear":
-            core.hear(Measured(*values), now_s)
+            core.hear(values[0], values[1], values[2], now_s)
         else:
             now_s += values[0]
         may_drive = core.state is State.ENABLED

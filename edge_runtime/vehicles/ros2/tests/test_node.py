@@ -75,24 +75,24 @@ def test_any_vehicle_id_gives_a_valid_namespace(vehicle_id):
 
 
 def test_a_publishers_token_by_the_letter():
-    token = ros.topic_token("a1b2", ros.PUBLISHER, "hunter01/cmd_vel", "geometry_msgs/msg/Twist")
+    token = ros.topic_token("a1b2", ros.PUBLISHER, "hunter01/cmd_vel", ros.Twist)
     assert token == (
         "@/a1b2/@ros2_lv/MP/hunter01§cmd_vel/geometry_msgs§msg§Twist/:1:0:0,10:typehash="
         "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a;"
     )
 
 
-@pytest.mark.parametrize("type_name", ros.TYPES)
+@pytest.mark.parametrize("message", [ros.Twist, ros.AckermannDriveStamped, ros.Odometry, ros.Image])
 @pytest.mark.parametrize("kind", [ros.PUBLISHER, ros.SUBSCRIBER])
-def test_a_token_parses_as_the_bridge_parses_it(type_name, kind):
-    token = ros.topic_token("a1", kind, "x/y", type_name)
+def test_a_token_parses_as_the_bridge_parses_it(message, kind):
+    token = ros.topic_token("a1", kind, "x/y", message)
     zenoh.KeyExpr(token)  # raises for what Zenoh would not declare
     found = BRIDGE_TOKEN.fullmatch(token)
     assert found is not None
     zid, role, key, kind_of_message, qos = found.groups()
     assert (zid, role) == ("a1", kind)
     assert key.replace("§", "/") == "x/y"
-    assert kind_of_message.replace("§", "/") == type_name
+    assert kind_of_message.replace("§", "/") == type_name(message)
     keyed, reliable, durable, history, user_data = qos.split(":")
     assert (keyed, reliable, durable, history) == ("", str(int(kind == "MP")), "0", "0,10")
     assert re.fullmatch(r"typehash=RIHS01_[0-9a-f]{64};", user_data)
