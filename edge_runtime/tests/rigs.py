@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from edge_runtime.config import Ros2Settings
+from edge_runtime.config import CarSettings, Ros2Settings
 from edge_runtime.vehicles.core import State
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
@@ -16,6 +16,9 @@ LEFT_TURN, CONGESTION = (similarity_to(CARS[name], SPEC) for name in ("left_turn
 OK = protocol.SystemStatus(0, protocol.CAN_CONTROL, 24.0, 0, 0, 0)
 STREAM_S = 0.02
 PEDAL = {"pedal": 1.0}
+CAR = CarSettings(
+    throttle_mps2=1.0, brake_mps2=2.0, max_speed_mps=0.5, full_steering_rad=0.3, wheelbase_m=1.0
+)
 
 
 class Rig:

@@ -12,8 +12,9 @@ import can
 import pytest
 from can.interfaces.udp_multicast.utils import pack_message
 
-from edge_runtime.config import DEFAULT_BUS, CarSettings, Config, SimilaritySettings
+from edge_runtime.config import DEFAULT_BUS, Config, SimilaritySettings
 from edge_runtime.tests.harness import wait_until
+from edge_runtime.tests.rigs import CAR, LEFT_TURN, PEDAL
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import make_vehicle, stream, vehicle_limits
 from edge_runtime.vehicles.core import State
@@ -27,10 +28,7 @@ from edge_runtime.vehicles.hunter import (
     parse_bus,
     protocol,
 )
-from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
 
-SPEC = SPECS["2.0"]
-LEFT_TURN = similarity_to(CARS["left_turn"], SPEC)
 _numbers = itertools.count()
 
 
@@ -114,7 +112,7 @@ def drive(vehicle, until, what):
     """Full throttle at 10 Hz until something holds."""
 
     def step():
-        vehicle.command({"pedal": 1.0}, time.monotonic())
+        vehicle.command(PEDAL, time.monotonic())
         return until()
 
     wait_until(step, what)
@@ -139,7 +137,7 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     assert report.scenario_speed_mps == pytest.approx(4 * report.speed_mps)
     vehicle.brake(time.monotonic())
     wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
-    vehicle.command({"pedal": 1.0}, time.monotonic())
+    vehicle.command(PEDAL, time.monotonic())
     count = len(chassis.speeds)
     wait_until(lambda: len(chassis.speeds) > count + 5, "the stream going on")
     assert set(chassis.speeds[count:]) == {0.0}
@@ -153,19 +151,17 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     vehicle.close()
 
 
-def test_commands_that_cease_end_in_a_latched_stop(chassis, driving):
-    wait_until(lambda: driving.state is State.STOPPED, "its own stop")
-    assert driving.feedback(time.monotonic()).faults == ["no command for 0.24 s"]
-    wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
-
-
-def test_its_own_stop_does_not_wait_for_the_next_period(chassis, driving, monkeypatch):
+def test_commands_that_cease_end_in_a_latched_stop_before_the_next_period(
+    chassis, driving, monkeypatch
+):
     monkeypatch.setattr(stream, "PERIOD_S", 3.0)
     time.sleep(0.05)  # one more period of before
     commanded_s = time.monotonic()
-    driving.command({"pedal": 1.0}, commanded_s)
+    driving.command(PEDAL, commanded_s)
     wait_until(lambda: chassis.speeds[-1] == 0.0, "its own stop")
     assert time.monotonic() - commanded_s < 1.5
+    assert driving.state is State.STOPPED
+    assert driving.feedback(time.monotonic()).faults == ["no command for 0.24 s"]
 
 
 def test_the_remote_control_is_reported_and_the_chassis_that_comes_back_is_not_believed(
@@ -210,21 +206,18 @@ def test_without_a_chassis_it_says_so(channel, vehicle):
 
 
 def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle):
-    crowd = can.Bus(interface="virtual", channel=channel, rx_queue_size=3)
-    try:
+    with can.Bus(interface="virtual", channel=channel, rx_queue_size=3) as crowd:
         vehicle.enable(time.monotonic())
         wait_until(lambda: vehicle.state is State.STOPPED, "its stop")
         assert "the CAN bus fails: Could not send" in vehicle.feedback(time.monotonic()).faults[0]
         assert vehicle.feedback(time.monotonic()).standing
         began_s = time.monotonic()
-        vehicle.command({"pedal": 1.0}, time.monotonic())
+        vehicle.command(PEDAL, time.monotonic())
         vehicle.brake(time.monotonic())
         assert time.monotonic() - began_s < 5.0  # a bus that is waited for is waited for for ever
         while crowd.recv(0.0) is not None:
             pass
         assert crowd.recv(5.0) is not None  # it sends as soon as it can
-    finally:
-        crowd.shutdown()
 
 
 def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle):
@@ -238,8 +231,7 @@ def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle)
 
 
 def test_random_frames_on_the_bus_never_move_it(chassis, enabled):
-    junk = can.Bus(interface="virtual", channel=chassis.bus.channel_id)
-    try:
+    with can.Bus(interface="virtual", channel=chassis.bus.channel_id) as junk:
         for number in range(2000):
             message = can.Message(
                 arbitration_id=number * 7919 % 0x800,
@@ -247,8 +239,6 @@ def test_random_frames_on_the_bus_never_move_it(chassis, enabled):
                 is_extended_id=number % 5 == 0,
             )
             junk.send(message, timeout=0.1)
-    finally:
-        junk.shutdown()
     assert len(enabled.feedback(time.monotonic()).faults) <= 3
     assert enabled._stream._thread.is_alive()
     assert enabled._listener.is_alive()
@@ -256,10 +246,10 @@ def test_random_frames_on_the_bus_never_move_it(chassis, enabled):
 
 
 def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(channel):
-    receiver = can.Bus(interface="virtual", channel=channel)
-    sender = can.Bus(interface="virtual", channel=channel)
-    gate = Gate(sender)
-    try:
+    with can.Bus(interface="virtual", channel=channel) as receiver, can.Bus(
+        interface="virtual", channel=channel
+    ) as sender:
+        gate = Gate(sender)
         with pytest.raises(RuntimeError, match="before the vehicle is enabled"):
             gate.send(protocol.MOTION_COMMAND, bytes(8))
         gate.open()
@@ -274,9 +264,6 @@ def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(ch
             message = receiver.recv(1.0)
             assert message is not None
             assert (message.arbitration_id, message.is_extended_id) == (frame.can_id, False)
-    finally:
-        receiver.shutdown()
-        sender.shutdown()
 
 
 @pytest.mark.parametrize(
@@ -349,11 +336,7 @@ def test_the_registry_makes_it_for_a_known_scenario_only(channel):
     for make in (make_vehicle, vehicle_limits):
         with pytest.raises(UserError, match="parking"):
             make("hunter", Config(bus=bus), "parking")
-    car = CarSettings(
-        throttle_mps2=1.0, brake_mps2=1.0, max_speed_mps=3.0, full_steering_rad=0.5,
-        wheelbase_m=2.0,
-    )  # fmt: skip
-    config = Config(bus=bus, similarity=SimilaritySettings(scale=0.1, car=car))
+    config = Config(bus=bus, similarity=SimilaritySettings(scale=0.1, car=CAR))
     vehicle = make_vehicle("hunter", config, "parking")
     assert isinstance(vehicle, HunterVehicle)
     assert vehicle._core.similarity.scale == 0.1
@@ -375,9 +358,8 @@ def sent_packets():
 
 def test_frames_reach_the_other_end_and_no_network():
     name = f"udp_multicast:{GROUP}:{free_udp_port()}"
-    near, far = open_bus(parse_bus(name)), open_bus(parse_bus(name))
     count = 300
-    try:
+    with open_bus(parse_bus(name)) as near, open_bus(parse_bus(name)) as far:
         before = sent_packets()
         for number in range(count):
             data = number.to_bytes(8, "big")
@@ -388,29 +370,18 @@ def test_frames_reach_the_other_end_and_no_network():
         time.sleep(0.02)
         # The machine's own traffic goes on beside us; a frame each would be 300 and more.
         assert sent_packets() - before < count / 2
-    finally:
-        near.shutdown()
-        far.shutdown()
-
-
-def address_on_a_network():
-    """Ours on a network, by what the kernel would take for a datagram; nothing is sent."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.connect(("192.0.2.1", 9))
-        return one.getsockname()[0]
 
 
 def test_what_is_sent_through_a_networks_device_is_not_heard():
     """As a neighbour's frames come: the kernel loops them back from the device they leave by."""
     port = free_udp_port()
-    far = open_bus(parse_bus(f"udp_multicast:{GROUP}:{port}"))
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-            device = socket.inet_aton(address_on_a_network())
-            stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, device)
-            frame = can.Message(arbitration_id=0x111, data=bytes(8), is_extended_id=False)
-            stranger.sendto(pack_message(frame), (GROUP, port))
+    with open_bus(parse_bus(f"udp_multicast:{GROUP}:{port}")) as far, socket.socket(
+        socket.AF_INET, socket.SOCK_DGRAM
+    ) as stranger, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        asked.connect(("192.0.2.1", 9))  # our address on a network; nothing is sent
+        device = socket.inet_aton(asked.getsockname()[0])
+        stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, device)
+        frame = can.Message(arbitration_id=0x111, data=bytes(8), is_extended_id=False)
+        stranger.sendto(pack_message(frame), (GROUP, port))
         assert far.recv(0.2) is None
-    finally:
-        far.shutdown()

@@ -29,7 +29,8 @@ from edge_runtime.vehicles.hunter.protocol import (
 )
 from edge_runtime.vehicles.mapping import SPECS
 
-HUNTER_2, HUNTER_SE = SPECS["2.0"], SPECS["se"]
+HUNTER_2 = SPECS["2.0"]
+OK = SystemStatus(0, 1, 24.0, 0, 0, 0)
 
 
 def hexed(data):
@@ -123,21 +124,20 @@ def test_a_hundred_thousand_random_frames_raise_nothing():
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_fault_bit_has_words_and_back(profile):
-    ok = SystemStatus(0, 1, 24.0, 0, 0, 0)
-    assert status_faults(ok, profile) == []
+    assert status_faults(OK, profile) == []
     for bit in range(16):
-        (words,) = status_faults(ok._replace(faults=1 << bit), profile)
+        (words,) = status_faults(OK._replace(faults=1 << bit), profile)
         known = fault_bits(words, profile)
         assert known == (1 << bit) or (known == 0 and "unknown to profile" in words)
 
 
 def test_profiles_place_bits_elsewhere():
-    assert status_faults(SystemStatus(0, 1, 24.0, 0x0100, 0, 0), "manual") == ["motor driver"]
-    assert status_faults(SystemStatus(0, 1, 24.0, 0x0100, 0, 0), "v2") == [
+    assert status_faults(OK._replace(faults=0x0100), "manual") == ["motor driver"]
+    assert status_faults(OK._replace(faults=0x0100), "v2") == [
         "unknown to profile v2: byte 4 bit 0"
     ]
     assert fault_bits(LINK_LOST, "v2") == 0x1000
-    assert status_faults(SystemStatus(0, 1, 24.0, 0x0001, 0, 0), "v2") == ["battery undervoltage"]
+    assert status_faults(OK._replace(faults=0x0001), "v2") == ["battery undervoltage"]
 
 
 def test_motor_faults_name_the_motor():
