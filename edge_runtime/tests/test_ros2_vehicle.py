@@ -282,34 +282,6 @@ def test_both_kinds_of_command_below_a_namespace_and_their_tokens(linked):
     assert hunter.asked_mps == 0.0
 
 
-def test_silence_stops_it_and_only_an_enable_leads_out(enabled):
-    vehicle, hunter = enabled
-    with Commands(vehicle, PEDAL):
-        for _ in range(4):
-            drive(vehicle, hunter, 0.3)
-            hunter.silent = True
-            wait_until(lambda: vehicle.state is State.STOPPED, "the stop")
-            faults = report(vehicle).faults
-            hunter.silent = False
-            if vehicle._core.cause is not Event.COMMAND_LATE:  # this machine paused itself
-                break
-        assert vehicle._core.cause is Event.SILENT
-        assert faults[0] == "no fresh odometry on odom"
-        time.sleep(0.3)
-        assert vehicle.state is State.STOPPED
-        assert hunter.asked_mps == 0.0
-        drive(vehicle, hunter, 0.3)
-
-
-def test_the_stream_goes_on_with_zeros_while_stopped(enabled):
-    """The chassis is never left to its own time-out, after which any frame gives control back."""
-    vehicle, hunter = enabled
-    vehicle.brake(time.monotonic())
-    count = len(hunter.twists)
-    wait_until(lambda: len(hunter.twists) > count + 25, "half a second of messages")
-    assert {twist["linear"]["x"] for twist in hunter.twists} == {0.0}
-
-
 def test_at_the_end_zeros_go_out_until_it_stands(enabled):
     vehicle, hunter = enabled
     with Commands(vehicle, PEDAL):

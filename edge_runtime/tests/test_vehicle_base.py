@@ -268,8 +268,7 @@ def test_an_actuator_on_its_way_between_two_commands_is_not_stuck():
 
 
 @pytest.mark.parametrize(
-    "impossible",
-    [{"speed_mps": 9.0}, {"speed_mps": math.nan}, {"pedal": 1.1}, {"pedal": math.inf}],
+    "impossible", [{"speed_mps": 9.0}, {"speed_mps": math.nan}, {"pedal": 1.1}, {"pedal": math.inf}]
 )
 def test_what_cannot_be_is_a_lie(impossible):
     watch, now_s = watched()

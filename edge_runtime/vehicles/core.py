@@ -33,8 +33,7 @@ FOLLOWS_S = 10 * CONTROL_PERIOD_S  # a drive may still follow a set-point of thi
 DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
 DEVIATES_S = CONTROL_PERIOD_S
 STANDS_MPS = 0.02
-IMPOSSIBLE = 1.3
-"""Times what the model can do: a vehicle that reports more than that is not believed."""
+IMPOSSIBLE = 1.3  # times what the model can do: a vehicle that reports more is not believed
 _SLACK_S = 0.01
 
 
@@ -199,13 +198,15 @@ class StreamedCore(abc.ABC):
 
     def report(self, now_s: float) -> VehicleReport:
         """What the vehicle does, in the policy's terms and in its own."""
-        speed_mps = self._heard.speed_mps
+        speed_mps, standing = self._heard.speed_mps, self.standing(now_s)
+        words = [self.words] if self.words else []
+        faults = words + [more for more in standing if more not in words]
         return VehicleReport(
             action={"pedal": self._pedal(), "steering": self._steering()},
             speed_mps=speed_mps,
             self_braking=self.state is not State.ENABLED,
-            faults=self._faults(now_s),
-            standing=self.standing(now_s),
+            faults=faults if self.state is State.STOPPED else [],
+            standing=standing,
             scenario_speed_mps=speed_mps / self.similarity.scale,
             commanded_speed_mps=self.set_point.speed_mps,
         )
@@ -274,12 +275,6 @@ class StreamedCore(abc.ABC):
             self.set_point.follow(self._wish, step_s, self._heard.speed_mps)
         else:
             self.set_point.speed_mps = 0.0
-
-    def _faults(self, now_s: float) -> List[str]:
-        if self.state is not State.STOPPED:
-            return []
-        words = [self.words] if self.words else []
-        return words + [more for more in self.standing(now_s) if more not in words]
 
     def _pedal(self) -> float:
         """From the measured acceleration; the brake where it stands and is to stand."""

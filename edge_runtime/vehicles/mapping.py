@@ -138,15 +138,10 @@ class Similarity(NamedTuple):
     def pedal_to_speed(
         self, speed_mps: float, pedal: float, step_s: float, measured_mps: float
     ) -> float:
-        """The speed to ask for after `speed_mps` when the pedal was held for `step_s`.
-
-        Downwards only the throttle is bounded by the measured speed: a brake that does not bite is
-        asked for all the more.
-        """
+        """The speed to ask for after `speed_mps` when the pedal was held for `step_s`."""
         lead_mps = self.acceleration_mps2(1.0) * LEAD_S
-        speed_mps += self.acceleration_mps2(pedal) * step_s
-        speed_mps = min(speed_mps, measured_mps + lead_mps)
-        if pedal > 0:
+        speed_mps = min(speed_mps + self.acceleration_mps2(pedal) * step_s, measured_mps + lead_mps)
+        if pedal > 0:  # a brake that does not bite is asked for all the more
             speed_mps = max(speed_mps, measured_mps - lead_mps)
         return min(max(speed_mps, 0.0), self.spec.max_speed_mps)
 

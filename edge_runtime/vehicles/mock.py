@@ -16,15 +16,11 @@ from edge_runtime.wire import CONTROL_PERIOD_S
 
 COMMAND_TIMEOUT_S = 2 * CONTROL_PERIOD_S
 _INTEGRATION_STEP_S = 0.005
-# After this long without a command it has braked to a stand, whatever it did before.
-_LONGEST_GAP_S = 10.0
+_LONGEST_GAP_S = 10.0  # without a command it then stands, whatever it did before
 
 
 class MockParameters(NamedTuple):
-    """The actuators and the body of the mock. Rates are in full pedal or steering per second.
-
-    The body's numbers are the car's of this repository's scenarios (mapping.CARS).
-    """
+    """Actuators (rates in full pedal or steering per second), and a body as in mapping.CARS."""
 
     dead_time_s: float = 0.02
     time_constant_s: float = 0.05

@@ -82,8 +82,7 @@ def open_bus(name: BusName) -> Any:
     """An open python-can bus; nothing is sent. Raises UserError, one line that says what to do."""
     can = import_can()
     options: Dict[str, Any] = {} if name.bitrate is None else {"bitrate": name.bitrate}
-    if name.port is not None:
-        # Pinned to the loopback device as well: no neighbour hears it either way.
+    if name.port is not None:  # pinned to the loopback device as well: no neighbour hears it
         options = {"port": name.port, "hop_limit": 0, "fd": False}
     bus = None
     try:
@@ -175,12 +174,11 @@ class Gate:
         """
         if not self._is_open:
             raise RuntimeError("nothing is sent before the vehicle is enabled")
-        if frame not in COMMANDS or len(data) != frame.length:
-            raise RuntimeError(
-                f"0x{frame.can_id:x} with {len(data)} bytes is not on the allow-list"
-            )
+        can_id, length = frame.can_id, len(data)
+        if frame not in COMMANDS or length != frame.length:
+            raise RuntimeError(f"0x{can_id:x} with {length} bytes is not on the allow-list")
         message = self._can.Message(
-            arbitration_id=frame.can_id, data=data, is_extended_id=False, check=True
+            arbitration_id=can_id, data=data, is_extended_id=False, check=True
         )
         # Not None: the virtual bus would then wait for ever where a receiver's queue is full.
         self._bus.send(message, timeout=0.0)

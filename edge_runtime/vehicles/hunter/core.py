@@ -30,7 +30,6 @@ STATUS_SILENCE_S = 3 * CONTROL_PERIOD_S  # three frames of 0x211
 COUNTERS = 256  # byte 7 of 0x211 runs over
 ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
 BUS_PATIENCE_S = 0.1  # five frames of the stream
-_STOPS_AT_ONCE = (Event.STUCK,)  # no set-point will stop it: the brake must
 
 
 def _sent(frame: protocol.Frame, message: object) -> Sent:
@@ -227,7 +226,7 @@ class HunterCore(StreamedCore):
         before = self.state
         super()._apply(finding, now_s)
         if self.state is not before and self.state is State.STOPPED:
-            at_once = finding.event in _STOPS_AT_ONCE
+            at_once = finding.event is Event.STUCK  # no set-point will stop it: the brake must
             self._ask_s = now_s + (0.0 if at_once else STOP_TAKES_S)
         elif self.state is State.ENABLED:
             self._ask_s = math.inf

@@ -221,14 +221,14 @@ PROFILES: Dict[str, Dict[int, str]] = {
 DEFAULT_PROFILE = "v2"
 
 # Bits 0 to 5 of byte 5 of 0x261 to 0x263; 6 and 7 (enabled, reset) are no faults.
-DRIVER_FAULTS = (
-    "supply voltage low",
-    "motor overtemperature",
-    "driver overcurrent",
-    "driver overtemperature",
-    "sensor",
-    "driver",
-)
+DRIVER_FAULTS = {
+    0x01: "supply voltage low",
+    0x02: "motor overtemperature",
+    0x04: "driver overcurrent",
+    0x08: "driver overtemperature",
+    0x10: "sensor",
+    0x20: "driver",
+}
 
 
 def status_faults(status: SystemStatus, profile: str) -> List[str]:
@@ -248,9 +248,5 @@ def fault_bits(words: str, profile: str) -> int:
 
 def motor_faults(can_id: int, motor: MotorSlow) -> List[str]:
     """The faults that 0x261 to 0x263 name, in words, with the motor's place."""
-    place = MOTOR_OF_SLOW[can_id]
-    return [
-        f"{place} motor: {words}"
-        for bit, words in enumerate(DRIVER_FAULTS)
-        if motor.status & (1 << bit)
-    ]
+    known = [words for mask, words in DRIVER_FAULTS.items() if motor.status & mask]
+    return [f"{MOTOR_OF_SLOW[can_id]} motor: {words}" for words in known]

@@ -185,10 +185,7 @@ _M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry, Image)
 
 
 def encode(message: IdlStruct) -> bytes:
-    """The header and the message in little-endian CDR.
-
-    Raises struct.error for a number that its field cannot hold.
-    """
+    """The message in little-endian CDR; struct.error for a number that its field cannot hold."""
     return bytes(message.serialize(buffer=Buffer(), endianness=Endianness.Little))
 
 
@@ -272,8 +269,7 @@ def topic_token(zid: str, role: str, key: str, kind: Any) -> str:
 class Ros2Node:
     """Uses a session that somebody else opens and closes. `close` it before the session.
 
-    `rejected` counts what arrived and could not be read, by reason; `sent` what was published, by
-    key.
+    `rejected` counts what could not be read, by reason; `sent` what was published, by key.
     """
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
