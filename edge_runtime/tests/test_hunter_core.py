@@ -252,8 +252,7 @@ def test_a_motors_fault_stops_it(driving):
 def test_feedback_that_falls_silent_stops_it_and_the_brake_is_locked(driving):
     driving.talks = False
     driving.step(12, PEDAL)
-    assert driving.words == ["the chassis sends no 0x221"]
-    assert driving.report.standing
+    assert driving.words == driving.report.standing == ["the chassis sends no 0x221"]
     assert 0x131 not in driving.ids(-10)
     driving.step(60, PEDAL)
     assert LOCK in driving.frames(-10)

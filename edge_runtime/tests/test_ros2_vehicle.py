@@ -31,25 +31,19 @@ from edge_runtime.vehicles.ros2.node import drive_of, twist_of
 from edge_runtime.wire import CONTROL_PERIOD_S
 
 
-def test_it_drives_only_after_odometry_has_confirmed_it():
+def test_only_odometry_confirms_it_and_without_any_it_stops_and_says_so():
     rig = Ros2Rig()
     rig.talks = False
     rig.core.enable(rig.now_s)
     rig.step(25, PEDAL)
     assert rig.sent[-1][1] == Motion(0.0, 0.0)
-    rig.talks = True
-    rig.step(55, PEDAL)
-    assert rig.speed_mps > 0.5
-
-
-def test_without_odometry_it_stops_and_says_so_in_words():
-    rig = Ros2Rig()
-    rig.talks = False
-    rig.core.enable(rig.now_s)
-    rig.step(55)
+    rig.step(30)
     assert rig.core.state is State.STOPPED
     assert rig.words == ["no odometry on odom within 1 s", "no fresh odometry on odom"]
     assert rig.report.standing == ["no fresh odometry on odom"]
+    rig.talks = True
+    rig.enabled().step(55, PEDAL)
+    assert rig.speed_mps > 0.5
 
 
 def test_odometry_that_repeats_itself_is_silence():
