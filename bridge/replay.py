@@ -30,7 +30,7 @@ from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.safety import MAX_INFERENCE_S, SILENCE_S, Event
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, printable
-from edge_runtime.vehicles.registry import vehicle_limits
+from edge_runtime.vehicles import vehicle_limits
 from edge_runtime.wire import (
     SAFE_STOP,
     Command,

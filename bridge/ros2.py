@@ -27,14 +27,14 @@ from edge_runtime.files import write_json_out
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import CARS, ScenarioCar
-from edge_runtime.vehicles.ros2 import node as ros
-from edge_runtime.vehicles.ros2.names import (
+from edge_runtime.vehicles.ros2 import (
     DEFAULT_ROS2_ENDPOINT,
     check_ros2_endpoint,
     check_ros_name,
     namespace_of,
     open_ros2_session,
 )
+from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.vehicles.ros2.node import Ros2Node
 from edge_runtime.wire import (
     CONTROL_PERIOD_S,

@@ -185,7 +185,7 @@ def _check(config: Config) -> None:
     check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
     defaults = Config()
     if any(getattr(config, name) != getattr(defaults, name) for name in _OF_VEHICLES):
-        from edge_runtime.vehicles.registry import check_settings  # The defaults need no check.
+        from edge_runtime.vehicles import check_settings  # The defaults need no check.
 
         check_settings(config)
     check_choice("log_level", config.log_level, log.LEVELS)

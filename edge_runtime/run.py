@@ -104,7 +104,7 @@ class _Runtime:
         with contextlib.ExitStack() as undo:
             vehicle: Optional[Vehicle] = None
             if config.vehicle != NONE:
-                from edge_runtime.vehicles.registry import make_vehicle
+                from edge_runtime.vehicles import make_vehicle
 
                 vehicle = make_vehicle(config.vehicle, config, manifest.scenario)
                 undo.callback(vehicle.close)

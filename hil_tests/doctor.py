@@ -283,7 +283,7 @@ def port(number: int) -> str:
 def _can_over_udp() -> str:
     import can
 
-    from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+    from edge_runtime.vehicles.hunter import open_bus, parse_bus
     from hil_tests.faults.rig import free_bus
 
     name = parse_bus(free_bus())

@@ -37,12 +37,12 @@ from bridge.tests.harness import (
     start_simulate,
 )
 from edge_runtime.link_probe import free_endpoint
+from edge_runtime.tests import ros2_side
 from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import CARS
-from edge_runtime.vehicles.ros2 import names
-from edge_runtime.vehicles.ros2.tests import second
+from edge_runtime.vehicles.ros2 import topic_key
 from edge_runtime.wire import encode
 
 PEDAL = Policy(["pedal"], CARS["left_turn"])
@@ -145,7 +145,7 @@ class FakeNode:
         self.published = defaultdict(list)
 
     def publisher(self, topic, _kind):
-        names.key("/x", topic)
+        topic_key("/x", topic)
         return self.published[topic].append
 
 
@@ -252,7 +252,7 @@ class Listener:
 
     def _reader(self, key, type_name):
         def hear(sample):
-            self.heard[key].append(second.deserialize(type_name, sample.payload.to_bytes()))
+            self.heard[key].append(ros2_side.deserialize(type_name, sample.payload.to_bytes()))
 
         return hear
 

@@ -37,7 +37,7 @@ WITH_VEHICLE = """\
 RUNS = "                self.loop.run()"
 FAULTS = {
     "it answers for a while, then ends": (RUN, RUNS, WITH_VEHICLE),
-    "it cannot open the vehicle": (MOCK, "self._state = MockState()", "1 / 0"),
+    "it cannot open the vehicle": (MOCK, "self._commanded_s = -math.inf", "1 / 0"),
     "it never says that it is ready": (RUN, "self._say_ready()", "pass"),
     "it ends as soon as it is ready": (RUN, RUNS, RUNS.replace("self.loop.run()", "os._exit(3)")),
 }

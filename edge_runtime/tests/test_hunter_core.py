@@ -1,53 +1,49 @@
-"""The Hunter's driver in made-up time: how it is enabled, and what is known of it then."""
+"""The Hunter's driver in made-up time: how it is enabled, what stops it, and how it ends."""
 
 from __future__ import annotations
 
-import math
 import random
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import edge_runtime
-from edge_runtime.tests.harness import render_table
-from edge_runtime.tests.hunter_bench import OK, STREAM_S, Bench, sent_ids, told_by
+from edge_runtime.tests.rigs import OK, PEDAL, STREAM_S, HunterRig
 from edge_runtime.vehicles import core as rules
-from edge_runtime.vehicles.core import LEADS_TO, Event, Finding, State
+from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S
-from edge_runtime.vehicles.mapping import wish_of
+
+TAKE, RELEASE, STAND = (0x421, b"\x01"), (0x131, b"\x00"), (0x111, bytes(8))
+CLEAR, LOCK, GIVE_BACK = (0x441, b"\x00"), (0x131, b"\x01"), (0x421, b"\x00")
+REMOTE = OK._replace(mode=protocol.REMOTE_CONTROL)
 
 
-def test_nothing_leaves_before_enable():
-    bench = Bench()
-    bench.core.brake(bench.now_s)
-    bench.step(100, {"pedal": 1.0})
-    assert bench.sent == []
-    assert bench.core.close(bench.now_s) == []
+@pytest.fixture
+def rig():
+    return HunterRig()
 
 
-def test_the_enable_sequence_and_its_confirmation():
-    bench = Bench()
-    bench.status = OK._replace(mode=protocol.STANDBY, brake=1)
-    bench.core.enable(bench.now_s)
-    bench.step()
-    assert [(part.frame.can_id, part.data) for _, part in bench.sent] == [
-        (0x421, b"\x01"),
-        (0x131, b"\x00"),
-        (0x111, bytes(8)),
-    ]
-    bench.step(20, {"pedal": 1.0})
-    assert bench.core.state is State.ENABLING
-    assert sent_ids(bench).count(0x421) == 5  # each 0.1 s until it is confirmed
-    bench.status = OK
-    bench.step(6, {"pedal": 1.0})
-    assert bench.core.state is State.ENABLED
-    count = sent_ids(bench).count(0x421)
-    bench.step(50, {"pedal": 1.0})
-    assert sent_ids(bench).count(0x421) == count
-    assert bench.speed_mps == pytest.approx(0.75, abs=0.1)
+@pytest.fixture
+def driving(rig):
+    return rig.driving()
+
+
+def test_the_enable_sequence_and_its_confirmation(rig):
+    rig.status = OK._replace(mode=protocol.STANDBY, brake=1)
+    rig.core.enable(rig.now_s)
+    rig.step()
+    assert rig.frames() == [TAKE, RELEASE, STAND]
+    rig.step(20, PEDAL)
+    assert rig.core.state is State.ENABLING
+    assert rig.ids().count(0x421) == 5  # each 0.1 s until it is confirmed
+    rig.status = OK
+    rig.step(6, PEDAL)
+    assert rig.core.state is State.ENABLED
+    count = rig.ids().count(0x421)
+    rig.step(50, PEDAL)
+    assert rig.ids().count(0x421) == count
+    assert rig.speed_mps == pytest.approx(0.75, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -61,56 +57,30 @@ def test_the_enable_sequence_and_its_confirmation():
         (OK._replace(state=2), "the chassis is in state 2 (exception)"),
     ],
 )
-def test_a_chassis_that_does_not_confirm(status, words):
-    bench = Bench()
-    bench.status, bench.hears = status, status is not None
-    bench.core.enable(bench.now_s)
-    bench.step(48, {"pedal": 1.0})
-    assert bench.core.state is State.ENABLING
-    bench.step(5, {"pedal": 1.0})
-    assert bench.core.state is State.STOPPED
-    assert bench.words[0] == f"not enabled within 1 s: {words}"
-    assert set(bench.motions()) == {(0.0, 0.0)}
+def test_a_chassis_that_does_not_confirm(rig, status, words):
+    rig.status, rig.talks = status, status is not None
+    rig.core.enable(rig.now_s)
+    rig.step(48, PEDAL)
+    assert rig.core.state is State.ENABLING
+    rig.step(5, PEDAL)
+    assert rig.core.state is State.STOPPED
+    assert rig.words[0] == f"not enabled within 1 s: {words}"
+    assert {data for can_id, data in rig.frames() if can_id == 0x111} == {bytes(8)}
 
 
-def test_a_new_core_knows_nothing():
-    core = Bench().core
-    assert (core.state, core.cause, core.words) == (State.DISABLED, None, "")
-    report = core.report(0.0)
-    assert (report.faults, report.speed_mps, report.battery_v) == ([], 0.0, None)
-    assert report.action == {"pedal": -1.0, "steering": 0.0}
-    assert report.self_braking
-    assert core.standing(0.0) == ["the chassis sends no 0x221"]
-    assert core.late_at_s == math.inf
+@pytest.mark.parametrize(("faults", "clears"), [(0x0001, True), (0x1000, False), (0, False)])
+def test_errors_are_cleared_before_control_is_asked_for_but_a_lost_link_is_not(rig, faults, clears):
+    rig.status = OK._replace(faults=faults)
+    rig.tell(protocol.SYSTEM_STATUS, rig.status)
+    rig.core.enable(rig.now_s)
+    rig.step()
+    assert rig.frames() == [*([CLEAR] if clears else []), TAKE, RELEASE, STAND]
+    rig.step(11)
+    assert (0x441 in rig.ids()) == clears
 
 
-def test_errors_are_cleared_before_control_is_asked_for():
-    bench = Bench()
-    bench.tell(protocol.SYSTEM_STATUS, OK._replace(faults=1))
-    bench.core.enable(bench.now_s)
-    bench.step()
-    assert [(part.frame.can_id, part.data) for _, part in bench.sent] == [
-        (0x441, b"\x00"),
-        (0x421, b"\x01"),
-        (0x131, b"\x00"),
-        (0x111, bytes(8)),
-    ]
-
-
-def test_a_chassis_that_stands_has_its_brake_on_unless_it_is_asked_to_go():
-    bench = Bench().enabled()
-    assert bench.core.report(bench.now_s).action["pedal"] == -1.0
-    bench.obeys = False
-    bench.step(20, {"pedal": 1.0})
-    assert bench.core.report(bench.now_s).action["pedal"] == 0.0
-    bench.core.brake(bench.now_s, latch=False)
-    bench.step()
-    assert bench.core.report(bench.now_s).action["pedal"] == -1.0
-
-
-def test_time_limits_to_the_instant():
-    bench = Bench().driving()
-    core = bench.core
+def test_time_limits_to_the_instant(driving):
+    core = driving.core
     core._wished_s, core._since_s = 0.0, -1.0
     now_s = rules.COMMAND_TIMEOUT_S
     for at_s, state in ((now_s, State.ENABLED), (now_s + 1e-9, State.STOPPED)):
@@ -132,267 +102,78 @@ def test_time_limits_to_the_instant():
     assert core.state is State.STOPPED
 
 
-def test_what_is_at_rest():
-    bench = Bench()
-    assert bench.core.is_at_rest(bench.now_s)  # never enabled
-    bench.driving()
-    assert not bench.core.is_at_rest(bench.now_s)
-    bench.status = OK._replace(mode=protocol.REMOTE_CONTROL)
-    bench.step(6)
-    bench.speed_mps, bench.obeys = 1.0, False
-    bench.step(6)
-    assert bench.core.is_at_rest(bench.now_s)  # a person has it
-    bench.status = OK
-    bench.step(6)
-    assert not bench.core.is_at_rest(bench.now_s)
-    bench.core.bus_failed("bus-off", bench.now_s, fatal=True)
-    assert bench.core.is_at_rest(bench.now_s)  # nothing reaches it
-    bench.core.bus_works()
-    bench.speed_mps = 0.0
-    bench.step(1)
-    assert bench.core.is_at_rest(bench.now_s)
-    assert not bench.core.is_at_rest(bench.now_s + 1.0)  # that was then
+def test_what_is_at_rest(rig):
+    def is_at_rest(later_s=0.0):
+        return rig.core.is_at_rest(rig.now_s + later_s)
+
+    assert is_at_rest()  # never enabled
+    rig.driving()
+    assert not is_at_rest()
+    rig.status = REMOTE
+    rig.step(6)
+    rig.speed_mps, rig.obeys = 1.0, False
+    rig.step(6)
+    assert is_at_rest()  # a person has it
+    rig.status = OK
+    rig.step(6)
+    assert not is_at_rest()
+    rig.core.bus_failed("bus-off", rig.now_s, fatal=True)
+    assert is_at_rest()  # nothing reaches it
+    rig.core.bus_works()
+    rig.speed_mps = 0.0
+    rig.step(1)
+    assert is_at_rest()
+    assert not is_at_rest(later_s=1.0)  # that was then
 
 
 @pytest.mark.parametrize("age_s", [0.0, 0.3])
-def test_a_status_from_before_confirms_nothing(age_s):
-    bench = Bench()
-    bench.tell(protocol.SYSTEM_STATUS, OK)
-    bench.now_s += age_s
-    bench.core.enable(bench.now_s)
-    bench.tell(protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 30, 0))
-    assert bench.core.state is State.ENABLING
-    bench.now_s += 0.05
-    bench.tell(protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 30, 0))
-    assert bench.core.state is State.ENABLING
-    bench.tell(protocol.SYSTEM_STATUS, OK)
-    assert bench.core.state is State.ENABLED
+def test_a_status_from_before_confirms_nothing(rig, age_s):
+    rig.tell(protocol.SYSTEM_STATUS, OK)
+    rig.now_s += age_s
+    rig.core.enable(rig.now_s)
+    for wait_s in (0.0, 0.05):
+        rig.now_s += wait_s
+        rig.tell(protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 30, 0))
+        assert rig.core.state is State.ENABLING
+    rig.tell(protocol.SYSTEM_STATUS, OK)
+    assert rig.core.state is State.ENABLED
 
 
-def test_to_enable_it_again_gives_it_the_whole_time_again():
-    bench = Bench()
-    bench.hears = False
-    bench.core.enable(bench.now_s)
-    bench.step(45)
-    bench.core.enable(bench.now_s)
-    bench.step(45)
-    assert bench.core.state is State.ENABLING
-
-
-def test_to_enable_it_while_it_drives_makes_it_stand_until_the_next_command():
-    bench = Bench().driving()
-    bench.core.enable(bench.now_s)
-    count = len(bench.sent)
-    bench.step(6)
-    assert bench.core.state is State.ENABLED
-    assert set(bench.motions(count)) == {(0.0, 0.0)}
-
-
-def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow():
-    bench = Bench().driving(1.0)
-    bench.obeys, bench.speed_mps = False, 0.7
-    bench.step(130, {"pedal": -1.0})
-    assert bench.core.cause is Event.STUCK
-    bench.enabled().step(40, {"pedal": -1.0})
-    assert bench.core.state is State.ENABLED
-    bench.step(30, {"pedal": -1.0})
-    assert bench.core.cause is Event.STUCK
-
-
-def test_errors_are_cleared_when_it_is_enabled_but_a_lost_link_is_not():
-    for faults, clears in ((0x0001, True), (0x1000, False), (0, False)):
-        bench = Bench()
-        bench.status = OK._replace(faults=faults)
-        bench.core.enable(bench.now_s)
-        bench.step(12)
-        assert (0x441 in sent_ids(bench)) == clears
-
-
-def test_pedals_become_a_speed_and_the_speed_comes_back_as_the_scenarios():
-    bench = Bench().driving(1.0)
-    report = bench.core.report(bench.now_s)
-    assert report.speed_mps == pytest.approx(46 * 0.75 * STREAM_S)  # its first command came late
-    assert report.scenario_speed_mps == pytest.approx(4 * report.speed_mps)
-    assert report.commanded_speed_mps == pytest.approx(report.speed_mps, abs=0.002)
-    assert report.action["pedal"] == pytest.approx(1.0, abs=0.05)
-    assert (report.faults, report.self_braking, report.battery_v) == ([], False, 24.0)
-    bench.step(20, {"pedal": -0.5})
-    assert bench.core.report(bench.now_s).action["pedal"] == pytest.approx(-0.5, abs=0.05)
-
-
-def test_a_policy_without_a_pedal_has_the_scenarios_speed():
-    bench = Bench("congestion").enabled()
-    bench.step(200, {"steering": -1.0}, scenario_speed_mps=4.0)
-    assert bench.speed_mps == pytest.approx(1.0)
-    assert bench.inner_rad > 0.05
-    assert bench.core.report(bench.now_s).action["steering"] == pytest.approx(-1.0, abs=0.02)
-    bench.step(100, {"steering": 1.0}, scenario_speed_mps=0.0)
-    assert bench.speed_mps == 0.0
-    assert bench.inner_rad < -0.05
-
-
-def test_a_brake_is_speed_zero_at_once_and_latches():
-    bench = Bench().driving()
-    bench.core.brake(bench.now_s)
-    assert bench.core.report(bench.now_s).commanded_speed_mps == 0.0  # before the next tick, too
-    count = len(bench.sent)
-    bench.step(100, {"pedal": 1.0})
-    assert set(bench.motions(count)) == {(0.0, 0.0)}
-    assert bench.words == []  # our own wish is no fault
-    assert bench.core.report(bench.now_s).self_braking
-    bench.enabled().step(20, {"pedal": 1.0})
-    assert bench.speed_mps > 0
-
-
-def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch():
-    bench = Bench().driving()
-    bench.core.brake(bench.now_s, latch=False)
-    count = len(bench.sent)
-    bench.step(500)
-    assert set(bench.motions(count)) == {(0.0, 0.0)}
-    assert bench.core.state is State.ENABLED
-    bench.step(20, {"pedal": 1.0})
-    assert bench.speed_mps > 0
-
-
-def test_without_a_fresh_command_it_stops_within_the_promise_and_latches():
-    bench = Bench().driving()
-    last_s = bench.core._wished_s
-    assert bench.core.late_at_s == last_s + 0.24 < last_s + 0.25  # vehicle.py ticks then, too
-    count = len(bench.sent)
-    bench.step(100)
-    assert bench.core.late_at_s == float("inf")
-    stopped_s = next(
-        time_s
-        for time_s, part in bench.sent[count:]
-        if part.frame.can_id == 0x111 and told_by(part).speed_mps == 0
-    )
-    assert 0.2 < stopped_s - last_s <= 0.25 + 0.02
-    assert bench.words == ["no command for 0.24 s"]
-    bench.step(50, {"pedal": 1.0})
-    assert bench.speed_mps == 0
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_command_that_is_not_finite_is_refused(value):
-    bench = Bench().enabled()
-    for action, speed in (({"pedal": value}, None), ({"steering": value}, 1.0), ({}, value)):
-        with pytest.raises(ValueError, match="not finite"):
-            bench.core.command(action, bench.now_s, speed)
-    bench.step(10)
-    assert bench.speed_mps == 0
-
-
-@pytest.mark.parametrize(
-    ("action", "speed_mps"), [({}, 6.0), ({}, None), ({"steering": 0.1}, None)]
-)
-def test_a_command_that_lacks_an_action_is_refused(action, speed_mps):
-    """No pedal means the speed of the scenario's car only where there is a steering beside it."""
-    bench = Bench().enabled()
-    with pytest.raises(ValueError, match="lacks an action"):
-        bench.core.command(action, bench.now_s, speed_mps)
-    bench.step(10)
-    assert bench.speed_mps == 0
-
-
-def test_the_remote_control_keeps_its_brake_and_its_control_at_the_end():
-    bench = Bench().driving()
-    bench.status = OK._replace(mode=protocol.REMOTE_CONTROL)
-    bench.obeys, bench.speed_mps = False, 1.0  # a person drives
-    count = len(bench.sent)
-    bench.step(200, {"pedal": 1.0})
-    assert set(sent_ids(bench)[count + 6 :]) == {0x111}
-    ends = [part.frame.can_id for part in bench.core.close(bench.now_s)]
-    assert ends == [0x111, 0x421]
+def test_the_remote_control_keeps_its_brake_and_its_control_at_the_end(driving):
+    driving.status = REMOTE
+    driving.obeys, driving.speed_mps = False, 1.0  # a person drives
+    count = len(driving.sent)
+    driving.step(200, PEDAL)
+    assert set(driving.ids(count + 6)) == {0x111}
+    assert [part.frame.can_id for part in driving.core.close(driving.now_s)] == [0x111, 0x421]
 
 
 @pytest.mark.parametrize("brakes", [True, False])
-def test_the_end_stands_parks_and_gives_control_back(brakes):
-    bench = Bench().driving()
+def test_the_end_stands_parks_and_gives_control_back(driving, brakes):
     if brakes:
-        bench.core.brake(bench.now_s)
-    ends = bench.core.close(bench.now_s)
-    assert [(part.frame.can_id, part.data) for part in ends] == [
-        (0x111, bytes(8)),
-        (0x131, b"\x01"),
-        (0x421, b"\x00"),
-    ]
-    assert bench.core.tick(bench.now_s) == []
+        driving.core.brake(driving.now_s)
+    ends = driving.core.close(driving.now_s)
+    assert [(part.frame.can_id, part.data) for part in ends] == [STAND, LOCK, GIVE_BACK]
+    assert driving.core.tick(driving.now_s) == []
 
 
-# The rules that the table was written from, in other words.
-
-
-OURS = {Event.ENABLE: State.ENABLING, Event.CLOSE: State.DISABLED}
-STOP_ENABLING = {
-    Event.BRAKE, Event.NOT_CONFIRMED, Event.REMOTE, Event.ESTOP, Event.BUS, Event.FOREIGN
-}  # fmt: skip
-STOP_DRIVING = set(Event) - set(OURS) - {Event.CONFIRMED, Event.NOT_CONFIRMED}
-
-
-def expected(state, event):
-    if event in OURS:
-        return OURS[event]
-    if state is State.ENABLING and event is Event.CONFIRMED:
-        return State.ENABLED
-    stops = {State.ENABLING: STOP_ENABLING, State.ENABLED: STOP_DRIVING}
-    return State.STOPPED if event in stops.get(state, ()) else state
-
-
-def after(state, event):
-    return LEADS_TO[event].get(state, state)
-
-
-def test_every_pair_of_state_and_event():
-    assert {(state, event): expected(state, event) for state in State for event in Event} == {
-        (state, event): LEADS_TO[event].get(state, state) for state in State for event in Event
-    }
-
-
-def test_the_readme_shows_the_table():
-    readme = Path(edge_runtime.__file__).with_name("README.md").read_text(encoding="utf-8")
-    assert render_table(Event, State, after) in readme
-
-
-@pytest.mark.parametrize("state", State)
-@pytest.mark.parametrize("event", Event)
-def test_the_core_goes_where_the_table_says(state, event):
-    bench = Bench()
-    core = bench.core
-    core.state = state
-    core.set_point.speed_mps = 1.0
-    core._wish = core_wish = wish_of({"pedal": 1.0}, None)
-    core._apply(Finding(event, "why"), bench.now_s)
-    leads_to = after(state, event)
-    assert core.state is leads_to
-    if leads_to is State.STOPPED and state is not State.STOPPED:
-        assert (core.cause, core.words) == (event, "why")
-        assert core.set_point.speed_mps == 0
-        assert core._wish is None
-    elif leads_to is state:
-        assert core._wish is core_wish
-
-
-def test_a_hundred_thousand_random_frames_never_move_the_vehicle():
-    source = random.Random(7)
-    bench = Bench()
-    core = bench.core
-    known = list(protocol.FRAMES)
+def test_a_hundred_thousand_random_frames_never_move_the_vehicle(rig):
+    source, core, known = random.Random(7), rig.core, list(protocol.FRAMES)
     for number in range(100_000):
         if number % 10_000 == 1_000:
-            core.enable(bench.now_s)
+            core.enable(rig.now_s)
         can_id = source.choice(known) if source.random() < 0.8 else source.randrange(0x800)
         data = source.getrandbits(64).to_bytes(8, "big")
         if source.random() < 0.1:
             data = data[: source.randrange(9)]
-        core.hear(can_id, data, bench.now_s)
+        core.hear(can_id, data, rig.now_s)
         if number % 10 == 0:
-            bench.now_s += STREAM_S
-            for frame, sent in core.tick(bench.now_s):
+            rig.now_s += STREAM_S
+            for frame, sent in core.tick(rig.now_s):
                 assert frame in protocol.COMMANDS
                 if frame is protocol.MOTION_COMMAND:
                     assert sent == bytes(8)
-            core.report(bench.now_s)
+            core.report(rig.now_s)
 
 
 _HAPPENS = st.sampled_from(
@@ -403,29 +184,205 @@ _HAPPENS = st.sampled_from(
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(_HAPPENS, st.floats(-1, 1)), max_size=120))
 def test_it_only_moves_enabled_on_a_fresh_command(happenings):
-    bench = Bench()
-    core, commanded_s, allowed = bench.core, -1e9, False
+    rig = HunterRig()
+    core, commanded_s, allowed = rig.core, -1e9, False
     for what, number in happenings:
         if what == "tick":
-            before = len(bench.sent)
-            bench.step()
-            for motion in bench.motions(before):
-                if motion.speed_mps != 0:
-                    assert allowed
-                    assert core.state is State.ENABLED
-                    assert bench.now_s - commanded_s <= 0.25 + STREAM_S
+            before = len(rig.asked)
+            rig.step()
+            if any(rig.speeds(before)):
+                assert allowed
+                assert core.state is State.ENABLED
+                assert rig.now_s - commanded_s <= 0.25 + STREAM_S
         elif what == "command":
-            core.command({"pedal": abs(number)}, bench.now_s)
-            commanded_s = bench.now_s
+            core.command({"pedal": abs(number)}, rig.now_s)
+            commanded_s = rig.now_s
         elif what == "enable":
-            core.enable(bench.now_s)
+            core.enable(rig.now_s)
             allowed = True
         elif what in ("brake", "hold"):
-            core.brake(bench.now_s, latch=what == "brake")
-            if what == "brake":
-                allowed = False
+            core.brake(rig.now_s, latch=what == "brake")
+            allowed = allowed and what == "hold"
         elif what == "silent":
-            bench.hears = number > 0
+            rig.talks = number > 0
         else:
-            mode = protocol.REMOTE_CONTROL if what == "remote" else protocol.CAN_CONTROL
-            bench.status = OK._replace(mode=mode)
+            rig.status = REMOTE if what == "remote" else OK
+
+
+# What of chassis and bus stops it.
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "stands"),
+    [
+        ({"mode": protocol.REMOTE_CONTROL}, "the remote control drives", True),
+        ({"state": protocol.STATE_ESTOP}, "the emergency stop is pressed", True),
+        ({"mode": protocol.STANDBY}, "the chassis is in standby, not under CAN control", False),
+        ({"brake": 1}, "the chassis has locked its brake", False),
+        ({"faults": 0x1000}, "link to the upper computer lost", False),
+        ({"faults": 0x0241}, "steering encoder, battery undervoltage, overtemperature", False),
+        ({"state": protocol.STATE_EXCEPTION}, "the chassis is in state 2 (exception)", False),
+    ],
+)
+def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(driving, change, words, stands):
+    driving.status = OK._replace(**change)
+    driving.step(6, PEDAL)
+    assert driving.core.state is State.STOPPED
+    assert driving.words == [words]
+    assert (driving.report.standing == [words]) == stands
+    driving.status = OK  # the chassis gives control back by itself
+    count = len(driving.asked)
+    driving.step(100, PEDAL)
+    assert set(driving.speeds(count)) == {0.0}
+    assert driving.words == [words]
+    assert driving.report.standing == []
+    driving.enabled().step(20, PEDAL)
+    assert driving.words == []
+    assert driving.speed_mps > 0
+
+
+def test_a_motors_fault_stops_it(driving):
+    driving.tell(protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 90, 0b10))
+    assert driving.words == ["rear left motor: motor overtemperature"]
+    assert driving.core.cause is Event.FAULT
+    driving.core.enable(driving.now_s)
+    assert (driving.core.cause, driving.core.words) == (None, "")
+
+
+def test_feedback_that_falls_silent_stops_it_and_the_brake_is_locked(driving):
+    driving.talks = False
+    driving.step(12, PEDAL)
+    assert driving.words == driving.report.standing == ["the chassis sends no 0x221"]
+    assert 0x131 not in driving.ids(-10)
+    driving.step(60, PEDAL)
+    assert LOCK in driving.frames(-10)
+
+
+def test_a_status_that_falls_silent_alone(driving):
+    driving.talks = False
+    for _ in range(20):
+        driving.step(1, PEDAL)
+        driving.tell(protocol.MOTION_STATUS, protocol.MotionStatus(driving.speed_mps, 0.0))
+    assert driving.words == ["the chassis sends no 0x211"]
+
+
+FROZEN = "the chassis repeats itself: the counter of 0x211 stands still"
+
+
+def test_frames_that_repeat_themselves_are_silence_after_three_of_them(driving):
+    driving.obeys, driving.counter = False, None
+    driving.status = OK._replace(counter=driving.core.reports.status.counter)
+    driving.step(10, PEDAL)
+    assert driving.core.state is State.ENABLED
+    driving.step(7, PEDAL)
+    assert (driving.core.state, driving.core.cause) == (State.STOPPED, Event.SILENT)
+    assert driving.words == [FROZEN]
+    assert driving.report.standing == [FROZEN]  # it is not re-armed
+    driving.core.enable(driving.now_s)
+    driving.step(60, PEDAL)
+    assert driving.core.state is State.STOPPED
+    assert driving.words[0] == f"not enabled within 1 s: {FROZEN}"
+    driving.obeys, driving.counter = True, driving.status.counter
+    driving.step(6)
+    assert driving.report.standing == []
+    driving.enabled()
+
+
+@pytest.mark.parametrize("count", [2, 7, 50])
+def test_frames_that_go_round_and_round_are_silence(rig, count):
+    newest = rig.driving(8.0).core.reports.status.counter
+    rig.counter = None
+    for turn in range(20):
+        rig.status = OK._replace(counter=(newest - count + 1 + turn % count) % 256)
+        rig.step(5, PEDAL)
+    assert rig.words == [FROZEN]
+
+
+def test_a_counter_that_runs_over_or_loses_two_frames_goes_on(driving):
+    for turn in range(600):
+        driving.counter += (turn % 5) // 4 * 2
+        driving.step(5, PEDAL)
+        assert driving.core.state is State.ENABLED, driving.words
+
+
+def test_a_chassis_that_was_switched_off_may_count_from_0_again(rig):
+    rig.driving(20.0).talks = False
+    rig.step(30)
+    rig.talks, rig.counter = True, 0
+    rig.step(12).enabled()
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [((3.0, 0.0), "the chassis reports 3.0 m/s"), ((0.0, 1.0), "a steering angle of 1.00 rad")],
+)
+def test_feedback_that_cannot_be_stops_it_before_the_next_tick(driving, motion, words):
+    driving.tell(protocol.MOTION_STATUS, protocol.MotionStatus(*motion))
+    assert driving.core.state is State.STOPPED
+    assert words in driving.words[0]
+
+
+def test_feedback_that_could_not_be_while_it_is_enabled_stops_it_then(rig):
+    rig.core.enable(rig.now_s)
+    rig.step(1)
+    rig.tell(protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0))
+    assert rig.core.state is State.ENABLING
+    rig.tell(protocol.SYSTEM_STATUS, OK)
+    rig.step(1)
+    assert rig.core.state is State.STOPPED
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 0.7])
+def test_a_drive_that_does_not_follow_is_stuck_and_its_brake_is_locked_at_once(driving, speed_mps):
+    driving.obeys, driving.speed_mps = False, speed_mps
+    pedal = {"pedal": -1.0 if speed_mps else 1.0}
+    while driving.core.state is State.ENABLED:
+        assert driving.ticks < 200
+        driving.step(1, pedal)
+    driving.step(1, pedal)
+    assert "the speed stays at" in driving.words[0]
+    assert (LOCK in driving.frames()) == (speed_mps > 0)
+
+
+FULL = "Transmit buffer full"
+
+
+@pytest.mark.parametrize(
+    ("failures", "works_between", "words"),
+    [
+        ([0, 4], False, []),  # by the tick: for less than five frames
+        ([0, 4, 6], False, [f"the CAN bus fails: {FULL}"]),
+        (range(8), False, [f"the CAN bus fails: {FULL}"]),  # though it hears all the time
+        (range(50), True, []),  # a frame that was not taken now and then
+    ],
+)
+def test_a_bus_that_takes_nothing_for_five_frames_stops_it(driving, failures, works_between, words):
+    for tick in range(max(failures) + 1):
+        if tick in failures:
+            driving.core.bus_failed(FULL, driving.now_s)
+        if works_between:
+            driving.core.bus_works()
+        driving.step(1, PEDAL)
+    assert driving.words == words
+    assert driving.core.state is (State.STOPPED if words else State.ENABLED)
+    driving.core.bus_works()
+    assert driving.report.standing == []
+
+
+def test_a_bus_that_failed_before_it_was_enabled_works_once_it_is_heard_again(rig):
+    for now_s in (rig.now_s, rig.now_s + 1.0):
+        rig.core.bus_failed("Network is down", now_s)
+    assert rig.report.standing[-1] == "the CAN bus fails: Network is down"
+    rig.step(5)  # nothing is sent that the bus could take
+    assert rig.sent == []
+    assert rig.report.standing == []
+    rig.core.bus_failed("a frame lost, an hour later", rig.now_s + 3600.0)
+    assert rig.report.standing == []
+
+
+def test_bus_off_and_another_sender_stop_it_at_once():
+    off, other = HunterRig().driving(), HunterRig().driving()
+    off.core.bus_failed("bus-off", off.now_s, fatal=True)
+    assert off.words == ["the CAN bus fails: bus-off"]
+    other.core.hear(0x111, bytes(8), other.now_s)
+    assert other.words == ["somebody else sends 0x111"]

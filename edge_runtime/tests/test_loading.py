@@ -13,10 +13,10 @@ import pytest
 
 import edge_runtime
 from edge_runtime.config import DEFAULT_BUS, HunterSettings, Ros2Settings
-from edge_runtime.vehicles.hunter.bus import parse_bus
+from edge_runtime.vehicles.hunter import parse_bus
 from edge_runtime.vehicles.hunter.protocol import PROFILES
 from edge_runtime.vehicles.mapping import SPECS
-from edge_runtime.vehicles.ros2.names import check_settings
+from edge_runtime.vehicles.ros2 import check_settings
 
 ROOT = Path(edge_runtime.__file__).parent
 # Only who asks for them loads them.
@@ -51,7 +51,7 @@ def test_run_without_a_vehicle_loads_no_more_than_it_needs(what, most_lines):
 def test_a_vehicle_loads_no_other_one():
     making = """
 from edge_runtime.config import Config
-from edge_runtime.vehicles.registry import make_vehicle
+from edge_runtime.vehicles import make_vehicle
 make_vehicle("mock", Config(), "left_turn")
 """
     folders = {path.parent.name for path in loaded_by(making)}

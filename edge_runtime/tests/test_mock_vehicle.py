@@ -6,11 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.config import CarSettings, Config, SimilaritySettings
+from edge_runtime.config import Config, SimilaritySettings
+from edge_runtime.tests.rigs import CAR, PEDAL
 from edge_runtime.util import UserError
+from edge_runtime.vehicles import make_vehicle, vehicle_limits
 from edge_runtime.vehicles.mapping import CARS
-from edge_runtime.vehicles.mock import MockParameters, MockState, MockVehicle, advance
-from edge_runtime.vehicles.registry import make_vehicle, vehicle_limits
+from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 
 
 def enabled(**parameters):
@@ -20,10 +21,14 @@ def enabled(**parameters):
 
 
 def test_first_order_lag_by_hand():
-    parameters = MockParameters(time_constant_s=0.1, slew_per_s=1e9)
-    after = advance(MockState(pedal=0.0), 1.0, 0.0, 0.1, parameters)
-    assert after.pedal == pytest.approx(1 - math.exp(-1))
-    assert after.speed_mps == pytest.approx((1 - math.exp(-1)) * 3.0 * 0.1)
+    """From full brake to full throttle in one time constant; and the speed, 5 ms by 5 ms."""
+    vehicle = enabled(dead_time_s=0.0, time_constant_s=0.1, slew_per_s=1e9)
+    vehicle.command({"pedal": 1.0, "steering": 1.0}, 0.0)
+    after = vehicle.feedback(0.1)
+    assert after.action["pedal"] == pytest.approx(1 - 2 * math.exp(-1))
+    assert after.action["steering"] == pytest.approx(1 - math.exp(-1))
+    pedals = [1 - 2 * math.exp(-0.05 * step) for step in range(1, 21)]
+    assert after.speed_mps == pytest.approx(sum(max(0.0, 3.0 * pedal) for pedal in pedals) * 0.005)
 
 
 @pytest.mark.parametrize("scenario", [*CARS, "another"])
@@ -42,31 +47,18 @@ def test_it_is_no_quicker_than_the_policys_car(scenario):
 
 
 def test_a_car_of_the_settings_is_its_car():
-    car = CarSettings(
-        throttle_mps2=1.0,
-        brake_mps2=2.0,
-        max_speed_mps=0.5,
-        full_steering_rad=0.3,
-        wheelbase_m=1.0,
-    )
-    config = Config(similarity=SimilaritySettings(car=car))
+    config = Config(similarity=SimilaritySettings(car=CAR))
     vehicle = make_vehicle("mock", config, "left_turn")
     vehicle.enable(0.0)
     for tick in range(100):
-        vehicle.command({"pedal": 1.0}, tick * 0.1)
+        vehicle.command(PEDAL, tick * 0.1)
     assert vehicle.feedback(10.0).speed_mps == 0.5
 
 
 def test_the_rate_limit_by_hand():
-    parameters = MockParameters(time_constant_s=1e-9, slew_per_s=2.0)
-    assert advance(MockState(pedal=0.0), 1.0, 0.0, 0.1, parameters).pedal == pytest.approx(0.2)
-
-
-def test_the_dead_time_passes_before_anything_moves():
-    vehicle = enabled(dead_time_s=0.1)
-    vehicle.command({"pedal": 1.0}, 0.0)
-    assert vehicle.feedback(0.09).action["pedal"] == -1.0
-    assert vehicle.feedback(0.19).action["pedal"] > -1.0
+    vehicle = enabled(dead_time_s=0.0, time_constant_s=1e-9, slew_per_s=2.0)
+    vehicle.command(PEDAL, 0.0)
+    assert vehicle.feedback(0.1).action["pedal"] == pytest.approx(-1.0 + 0.2)
 
 
 def test_it_follows_commands_and_brakes_by_itself_without_them():
@@ -86,17 +78,15 @@ def test_it_follows_commands_and_brakes_by_itself_without_them():
     assert stopped.action["steering"] == pytest.approx(0.5, abs=1e-3)
 
 
-def test_the_brake_overtakes_commands_on_their_way():
-    vehicle = enabled(dead_time_s=0.1)
-    vehicle.command({"pedal": 1.0}, 0.0)
-    vehicle.brake(0.05)
-    assert vehicle.feedback(0.15).action["pedal"] == -1.0
-
-
-def test_a_long_gap_is_no_long_computation():
-    vehicle = enabled()
-    vehicle.command({"pedal": 1.0}, 0.0)
-    assert vehicle.feedback(1e6).speed_mps == 0.0
+def test_the_dead_time_passes_before_anything_moves_and_a_brake_overtakes_it():
+    for brakes in (False, True):
+        vehicle = enabled(dead_time_s=0.1)
+        vehicle.command(PEDAL, 0.0)
+        if brakes:
+            vehicle.brake(0.05)
+        assert vehicle.feedback(0.09).action["pedal"] == -1.0
+        assert (vehicle.feedback(0.19).action["pedal"] > -1.0) != brakes
+        assert vehicle.feedback(1e6).speed_mps == 0.0  # a long gap is no long computation
 
 
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(0.001, 0.5)), max_size=20))
@@ -119,32 +109,23 @@ def test_the_registry():
             make("tank", Config(), "")
 
 
-def test_a_stop_is_latched_until_it_is_enabled_again():
-    vehicle = enabled()
-    vehicle.brake(0.0)
-    vehicle.command({"pedal": 1.0}, 0.1)
-    assert vehicle.feedback(0.3).speed_mps == 0.0
-    vehicle.enable(0.3)
-    vehicle.command({"pedal": 1.0}, 0.3)
-    assert vehicle.feedback(0.5).speed_mps > 0.0
-
-
-def test_the_stop_at_an_episodes_end_holds_only_until_the_next_command():
-    vehicle = enabled()
-    vehicle.brake(0.0, latch=False)
+def test_it_moves_only_enabled_and_a_stop_latches_but_at_an_episodes_end():
+    vehicle = MockVehicle()
+    vehicle.command(PEDAL, 0.0)
+    assert vehicle.feedback(0.2).speed_mps == 0.0
+    vehicle.enable(0.2)
+    vehicle.brake(0.2)
+    vehicle.command(PEDAL, 0.3)
+    assert vehicle.feedback(0.5).speed_mps == 0.0
+    vehicle.enable(0.5)
+    vehicle.command(PEDAL, 0.5)
+    assert vehicle.feedback(0.7).speed_mps > 0.0
+    vehicle.brake(0.7, latch=False)
     assert vehicle.feedback(5.0).speed_mps == 0.0
-    vehicle.command({"pedal": 1.0}, 5.0)
+    vehicle.command(PEDAL, 5.0)
     assert vehicle.feedback(5.2).speed_mps > 0.0
 
 
-def test_it_does_not_move_before_it_is_enabled():
-    vehicle = MockVehicle()
-    vehicle.command({"pedal": 1.0}, 0.0)
-    assert vehicle.feedback(0.2).speed_mps == 0.0
-
-
 def test_a_command_without_an_action_is_refused():
-    vehicle = MockVehicle()
-    vehicle.enable(0.0)
     with pytest.raises(ValueError, match="lacks an action"):
-        vehicle.command({}, 0.1, 6.0)
+        enabled().command({}, 0.1, 6.0)

@@ -1,7 +1,6 @@
 """The stream's thread: periods, a command that gets too old, a wake, a process that was held up."""
 
 import math
-import threading
 import time
 
 import pytest
@@ -36,6 +35,12 @@ def started():
         each.stop()
 
 
+def once(pause_s):
+    """A pause of the process, at the first call only."""
+    pauses = [pause_s]
+    return lambda: time.sleep(pauses.pop()) if pauses else None
+
+
 def test_it_sends_fifty_times_a_second(started):
     running, sent = started()
     wait_until(lambda: len(sent) > 50, "a second of sending")
@@ -62,27 +67,13 @@ def test_a_command_that_gets_too_old_does_not_wait_for_the_period(started, monke
 
 def test_what_was_held_up_is_followed_at_once(started, monkeypatch):
     monkeypatch.setattr(stream, "PERIOD_S", 2.0)
-    held = threading.Event()
-
-    def hold():
-        if not held.is_set():
-            held.set()
-            time.sleep(2.5)
-
-    _, sent = started(during=hold)
+    _, sent = started(during=once(2.5))
     wait_until(lambda: len(sent) >= 2, "the next")
     assert sent[1] - sent[0] < 3.9  # the next period would have come 4 s after the first
 
 
 def test_after_a_pause_it_sends_once_and_not_for_each_missed_period(started):
-    held = threading.Event()
-
-    def hold():
-        if not held.is_set():
-            held.set()
-            time.sleep(0.5)
-
-    _, sent = started(during=hold)
+    _, sent = started(during=once(0.5))
     wait_until(lambda: len(sent) > 10, "ten more")
     assert sent[10] - sent[1] > 0.12
 
@@ -106,6 +97,8 @@ periods = st.floats(0.005, 0.1)
 def test_before_the_first_it_stands():
     speeds = Speeds()
     assert (speeds.speed_mps, speeds.stands, speeds.acceleration_mps2()) == (0.0, True, 0.0)
+    speeds.note(3.0, 0.0)
+    assert not speeds.stands
 
 
 @given(accelerations, periods, st.integers(2, 60), st.floats(-1.0, 1.0))
@@ -127,14 +120,6 @@ def test_what_is_older_than_a_control_period_counts_no_more(earlier, period_s):
     assert speeds.acceleration_mps2() == 0.0
     speeds.note(1.1, later_s + 0.1)
     assert speeds.acceleration_mps2() == pytest.approx(1.0)
-
-
-def test_what_is_forgotten_is_as_before_the_first():
-    speeds = Speeds()
-    speeds.note(3.0, 0.0)
-    assert not speeds.stands
-    speeds.forget()
-    assert (speeds.speed_mps, speeds.stands) == (0.0, True)
 
 
 def test_two_reports_in_one_moment_are_no_acceleration():

@@ -41,14 +41,22 @@ class BrokenVehicle(MockVehicle):
         self.asked: list = []
         self.says: list = []
         self.stands: list = []
-        self.hangs = threading.Event()
+        self.hanging = threading.Event()
         self.released = threading.Event()
+
+    def hang(self):
+        self.broken = "hang"
+        assert self.hanging.wait(10.0)
+
+    def go_on(self):
+        self.broken = ""
+        self.released.set()
 
     def feedback(self, now_s):
         if self.broken == "feedback":
             raise OSError("no such device")
         if self.broken == "hang":
-            self.hangs.set()
+            self.hanging.set()
             self.released.wait()
         report = super().feedback(now_s)
         return report._replace(faults=list(self.says), standing=list(self.stands))
@@ -128,20 +136,17 @@ def test_a_command_without_just_the_policys_actions_is_a_fault(vehicle, runner, 
 
 
 def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(vehicle, runner):
-    vehicle.broken = "hang"
-    assert vehicle.hangs.wait(10.0)
+    vehicle.hang()
     runner.command(make_command())
     runner.command(make_command("safe_stop", step=1))
     wait_until(lambda: runner.fault(time.monotonic()) == SILENT, "the fault")
     assert vehicle.asked == []
-    vehicle.broken = ""
-    vehicle.released.set()
+    vehicle.go_on()
     wait_until(lambda: vehicle.asked == ["brake"], "the brake alone")
 
 
 def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner):
-    vehicle.broken = "hang"
-    assert vehicle.hangs.wait(10.0)
+    vehicle.hang()
     runner.close()
     assert vehicle.asked == []  # it may be in the middle of a call
     vehicle.broken = "command"
@@ -167,29 +172,21 @@ def test_a_drivers_words_are_a_fault_until_it_is_enabled_again(vehicle, runner):
 
 
 def test_a_stop_from_before_the_rearm_does_not_undo_it(vehicle, runner):
-    vehicle.broken = "hang"
-    assert vehicle.hangs.wait(10.0)
+    vehicle.hang()
     runner.command(make_command("safe_stop"))
     runner.enable()
     runner.command(make_command("safe_stop", step=1), latch=False)
-    vehicle.broken = ""
-    vehicle.released.set()
+    vehicle.go_on()
     wait_until(lambda: vehicle.asked == ["enable", "stand"], "the order of things")
-
-
-def test_a_stop_after_the_rearm_does_undo_it(vehicle, runner):
-    runner.enable()
     runner.command(make_command("safe_stop"))
-    wait_until(lambda: vehicle.asked == ["enable", "brake"], "both")
+    wait_until(lambda: vehicle.asked == ["enable", "stand", "brake"], "a stop after it does")
 
 
 def test_a_command_that_waited_too_long_moves_nothing(vehicle, runner):
-    vehicle.broken = "hang"
-    assert vehicle.hangs.wait(10.0)
+    vehicle.hang()
     runner.command(make_command())
     time.sleep(0.3)
-    vehicle.broken = ""
-    vehicle.released.set()
+    vehicle.go_on()
     count = len(runner.heard)
     wait_until(lambda: len(runner.heard) > count + 1, "feedback again")
     assert vehicle.asked == []
@@ -229,8 +226,13 @@ def watched(seconds=1.0, asked=0.0, **reported):
     return watch, now_s
 
 
-def test_nothing_is_wrong_with_a_vehicle_that_obeys():
-    watch, now_s = watched(asked=0.3, pedal=0.3)
+@pytest.mark.parametrize(
+    "drive",
+    [{"asked": 0.3, "pedal": 0.3}, {"asked": 0.6, "pedal": -1.0, "self_braking": True}],
+    ids=["it obeys", "it brakes by itself and obeys nobody"],
+)
+def test_nothing_is_wrong_with_a_vehicle_that_obeys_or_brakes_by_itself(drive):
+    watch, now_s = watched(**drive)
     assert watch.fault(now_s) == ""
 
 
@@ -265,23 +267,12 @@ def test_an_actuator_on_its_way_between_two_commands_is_not_stuck():
         assert watch.fault(now_s + tick * TICK_S) == ""
 
 
-def test_a_vehicle_that_brakes_by_itself_obeys_nobody_and_is_not_stuck():
-    watch, now_s = watched(asked=0.6, pedal=-1.0, self_braking=True)
-    assert watch.fault(now_s) == ""
-
-
 @pytest.mark.parametrize(
-    "impossible",
-    [
-        report(speed_mps=9.0),
-        report(speed_mps=math.nan),
-        report(pedal=1.1),
-        report(pedal=math.inf),
-    ],
+    "impossible", [{"speed_mps": 9.0}, {"speed_mps": math.nan}, {"pedal": 1.1}, {"pedal": math.inf}]
 )
 def test_what_cannot_be_is_a_lie(impossible):
     watch, now_s = watched()
-    watch.report(impossible, now_s + TICK_S)
+    watch.report(report(**impossible), now_s + TICK_S)
     assert watch.fault(now_s + TICK_S) == LYING
 
 

@@ -139,15 +139,11 @@ class VehicleWatch:
         return STUCK if since_s is not None and now_s - since_s > DEVIATES_S else ""
 
     def _is_impossible(self, report: VehicleReport, now_s: float) -> bool:
-        values = report.action.values()
-        if not all(map(math.isfinite, [report.speed_mps, *values])):
+        is_in_range = all(abs(value) <= 1.0 + _ROUNDING for value in report.action.values())
+        if not (is_in_range and math.isfinite(report.speed_mps)):  # NaN is in no range
             return True
-        if any(abs(value) > 1.0 + _ROUNDING for value in values):
-            return True
-        if self._believed is None:
-            return False
         # From the last possible report on: a leap is a lie until that speed could be real.
-        since_s, speed_mps = self._believed
+        since_s, speed_mps = self._believed or (now_s, report.speed_mps)
         most_mps = SPEED_NOISE_MPS + MAX_ACCELERATION_MPS2 * (now_s - since_s)
         return abs(report.speed_mps - speed_mps) > most_mps
 
@@ -185,6 +181,7 @@ class VehicleRunner:
     def __init__(
         self, vehicle: Vehicle, action_names: Sequence[str], publish: Callable[[Feedback], None]
     ) -> None:
+        self.name = vehicle.name
         self._vehicle = vehicle
         self._action_names = action_names
         self._publish = publish
@@ -202,11 +199,6 @@ class VehicleRunner:
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
 
     @property
-    def name(self) -> str:
-        """The vehicle's, as `--vehicle` knows it."""
-        return self._vehicle.name
-
-    @property
     def silent_at_s(self) -> float:
         """When the vehicle counts as silent if nothing more is heard of it (monotonic)."""
         return self._watch.silent_at_s
@@ -219,9 +211,7 @@ class VehicleRunner:
     def fault(self, now_s: float) -> str:
         """What is wrong with the vehicle, empty if nothing. Never waits."""
         with self._due:
-            if self._enable_due:
-                return self._seen_fault(now_s)
-        seen = self._report_seen
+            seen = None if self._enable_due else self._report_seen
         return self._seen_fault(now_s) or (seen.faults[0] if seen and seen.faults else "")
 
     def standing_fault(self, now_s: float) -> str:
@@ -294,9 +284,9 @@ class VehicleRunner:
     def _wait(self, until_s: float) -> Tuple[bool, Optional[_Task]]:
         """Whether to enable, and then the newest command; as soon as there is one, or at a time."""
         with self._due:
-            pause_s = max(0.0, until_s - time.monotonic())
             self._due.wait_for(
-                lambda: self._next is not None or self._enable_due or self._stopping, pause_s
+                lambda: self._next is not None or self._enable_due or self._stopping,
+                max(0.0, until_s - time.monotonic()),
             )
             task, self._next = self._next, None
             return self._enable_due, task
@@ -333,12 +323,30 @@ class VehicleRunner:
         self._refuses = False
 
     def _report(self) -> None:
-        report = self._ask()
+        report, last = self._ask(), self._last
         fault = self.fault(time.monotonic())
         if fault:
             self.on_fault()
-        if report is not None:
-            self._publish(self._feedback(report, self._last, fault))
+        if report is None:
+            return
+        faults = [*report.faults, fault] if fault and fault not in report.faults else report.faults
+        self._publish(
+            Feedback(
+                vehicle=self.name,
+                session=last.session if last else "",
+                episode=last.episode if last else -1,
+                step=last.step if last else -1,
+                mode=last.mode if last else "standby",
+                action=[report.action.get(name, 0.0) for name in self._action_names],
+                speed_mps=report.speed_mps,
+                self_braking=report.self_braking,
+                faults=[text[:MAX_TEXT_CHARS] for text in faults],
+                sent_ns=time.time_ns(),
+                scenario_speed_mps=report.scenario_speed_mps,
+                commanded_speed_mps=report.commanded_speed_mps,
+                battery_v=report.battery_v,
+            )
+        )
 
     def _seen_fault(self, now_s: float) -> str:
         return SILENT if self._refuses else self._watch.fault(now_s)
@@ -356,23 +364,3 @@ class VehicleRunner:
         self._report_seen = report
         self._watch.report(report, time.monotonic())
         return report
-
-    def _feedback(self, report: VehicleReport, last: Optional[Command], fault: str) -> Feedback:
-        faults = report.faults
-        if fault and fault not in faults:
-            faults = [*faults, fault]
-        return Feedback(
-            vehicle=self._vehicle.name,
-            session=last.session if last else "",
-            episode=last.episode if last else -1,
-            step=last.step if last else -1,
-            mode=last.mode if last else "standby",
-            action=[report.action.get(name, 0.0) for name in self._action_names],
-            speed_mps=report.speed_mps,
-            self_braking=report.self_braking,
-            faults=[text[:MAX_TEXT_CHARS] for text in faults],
-            sent_ns=time.time_ns(),
-            scenario_speed_mps=report.scenario_speed_mps,
-            commanded_speed_mps=report.commanded_speed_mps,
-            battery_v=report.battery_v,
-        )

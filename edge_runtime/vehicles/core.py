@@ -33,8 +33,7 @@ FOLLOWS_S = 10 * CONTROL_PERIOD_S  # a drive may still follow a set-point of thi
 DEVIATION = 0.1  # of top speed, outside of all that was asked within FOLLOWS_S
 DEVIATES_S = CONTROL_PERIOD_S
 STANDS_MPS = 0.02
-IMPOSSIBLE = 1.3
-"""Times what the model can do: a vehicle that reports more than that is not believed."""
+IMPOSSIBLE = 1.3  # times what the model can do: a vehicle that reports more is not believed
 _SLACK_S = 0.01
 
 
@@ -110,10 +109,6 @@ class Speeds:
         while self._noted[0][0] < now_s - CONTROL_PERIOD_S - _SLACK_S:
             self._noted.popleft()
 
-    def forget(self) -> None:
-        """As before the first one."""
-        self._noted.clear()
-
     @property
     def speed_mps(self) -> float:
         """The newest one, 0 before the first."""
@@ -139,11 +134,6 @@ class SpeedWatch:
         self._tolerance_mps = DEVIATION * max_speed_mps
         self._asked: Deque[Tuple[float, float]] = deque()
         self._deviates_since_s: Optional[float] = None
-
-    def begin(self) -> None:
-        """Forget what was asked before: it has a new chance to follow."""
-        self._asked.clear()
-        self._deviates_since_s = None
 
     def is_stuck(self, asked_mps: float, measured_mps: float, now_s: float) -> bool:
         """Note what is asked and measured now, and judge."""
@@ -181,8 +171,8 @@ class StreamedCore(abc.ABC):
     def enable(self, now_s: float) -> None:
         """Ask for control, from now on until the vehicle confirms it."""
         self._wish = None
-        self.set_point.stand()
-        self._speed_watch.begin()
+        self.set_point.speed_mps = 0.0
+        self._speed_watch = SpeedWatch(self._spec.max_speed_mps)  # a new chance to follow
         self._apply(Finding(Event.ENABLE, ""), now_s)
         self._since_s = now_s
 
@@ -197,7 +187,7 @@ class StreamedCore(abc.ABC):
     def brake(self, now_s: float, latch: bool = True) -> None:
         """Speed 0 at the next tick, until the next command or (latched) the next `enable`."""
         self._wish = None
-        self.set_point.stand()
+        self.set_point.speed_mps = 0.0
         if latch:
             self._apply(Finding(Event.BRAKE, ""), now_s)
 
@@ -208,13 +198,15 @@ class StreamedCore(abc.ABC):
 
     def report(self, now_s: float) -> VehicleReport:
         """What the vehicle does, in the policy's terms and in its own."""
-        speed_mps = self._heard.speed_mps
+        speed_mps, standing = self._heard.speed_mps, self.standing(now_s)
+        words = [self.words] if self.words else []
+        faults = words + [more for more in standing if more not in words]
         return VehicleReport(
             action={"pedal": self._pedal(), "steering": self._steering()},
             speed_mps=speed_mps,
             self_braking=self.state is not State.ENABLED,
-            faults=self._faults(now_s),
-            standing=self.standing(now_s),
+            faults=faults if self.state is State.STOPPED else [],
+            standing=standing,
             scenario_speed_mps=speed_mps / self.similarity.scale,
             commanded_speed_mps=self.set_point.speed_mps,
         )
@@ -229,20 +221,25 @@ class StreamedCore(abc.ABC):
         """Whether the vehicle is known to stand, or no more can be done about it."""
 
     @abc.abstractmethod
-    def _obstacles(self, now_s: float) -> List[str]:
-        """In words what stands between the vehicle and our commands."""
+    def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
+        """SILENT where feedback is missing that was due since `since_s`."""
 
     @abc.abstractmethod
     def _why_not_confirmed(self, now_s: float) -> str:
         """In words why the vehicle did not confirm an `enable` in time."""
 
     @abc.abstractmethod
-    def _wrong(self, now_s: float) -> Optional[Finding]:
-        """What is wrong with the newest feedback while ENABLED."""
-
-    @abc.abstractmethod
     def _steering(self) -> float:
         """The steering in -1 to 1 that the vehicle reports."""
+
+    def _lie(self) -> Optional[Finding]:
+        """LYING where the newest feedback cannot be, and it was not refused when it came."""
+        return None
+
+    def _obstacles(self, now_s: float) -> List[str]:
+        """In words what stands between the vehicle and our commands."""
+        silence = self._silence(-math.inf, now_s)
+        return [silence.words] if silence else []
 
     def _apply(self, finding: Finding, now_s: float) -> None:
         after = self.leads_to[finding.event].get(self.state, self.state)
@@ -251,7 +248,7 @@ class StreamedCore(abc.ABC):
         self.cause, self.words = None, ""
         if after is State.STOPPED:
             self._wish = None
-            self.set_point.stand()
+            self.set_point.speed_mps = 0.0
             self.cause, self.words = finding
         self.state, self._since_s = after, now_s
 
@@ -261,7 +258,7 @@ class StreamedCore(abc.ABC):
             self._apply(Finding(Event.NOT_CONFIRMED, self._why_not_confirmed(now_s)), now_s)
         if self.state is not State.ENABLED:
             return
-        found = self._wrong(now_s)
+        found = self._silence(self._since_s, now_s) or self._lie()
         if found is None and self._wish is not None and now_s - self._wished_s > COMMAND_TIMEOUT_S:
             found = Finding(Event.COMMAND_LATE, f"no command for {COMMAND_TIMEOUT_S:.2f} s")
         asked_mps, measured_mps = self.set_point.speed_mps, self._heard.speed_mps
@@ -277,13 +274,7 @@ class StreamedCore(abc.ABC):
         if self.state is State.ENABLED and self._wish is not None:
             self.set_point.follow(self._wish, step_s, self._heard.speed_mps)
         else:
-            self.set_point.stand()
-
-    def _faults(self, now_s: float) -> List[str]:
-        if self.state is not State.STOPPED:
-            return []
-        words = [self.words] if self.words else []
-        return words + [more for more in self.standing(now_s) if more not in words]
+            self.set_point.speed_mps = 0.0
 
     def _pedal(self) -> float:
         """From the measured acceleration; the brake where it stands and is to stand."""

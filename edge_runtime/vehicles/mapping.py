@@ -24,6 +24,11 @@ LEAD_S = 0.5
 _LONGEST_STEP_S = CONTROL_PERIOD_S  # after a pause of the process the pedal was not held for it
 
 
+def clamp(value: float, most: float) -> float:
+    """The value within -`most` to `most`."""
+    return min(max(value, -most), most)
+
+
 class HunterSpec(NamedTuple):
     """A model's limits and geometry. Angles are those of the inner front wheel, as it is told.
 
@@ -89,7 +94,7 @@ class ScenarioCar(NamedTuple):
 
     def steering(self, curvature: float) -> float:
         """The steering action of a path; not clamped. Inverse of the above."""
-        slip_rad = math.asin(_clamp(0.5 * self.wheelbase_m * curvature, 1.0))
+        slip_rad = math.asin(clamp(0.5 * self.wheelbase_m * curvature, 1.0))
         return math.atan(2.0 * math.tan(slip_rad)) / self.full_steering_rad
 
 
@@ -128,20 +133,15 @@ class Similarity(NamedTuple):
     def pedal(self, acceleration_mps2: float) -> float:
         """The pedal that gives the robot this acceleration, within -1 to 1."""
         full_mps2 = self.car.throttle_mps2 if acceleration_mps2 > 0 else self.car.brake_mps2
-        return _clamp(acceleration_mps2 / self.scale / full_mps2, 1.0)
+        return clamp(acceleration_mps2 / self.scale / full_mps2, 1.0)
 
     def pedal_to_speed(
         self, speed_mps: float, pedal: float, step_s: float, measured_mps: float
     ) -> float:
-        """The speed to ask for after `speed_mps` when the pedal was held for `step_s`.
-
-        Downwards only the throttle is bounded by the measured speed: a brake that does not bite is
-        asked for all the more.
-        """
+        """The speed to ask for after `speed_mps` when the pedal was held for `step_s`."""
         lead_mps = self.acceleration_mps2(1.0) * LEAD_S
-        speed_mps += self.acceleration_mps2(pedal) * step_s
-        speed_mps = min(speed_mps, measured_mps + lead_mps)
-        if pedal > 0:
+        speed_mps = min(speed_mps + self.acceleration_mps2(pedal) * step_s, measured_mps + lead_mps)
+        if pedal > 0:  # a brake that does not bite is asked for all the more
             speed_mps = max(speed_mps, measured_mps - lead_mps)
         return min(max(speed_mps, 0.0), self.spec.max_speed_mps)
 
@@ -161,15 +161,14 @@ class Similarity(NamedTuple):
     def steering(self, centre_rad: float) -> float:
         """The steering whose path the robot drives, within -1 to 1."""
         curvature = math.tan(centre_rad) / self.spec.wheelbase_m
-        return _clamp(self.car.steering(curvature * self.scale), 1.0)
+        return clamp(self.car.steering(curvature * self.scale), 1.0)
 
     def limits(self) -> Dict[str, ActionLimit]:
         """Ranges and slew rates of the actions. A pedal is integrated: any leap of it is a ramp."""
         full_rad = abs(self.spec.inner_rad(self.centre_rad(1.0)))
-        steering_slew_per_s = self.spec.max_steering_rate_radps / full_rad
         return {
             "pedal": ActionLimit(-1.0, 1.0, math.inf),
-            "steering": ActionLimit(-1.0, 1.0, steering_slew_per_s),
+            "steering": ActionLimit(-1.0, 1.0, self.spec.max_steering_rate_radps / full_rad),
         }
 
 
@@ -191,46 +190,34 @@ def wish_of(action: Dict[str, float], scenario_speed_mps: Optional[float]) -> Wi
 
     Raises ValueError for what is not finite, and for what leaves out how fast to drive.
     """
-    wish = Wish(action.get("pedal"), scenario_speed_mps, action.get("steering"))
-    if not all(math.isfinite(value) for value in wish if value is not None):
+    given = [*action.values(), 0.0 if scenario_speed_mps is None else scenario_speed_mps]
+    if not all(map(math.isfinite, given)):
         raise ValueError(f"a command that is not finite: {action}, {scenario_speed_mps} m/s")
-    if not action or (wish.pedal is None and scenario_speed_mps is None):
+    if not action or ("pedal" not in action and scenario_speed_mps is None):
         raise ValueError(f"a command that lacks an action: {action}, {scenario_speed_mps} m/s")
     # A pedal of 1e308 times a step of 0 s is no number.
-    pedal, steering = (
-        None if value is None else _clamp(value, 1.0) for value in (wish.pedal, wish.steering)
-    )
-    return Wish(pedal, scenario_speed_mps, steering)
+    within = {name: clamp(value, 1.0) for name, value in action.items()}
+    return Wish(within.get("pedal"), scenario_speed_mps, within.get("steering"))
 
 
 class SetPoint:
-    """`speed_mps` and `inner_rad` are within the model's limits at all times."""
+    """What is asked of the vehicle now, within the model's limits."""
 
     def __init__(self, similarity: Similarity) -> None:
         self.speed_mps = 0.0
         self.inner_rad = 0.0
         self._similarity = similarity
 
-    def stand(self) -> None:
-        """Speed 0 at once, the angle held."""
-        self.speed_mps = 0.0
-
     def follow(self, wish: Wish, step_s: float, measured_mps: float) -> None:
         """One step of time towards what is wished for."""
-        similarity, spec = self._similarity, self._similarity.spec
+        similarity, spec, speed_mps = self._similarity, self._similarity.spec, self.speed_mps
         step_s = min(max(step_s, 0.0), _LONGEST_STEP_S)
         if wish.pedal is not None:
-            self.speed_mps = similarity.pedal_to_speed(
-                self.speed_mps, wish.pedal, step_s, measured_mps
-            )
+            speed_mps = similarity.pedal_to_speed(speed_mps, wish.pedal, step_s, measured_mps)
         else:
-            scenario_mps = wish.scenario_speed_mps or 0.0
-            self.speed_mps = similarity.follow_speed(self.speed_mps, scenario_mps, step_s)
+            speed_mps = similarity.follow_speed(speed_mps, wish.scenario_speed_mps or 0.0, step_s)
+        self.speed_mps = speed_mps
         if wish.steering is not None:
             wanted_rad = spec.inner_rad(similarity.centre_rad(wish.steering))
             most_rad = spec.max_steering_rate_radps * step_s
-            self.inner_rad += _clamp(wanted_rad - self.inner_rad, most_rad)
-
-
-def _clamp(value: float, most: float) -> float:
-    return min(max(value, -most), most)
+            self.inner_rad += clamp(wanted_rad - self.inner_rad, most_rad)

@@ -16,15 +16,11 @@ from edge_runtime.wire import CONTROL_PERIOD_S
 
 COMMAND_TIMEOUT_S = 2 * CONTROL_PERIOD_S
 _INTEGRATION_STEP_S = 0.005
-# After this long without a command it has braked to a stand, whatever it did before.
-_LONGEST_GAP_S = 10.0
+_LONGEST_GAP_S = 10.0  # without a command it then stands, whatever it did before
 
 
 class MockParameters(NamedTuple):
-    """The actuators and the body of the mock. Rates are in full pedal or steering per second.
-
-    The body's numbers are the car's of this repository's scenarios (similarity.CARS).
-    """
+    """Actuators (rates in full pedal or steering per second), and a body as in mapping.CARS."""
 
     dead_time_s: float = 0.02
     time_constant_s: float = 0.05
@@ -32,35 +28,6 @@ class MockParameters(NamedTuple):
     throttle_mps2: float = 3.0  # at full pedal
     brake_mps2: float = 4.0
     max_speed_mps: float = 6.0
-
-
-class MockState(NamedTuple):
-    """Actuator positions in -1 to 1, and the speed."""
-
-    pedal: float = -1.0
-    steering: float = 0.0
-    speed_mps: float = 0.0
-
-
-def advance(
-    state: MockState, pedal: float, steering: float, step_s: float, parameters: MockParameters
-) -> MockState:
-    """One integration step towards the targets `pedal` and `steering`."""
-    position = _follow(state.pedal, pedal, step_s, parameters)
-    full_mps2 = parameters.throttle_mps2 if position > 0.0 else parameters.brake_mps2
-    speed_mps = state.speed_mps + position * full_mps2 * step_s
-    return MockState(
-        pedal=position,
-        steering=_follow(state.steering, steering, step_s, parameters),
-        speed_mps=min(max(speed_mps, 0.0), parameters.max_speed_mps),
-    )
-
-
-def _follow(position: float, target: float, step_s: float, parameters: MockParameters) -> float:
-    """First-order lag towards the target, no faster than the actuator's rate."""
-    change = (target - position) * (1.0 - math.exp(-step_s / parameters.time_constant_s))
-    most = parameters.slew_per_s * step_s
-    return position + min(max(change, -most), most)
 
 
 class MockVehicle(Vehicle):
@@ -76,10 +43,10 @@ class MockVehicle(Vehicle):
 
     def __init__(self, parameters: Optional[MockParameters] = None) -> None:
         self._parameters = parameters or MockParameters()
-        self._state = MockState()
+        self._pedal, self._steering, self._speed_mps = -1.0, 0.0, 0.0
         self._now_s: Optional[float] = None
         self._commanded_s = -math.inf
-        self._on_the_way: Deque[Tuple[float, float, float]] = deque()
+        self._on_the_way: Deque[Tuple[float, Tuple[float, float]]] = deque()
         self._target = (-1.0, 0.0)
         self._latched = True  # until it is enabled
 
@@ -98,10 +65,8 @@ class MockVehicle(Vehicle):
         if self._latched:
             return
         self._commanded_s = now_s
-        effective_s = now_s + self._parameters.dead_time_s
-        self._on_the_way.append(
-            (effective_s, action.get("pedal", 0.0), action.get("steering", 0.0))
-        )
+        target = (action.get("pedal", 0.0), action.get("steering", 0.0))
+        self._on_the_way.append((now_s + self._parameters.dead_time_s, target))
 
     def brake(self, now_s: float, latch: bool = True) -> None:
         """Full brake without the dead time of the command's way."""
@@ -115,8 +80,8 @@ class MockVehicle(Vehicle):
         """Where the actuators are and how fast the body is."""
         self._integrate(now_s)
         return VehicleReport(
-            action={"pedal": self._state.pedal, "steering": self._state.steering},
-            speed_mps=self._state.speed_mps,
+            action={"pedal": self._pedal, "steering": self._steering},
+            speed_mps=self._speed_mps,
             self_braking=self._is_left_alone(now_s),
             faults=[],
         )
@@ -130,19 +95,28 @@ class MockVehicle(Vehicle):
         return now_s - self._commanded_s > COMMAND_TIMEOUT_S
 
     def _integrate(self, until_s: float) -> None:
-        if self._now_s is None:
-            self._now_s = until_s
-        self._now_s = max(self._now_s, until_s - _LONGEST_GAP_S)
+        begin_s = until_s if self._now_s is None else self._now_s
+        self._now_s = max(begin_s, until_s - _LONGEST_GAP_S)
+        car = self._parameters
         while until_s - self._now_s > 1e-9:
             step_s = min(_INTEGRATION_STEP_S, until_s - self._now_s)
-            pedal, steering = self._target_at(self._now_s + step_s)
-            self._state = advance(self._state, pedal, steering, step_s, self._parameters)
             self._now_s += step_s
+            pedal, steering = self._target_at(self._now_s)
+            self._pedal = self._follow(self._pedal, pedal, step_s)
+            self._steering = self._follow(self._steering, steering, step_s)
+            full_mps2 = car.throttle_mps2 if self._pedal > 0.0 else car.brake_mps2
+            speed_mps = self._speed_mps + self._pedal * full_mps2 * step_s
+            self._speed_mps = min(max(speed_mps, 0.0), car.max_speed_mps)
+
+    def _follow(self, position: float, target: float, step_s: float) -> float:
+        """First-order lag towards the target, no faster than the actuator's rate."""
+        change = (target - position) * (1.0 - math.exp(-step_s / self._parameters.time_constant_s))
+        most = self._parameters.slew_per_s * step_s
+        return position + min(max(change, -most), most)
 
     def _target_at(self, now_s: float) -> Tuple[float, float]:
         while self._on_the_way and self._on_the_way[0][0] <= now_s:
-            _, pedal, steering = self._on_the_way.popleft()
-            self._target = (pedal, steering)
+            _, self._target = self._on_the_way.popleft()
         if self._is_left_alone(now_s):
             self._target = (-1.0, self._target[1])
         return self._target

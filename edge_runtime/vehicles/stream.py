@@ -44,7 +44,7 @@ class StreamedVehicle(Vehicle):
             return
         with self._lock:
             self._core.enable(now_s)
-        self._stream.start()
+        self._start()
         self._stream.wake()
 
     def command(
@@ -70,20 +70,29 @@ class StreamedVehicle(Vehicle):
             log.event("warning" if words else "info", self.name, state=state, why=words)
         return report
 
+    def close(self) -> None:
+        """Stand, send no more, give control back and free what the driver holds."""
+        if self._closed:
+            return
+        self._closed = True
+        self.brake(time.monotonic())
+        self._stream.run_until(self._is_at_rest, STOP_TAKES_S)
+        self._stream.stop()
+        gaps_ms = self._stream.gaps_ms()
+        if gaps_ms:
+            log.event("info", f"{self.name}_stream", **gaps_ms)
+        self._leave()
+
     @abc.abstractmethod
     def _send_due(self) -> bool:
         """Send what the core's `tick` gives; whether anything was. Never raises."""
 
-    def _end_stream(self) -> None:
-        """Stand, and send no more."""
-        self.brake(time.monotonic())
-        self._stream.run_until(self._is_at_rest, STOP_TAKES_S)
-        self._stream.stop()
+    @abc.abstractmethod
+    def _leave(self) -> None:
+        """The stream has ended: give control back, and free what is held."""
 
-    def _log_gaps(self) -> None:
-        gaps_ms = self._stream.gaps_ms()
-        if gaps_ms:
-            log.event("info", f"{self.name}_stream", **gaps_ms)
+    def _start(self) -> None:
+        self._stream.start()
 
     def _is_at_rest(self) -> bool:
         with self._lock:
@@ -145,17 +154,14 @@ class Stream:
             sent = self._send()
             now_s = time.monotonic()
             if sent:
-                self._note_sent(now_s)
-            if sent and now_s - began_s > PERIOD_S:
-                # A process that was stopped in between has said what was asked for before it was.
-                # The vehicle cannot tell, and may have control again: the next does not wait.
-                self._wake.set()
+                if self._sent_s is not None:
+                    self._gaps.add(int((now_s - self._sent_s) * 1e9))
+                self._sent_s = now_s
+                if now_s - began_s > PERIOD_S:
+                    # A process that was stopped in between has sent what was asked for before.
+                    # The vehicle cannot tell, and may have control again: the next does not wait.
+                    self._wake.set()
             if now_s >= next_s:
                 # After a pause one sending, not one for each missed period.
                 next_s += (int((now_s - next_s) / PERIOD_S) + 1) * PERIOD_S
             self._wake.wait(max(0.0, min(next_s, self._late_at_s()) - time.monotonic()))
-
-    def _note_sent(self, now_s: float) -> None:
-        if self._sent_s is not None:
-            self._gaps.add(int((now_s - self._sent_s) * 1e9))
-        self._sent_s = now_s

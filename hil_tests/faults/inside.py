@@ -24,8 +24,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from edge_runtime import vehicles
 from edge_runtime.transport import open_session
-from edge_runtime.vehicles import registry
 from edge_runtime.vehicles.base import VehicleReport
 from edge_runtime.vehicles.mock import MockVehicle
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE
@@ -138,7 +138,7 @@ def launch(package: str) -> None:
     """Put the faults in, then be the command."""
     SteppedClock().install()
     switch = Path(os.environ[DIRECTORY]) / VEHICLE
-    registry._mock = lambda config, scenario: FaultyMockVehicle(switch)
+    vehicles._mock = lambda config, scenario: FaultyMockVehicle(switch)
     sys.argv = [package, *sys.argv[2:]]
     runpy.run_module(package, run_name="__main__", alter_sys=True)
 

@@ -18,7 +18,7 @@ import zenoh
 
 from edge_runtime import wire
 from edge_runtime.transport import open_session
-from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+from edge_runtime.vehicles.hunter import open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import FRAMES
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP
 

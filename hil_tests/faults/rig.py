@@ -24,7 +24,7 @@ import numpy as np
 from edge_runtime.commands import ask
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.hunter import bus as multicast
+from edge_runtime.vehicles.hunter import GROUP
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, FRAMES_SHAPE, SAFE_STOP, State, encode
 from hil_tests.faults.inside import BRAKES, BRIGHT, DIRECTORY, END, ENVIRONMENT
 from hil_tests.faults.observe import (
@@ -411,7 +411,7 @@ def free_bus() -> str:
     """A bus of its own: Linux mixes buses that share a port, whatever their groups."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("", 0))
-        return f"udp_multicast:{multicast.GROUP}:{one.getsockname()[1]}"
+        return f"udp_multicast:{GROUP}:{one.getsockname()[1]}"
 
 
 class Link:

@@ -87,10 +87,10 @@ class MockHunter:
     def receive(self, can_id: int, data: bytes, now_s: float) -> None:
         """A frame of the bus; one that the chassis does not know, or of a wrong length, is none."""
         self.advance(now_s)
-        decoded = codec.decode(can_id, data)
-        if decoded is None or "bus_off" in self.faults:
+        message = codec.decode(can_id, data)
+        if message is None or "bus_off" in self.faults:
             return
-        self._obey(decoded.message, now_s)
+        self._obey(message, now_s)
 
     def switch(self, name: str, on: bool, now_s: float) -> None:
         """Switch a fault on or off. Raises UserError for one that is not known."""

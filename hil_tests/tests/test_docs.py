@@ -15,7 +15,7 @@ from deploy.wheels import TARGETS
 from edge_runtime.cli import run_cli
 from edge_runtime.tests.harness import make_state
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.ros2.names import DEFAULT_ROS2_ENDPOINT
+from edge_runtime.vehicles.ros2 import DEFAULT_ROS2_ENDPOINT
 from hil_tests import pictures, processes
 from hil_tests.__main__ import main
 from hil_tests.pictures import (

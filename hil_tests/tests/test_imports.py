@@ -26,7 +26,7 @@ EDGE_LIBRARIES = {
     "numpy", "onnxruntime", "zenoh", "msgspec", "cryptography", "tomli", "typing_extensions",
 }  # fmt: skip
 DOORS = {
-    "can": ROOT / "edge_runtime/vehicles/hunter/bus.py",
+    "can": ROOT / "edge_runtime/vehicles/hunter/__init__.py",
     "pycdr2": ROOT / "edge_runtime/vehicles/ros2/node.py",
 }
 """Where alone the edge runtime may load a library that only one kind of vehicle needs."""

@@ -1,1 +1,286 @@
-"""AgileX Hunter 2.0 and Hunter SE over CAN."""
+"""AgileX Hunter 2.0 and SE: the CAN bus, the gate that lets our own frames out only, the driver.
+
+python-can is imported here and nowhere else in the runtime, and only when a bus is opened: a board
+without a CAN vehicle need not have it. Two threads are around the core (core.py):
+
+- The stream's thread sends what `tick` gives, 50 times a second at absolute deadlines, and at
+  once when somebody brakes, no command came in time, or the chassis says what stops it. It is
+  the only one that sends, until `close` has joined it.
+- The listener's thread hands every frame to `hear`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import ipaddress
+import logging
+import os
+import re
+import socket
+import struct
+import threading
+import time
+from typing import Any, ClassVar, Dict, NamedTuple, Optional
+
+from edge_runtime import log
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.base import VehicleReport
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.hunter.core import HunterCore
+from edge_runtime.vehicles.hunter.protocol import BITRATE, COMMAND_IDS, COMMANDS, Frame
+from edge_runtime.vehicles.mapping import Similarity
+from edge_runtime.vehicles.stream import PERIOD_S, StreamedVehicle
+
+_LISTEN_S = 0.1
+_JOIN_S = 0.5
+
+_SYNTAX = "INTERFACE:CHANNEL or INTERFACE:CHANNEL:BITRATE, like socketcan:can0"
+# Without a bit rate: the first has it from `ip link`, the others know none.
+_WITHOUT_BITRATE = ("socketcan", "virtual")
+_ERROR_BUS_OFF = 0x40  # of SocketCAN's error frames (linux/can/error.h)
+
+GROUP, PORT = "239.74.163.2", 43113  # python-can's own
+# Two buses need two ports: Linux hands what comes for any group to every socket of its port.
+MULTICAST_BUS = f"udp_multicast:{GROUP}:{PORT}"
+_LOOPBACK = "lo"
+_GROUP_AND_PORT = re.compile(r"([0-9.]+)(?::([0-9]{1,5}))?")
+
+
+class BusName(NamedTuple):
+    """What to open. `bitrate` is None where the interface has none to set."""
+
+    interface: str
+    channel: str
+    bitrate: Optional[int]
+    port: Optional[int] = None  # of udp_multicast
+
+
+def parse_bus(text: str) -> BusName:
+    """The bus of INTERFACE:CHANNEL[:BITRATE]. Raises UserError for anything else."""
+    interface, _, channel = text.partition(":")
+    if interface == "udp_multicast":  # GROUP:PORT, an IPv4 group, or nothing
+        found = _GROUP_AND_PORT.fullmatch(channel or GROUP)
+        with contextlib.suppress(ValueError):  # no address
+            port = int(found[2] or PORT) if found else 0
+            if found and ipaddress.IPv4Address(found[1]).is_multicast and 1 <= port <= 65535:
+                return BusName(interface, found[1], None, port)
+        raise UserError(
+            f"bus {text!r} is no IPv4 multicast group and port: write it as {MULTICAST_BUS}"
+        )
+    name, colon, rate = channel.partition(":")
+    if interface == "socketcan" and colon:
+        raise UserError(f"bus {text!r} has its bit rate from `ip link`: write {interface}:{name}")
+    if interface in _WITHOUT_BITRATE and channel:
+        return BusName(interface, channel, None)
+    if interface and name and (not rate or (rate.isdecimal() and int(rate) > 0)):
+        return BusName(interface, name, int(rate or BITRATE))
+    raise UserError(f"bus {text!r} is no CAN bus: write it as {_SYNTAX}")
+
+
+def open_bus(name: BusName) -> Any:
+    """An open python-can bus; nothing is sent. Raises UserError, one line that says what to do."""
+    can = import_can()
+    options: Dict[str, Any] = {} if name.bitrate is None else {"bitrate": name.bitrate}
+    if name.port is not None:  # pinned to the loopback device as well: no neighbour hears it
+        options = {"port": name.port, "hop_limit": 0, "fd": False}
+    bus = None
+    try:
+        bus = can.Bus(interface=name.interface, channel=name.channel, **options)
+        if name.port is not None:
+            pin_to_loopback(bus, name.channel)
+    except Exception as error:  # each backend raises what its library raises, NameError included
+        if bus is not None:
+            bus.shutdown()
+        raise UserError(_explain(name, error)) from None
+    return bus
+
+
+def pin_to_loopback(bus: Any, group: str) -> None:
+    """Let the python-can bus speak and hear on the loopback device only. Raises OSError.
+
+    It sends to whatever network the machine has. Pinned, no frame leaves the machine and none comes
+    in from outside, whoever sends it to the group or to the port; that needs no privilege (Linux
+    5.7 or newer), only a route for multicast, which any machine with a network has.
+    """
+    device = socket.if_nametoindex(_LOOPBACK)
+    member = struct.pack("=4s4xi", socket.inet_aton(group), device)  # struct ip_mreqn
+    sender = struct.pack("=8xi", device)
+    with socket.socket(fileno=os.dup(bus.fileno())) as same:
+        same.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK.encode() + b"\0")
+        try:
+            same.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:  # python-can joined there: it is the only device
+                raise
+        same.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, sender)
+    while bus.recv(0.0) is not None:
+        pass  # from before
+
+
+def import_can() -> Any:
+    """The python-can package. Raises UserError where it is not installed."""
+    # Its backends say on stderr what they miss; our error says it in its one line.
+    logging.getLogger("can").setLevel(logging.CRITICAL)
+    try:
+        import can
+    except ImportError:
+        raise UserError(
+            "the hunter needs python-can, which is not installed:"
+            " pip install 'phil-edge-runtime[can]'"
+        ) from None
+    return can
+
+
+def _explain(name: BusName, error: Exception) -> str:
+    where = f"the CAN bus {name.interface}:{name.channel} cannot be opened"
+    cause = " ".join(str(error).split()) or type(error).__name__
+    if name.interface != "socketcan" and "Unknown interface" in cause:
+        return f"{where}: choose from {', '.join(sorted(import_can().VALID_INTERFACES))}"
+    number: Any = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    advice = f"python-can's manual says what its {name.interface} needs"
+    if name.interface == "udp_multicast":
+        advice = "it needs msgpack, and a route for multicast (`ip route`)"
+    elif name.interface == "socketcan":
+        advice = {
+            errno.EPERM: "this user may not open a CAN socket",
+            errno.EACCES: "this user may not open a CAN socket",
+            errno.EAFNOSUPPORT: "this kernel has no SocketCAN (modprobe can_raw)",
+        }.get(
+            number,
+            f"bring it up with `ip link set {name.channel} up type can bitrate {BITRATE}`,"
+            " `ip link` lists them",
+        )
+    return f"{where}: {cause}; {advice}"
+
+
+class Gate:
+    """The only way out to the bus: closed until `open`, and then for our commands only."""
+
+    def __init__(self, bus: Any) -> None:
+        self._bus = bus
+        self._can = import_can()
+        self._is_open = False
+
+    def open(self) -> None:
+        """From now on our commands may pass."""
+        self._is_open = True
+
+    def send(self, frame: Frame, data: bytes) -> None:
+        """Put a frame on the bus without waiting.
+
+        Raises can.CanError or OSError where the bus does not take it, and RuntimeError, before
+        anything is sent, for a frame that must not leave.
+        """
+        if not self._is_open:
+            raise RuntimeError("nothing is sent before the vehicle is enabled")
+        can_id, length = frame.can_id, len(data)
+        if frame not in COMMANDS or length != frame.length:
+            raise RuntimeError(f"0x{can_id:x} with {length} bytes is not on the allow-list")
+        message = self._can.Message(
+            arbitration_id=can_id, data=data, is_extended_id=False, check=True
+        )
+        # Not None: the virtual bus would then wait for ever where a receiver's queue is full.
+        self._bus.send(message, timeout=0.0)
+
+
+class HunterVehicle(StreamedVehicle):
+    """Opens its bus when made (UserError where it cannot), and sends nothing before `enable`."""
+
+    name: ClassVar[str] = "hunter"
+
+    def __init__(self, bus: BusName, similarity: Similarity, profile: str) -> None:
+        self._bus: Any = open_bus(bus)
+        self._gate = Gate(self._bus)
+        # Our own frames come back there: a command need not be somebody else's.
+        self._ignores_commands = bus.interface == "udp_multicast"
+        self._core: HunterCore
+        super().__init__(HunterCore(similarity, profile))
+        self._stopping = False
+        self._listener = threading.Thread(target=self._listen, name="hunter-listener", daemon=True)
+
+    def enable(self, now_s: float) -> None:
+        """Ask the chassis for control; `feedback` tells whether it came. Nothing once closed."""
+        self._gate.open()  # the core gives no frame before it is enabled
+        super().enable(now_s)
+
+    def feedback(self, now_s: float) -> VehicleReport:
+        """From the newest frames of the chassis, which it listens to before `enable`, too."""
+        if not self._closed:
+            self._start()
+        return super().feedback(now_s)
+
+    def _leave(self) -> None:
+        """Lock the brake, give control back, and leave the bus."""
+        self._stopping = True
+        if self._listener.ident is not None:
+            self._listener.join(_JOIN_S)
+        with self._lock:
+            parts = self._core.close(time.monotonic())
+        try:
+            for part in parts:
+                self._gate.send(*part)
+        except Exception as error:  # the chassis stops by itself, and the bus must be freed
+            log.event("warning", "hunter_not_parked", detail=error)
+        self._bus.shutdown()
+
+    def _start(self) -> None:
+        super()._start()
+        if self._listener.ident is None:
+            self._listener.start()
+
+    def _send_due(self) -> bool:
+        with self._lock:
+            parts = self._core.tick(time.monotonic())
+        try:
+            for part in parts:
+                self._gate.send(*part)
+        except Exception as error:  # CanError, OSError, or what else a backend raises
+            self._note_bus(error)
+            return False
+        if parts:
+            with self._lock:
+                self._core.bus_works()
+        return bool(parts)
+
+    def _listen(self) -> None:
+        self._skip_the_past()
+        while not self._stopping:
+            try:
+                message = self._bus.recv(_LISTEN_S)
+            except Exception as error:  # as in _send_due; it may raise at once, again and again
+                self._note_bus(error)
+                time.sleep(PERIOD_S)
+                continue
+            if message is not None:
+                self._hear(message)
+
+    def _skip_the_past(self) -> None:
+        """Drop what waited in the bus since it was opened: it would be taken for fresh."""
+        end_s = time.monotonic() + PERIOD_S  # of a flood some will be left
+        try:
+            while time.monotonic() < end_s and self._bus.recv(0.0) is not None:
+                pass
+        except Exception as error:  # as in _send_due
+            self._note_bus(error)
+
+    def _hear(self, message: Any) -> None:
+        if message.is_error_frame:
+            if message.arbitration_id & _ERROR_BUS_OFF:
+                self._note_bus("bus-off", fatal=True)
+            return
+        if message.is_extended_id or message.is_remote_frame or message.is_fd:
+            return  # no frame of this protocol
+        if self._ignores_commands and message.arbitration_id in COMMAND_IDS:
+            return
+        with self._lock:
+            was = self._core.state
+            self._core.hear(message.arbitration_id, bytes(message.data), time.monotonic())
+            stopped = self._core.state is State.STOPPED and was is not State.STOPPED
+        if stopped:
+            self._stream.wake()
+
+    def _note_bus(self, error: object, fatal: bool = False) -> None:
+        words = " ".join(str(error).split()) or type(error).__name__
+        with self._lock:
+            self._core.bus_failed(words, time.monotonic(), fatal)

@@ -30,10 +30,17 @@ STATUS_SILENCE_S = 3 * CONTROL_PERIOD_S  # three frames of 0x211
 COUNTERS = 256  # byte 7 of 0x211 runs over
 ASK_AGAIN_S = 0.1  # a frame may be lost, and the chassis answers every 100 ms
 BUS_PATIENCE_S = 0.1  # five frames of the stream
-_STOPS_AT_ONCE = (Event.STUCK,)  # no set-point will stop it: the brake must
 
-REMOTE_WORDS = "the remote control drives"
-ESTOP_WORDS = "the emergency stop is pressed"
+
+def _sent(frame: protocol.Frame, message: object) -> Sent:
+    return Sent(frame, protocol.encode(frame, message))
+
+
+_TAKE = _sent(protocol.MODE_COMMAND, protocol.ModeCommand(protocol.CAN_CONTROL))
+_GIVE_BACK = _sent(protocol.MODE_COMMAND, protocol.ModeCommand(protocol.STANDBY))
+_RELEASE = _sent(protocol.BRAKE_COMMAND, protocol.BrakeCommand(0))
+_LOCK = _sent(protocol.BRAKE_COMMAND, protocol.BrakeCommand(1))
+_CLEAR = _sent(protocol.CLEAR_COMMAND, protocol.ClearCommand())
 
 
 class Reports(Speeds):
@@ -50,10 +57,7 @@ class Reports(Speeds):
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
         """Note a frame; one that is not in the table, or of a wrong length, is none."""
-        decoded = protocol.decode(can_id, data)
-        if decoded is None:
-            return
-        message = decoded.message
+        message = protocol.decode(can_id, data)
         if isinstance(message, SystemStatus):
             self.status = message
             self._count(message.counter, now_s)
@@ -98,9 +102,9 @@ class Reports(Speeds):
     def commander(self) -> Optional[Finding]:
         """What outranks us: the remote control, or the emergency stop."""
         if self.remote_drives:
-            return Finding(Event.REMOTE, REMOTE_WORDS)
+            return Finding(Event.REMOTE, "the remote control drives")
         if self.status is not None and self.status.state == protocol.STATE_ESTOP:
-            return Finding(Event.ESTOP, ESTOP_WORDS)
+            return Finding(Event.ESTOP, "the emergency stop is pressed")
         return None
 
     def finding(self) -> Optional[Finding]:
@@ -165,21 +169,16 @@ class HunterCore(StreamedCore):
         """The last frames: stand, park, give control back. None where it was never taken."""
         if self.state is State.DISABLED:
             return []
-        self.set_point.stand()
-        parts = [
-            self._motion(),
-            _sent(protocol.MODE_COMMAND, protocol.ModeCommand(protocol.STANDBY)),
-        ]
-        if not self.reports.remote_drives:
-            parts.insert(1, _sent(protocol.BRAKE_COMMAND, protocol.BrakeCommand(1)))
+        self.set_point.speed_mps = 0.0
         self._apply(Finding(Event.CLOSE, ""), now_s)
-        return parts
+        park = [] if self.reports.remote_drives else [_LOCK]
+        return [self._motion(), *park, _GIVE_BACK]
 
     def hear(self, can_id: int, data: bytes, now_s: float) -> None:
         """A frame of the bus, from any sender; never raises."""
         if self.state is State.DISABLED:
             self.bus_works()  # nothing is sent then that it could take
-        if self.is_command(can_id):
+        if can_id in protocol.COMMAND_IDS:
             self._apply(Finding(Event.FOREIGN, f"somebody else sends 0x{can_id:x}"), now_s)
             return
         self.reports.hear(can_id, data, now_s)
@@ -188,7 +187,7 @@ class HunterCore(StreamedCore):
         elif can_id == protocol.MOTION_STATUS.can_id:
             # At once, not with the next tick: else the runtime's own watch would stop it first,
             # and what it then says is over with the lie.
-            lie = self.reports.lie()
+            lie = self._lie()
             if lie is not None:
                 self._apply(lie, now_s)
 
@@ -218,11 +217,6 @@ class HunterCore(StreamedCore):
         status = self.reports.status
         return super().report(now_s)._replace(battery_v=status.battery_v if status else None)
 
-    @staticmethod
-    def is_command(can_id: int) -> bool:
-        """Whether it is for the chassis, so that only we should send it."""
-        return any(can_id == frame.can_id for frame in protocol.COMMANDS)
-
     def is_at_rest(self, now_s: float) -> bool:
         """As in StreamedCore; no more can be done about a dead bus or a remote control."""
         blind = self.state is State.DISABLED or bool(self._bus_words) or self.reports.remote_drives
@@ -232,7 +226,7 @@ class HunterCore(StreamedCore):
         before = self.state
         super()._apply(finding, now_s)
         if self.state is not before and self.state is State.STOPPED:
-            at_once = finding.event in _STOPS_AT_ONCE
+            at_once = finding.event is Event.STUCK  # no set-point will stop it: the brake must
             self._ask_s = now_s + (0.0 if at_once else STOP_TAKES_S)
         elif self.state is State.ENABLED:
             self._ask_s = math.inf
@@ -245,17 +239,20 @@ class HunterCore(StreamedCore):
         self._apply(finding or Finding(Event.CONFIRMED, ""), now_s)
 
     def _obstacles(self, now_s: float) -> List[str]:
-        found = [self.reports.commander(), self.reports.silence(-math.inf, now_s)]
-        words = [finding.words for finding in found if finding is not None]
-        return [*words, self._bus_words] if self._bus_words else words
+        outranked = self.reports.commander()
+        words = [outranked.words] if outranked else []
+        return words + super()._obstacles(now_s) + ([self._bus_words] if self._bus_words else [])
 
     def _why_not_confirmed(self, now_s: float) -> str:
-        why = self.reports.silence(self._since_s, now_s) or self.reports.finding()
+        why = self._silence(self._since_s, now_s) or self.reports.finding()
         words = f"not enabled within {ENABLE_TIMEOUT_S:.0f} s"
         return f"{words}: {why.words}" if why else words
 
-    def _wrong(self, now_s: float) -> Optional[Finding]:
-        return self.reports.silence(self._since_s, now_s) or self.reports.lie()
+    def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
+        return self.reports.silence(since_s, now_s)
+
+    def _lie(self) -> Optional[Finding]:
+        return self.reports.lie()
 
     def _requests(self, now_s: float) -> List[Sent]:
         """Beside the stream: for control while ENABLING, for the brake while STOPPED."""
@@ -264,26 +261,16 @@ class HunterCore(StreamedCore):
             # A person with the remote control knows better than we do.
             if self.reports.remote_drives or self.reports.is_known_to_stand(now_s):
                 return []
-            return [_sent(protocol.BRAKE_COMMAND, protocol.BrakeCommand(1))]
-        parts = [
-            _sent(protocol.MODE_COMMAND, protocol.ModeCommand(protocol.CAN_CONTROL)),
-            _sent(protocol.BRAKE_COMMAND, protocol.BrakeCommand(0)),
-        ]
-        if self.reports.needs_clearing:
-            parts.insert(0, _sent(protocol.CLEAR_COMMAND, protocol.ClearCommand()))
-        return parts
+            return [_LOCK]
+        clear = [_CLEAR] if self.reports.needs_clearing else []
+        return [*clear, _TAKE, _RELEASE]
 
     def _motion(self) -> Sent:
-        speed_mps, inner_rad = self.set_point.speed_mps, self.set_point.inner_rad
-        return Sent(
-            protocol.MOTION_COMMAND, protocol.encode_motion(speed_mps, inner_rad, self._spec)
-        )
+        asked = self.set_point
+        data = protocol.encode_motion(asked.speed_mps, asked.inner_rad, self._spec)
+        return Sent(protocol.MOTION_COMMAND, data)
 
     def _steering(self) -> float:
         motion = self.reports.motion
         inner_rad = motion.inner_steering_rad if motion else 0.0
         return self.similarity.steering(self._spec.centre_rad(inner_rad))
-
-
-def _sent(frame: protocol.Frame, message: object) -> Sent:
-    return Sent(frame, protocol.encode(frame, message))

@@ -14,7 +14,7 @@ import math
 import struct
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple, Type
 
-from edge_runtime.vehicles.mapping import HunterSpec
+from edge_runtime.vehicles.mapping import HunterSpec, clamp
 
 BITRATE = 500_000
 
@@ -116,31 +116,17 @@ MODE_COMMAND = Frame(0x421, ModeCommand, 1, (Field(0, "B"),))
 CLEAR_COMMAND = Frame(0x441, ClearCommand, 1, (Field(0, "B"),))
 SYSTEM_STATUS = Frame(0x211, SystemStatus, 8, _STATUS, 0.1)
 MOTION_STATUS = Frame(0x221, MotionStatus, 8, _MOTION, 0.02)
-STEER_MOTOR_FAST = Frame(0x251, MotorFast, 8, _FAST, 0.02)
-REAR_RIGHT_FAST = Frame(0x252, MotorFast, 8, _FAST, 0.02)
-REAR_LEFT_FAST = Frame(0x253, MotorFast, 8, _FAST, 0.02)
-STEER_MOTOR_SLOW = Frame(0x261, MotorSlow, 8, _SLOW, 0.1)
-REAR_RIGHT_SLOW = Frame(0x262, MotorSlow, 8, _SLOW, 0.1)
-REAR_LEFT_SLOW = Frame(0x263, MotorSlow, 8, _SLOW, 0.1)
+_MOTORS = ("steering", "rear right", "rear left")
+MOTORS_FAST = [Frame(0x251 + place, MotorFast, 8, _FAST, 0.02) for place in range(len(_MOTORS))]
+MOTORS_SLOW = [Frame(0x261 + place, MotorSlow, 8, _SLOW, 0.1) for place in range(len(_MOTORS))]
+STEER_MOTOR_FAST, REAR_RIGHT_FAST, REAR_LEFT_FAST = MOTORS_FAST
+STEER_MOTOR_SLOW, REAR_RIGHT_SLOW, REAR_LEFT_SLOW = MOTORS_SLOW
 
 COMMANDS: Tuple[Frame, ...] = (MOTION_COMMAND, BRAKE_COMMAND, MODE_COMMAND, CLEAR_COMMAND)
-FEEDBACK: Tuple[Frame, ...] = (
-    SYSTEM_STATUS,
-    MOTION_STATUS,
-    STEER_MOTOR_FAST,
-    REAR_RIGHT_FAST,
-    REAR_LEFT_FAST,
-    STEER_MOTOR_SLOW,
-    REAR_RIGHT_SLOW,
-    REAR_LEFT_SLOW,
-)
+FEEDBACK: Tuple[Frame, ...] = (SYSTEM_STATUS, MOTION_STATUS, *MOTORS_FAST, *MOTORS_SLOW)
+COMMAND_IDS = {frame.can_id for frame in COMMANDS}  # only we should send these
 FRAMES: Dict[int, Frame] = {frame.can_id: frame for frame in COMMANDS + FEEDBACK}
-
-MOTOR_OF_SLOW: Dict[int, str] = {
-    STEER_MOTOR_SLOW.can_id: "steering",
-    REAR_RIGHT_SLOW.can_id: "rear right",
-    REAR_LEFT_SLOW.can_id: "rear left",
-}
+MOTOR_OF_SLOW = {frame.can_id: motor for frame, motor in zip(MOTORS_SLOW, _MOTORS)}
 
 
 class Sent(NamedTuple):
@@ -150,13 +136,6 @@ class Sent(NamedTuple):
     data: bytes
 
 
-class Decoded(NamedTuple):
-    """A frame that was understood: its row and its message."""
-
-    frame: Frame
-    message: Any
-
-
 def encode(frame: Frame, message: Any) -> bytes:
     """The data bytes of a message: rounded to counts, and clamped to what the field can hold.
 
@@ -164,18 +143,22 @@ def encode(frame: Frame, message: Any) -> bytes:
     """
     data = bytearray(frame.length)
     for field, value in zip(frame.fields, message):
-        _PACKERS[field.code].pack_into(data, field.offset, _count(field, value))
+        if not math.isfinite(value):
+            raise ValueError(f"{value} is no number for the bus")
+        low, high = _RANGES[field.code]
+        counts = value if field.per_count is None else value / field.per_count
+        _PACKERS[field.code].pack_into(data, field.offset, round(min(max(counts, low), high)))
     return bytes(data)
 
 
 def encode_motion(speed_mps: float, inner_steering_rad: float, spec: HunterSpec) -> bytes:
     """0x111 within the limits of the model. Raises ValueError for what is not finite."""
-    speed_mps = _clamp(speed_mps, spec.max_speed_mps)
-    inner_rad = _clamp(inner_steering_rad, spec.max_inner_steering_rad)
+    speed_mps = clamp(speed_mps, spec.max_speed_mps)  # NaN passes, and encode refuses it
+    inner_rad = clamp(inner_steering_rad, spec.max_inner_steering_rad)
     return encode(MOTION_COMMAND, MotionCommand(speed_mps, inner_rad))
 
 
-def decode(can_id: int, data: bytes) -> Optional[Decoded]:
+def decode(can_id: int, data: bytes) -> Any:
     """The message of a frame; None for an identifier or a length that is not in the table."""
     frame = FRAMES.get(can_id)
     if frame is None or len(data) != frame.length:
@@ -184,7 +167,7 @@ def decode(can_id: int, data: bytes) -> Optional[Decoded]:
     for field in frame.fields:
         (count,) = _PACKERS[field.code].unpack_from(data, field.offset)
         values.append(count if field.per_count is None else count * field.per_count)
-    return Decoded(frame, frame.message(*values))
+    return frame.message(*values)
 
 
 _RANGES: Dict[str, Tuple[int, int]] = {
@@ -195,31 +178,6 @@ _RANGES: Dict[str, Tuple[int, int]] = {
     "i": (-(2**31), 2**31 - 1),
 }
 _PACKERS: Dict[str, struct.Struct] = {code: struct.Struct(f">{code}") for code in _RANGES}
-
-
-def _count(field: Field, value: float) -> int:
-    if not math.isfinite(value):
-        raise ValueError(f"{value} is no number for the bus")
-    low, high = _RANGES[field.code]
-    counts = value if field.per_count is None else value / field.per_count
-    return round(min(max(counts, low), high))
-
-
-def _clamp(value: float, most: float) -> float:
-    return min(max(value, -most), most)  # NaN passes, and encode refuses it
-
-
-class FaultBit(NamedTuple):
-    """Byte 4 or 5 of 0x211, bit 0 to 7 of it, and what it means."""
-
-    byte: int
-    bit: int
-    words: str
-
-    @property
-    def mask(self) -> int:
-        """The bit within SystemStatus.faults."""
-        return 1 << (self.bit + (8 if self.byte == 4 else 0))
 
 
 # While nobody streams, the chassis misses its upper computer: only a fault once we stream.
@@ -234,66 +192,61 @@ LINK_REAR_LEFT = "link to the rear left motor lost"
 OVERTEMPERATURE = "overtemperature"
 OVERCURRENT = "overcurrent"
 
-PROFILES: Dict[str, List[FaultBit]] = {
-    # The hardware facts' layout.
-    "v2": [
-        FaultBit(4, 1, STEER_ENCODER),
-        FaultBit(4, 2, REMOTE_LOST),
-        FaultBit(4, 4, LINK_LOST),
-        FaultBit(4, 6, DRIVER),
-        FaultBit(5, 0, UNDERVOLTAGE),
-        FaultBit(5, 3, LINK_STEER),
-        FaultBit(5, 4, LINK_REAR_RIGHT),
-        FaultBit(5, 5, LINK_REAR_LEFT),
-        FaultBit(5, 6, OVERTEMPERATURE),
-        FaultBit(5, 7, OVERCURRENT),
-    ],
+PROFILES: Dict[str, Dict[int, str]] = {
+    # The hardware facts' layout. A key is a bit of SystemStatus.faults: the high byte is byte 4.
+    "v2": {
+        0x0200: STEER_ENCODER,
+        0x0400: REMOTE_LOST,
+        0x1000: LINK_LOST,
+        0x4000: DRIVER,
+        0x0001: UNDERVOLTAGE,
+        0x0008: LINK_STEER,
+        0x0010: LINK_REAR_RIGHT,
+        0x0020: LINK_REAR_LEFT,
+        0x0040: OVERTEMPERATURE,
+        0x0080: OVERCURRENT,
+    },
     # Table 3.1 of the Hunter 2.0 user manual, page 7.
-    "manual": [
-        FaultBit(4, 0, DRIVER),
-        FaultBit(4, 1, LINK_LOST),
-        FaultBit(5, 0, UNDERVOLTAGE),
-        FaultBit(5, 2, REMOTE_LOST),
-        FaultBit(5, 3, LINK_STEER),
-        FaultBit(5, 4, LINK_REAR_RIGHT),
-        FaultBit(5, 5, LINK_REAR_LEFT),
-        FaultBit(5, 7, STEER_ENCODER),
-    ],
+    "manual": {
+        0x0100: DRIVER,
+        0x0200: LINK_LOST,
+        0x0001: UNDERVOLTAGE,
+        0x0004: REMOTE_LOST,
+        0x0008: LINK_STEER,
+        0x0010: LINK_REAR_RIGHT,
+        0x0020: LINK_REAR_LEFT,
+        0x0080: STEER_ENCODER,
+    },
 }
 DEFAULT_PROFILE = "v2"
 
 # Bits 0 to 5 of byte 5 of 0x261 to 0x263; 6 and 7 (enabled, reset) are no faults.
-DRIVER_FAULTS = (
-    "supply voltage low",
-    "motor overtemperature",
-    "driver overcurrent",
-    "driver overtemperature",
-    "sensor",
-    "driver",
-)
+DRIVER_FAULTS = {
+    0x01: "supply voltage low",
+    0x02: "motor overtemperature",
+    0x04: "driver overcurrent",
+    0x08: "driver overtemperature",
+    0x10: "sensor",
+    0x20: "driver",
+}
 
 
 def status_faults(status: SystemStatus, profile: str) -> List[str]:
     """The faults that 0x211 names, in words; empty where it names none."""
     known = PROFILES[profile]
-    words = [fault.words for fault in known if status.faults & fault.mask]
+    words = [fault for mask, fault in known.items() if status.faults & mask]
     for bit in range(16):
-        mask = 1 << bit
-        if status.faults & mask and not any(fault.mask == mask for fault in known):
+        if status.faults & (1 << bit) and 1 << bit not in known:
             words.append(f"unknown to profile {profile}: byte {5 - bit // 8} bit {bit % 8}")
     return words
 
 
 def fault_bits(words: str, profile: str) -> int:
     """The bits of SystemStatus.faults of a fault in words: what the mock sends."""
-    return sum(fault.mask for fault in PROFILES[profile] if fault.words == words)
+    return sum(mask for mask, fault in PROFILES[profile].items() if fault == words)
 
 
 def motor_faults(can_id: int, motor: MotorSlow) -> List[str]:
     """The faults that 0x261 to 0x263 name, in words, with the motor's place."""
-    place = MOTOR_OF_SLOW[can_id]
-    return [
-        f"{place} motor: {words}"
-        for bit, words in enumerate(DRIVER_FAULTS)
-        if motor.status & (1 << bit)
-    ]
+    known = [words for mask, words in DRIVER_FAULTS.items() if motor.status & mask]
+    return [f"{MOTOR_OF_SLOW[can_id]} motor: {words}" for words in known]

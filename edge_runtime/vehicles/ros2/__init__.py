@@ -1,1 +1,289 @@
-"""A vehicle behind a ROS 2 driver of its own: standard messages on Zenoh. See README.md."""
+"""A vehicle behind its own ROS 2 driver: standard messages on Zenoh. See README.md.
+
+First names and settings; then what decides, pure: odometry in, motion out; then the session and two
+threads around it:
+- The stream's thread publishes what `tick` gives: the vehicle's ROS driver makes a frame of each
+  message, and has no stream of its own.
+- Zenoh's thread hands every odometry to `hear`.
+
+node.py, which needs pycdr2, is imported when a session opens: settings are checked without it, too.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from typing import TYPE_CHECKING, Callable, ClassVar, Dict, List, NamedTuple, Optional
+
+import zenoh
+
+from edge_runtime import log
+from edge_runtime.config import Ros2Settings, check_choice
+from edge_runtime.transport import check_endpoint, is_tls, open_session
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.core import (
+    ENABLE_TIMEOUT_S,
+    IMPOSSIBLE,
+    LEADS_TO,
+    Event,
+    Finding,
+    Speeds,
+    State,
+    StreamedCore,
+)
+from edge_runtime.vehicles.mapping import SPECS, Similarity
+from edge_runtime.vehicles.stream import StreamedVehicle
+from edge_runtime.wire import CONTROL_PERIOD_S
+
+if TYPE_CHECKING:
+    from edge_runtime.vehicles.ros2.node import Odometry
+
+# Beside our own 7447, where a bridge listens by default, too; and of this machine only.
+DEFAULT_ROS2_ENDPOINT = "tcp/127.0.0.1:7448"
+YAW_RATE, STEERING = "yaw_rate", "steering"
+_ANGULAR = (YAW_RATE, STEERING)
+_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_MAX_CHARS = 200
+
+ODOMETRY_SILENCE_S = 2 * CONTROL_PERIOD_S
+# Below this the path's curvature, yaw rate over speed, is more noise than steering.
+STEERS_FROM_MPS = 0.2
+
+# Odometry that cannot be confirms nothing, and need not be waited for.
+ROS2_LEADS_TO = {
+    **LEADS_TO,
+    Event.LYING: {State.ENABLING: State.STOPPED, State.ENABLED: State.STOPPED},
+}
+
+
+def check_ros_name(name: str, what: str = "ROS name") -> str:
+    """The name itself, as in `/hunter01/odom` or `/`; UserError if ROS would not take it."""
+    plain = name[1:] if name.startswith("/") else name
+    parts = plain.split("/") if plain else []
+    valid = len(name) <= _MAX_CHARS and all(_WORD.fullmatch(part) for part in parts)
+    if not name or not valid:
+        raise UserError(
+            f"{what} {name!r} is not valid: words of A-Z a-z 0-9 _ that begin with no digit,"
+            f" between slashes, {_MAX_CHARS} characters at most, like /hunter01/odom"
+        )
+    return name
+
+
+def topic_key(namespace: str, topic: str) -> str:
+    """The Zenoh key of a topic: below the namespace, or as it is where it begins with a slash."""
+    check_ros_name(namespace, "namespace")
+    check_ros_name(topic, "topic")
+    whole = topic if topic.startswith("/") else f"{namespace}/{topic}"
+    joined = "/".join(filter(None, whole.split("/")))
+    if not joined:
+        raise UserError(f"topic {topic!r} names nothing")
+    return joined
+
+
+def namespace_of(vehicle_id: str) -> str:
+    """A ROS namespace for a vehicle id, which may hold a hyphen and begin with a digit."""
+    word = vehicle_id.replace("-", "_")
+    return f"/v{word}" if word[:1].isdigit() else f"/{word}"
+
+
+def check_ros2_endpoint(endpoint: Optional[str]) -> None:
+    """Raise UserError for an endpoint (None is one that was not given) that cannot be used."""
+    if endpoint is not None and is_tls(check_endpoint(endpoint)):
+        raise UserError(
+            f"endpoint {endpoint} is not for the ROS 2 side: it speaks plain text, as DDS does;"
+            " use tcp/ or udp/ on one machine, or inside a tunnel"
+        )
+
+
+def open_ros2_session(
+    listen: Optional[str], connect: Optional[str], option: str = "--ros2-listen"
+) -> zenoh.Session:
+    """Listen as a router (the default, on loopback), or go on connecting to a bridge as a peer.
+
+    Raises UserError for a malformed endpoint and for a busy port; `option` is where the user has
+    set `listen`.
+    """
+    check_ros2_endpoint(listen)
+    check_ros2_endpoint(connect)
+    if connect is not None:
+        return open_session(connect=connect, mode="peer")
+    try:
+        return open_session(listen=listen or DEFAULT_ROS2_ENDPOINT, mode="router")
+    except UserError as error:
+        raise UserError(str(error).replace("--listen", option)) from None
+
+
+def check_settings(settings: Ros2Settings) -> None:
+    """Raise UserError where the settings are not valid, or name nothing to be driven by."""
+    check_choice("ros2.model", settings.model, tuple(SPECS))
+    check_choice("ros2.twist_angular", settings.twist_angular, _ANGULAR)
+    check_choice("ros2.odometry_angular", settings.odometry_angular, _ANGULAR)
+    if settings.listen is not None and settings.connect is not None:
+        raise UserError("ros2 has both listen and connect: give one of them")
+    for endpoint in (settings.listen, settings.connect):
+        check_ros2_endpoint(endpoint)
+    if not settings.twist_topic and not settings.ackermann_topic:
+        raise UserError("ros2 has no topic to command by: set twist_topic or ackermann_topic")
+    if not settings.odometry_topic:
+        raise UserError("ros2 has no odometry_topic: without feedback nothing may drive")
+    topics = [settings.twist_topic, settings.ackermann_topic, settings.odometry_topic]
+    keys = [topic_key(settings.namespace, topic) for topic in topics if topic]
+    if len(set(keys)) < len(keys):
+        raise UserError(f"ros2 uses a topic twice: {', '.join(keys)}")
+
+
+class Motion(NamedTuple):
+    """What the vehicle is told: `centre_rad` of the front wheels, positive to the left."""
+
+    speed_mps: float
+    centre_rad: float
+
+
+class Ros2Core(StreamedCore):
+    """The state machine, what was heard, and what is asked for."""
+
+    leads_to = ROS2_LEADS_TO
+
+    def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
+        super().__init__(similarity, Speeds())
+        self.stale = 0  # odometry that was repeated or came late: it shows nobody alive
+        self._stamp_ns = 0  # of the newest, by its sender's clock
+        self._angular: Optional[float] = None  # of the newest, as the settings say
+        self._newest_s = -math.inf
+        self._topic = settings.odometry_topic
+        self._is_angle = settings.odometry_angular == STEERING
+
+    def enable(self, now_s: float) -> None:
+        """Drive again as soon as fresh odometry shows that the vehicle is there."""
+        self._stamp_ns = 0  # whatever comes next counts: the sender's clock may have been set back
+        self._angular = None
+        self._heard = Speeds()
+        super().enable(now_s)
+
+    def close(self, now_s: float) -> None:
+        """Nothing more is sent."""
+        self._apply(Finding(Event.CLOSE, ""), now_s)
+
+    def hear(self, stamp_ns: int, speed_mps: float, angular: float, now_s: float) -> None:
+        """Finite odometry; it counts where it is newer than the last by its own stamp.
+
+        A sender that leaves its stamps at 0 is believed by the time of arrival alone.
+        """
+        if 0 < stamp_ns <= self._stamp_ns:
+            self.stale += 1
+            return
+        self._stamp_ns, self._angular, self._newest_s = stamp_ns, angular, now_s
+        self._heard.note(speed_mps, now_s)
+        if abs(speed_mps) > IMPOSSIBLE * self._spec.max_speed_mps:
+            self._apply(Finding(Event.LYING, f"the odometry says {speed_mps:.2f} m/s"), now_s)
+        else:
+            self._apply(Finding(Event.CONFIRMED, ""), now_s)
+
+    def tick(self, now_s: float) -> Optional[Motion]:
+        """What to publish now; None while DISABLED."""
+        self._watch(now_s)
+        if self.state is State.DISABLED:
+            return None
+        self._step(now_s)
+        set_point = self.set_point
+        return Motion(set_point.speed_mps, self._spec.centre_rad(set_point.inner_rad))
+
+    def is_at_rest(self, now_s: float) -> bool:
+        """Whether the vehicle is known to stand, or nothing was ever asked of it."""
+        is_fresh = self._silence(-math.inf, now_s) is None
+        return self.state is State.DISABLED or (is_fresh and self._heard.stands)
+
+    def _why_not_confirmed(self, now_s: float) -> str:
+        return f"no odometry on {self._topic} within {ENABLE_TIMEOUT_S:.0f} s"
+
+    def _silence(self, since_s: float, now_s: float) -> Optional[Finding]:
+        if now_s - max(self._newest_s, since_s) <= ODOMETRY_SILENCE_S:
+            return None
+        return Finding(Event.SILENT, f"no fresh odometry on {self._topic}")
+
+    def _steering(self) -> float:
+        """From the odometry; what was asked for where a yaw rate tells nothing: it hardly moves."""
+        angular, speed_mps = self._angular, self._heard.speed_mps
+        if angular is None or (not self._is_angle and abs(speed_mps) < STEERS_FROM_MPS):
+            centre_rad = self._spec.centre_rad(self.set_point.inner_rad)
+        elif self._is_angle:
+            centre_rad = angular
+        else:
+            centre_rad = math.atan(self._spec.wheelbase_m * angular / speed_mps)
+        return self.similarity.steering(centre_rad)
+
+
+class Ros2Vehicle(StreamedVehicle):
+    """Opens its session and announces its topics when made; publishes nothing before `enable`.
+
+    Raises UserError, when made, for settings that are not valid and for a busy port.
+    """
+
+    name: ClassVar[str] = "ros2"
+
+    def __init__(self, settings: Ros2Settings, similarity: Similarity) -> None:
+        from edge_runtime.vehicles.ros2 import node as ros
+
+        check_settings(settings)
+        self._core: Ros2Core
+        super().__init__(Ros2Core(settings, similarity))
+        self._failing = False
+        self._publish: List[Callable[[Motion], None]] = []
+        self._session = open_ros2_session(settings.listen, settings.connect, "[ros2] listen")
+        try:
+            self._node = node = ros.Ros2Node(self._session, settings.namespace)
+            if settings.twist_topic:
+                twist = node.publisher(settings.twist_topic, ros.Twist)
+                self._publish.append(
+                    lambda motion: twist(
+                        ros.twist_of(motion, settings.twist_angular, similarity.spec.wheelbase_m)
+                    )
+                )
+            if settings.ackermann_topic:
+                drive = node.publisher(settings.ackermann_topic, ros.AckermannDriveStamped)
+                self._publish.append(lambda motion: drive(ros.drive_of(motion, time.time_ns())))
+            node.subscribe(settings.odometry_topic, ros.Odometry, self._hear)
+        except BaseException:
+            self._session.close()  # An open session would hang the process at its exit.
+            raise
+
+    @property
+    def rejected(self) -> Dict[str, int]:
+        """Odometry that could not be read or was not new, by reason."""
+        counts = dict(self._node.rejected)
+        if self._core.stale:
+            counts["stale"] = self._core.stale
+        return counts
+
+    def _leave(self) -> None:
+        try:
+            if self.rejected:
+                log.event("info", "ros2_odometry_rejected", **self.rejected)
+            self._node.close()
+        finally:
+            with self._lock:
+                self._core.close(time.monotonic())
+            self._session.close()
+
+    def _hear(self, odometry: Odometry) -> None:
+        stamp, twist = odometry.header.stamp, odometry.twist.twist
+        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+        with self._lock:
+            self._core.hear(stamp_ns, twist.linear.x, twist.angular.z, time.monotonic())
+
+    def _send_due(self) -> bool:
+        with self._lock:
+            motion = self._core.tick(time.monotonic())
+        if motion is None:
+            return False
+        try:
+            for publish in self._publish:
+                publish(motion)
+        except Exception as error:  # the vehicle stops by its own time-out, and the silence tells
+            if not self._failing:
+                log.event("error", "ros2_not_sent", detail=error)
+            self._failing = True
+            return False
+        self._failing = False
+        return True

@@ -19,7 +19,7 @@ import zenoh
 
 from edge_runtime.transport import only_own
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.ros2 import names
+from edge_runtime.vehicles.ros2 import STEERING, Motion, topic_key
 from edge_runtime.wire import Reason, Rejection
 
 try:
@@ -35,22 +35,33 @@ except ImportError:
     ) from None
 
 
+PUBLISHER, SUBSCRIBER = "MP", "MS"
+_SLASH = "\u00a7"  # The bridge's replacement for a slash inside one chunk of a token.
+TYPES: Dict[str, str] = {
+    "ackermann_msgs/msg/AckermannDriveStamped": (
+        "48ca7612a08d3bb72744fd98b71b7cf2ea24c6ad50fa4e1aa0bbad963c90d8cf"
+    ),
+    "geometry_msgs/msg/Twist": "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
+    "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    "sensor_msgs/msg/Image": "d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",
+}
+"""The types' hashes (REP 2016, RIHS01): from Iron on, ROS nodes look for them in discovery."""
+
 HEADER_BYTES = 4
 CDR_BIG_ENDIAN, CDR_LITTLE_ENDIAN = 0, 1
 MAX_PAYLOAD_BYTES = 1024 * 1024
 _ALIGNMENT = 4  # DDS fills a message up to this.
 # What hostile bytes make pycdr2 raise: the end too early, bad UTF-8, absurd lengths.
 _DECODE_ERRORS = (struct.error, ValueError, OverflowError, MemoryError, IndexError)
-COVARIANCE_SIZE = 36
 if TYPE_CHECKING:
     Covariance = List[float]
 else:
-    Covariance = array[float64, COVARIANCE_SIZE]
+    Covariance = array[float64, 36]
 
 
 def no_covariance() -> List[float]:
     """A 6x6 matrix of zeros, row by row: to ROS that means unknown."""
-    return [0.0] * COVARIANCE_SIZE
+    return [0.0] * 36
 
 
 @dataclass
@@ -170,15 +181,11 @@ def stamp_of(time_ns: int) -> Time:
     return Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
 
 
-RosMessage = Union[AckermannDriveStamped, Twist, Odometry, Image]
 _M = TypeVar("_M", AckermannDriveStamped, Twist, Odometry, Image)
 
 
-def encode(message: RosMessage) -> bytes:
-    """The header and the message in little-endian CDR.
-
-    Raises struct.error for a number that its field cannot hold.
-    """
+def encode(message: IdlStruct) -> bytes:
+    """The message in little-endian CDR; struct.error for a number that its field cannot hold."""
     return bytes(message.serialize(buffer=Buffer(), endianness=Endianness.Little))
 
 
@@ -203,10 +210,6 @@ def decode(payload: bytes, kind: Type[_M]) -> Union[_M, Rejection]:
     if not 0 <= len(payload) - buffer.tell() < _ALIGNMENT:
         detail = f"{len(payload)} bytes, the {kind.__name__} ends at {buffer.tell()}"
         return Rejection(Reason.MALFORMED, detail)
-    return _finite(message)
-
-
-def _finite(message: _M) -> Union[_M, Rejection]:
     for name, value in _leaves(message, ""):
         if isinstance(value, float) and not math.isfinite(value):
             return Rejection(Reason.NOT_FINITE, f"{name} is {value}")
@@ -224,11 +227,49 @@ def _leaves(value: Any, name: str) -> Iterator[Tuple[str, Any]]:
         yield name, value
 
 
+def twist_of(motion: Motion, angular: str, wheelbase_m: float) -> Twist:
+    """`linear.x` in m/s; `angular.z` is the yaw rate (rad/s), or the steering angle (rad).
+
+    A yaw rate of 0 says nothing of the wheels of a vehicle that stands: they go straight.
+    """
+    z = motion.centre_rad
+    if angular != STEERING:
+        z = motion.speed_mps * math.tan(motion.centre_rad) / wheelbase_m
+    return Twist(linear=Vector3(x=motion.speed_mps), angular=Vector3(z=z))
+
+
+def drive_of(motion: Motion, time_ns: int) -> AckermannDriveStamped:
+    """Speed and centre angle; no acceleration is given, because the speed is a ramp already."""
+    return AckermannDriveStamped(
+        header=Header(stamp_of(time_ns), "base_link"),
+        drive=AckermannDrive(speed=motion.speed_mps, steering_angle=motion.centre_rad),
+    )
+
+
+def member_token(zid: str) -> str:
+    """The token by which a bridge knows another one."""
+    return f"@/{zid}/@ros2_lv"
+
+
+def topic_token(zid: str, role: str, key: str, kind: Any) -> str:
+    """The token of a PUBLISHER or SUBSCRIBER of a message, as zenoh-bridge-ros2dds has it.
+
+    It makes every bridge (1.1 or later) create the reader or writer on its DDS side; without it a
+    bridge would carry only what a ROS node beside it already wants. Its last part is
+    `<keyed>:<reliable>:<transient local>:<history>,<depth>:<user data>` in DDS's numbers. We
+    publish reliably, because a reader of either kind matches, and subscribe best effort: a reliable
+    reader would never hear a best-effort writer, as sensors are. No key, no old messages for late
+    readers, and the last ten kept.
+    """
+    names = (name.replace("/", _SLASH) for name in (key, kind.__idl_typename__))
+    qos = f":{int(role == PUBLISHER)}:0:0,10:typehash=RIHS01_{TYPES[kind.__idl_typename__]};"
+    return "/".join((member_token(zid), role, *names, qos))
+
+
 class Ros2Node:
     """Uses a session that somebody else opens and closes. `close` it before the session.
 
-    `rejected` counts what arrived and could not be read, by reason; `sent` what was published, by
-    key.
+    `rejected` counts what could not be read, by reason; `sent` what was published, by key.
     """
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
@@ -238,16 +279,16 @@ class Ros2Node:
         self._namespace = namespace
         self._zid = str(session.info.zid())
         self._declared: List[Any] = []
-        self._announce(names.member_token(self._zid))
+        self._announce(member_token(self._zid))
 
     def publisher(self, topic: str, kind: Type[_M]) -> Callable[[_M], None]:
         """What publishes messages of that kind on that topic. It never waits for a subscriber."""
-        key = names.key(self._namespace, topic)
+        key = topic_key(self._namespace, topic)
         publisher = self._session.declare_publisher(
             key, congestion_control=zenoh.CongestionControl.DROP
         )
         self._declared.append(publisher)
-        self._announce_topic(names.PUBLISHER, key, kind)
+        self._announce(topic_token(self._zid, PUBLISHER, key, kind))
         self.sent[key] = 0
 
         def publish(message: _M) -> None:
@@ -258,32 +299,24 @@ class Ros2Node:
 
     def subscribe(self, topic: str, kind: Type[_M], take: Callable[[_M], None]) -> None:
         """Call `take` with each message, in Zenoh's thread; what cannot be read is counted."""
-        key = names.key(self._namespace, topic)
+        key = topic_key(self._namespace, topic)
 
         def hear(sample: zenoh.Sample) -> None:
-            # Something huge is not copied to be counted.
-            if len(sample.payload) > MAX_PAYLOAD_BYTES:
-                self._count(Reason.OVERSIZED)
-                return
-            message = decode(sample.payload.to_bytes(), kind)
+            message: Union[_M, Rejection] = Rejection(Reason.OVERSIZED, "")
+            if len(sample.payload) <= MAX_PAYLOAD_BYTES:  # something huge is not even copied
+                message = decode(sample.payload.to_bytes(), kind)
             if isinstance(message, Rejection):
-                self._count(message.reason)
+                self.rejected[message.reason.value] = self.rejected.get(message.reason.value, 0) + 1
             else:
                 take(message)
 
         self._declared.append(self._session.declare_subscriber(key, only_own(key, hear)))
-        self._announce_topic(names.SUBSCRIBER, key, kind)
+        self._announce(topic_token(self._zid, SUBSCRIBER, key, kind))
 
     def close(self) -> None:
         """Withdraw everything; safe to call twice."""
         while self._declared:
             self._declared.pop().undeclare()
 
-    def _announce_topic(self, role: str, key: str, kind: Any) -> None:
-        self._announce(names.topic_token(self._zid, role, key, str(kind.__idl_typename__)))
-
     def _announce(self, token: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(token))
-
-    def _count(self, reason: Reason) -> None:
-        self.rejected[reason.value] = self.rejected.get(reason.value, 0) + 1

@@ -9,7 +9,7 @@ import can
 import pytest
 
 from edge_runtime.cli import run_cli
-from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
+from edge_runtime.vehicles.hunter import open_bus, parse_bus
 from hil_tests.__main__ import main
 from hil_tests.faults.rig import ChassisProcess, free_bus
 from hil_tests.mock_hunter.body import MODELS

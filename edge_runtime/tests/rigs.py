@@ -1,0 +1,131 @@
+"""The core of a streamed vehicle in made-up time, and a vehicle that obeys it at once, or not."""
+
+from __future__ import annotations
+
+import math
+
+from edge_runtime.config import CarSettings, Ros2Settings
+from edge_runtime.vehicles.core import State
+from edge_runtime.vehicles.hunter import protocol
+from edge_runtime.vehicles.hunter.core import HunterCore
+from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
+from edge_runtime.vehicles.ros2 import STEERING, Ros2Core
+
+SPEC = SPECS["2.0"]
+LEFT_TURN, CONGESTION = (similarity_to(CARS[name], SPEC) for name in ("left_turn", "congestion"))
+OK = protocol.SystemStatus(0, protocol.CAN_CONTROL, 24.0, 0, 0, 0)
+STREAM_S = 0.02
+PEDAL = {"pedal": 1.0}
+CAR = CarSettings(
+    throttle_mps2=1.0, brake_mps2=2.0, max_speed_mps=0.5, full_steering_rad=0.3, wheelbase_m=1.0
+)
+
+
+class Rig:
+    """`obeys`: the vehicle does what it is told; `talks`: it reports, after each tick."""
+
+    def __init__(self, core):
+        self.core, self.now_s, self.ticks = core, 100.0, 0
+        self.obeys = self.talks = True
+        self.speed_mps = self.inner_rad = 0.0
+        self.sent = []  # each frame or message with its time
+        self.asked = []  # each speed with its time
+
+    def step(self, count=1, action=None, scenario_speed_mps=None):
+        """Ticks of 20 ms; with an action, a command every 100 ms."""
+        for _ in range(count):
+            if action is not None and self.ticks % 5 == 0:
+                self.core.command(action, self.now_s, scenario_speed_mps)
+            self.exchange(self.core.tick(self.now_s))
+            self.ticks += 1
+            self.now_s = 100.0 + self.ticks * STREAM_S
+        return self
+
+    def exchange(self, due):
+        """The vehicle takes what a tick gave, and reports."""
+        raise NotImplementedError
+
+    def enabled(self):
+        self.core.enable(self.now_s)
+        self.step(6)
+        assert self.core.state is State.ENABLED
+        return self
+
+    def driving(self, seconds=1.0):
+        self.enabled().step(round(seconds / STREAM_S), PEDAL)
+        assert self.core.set_point.speed_mps > 0
+        return self
+
+    def speeds(self, since=0):
+        return [speed_mps for _, speed_mps in self.asked[since:]]
+
+    @property
+    def report(self):
+        return self.core.report(self.now_s)
+
+    @property
+    def words(self):
+        return self.report.faults
+
+
+class HunterRig(Rig):
+    """The chassis speaks in frames written by hand: `status` each 100 ms, the motion each 20 ms."""
+
+    silence, lie, battery_v = "the chassis sends no 0x221", "the chassis reports 3.0 m/s", 24.0
+
+    def __init__(self, scenario="left_turn"):
+        super().__init__(HunterCore(similarity_to(CARS[scenario], SPEC), "v2"))
+        self.status = OK
+        self.counter = 0  # of 0x211; None: it stands still
+
+    def exchange(self, parts):
+        for frame, data in parts:
+            self.sent.append((self.now_s, frame.can_id, data))
+            message = protocol.decode(frame.can_id, data)
+            if isinstance(message, protocol.MotionCommand):
+                self.asked.append((self.now_s, message.speed_mps))
+                if self.obeys:
+                    self.speed_mps, self.inner_rad = message
+        if self.talks:
+            motion = protocol.MotionStatus(self.speed_mps, self.inner_rad)
+            self.tell(protocol.MOTION_STATUS, motion)
+            if self.ticks % 5 == 0:
+                self.tell(protocol.SYSTEM_STATUS, self.status)
+
+    def tell(self, frame, message):
+        if isinstance(message, protocol.SystemStatus) and self.counter is not None:
+            self.counter = (self.counter + 1) % 256
+            message = message._replace(counter=self.counter)
+        self.core.hear(frame.can_id, protocol.encode(frame, message), self.now_s)
+
+    def ids(self, since=0):
+        return [can_id for _, can_id, _ in self.sent[since:]]
+
+    def frames(self, since=0):
+        return [(can_id, data) for _, can_id, data in self.sent[since:]]
+
+
+class Ros2Rig(Rig):
+    """Odometry after each tick; `angular` is what it says of the wheels, None: what is true."""
+
+    silence, lie, battery_v = "no fresh odometry on odom", "the odometry says 3.00 m/s", None
+
+    def __init__(self, scenario="left_turn", **settings):
+        self.settings = Ros2Settings(**settings)
+        super().__init__(Ros2Core(self.settings, similarity_to(CARS[scenario], SPEC)))
+        self.angular = None
+        self.centre_rad = 0.0
+
+    def exchange(self, motion):
+        if motion is not None:
+            self.sent.append((self.now_s, motion))
+            self.asked.append((self.now_s, motion.speed_mps))
+            if self.obeys:
+                self.speed_mps, self.centre_rad = motion
+                self.inner_rad = SPEC.inner_rad(self.centre_rad)
+        if self.talks:
+            angular = self.centre_rad
+            if self.settings.odometry_angular != STEERING:
+                angular = self.speed_mps * math.tan(self.centre_rad) / SPEC.wheelbase_m
+            angular = angular if self.angular is None else self.angular
+            self.core.hear(round(self.now_s * 1e9), self.speed_mps, angular, self.now_s)

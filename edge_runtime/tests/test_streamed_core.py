@@ -1,0 +1,294 @@
+"""What holds for every streamed vehicle, in made-up time: enabling, commands, stops, the table."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+import edge_runtime
+from edge_runtime.tests.harness import render_table
+from edge_runtime.tests.rigs import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
+from edge_runtime.vehicles.core import LEADS_TO, Event, Finding, State
+from edge_runtime.vehicles.mapping import wish_of
+from edge_runtime.vehicles.ros2 import ROS2_LEADS_TO
+
+
+@pytest.fixture(params=[HunterRig, Ros2Rig])
+def make(request):
+    return request.param
+
+
+@pytest.fixture
+def rig(make):
+    return make()
+
+
+def test_nothing_leaves_before_enable(rig):
+    rig.core.brake(rig.now_s)
+    rig.step(100, PEDAL)
+    assert rig.sent == []
+    assert not rig.core.close(rig.now_s)
+    assert rig.core.state is State.DISABLED
+
+
+def test_a_new_core_knows_nothing(rig):
+    core = rig.core
+    assert (core.state, core.cause, core.words) == (State.DISABLED, None, "")
+    report = core.report(0.0)
+    assert (report.faults, report.speed_mps, report.battery_v) == ([], 0.0, None)
+    assert report.action == {"pedal": -1.0, "steering": 0.0}
+    assert report.self_braking
+    assert core.standing(0.0) == [rig.silence]
+    assert core.late_at_s == math.inf
+
+
+def test_a_vehicle_that_stands_has_its_brake_on_unless_it_is_asked_to_go(rig):
+    rig.enabled()
+    assert rig.report.action["pedal"] == -1.0
+    rig.obeys = False
+    rig.step(20, PEDAL)
+    assert rig.report.action["pedal"] == 0.0
+    rig.core.brake(rig.now_s, latch=False)
+    rig.step()
+    assert rig.report.action["pedal"] == -1.0
+
+
+def test_to_enable_it_again_gives_it_the_whole_time_again(rig):
+    rig.talks = False
+    for _ in range(2):
+        rig.core.enable(rig.now_s)
+        rig.step(45)
+    assert rig.core.state is State.ENABLING
+
+
+def test_to_enable_it_while_it_drives_makes_it_stand_until_the_next_command(rig):
+    count = len(rig.driving().asked)
+    rig.enabled()
+    assert set(rig.speeds(count)) == {0.0}
+
+
+def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
+    rig.driving(1.0)
+    rig.obeys, rig.speed_mps = False, 0.7
+    rig.step(130, {"pedal": -1.0})
+    assert rig.core.cause is Event.STUCK
+    rig.enabled().step(40, {"pedal": -1.0})
+    assert rig.core.state is State.ENABLED
+    rig.step(30, {"pedal": -1.0})
+    assert rig.core.cause is Event.STUCK
+
+
+def test_a_drive_with_a_lag_is_not_stuck(rig):
+    rig.enabled().obeys = False
+    for tick in range(1000):
+        rig.step(1, {"pedal": 1.0 if (tick // 150) % 2 == 0 else -1.0})
+        rig.speed_mps += (rig.core.set_point.speed_mps - rig.speed_mps) * STREAM_S / 0.3
+        assert rig.core.state is State.ENABLED, rig.words
+
+
+def test_pedals_become_a_speed_and_the_speed_comes_back_as_the_scenarios(rig):
+    """Full throttle: 3 m/s2 of the car, a quarter of it on the Hunter; its top speed in the end."""
+    report = rig.driving(1.0).report
+    assert report.speed_mps == pytest.approx(46 * 0.75 * STREAM_S)  # its first command came late
+    assert report.scenario_speed_mps == pytest.approx(4 * report.speed_mps)
+    assert report.commanded_speed_mps == pytest.approx(report.speed_mps, abs=0.002)
+    assert report.action["pedal"] == pytest.approx(1.0, abs=0.05)
+    assert (report.faults, report.self_braking) == ([], False)
+    assert report.battery_v == rig.battery_v
+    rig.step(20, {"pedal": -0.5})
+    assert rig.report.action["pedal"] == pytest.approx(-0.5, abs=0.05)
+    rig.step(150, PEDAL)
+    assert rig.core.set_point.speed_mps == SPEC.max_speed_mps
+    assert rig.report.scenario_speed_mps == pytest.approx(6.0)
+    assert rig.report.action["pedal"] == pytest.approx(0.0, abs=0.01)
+    rig.step(50, {"pedal": -1.0})
+    assert rig.speed_mps == pytest.approx(0.5, abs=0.08)
+    assert rig.report.action["pedal"] == pytest.approx(-1.0, abs=0.15)
+
+
+def test_a_policy_without_a_pedal_has_the_scenarios_speed_and_its_own_steering(make):
+    rig = make("congestion").enabled()
+    rig.step(200, {"steering": -1.0}, scenario_speed_mps=4.0)
+    assert rig.speed_mps == pytest.approx(1.0)
+    similarity = rig.core.similarity
+    assert similarity.centre_rad(-1.0) > 0  # -1 turns left
+    assert rig.inner_rad == pytest.approx(SPEC.inner_rad(similarity.centre_rad(-1.0)), abs=1e-3)
+    assert rig.report.action["steering"] == pytest.approx(-1.0, abs=0.02)
+    rig.step(100, {"steering": 1.0}, scenario_speed_mps=0.0)
+    assert rig.speed_mps == 0.0
+    assert rig.inner_rad < -0.05
+
+
+def test_a_brake_is_speed_zero_at_once_and_latches(rig):
+    rig.driving().core.brake(rig.now_s)
+    assert rig.report.commanded_speed_mps == 0.0  # before the next tick, too
+    count = len(rig.asked)
+    rig.step(100, PEDAL)
+    assert set(rig.speeds(count)) == {0.0}
+    assert rig.words == []  # our own wish is no fault
+    assert rig.report.self_braking
+    rig.enabled().step(20, PEDAL)
+    assert rig.speed_mps > 0
+
+
+def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch(rig):
+    rig.driving().core.brake(rig.now_s, latch=False)
+    count = len(rig.asked)
+    rig.step(500)
+    assert set(rig.speeds(count)) == {0.0}
+    assert rig.core.state is State.ENABLED
+    rig.step(20, PEDAL)
+    assert rig.speed_mps > 0
+
+
+def test_without_a_fresh_command_it_stops_within_the_promise_and_latches(rig):
+    last_s = rig.driving().core._wished_s
+    assert rig.core.late_at_s == last_s + 0.24 < last_s + 0.25  # the stream ticks then, too
+    count = len(rig.asked)
+    rig.step(100)
+    assert rig.core.late_at_s == float("inf")
+    stopped_s = next(time_s for time_s, speed_mps in rig.asked[count:] if speed_mps == 0)
+    assert 0.2 < stopped_s - last_s <= 0.25 + 0.02
+    assert rig.words == ["no command for 0.24 s"]
+    rig.step(50, PEDAL)
+    assert rig.speed_mps == 0
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("action", "speed_mps", "words"),
+    [
+        *(({"pedal": value}, None, "not finite") for value in (NAN, INF)),
+        *(({"steering": value}, 1.0, "not finite") for value in (NAN, INF)),
+        *(({}, value, "not finite") for value in (NAN, INF)),
+        # No pedal means the speed of the scenario's car only where there is a steering beside it.
+        *((lacks, speed, "lacks an action") for lacks, speed in (({}, 6.0), ({}, None))),
+        ({"steering": 0.1}, None, "lacks an action"),
+    ],
+)
+def test_a_command_that_is_not_finite_or_lacks_an_action_is_refused(rig, action, speed_mps, words):
+    with pytest.raises(ValueError, match=words):
+        rig.enabled().core.command(action, rig.now_s, speed_mps)
+    rig.step(10)
+    assert rig.speed_mps == 0
+
+
+def fall_silent(rig):
+    rig.talks = False
+    rig.step(12, PEDAL)
+    rig.talks = True
+    return rig.silence
+
+
+def command_no_more(rig):
+    rig.step(18)
+    return "no command for 0.24 s"
+
+
+def brake(rig):
+    rig.core.brake(rig.now_s)
+    return ""
+
+
+def lie(rig):
+    rig.speed_mps, rig.obeys = 3.0, False
+    rig.step(2, PEDAL)
+    rig.speed_mps, rig.obeys = 0.0, True
+    return rig.lie
+
+
+def be_stuck(rig):
+    rig.speed_mps, rig.obeys = 0.0, False
+    rig.step(100, PEDAL)
+    rig.obeys = True
+    return "the speed stays at 0.00 m/s"
+
+
+@pytest.mark.parametrize(
+    ("stop", "cause"),
+    [
+        (fall_silent, Event.SILENT),
+        (command_no_more, Event.COMMAND_LATE),
+        (brake, Event.BRAKE),
+        (lie, Event.LYING),
+        (be_stuck, Event.STUCK),
+    ],
+)
+def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):
+    words = stop(rig.driving())
+    assert rig.core.cause is cause
+    assert rig.words[0].startswith(words) if words else not rig.words
+    assert rig.report.self_braking
+    # All is well again, and commands come: it stands nevertheless.
+    count = len(rig.asked)
+    rig.step(100, PEDAL)
+    assert set(rig.speeds(count)) == {0.0}
+    assert rig.report.standing == []
+    rig.enabled().step(50, PEDAL)
+    assert rig.speed_mps > 0.5
+    assert rig.words == []
+
+
+# The rules that the table was written from, in other words.
+
+OURS = {Event.ENABLE: State.ENABLING, Event.CLOSE: State.DISABLED}
+STOP_ENABLING = {
+    Event.BRAKE, Event.NOT_CONFIRMED, Event.REMOTE, Event.ESTOP, Event.BUS, Event.FOREIGN
+}  # fmt: skip
+STOP_DRIVING = set(Event) - set(OURS) - {Event.CONFIRMED, Event.NOT_CONFIRMED}
+
+
+def expected(state, event):
+    if event in OURS:
+        return OURS[event]
+    if state is State.ENABLING and event is Event.CONFIRMED:
+        return State.ENABLED
+    stops = {State.ENABLING: STOP_ENABLING, State.ENABLED: STOP_DRIVING}
+    return State.STOPPED if event in stops.get(state, ()) else state
+
+
+def after(state, event, leads_to=LEADS_TO):
+    return leads_to[event].get(state, state)
+
+
+def test_every_pair_of_state_and_event():
+    pairs = [(state, event) for state in State for event in Event]
+    assert {pair: expected(*pair) for pair in pairs} == {pair: after(*pair) for pair in pairs}
+
+
+@pytest.mark.parametrize("leads_to", [LEADS_TO, ROS2_LEADS_TO])
+def test_every_event_names_states_only_where_it_changes_something(leads_to):
+    assert set(leads_to) == set(Event)
+    for leads in leads_to.values():
+        assert all(before is not after for before, after in leads.items())
+    into_enabled = {event for event in Event if State.ENABLED in leads_to[event].values()}
+    out_of_stopped = {event for event in Event if State.STOPPED in leads_to[event]}
+    assert into_enabled == {Event.CONFIRMED}
+    assert out_of_stopped == {Event.ENABLE, Event.CLOSE}
+
+
+def test_the_readme_shows_the_table():
+    readme = Path(edge_runtime.__file__).with_name("README.md").read_text(encoding="utf-8")
+    assert render_table(Event, State, after) in readme
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("event", Event)
+def test_the_core_goes_where_the_table_says(rig, state, event):
+    core = rig.core
+    core.state = state
+    core.set_point.speed_mps = 1.0
+    core._wish = core_wish = wish_of(PEDAL, None)
+    core._apply(Finding(event, "why"), rig.now_s)
+    leads_to = after(state, event, core.leads_to)
+    assert core.state is leads_to
+    if leads_to is State.STOPPED and state is not State.STOPPED:
+        assert (core.cause, core.words) == (event, "why")
+        assert core.set_point.speed_mps == 0
+        assert core._wish is None
+    elif leads_to is state:
+        assert core._wish is core_wish
