@@ -22,33 +22,31 @@ from bridge.rerun.sinks import Sink
 from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
-from trainer.drawing import (
-    DRIVERS,
-    LINES,
-    Entry,
-    Episode,
-    Steps,
-    TrainingLog,
-    q_advantage,
-)
 from trainer.drivers import make_environment
 from trainer.human.guide import Intervention, Reason
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Critic
 from trainer.person.recording import Recorder, read_steps
 from trainer.person.tests.people import recorded_step
-from trainer.plots import CURVE_FILE
+from trainer.pictures import CURVE_FILE
 from trainer.tests.drawn import values_in
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import Seen, TrainingRun
 from trainer.view import (
     CORRECTIONS,
+    DRIVERS,
+    LINES,
     MOST_WAITING,
     STEPS_TOGETHER,
     Background,
+    Entry,
+    Episode,
     Shown,
+    Steps,
+    TrainingLog,
     Watcher,
+    q_advantage,
     watched,
 )
 
@@ -197,7 +195,7 @@ def test_an_episode_that_is_broken_off_is_handed_over():
     watcher = looking_on(kept)
     for _ in range(7):
         watcher.on_step(control_period(human=False))
-    watcher.close()
+    watcher.hand_over()
     assert sum(len(part.entries) for part in kept if isinstance(part, Steps)) == 7
 
 

@@ -11,12 +11,11 @@ import pytest
 
 from bridge import rerun
 from trainer.drivers import load_driver, make_environment
-from trainer.person.devices import JoystickHands, KeyboardHands, WindowPerson, pygame
+from trainer.person.devices import SIZE, JoystickHands, KeyboardHands, Window, pygame
 from trainer.person.interface import LET_GO
 from trainer.person.profile import SHIPPED, read_profile
 from trainer.person.tests.pages import first_view
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
-from trainer.person.window import SIZE, Window
 
 G29 = read_profile(SHIPPED / "g29.toml")
 
@@ -131,11 +130,11 @@ def wheel(monkeypatch):
     pygame.quit()
 
 
-def at_the_wheel(scenario: str) -> WindowPerson:
-    return WindowPerson(JoystickHands(G29, scenario), Window())
+def at_the_wheel(scenario: str) -> Window:
+    return Window(JoystickHands(G29, scenario))
 
 
-def read(device: WindowPerson):
+def read(device: Window):
     """SDL tells axes on the next look at its devices."""
     device.poll(time.monotonic())
     return device.poll(time.monotonic())
@@ -177,7 +176,7 @@ def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
 
 def test_another_device_is_not_taken_for_the_profiles(wheel):
     other = msgspec.structs.replace(G29, match="Thrustmaster")
-    assert not JoystickHands(other, "left_turn").present
+    assert not Window(JoystickHands(other, "left_turn")).present
 
 
 @pytest.fixture
@@ -187,7 +186,7 @@ def opened(monkeypatch):
 
     def opened(*screen):
         monkeypatch.setattr(pygame.display, "get_desktop_sizes", lambda: [screen])
-        return Window()
+        return Window(KeyboardHands("left_turn"))
 
     yield opened
     pygame.quit()

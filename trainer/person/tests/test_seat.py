@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trainer.person.interface import LET_GO, WISHES
-from trainer.person.seat import SILENCE_S, Input, Seat
+from trainer.person.takeover import SILENCE_S, Input, Seat
 
 OFF = Input(at_ms=0.0, action=0.0, engaged=False)
 HOLD = Input(at_ms=0.0, action=0.8, engaged=True)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from itertools import pairwise, repeat
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from trainer.person.drive import drive
 from trainer.person.interface import LET_GO
 from trainer.person.recording import DISCARDED, read_episodes, read_steps
-from trainer.person.session import RESTARTED, STOPPED, Pacer
+from trainer.person.session import RESTARTED, STOPPED, Pacer, drive
 from trainer.person.takeover import MAX_SLEW
 from trainer.person.tests.people import QUIT, Discarding, Puppet, hold, make_sitting, wish
 
@@ -190,14 +190,17 @@ def test_sittings_drive_other_episodes(tmp_path):
         ([0.0, 0.11, 0.0], [0.0, 0.11, 0.2], 0),  # a hair is not late
     ],
 )
-def test_when_periods_begin_and_which_are_late(works_s, expected_s, late):
+def test_when_periods_begin_and_which_are_late(monkeypatch, works_s, expected_s, late):
     now_s = 100.0
 
     def wait(seconds: float) -> None:
         nonlocal now_s
         now_s += seconds
 
-    pacer, began_s = Pacer(0.1, lambda: now_s, wait), []
+    monkeypatch.setattr(
+        "trainer.person.session.time", SimpleNamespace(monotonic=lambda: now_s, sleep=wait)
+    )
+    pacer, began_s = Pacer(0.1), []
     for work_s in works_s:
         wait(work_s)
         pacer.wait()

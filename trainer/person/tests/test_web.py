@@ -17,7 +17,6 @@ import pytest
 from edge_runtime.util import UserError
 from trainer.person import web
 from trainer.person.interface import LET_GO, open_person
-from trainer.person.seat import MAX_INPUT_BYTES
 from trainer.person.tests.pages import (
     WAIT_S,
     first_view,
@@ -29,7 +28,7 @@ from trainer.person.tests.pages import (
     until,
     view_of_step,
 )
-from trainer.person.web import VIEWS_UNDERWAY, Cockpit
+from trainer.person.web import MAX_INPUT_BYTES, VIEWS_UNDERWAY, Cockpit
 
 RESET = struct.pack("ii", 1, 0)
 """SO_LINGER that closes without a good-bye."""

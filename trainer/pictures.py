@@ -1,4 +1,4 @@
-"""Draw a moment of an episode from above, or film all of it with its take-overs."""
+"""Pictures as files: learning curves (``plot``), a moment or a film of a drive (``picture``)."""
 
 from __future__ import annotations
 
@@ -6,23 +6,139 @@ import argparse
 import io
 from collections import deque
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from edge_runtime.cli import add_public_key, examples, positive_number
+from bridge.report import GOAL
+from edge_runtime.cli import Command, add_public_key, examples, positive_number
 from edge_runtime.files import check_writable, write_atomic
 from edge_runtime.util import UserError
 from trainer.drivers import ACTIONS, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver, Guide, HumanGuide, Intervention
-from trainer.options import add_scenario, add_seed, check_suffix
+from trainer.options import add_scenario, add_seed, check_suffix, existing_directory
 from trainer.scenarios.scene import COLOURS
+from trainer.training.metrics import read_metrics
 
-EXAMPLE = examples(
-    "python -m trainer picture expert --seed 8 --time 3.4 --out scene.png",
-    "python -m trainer picture runs/phil_1 --human expert --time 15 --out take_over.gif",
+CURVE_FILE = "learning_curve.png"
+WINDOW = 20
+"""Episodes of the moving average."""
+PANELS = {
+    "episode_return": "return (without shaping)",
+    "distance_m": "surviving distance, m",
+    "success": "success",
+    "human_share": "share of steps driven by the human",
+}
+"""Column -> title."""
+Values = NDArray[np.float64]
+
+
+def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "run_dirs",
+        metavar="RUN_DIR",
+        nargs="+",
+        help="directory of a training run; several are drawn thinly, and their mean",
+    )
+    text = f"the picture (default: RUN_DIR/{CURVE_FILE})"
+    parser.add_argument("--out", metavar="F.png", help=text)
+
+
+def _plot(arguments: argparse.Namespace) -> int:
+    run_dirs = [existing_directory(path, "run directory") for path in arguments.run_dirs]
+    if arguments.out is None and len(run_dirs) > 1:
+        raise UserError("several runs go into one picture: --out F.png")
+    if arguments.out is not None:
+        check_suffix(arguments.out, "a picture is a .png", ".png")
+    print(write_learning_curve(*run_dirs, out=arguments.out))
+    return 0
+
+
+PLOT = Command(
+    examples(
+        "python -m trainer plot runs/phil_1",
+        "python -m trainer plot runs/phil_1 runs/phil_2 runs/phil_3 --out curves.png",
+    ),
+    _add_plot_arguments,
+    _plot,
 )
+
+
+def write_learning_curve(*run_dirs: Path, out: str | None = None) -> Path:
+    """Draw return, surviving distance, success and human share over the episodes as a PNG.
+
+    Several runs are a thin line each, and their mean up to the end of the shortest. ``out``: the
+    file; by default in the first run's directory.
+
+    Raises:
+        UserError: one of the runs has no metrics yet, or the file cannot be written.
+    """
+    path = run_dirs[0] / CURVE_FILE if out is None else Path(out)
+    check_writable(path)
+    runs = [_columns(run_dir) for run_dir in run_dirs]
+    shortest = min(len(run["episode"]) for run in runs)
+    episodes = runs[0]["episode"][:shortest]
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    panels = dict(zip(PANELS, figure.subplots(2, 2, sharex=True).flat, strict=True))
+    for name, panel in panels.items():
+        curves = [moving_average(run[name], WINDOW) for run in runs]
+        label = f"mean of {WINDOW}"
+        if len(runs) == 1:
+            panel.plot(episodes, runs[0][name], ".", markersize=3, color="0.75")
+        else:
+            label = f"{len(runs)} runs, {label}"
+            for run, curve in zip(runs, curves, strict=True):
+                panel.plot(run["episode"], curve, color="C0", alpha=0.25, linewidth=1)
+        mean = np.mean([curve[:shortest] for curve in curves], axis=0)
+        panel.plot(episodes, mean, color="C0", label=label)
+        panel.set_title(PANELS[name])
+        panel.grid(alpha=0.3)
+    # Success of the policy alone where all runs were validated, and its mean.
+    validated = np.array([run["validation"][:shortest] for run in runs])
+    tested = ~np.isnan(validated).any(axis=0)
+    means = validated[:, tested].mean(axis=0)
+    success = panels["success"]
+    success.plot(episodes[tested], means, "o-", color="C1", label="policy alone, validation")
+    success.legend()
+    for name in ("success", "human_share"):
+        panels[name].set_xlabel("episode")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    write_atomic(path, buffer.getvalue())
+    return path
+
+
+def moving_average(values: Values, window: int) -> Values:
+    """The mean of the last ``window`` values (fewer at the start), same length."""
+    sums = np.cumsum(np.concatenate([[0.0], values]))
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - window, 0)
+    return (sums[ends] - sums[starts]) / (ends - starts)
+
+
+def _columns(run_dir: Path) -> dict[str, Values]:
+    rows = read_metrics(run_dir)
+    if not rows:
+        raise UserError(f"{run_dir} holds no metrics to draw")
+
+    def column(name: str) -> Values:
+        # Kept results have nothing where there was no number.
+        return np.array([row.get(name) or "nan" for row in rows], dtype=float)
+
+    return {
+        "episode": column("episode") + 1,
+        "episode_return": column("episode_return"),
+        "distance_m": column("distance_m"),
+        "success": np.array([row["outcome"] == GOAL for row in rows], dtype=float),
+        "human_share": column("human_steps") / column("steps"),
+        "validation": column("validation_success"),
+    }
+
+
 BAND_PIXELS = 58
 """Above the scene: who drives, and both actions."""
 GAUGE_PIXELS = (150, 14)
@@ -36,16 +152,15 @@ FACTS = {
     "person": "the human drives",
     None: "the policy drives",
 }
-"""What is said, by the reason of the intervention."""
+"""Reason of the intervention -> what is written."""
 POLICY, HUMAN, GAUGE = COLOURS["ego"], (46, 139, 76), (200, 206, 196)
 COLOUR_COUNT = 64
 """A GIF's palette: the scene has few colours, and letters some shades."""
 LAST_S = 1.5
-"""How long the last picture stays before it begins anew."""
+"""How long the last picture stays before the film begins anew."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def _add_picture_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("policy", metavar="POLICY", help="what drives: see `trainer evaluate`")
     add_public_key(parser)
     add_scenario(parser)
@@ -67,8 +182,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Drive to the moment and draw it, or film the way there; returns the exit status."""
+def _picture(arguments: argparse.Namespace) -> int:
     check_suffix(arguments.out, "a picture is a .png, a film a .gif", ".png", ".gif")
     is_film = arguments.out.endswith(".gif")
     if arguments.human is not None and not is_film:
@@ -94,6 +208,16 @@ def run(arguments: argparse.Namespace) -> int:
     write_atomic(arguments.out, data)
     print(arguments.out)
     return 0
+
+
+PICTURE = Command(
+    examples(
+        "python -m trainer picture expert --seed 8 --time 3.4 --out scene.png",
+        "python -m trainer picture runs/phil_1 --human expert --time 15 --out take_over.gif",
+    ),
+    _add_picture_arguments,
+    _picture,
+)
 
 
 class Moment(NamedTuple):
@@ -142,9 +266,8 @@ def draw_moment(moment: Moment, action_name: str) -> Image.Image:
     left = image.width - width - 16
     centre = left + width / 2
     text = COLOURS["text"]
-    for row, (name, value, shade) in enumerate(
-        (("the policy wants", moment.policy_action, POLICY), ("applied", moment.action, colour))
-    ):
+    rows = (("the policy wants", moment.policy_action, POLICY), ("applied", moment.action, colour))
+    for row, (name, value, shade) in enumerate(rows):
         top = 11 + 22 * row
         pen.rectangle((left, top, left + width, top + height), fill=GAUGE)
         ends = sorted((centre, centre + value * width / 2))  # Right is positive.
