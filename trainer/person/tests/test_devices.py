@@ -14,7 +14,7 @@ from trainer.drivers import load_driver, make_environment
 from trainer.person.devices import SIZE, JoystickHands, KeyboardHands, Window, pygame
 from trainer.person.interface import LET_GO
 from trainer.person.profile import SHIPPED, read_profile
-from trainer.person.tests.pages import first_view
+from trainer.person.tests.browser import first_view
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
 
 G29 = read_profile(SHIPPED / "g29.toml")
