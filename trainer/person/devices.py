@@ -289,19 +289,16 @@ class Window:
         nobody = view.control == "policy" and view.policy_action is None
         who = "nobody drives" if nobody else CONTROL_TEXT[view.control]
         self._text(who, (left, top), view.control, 38)
-        lines = (
-            f"{view.speed_mps:.1f} m/s",
-            f"{view.distance_m:.1f} of {view.goal_m:.0f} m",
-            f"{view.time_s:.1f} s",
-            f"episode {view.episode}, step {view.step}",
-        )
-        for row, line in enumerate(lines):
-            self._text(line, (left, top + 44 + 28 * row), "text", 24)
-        if view.late_ticks:
-            late = f"{view.late_ticks} control periods began late"
-            self._text(late, (left, top + 44 + 28 * len(lines)), "warning")
-        message = "paused: P goes on" if view.paused else view.message
-        self._text(message, (left, top + 220), "warning", 24)
+        late = f"{view.late_ticks} control periods began late" if view.late_ticks else ""
+        for y, line, colour, size in (
+            (44, f"{view.speed_mps:.1f} m/s", "text", 24),
+            (72, f"{view.distance_m:.1f} of {view.goal_m:.0f} m", "text", 24),
+            (100, f"{view.time_s:.1f} s", "text", 24),
+            (128, f"episode {view.episode}, step {view.step}", "text", 24),
+            (156, late, "warning", 20),
+            (220, "paused: P goes on" if view.paused else view.message, "warning", 24),
+        ):
+            self._text(line, (left, top + y), colour, size)
 
     def _bars(self, view: View) -> None:
         """The three actions, one above the other, -1 to 1."""

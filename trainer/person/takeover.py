@@ -1,19 +1,7 @@
 """Who is in control: which page of the browser, and the person or the policy. Pure but for a lock.
 
 Three parts, from the hands to the car: ``Seat`` says which page's hands count, ``Intent`` whether
-the person wants control, ``TakeOver`` what the car is told while that changes:
-
-```
-state       the person holds     the person has let go
-policy      taking or human      policy
-taking      taking or human      returning or policy
-human       human                returning or policy
-returning   taking or human      returning or policy
-```
-
-Where a cell names two states, the second is reached when the action is no further from its goal
-than a hand-over may move it (``MAX_SLEW``); until then it moves by just that. So the car never
-jumps at a hand-over, and feels it within the first control period.
+the person wants control, ``TakeOver`` what the car is told while that changes.
 """
 
 from __future__ import annotations
@@ -32,25 +20,19 @@ MAX_SLEW = 0.5
 """The most that the action changes in a control period of a hand-over. From full throttle to full
 brake takes four of them, 0.4 s: about what a foot needs from pedal to pedal."""
 State = Literal["policy", "taking", "human", "returning"]
-NEXT: dict[tuple[State, bool, bool], State] = {
-    ("policy", False, True): "policy",
-    ("policy", False, False): "policy",
-    ("policy", True, False): "taking",
-    ("policy", True, True): "human",
-    ("taking", True, False): "taking",
-    ("taking", True, True): "human",
-    ("taking", False, False): "returning",
-    ("taking", False, True): "policy",
-    ("human", True, False): "human",
-    ("human", True, True): "human",
-    ("human", False, False): "returning",
-    ("human", False, True): "policy",
-    ("returning", True, False): "taking",
-    ("returning", True, True): "human",
-    ("returning", False, False): "returning",
-    ("returning", False, True): "policy",
+NEXT: dict[tuple[State, bool], tuple[State, State]] = {
+    ("policy", True): ("taking", "human"),
+    ("policy", False): ("policy", "policy"),
+    ("taking", True): ("taking", "human"),
+    ("taking", False): ("returning", "policy"),
+    ("human", True): ("human", "human"),
+    ("human", False): ("returning", "policy"),
+    ("returning", True): ("taking", "human"),
+    ("returning", False): ("returning", "policy"),
 }
-"""(state, whether the person holds, whether the goal is within reach) -> state."""
+"""(state, whether the person holds) -> state while the goal is out of reach, state once it is
+within reach: no further away than a hand-over may move the action (``MAX_SLEW``). Until then the
+action moves by just that: the car never jumps at a hand-over, and feels it at once."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +61,7 @@ class TakeOver:
         # At an episode's start there is nothing to leave from but the policy's action.
         last = policy_action if self._applied is None else self._applied
         before = self.state
-        self.state = NEXT[before, holds, abs(goal - last) <= MAX_SLEW]
+        self.state = NEXT[before, holds][abs(goal - last) <= MAX_SLEW]
         handing_over = self.state in ("taking", "returning")
         self._applied = last + min(max(goal - last, -MAX_SLEW), MAX_SLEW) if handing_over else goal
         control: Control = "human" if self.state == "taking" else self.state

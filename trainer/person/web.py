@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from importlib.resources import files
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -308,8 +308,7 @@ async def _say_goodbye(socket: web.WebSocketResponse) -> None:
 
 
 def _page_files() -> dict[str, bytes]:
-    folder = files("trainer.person") / "page"
-    found = {entry.name: entry.read_bytes() for entry in folder.iterdir() if "." in entry.name}
+    found = {path.name: path.read_bytes() for path in (Path(__file__).parent / "page").glob("*.*")}
     colours = "".join(f"--{name}: rgb{colour}; " for name, colour in BY_NAME.items())
     return {**found, "colours.css": f":root {{ {colours}}}".encode()}
 

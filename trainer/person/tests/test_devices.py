@@ -20,13 +20,8 @@ from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
 G29 = read_profile(SHIPPED / "g29.toml")
 
 
-def key(down: bool, code: int):
-    return pygame.event.Event(pygame.KEYDOWN if down else pygame.KEYUP, key=code)
-
-
-def press(hands, *codes, down=True):
-    for code in codes:
-        hands.handle(key(down, code))
+def press(hands, code, down=True):
+    hands.handle(pygame.event.Event(pygame.KEYDOWN if down else pygame.KEYUP, key=code))
 
 
 def test_a_held_key_takes_over_and_its_action_grows():
@@ -108,8 +103,10 @@ def test_keys_are_enough_to_drive(scenario, keys):
             wanted.append(float(expert.act(observation)[0]))
             pressed = keys_for(wanted[-3], action, keys, down)
             if pressed != down:
-                press(hands, *filter(None, [down]), down=False)
-                press(hands, *filter(None, [pressed]))
+                if down:
+                    press(hands, down, down=False)
+                if pressed:
+                    press(hands, pressed)
                 down = pressed
             now_s += 0.1
             action = hands.read(now_s).action
@@ -140,12 +137,8 @@ def read(device: Window):
     return device.poll(time.monotonic())
 
 
-def test_pedals_nobody_has_touched_are_not_half_pressed(wheel):
-    device = at_the_wheel("left_turn")
-    assert read(device).action == 0.0
-
-
 def test_axes_and_buttons_of_a_wheel(wheel):
+    assert read(at_the_wheel("left_turn")).action == 0.0, "untouched pedals are not half pressed"
     device = at_the_wheel("congestion")
     wheel.axis(0, 0.25)
     reading = read(device)
