@@ -38,14 +38,10 @@ Values = NDArray[np.float64]
 
 
 def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "run_dirs",
-        metavar="RUN_DIR",
-        nargs="+",
-        help="directory of a training run; several are drawn thinly, and their mean",
-    )
-    text = f"the picture (default: RUN_DIR/{CURVE_FILE})"
-    parser.add_argument("--out", metavar="F.png", help=text)
+    runs = "directory of a training run; several are drawn thinly, and their mean"
+    parser.add_argument("run_dirs", metavar="RUN_DIR", nargs="+", help=runs)
+    out = f"the picture (default: RUN_DIR/{CURVE_FILE})"
+    parser.add_argument("--out", metavar="F.png", help=out)
 
 
 def _plot(arguments: argparse.Namespace) -> int:
@@ -165,21 +161,12 @@ def _add_picture_arguments(parser: argparse.ArgumentParser) -> None:
     add_public_key(parser)
     add_scenario(parser)
     add_seed(parser, "the episode")
-    parser.add_argument(
-        "--time",
-        type=positive_number,
-        default=3.0,
-        metavar="S",
-        help="simulated seconds from the start: the moment of a picture, the end of a film",
-    )
-    parser.add_argument(
-        "--human",
-        metavar="expert|HUMAN_DIR",
-        help="what takes over in a film, where the scripted human would (default: nothing)",
-    )
-    parser.add_argument(
-        "--out", required=True, metavar="F.png|F.gif", help="the picture, or the film"
-    )
+    add, out = parser.add_argument, "the picture, or the film"
+    when = "simulated seconds from the start: the moment of a picture, the end of a film"
+    add("--time", type=positive_number, default=3.0, metavar="S", help=when)
+    human = "what takes over in a film, where the scripted human would (default: nothing)"
+    add("--human", metavar="expert|HUMAN_DIR", help=human)
+    add("--out", required=True, metavar="F.png|F.gif", help=out)
 
 
 def _picture(arguments: argparse.Namespace) -> int:

@@ -16,7 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -124,12 +124,8 @@ DRIVERS = {"policy": POLICY, **dict.fromkeys(get_args(Reason), HUMAN)}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "recordings",
-        metavar="RECORDING",
-        nargs="+",
-        help="sitting-NNNN.mcap, a directory of such, or a run that a person guided",
-    )
+    what = "sitting-NNNN.mcap, a directory of such, or a run that a person guided"
+    parser.add_argument("recordings", metavar="RECORDING", nargs="+", help=what)
     add_sink(parser)
 
 
@@ -151,11 +147,9 @@ def run(arguments: argparse.Namespace) -> int:
             f"{shown.human_steps} of them the person's{road}",
             flush=True,
         )
-        try:
+        with suppress(KeyboardInterrupt):
             while sink.kind == SERVE:
                 time.sleep(LOOK_S)
-        except KeyboardInterrupt:
-            pass
     return 0
 
 

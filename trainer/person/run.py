@@ -171,7 +171,7 @@ class PersonRun(TrainingRun):
             print("validation left out", file=sys.stderr)
 
     def _due(self, last_steps: int) -> bool:
-        return True  # Whenever it is done: a person's run has no other end than a sitting's.
+        return True  # A person's run has no other end than a sitting's.
 
     def _more_state(self) -> dict[str, Any]:
         return {"recorded": [self.sitting.recorder.sitting, self.sitting.recorder.index]}

@@ -45,39 +45,18 @@ LATE_S = 0.02
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_scenario(parser)
-    parser.add_argument(
-        "--human",
-        "--device",
-        dest="human",
-        choices=list(HUMANS),
-        default="keyboard",
-        help="the device that your hands are on",
-    )
-    parser.add_argument(
-        "--policy",
-        metavar="POLICY",
-        help="what drives until you take over: see `trainer evaluate` (default: you drive alone)",
-    )
+    add = parser.add_argument
+    device = "the device that your hands are on"
+    add("--human", "--device", dest="human", choices=list(HUMANS), default="keyboard", help=device)
+    driver = "what drives until you take over: see `trainer evaluate` (default: you drive alone)"
+    add("--policy", metavar="POLICY", help=driver)
     add_public_key(parser)
     goal = parser.add_mutually_exclusive_group()
-    goal.add_argument(
-        "--out",
-        metavar="REC_DIR",
-        default="runs/drives",
-        help="the directory of the recordings; sittings add up there",
-    )
-    goal.add_argument(
-        "--calibrate",
-        metavar="F.toml",
-        help="instead of driving, ask for a wheel's or gamepad's axes and buttons, and write a "
-        "profile",
-    )
-    parser.add_argument(
-        "--episodes",
-        type=positive,
-        metavar="N",
-        help="stop after so many episodes (default: no end)",
-    )
+    out = "the directory of the recordings; sittings add up there"
+    goal.add_argument("--out", metavar="REC_DIR", default="runs/drives", help=out)
+    ask = "instead of driving, ask for a wheel's or gamepad's axes and buttons, and write a profile"
+    goal.add_argument("--calibrate", metavar="F.toml", help=ask)
+    add("--episodes", type=positive, metavar="N", help="stop after so many (default: no end)")
     add_seed(parser, "the episodes, which are others in every sitting")
     add_person(parser)
     add_threads(parser)
