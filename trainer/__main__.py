@@ -8,12 +8,12 @@ from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("trainer.training.command", "train a policy with human guidance"),
-    "drive": ("trainer.person.drive", "drive yourself, or take over from a policy; recorded"),
+    "drive": ("trainer.person.session", "drive yourself, or take over from a policy; recorded"),
     "human": ("trainer.human.dagger", "train the human model from interventions (DAgger)"),
     "evaluate": ("trainer.evaluate", "drive test episodes and report how well it does"),
     "export": ("trainer.export", "write a run's actor as the file that a board drives"),
-    "plot": ("trainer.plots", "draw the learning curve of a run"),
-    "picture": ("trainer.picture", "draw a moment of an episode from above, or film it"),
+    "plot": ("trainer.pictures:PLOT", "draw the learning curve of a run"),
+    "picture": ("trainer.pictures:PICTURE", "draw a moment of an episode from above, or film it"),
     "view": ("trainer.view", "show recorded sittings in rerun"),
     "bench": ("trainer.bench", "measure learner, environments and training beside peers"),
     "experiment": ("trainer.experiments.command", "run the paper's experiments, judge its claims"),

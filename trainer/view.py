@@ -1,8 +1,8 @@
 """Show a training in rerun as it goes on (``train --rerun``), or recorded sittings (``view``).
 
-The training loop only gathers what must be taken while it is there, and never waits; a thread of
-its own does everything that takes time, rerun's calls and the critic's. A sitting's recording does
-not hold the road: the same seed and the same actions drive it again.
+The training loop only collects what must be taken while it is there, and never waits. A thread of
+its own draws: calls of rerun and of the critic take time. A recording of a sitting does not hold
+the road: driving the same seed with the same actions again gives it back.
 """
 
 from __future__ import annotations
@@ -14,17 +14,42 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
-from bridge.messages import Pace
-from bridge.rerun.draw import PICTURE_INTERVAL_S
+from bridge.rerun import APPLIED, HUMAN, POLICY
+
+# isort: split
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bridge.messages import Pace, SeenScene, read_scene
+from bridge.report import GOAL
+from bridge.rerun.draw import (
+    ALL_OF_IT,
+    BLUE,
+    GREY,
+    ORANGE,
+    PICTURE_INTERVAL_S,
+    PURPLE,
+    Plot,
+    draw_cars,
+    draw_ground,
+    frames_view,
+    full_blueprint,
+    plot_view,
+    road_view,
+    style_lines,
+    style_points,
+)
 from bridge.rerun.sinks import (
     SERVE,
     Sink,
@@ -38,20 +63,9 @@ from bridge.rerun.sinks import (
 )
 from edge_runtime.cli import examples, sigterm_as_interrupt
 from edge_runtime.util import counted
-from trainer.drawing import (
-    APPLICATION,
-    EPISODES,
-    SITTING_APPLICATION,
-    SITTINGS,
-    Entry,
-    Episode,
-    StepEntry,
-    Steps,
-    TrainingLog,
-    make_blueprint,
-)
 from trainer.drivers import make_environment
 from trainer.human.guide import Reason
+from trainer.learner.networks import Critic
 from trainer.person.recording import Step, find_recordings, read_steps
 from trainer.training.metrics import NAMES, EpisodeMetrics
 from trainer.training.run import Seen, TrainingRun
@@ -63,22 +77,55 @@ EXAMPLE = examples(
 LOOK_S = 0.2
 """The kernel may hand a signal to any thread, which does not wake this one from a longer sleep."""
 STEPS_TOGETHER = 50
-"""Numbers are handed over with a picture, or when there are so many."""
+"""Numbers are handed over with a picture, or when there are this many."""
 CORRECTIONS = 32
-"""The Q advantage is shown for so many of an episode, evenly spread: the critic takes time."""
+"""The Q advantage is shown for this many steps of an episode, evenly spread: the critic is slow."""
 MOST_WAITING = 500
-"""Entries, some 50 s of pictures: a view that is slower loses some, and the loop nothing."""
-Draw = Callable[[Entry], None]
+"""Entries, some 50 s of pictures. A view that is slower loses some; the loop loses nothing."""
+APPLICATION, SITTING_APPLICATION = "phil_hil_training", "phil_hil_sittings"
+TIMELINE = "step"
+RECENT_STEPS = 200
+"""Shown of what changes within an episode."""
+WINDOW = 20
+"""Episodes of the moving means."""
+EPISODES = (
+    Plot("return", "Return of an episode, and the mean of 20"),
+    Plot("success", "Success: mean of 20 episodes, and policy alone in validation", (-0.05, 1.05)),
+    Plot("loss", "Losses, means of an episode"),
+    Plot("priority", "Mean priority in the replay buffer: the human's samples, the policy's"),
+    Plot("human", "The human's share of the steps", (-0.05, 1.05)),
+    Plot("advantage", "Q advantage of the human's action, where it took over"),
+)
+"""The plots of a training, from top to bottom."""
+SITTINGS = (EPISODES[0], EPISODES[1], EPISODES[4])
+"""The plots of recorded sittings, which hold nothing of a learner."""
+RECENT = (
+    Plot("action", "Action in [-1, 1], the last 20 s", (-1.1, 1.1)),
+    Plot("speed", "Speed, m/s, the last 20 s"),
+)
+LINES = {
+    "return/episode": GREY,
+    "return/mean_of_20": BLUE,
+    "success/mean_of_20": BLUE,
+    "success/validation": ORANGE,
+    "loss/critic": PURPLE,
+    "loss/policy": POLICY,
+    "loss/cloning": HUMAN,
+    "priority/human": HUMAN,
+    "priority/policy": POLICY,
+    "human/share": HUMAN,
+    "action/policy": POLICY,
+    "action/applied": APPLIED,
+    "speed/ego": BLUE,
+}
+DRIVERS = {"policy": POLICY, **dict.fromkeys(get_args(Reason), HUMAN)}
+"""The policy, or the human for one of these reasons -> the colour on the time line."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "recordings",
-        metavar="RECORDING",
-        nargs="+",
-        help="sitting-NNNN.mcap, a directory of such, or a run that a person guided",
-    )
+    what = "sitting-NNNN.mcap, a directory of such, or a run that a person guided"
+    parser.add_argument("recordings", metavar="RECORDING", nargs="+", help=what)
     add_sink(parser)
 
 
@@ -100,11 +147,9 @@ def run(arguments: argparse.Namespace) -> int:
             f"{shown.human_steps} of them the person's{road}",
             flush=True,
         )
-        try:
+        with suppress(KeyboardInterrupt):
             while sink.kind == SERVE:
                 time.sleep(LOOK_S)
-        except KeyboardInterrupt:
-            pass
     return 0
 
 
@@ -113,6 +158,43 @@ def check_word(word: str) -> Sink:
     sink = read_sink(word)
     check_sink(sink)
     return sink
+
+
+class StepEntry(NamedTuple):
+    """The numbers of one control period."""
+
+    step: int
+    """Since the run began."""
+    policy_action: float
+    action: float
+    speed_mps: float
+    reason: Reason | None
+    """Why the human acted; None where the policy did."""
+
+
+class Steps(NamedTuple):
+    """Some control periods, and perhaps the picture of the last one: at most ten a second."""
+
+    entries: list[StepEntry]
+    frames: NDArray[np.uint8] | None = None
+    """What the policy saw, [2, 45, 80]."""
+    scene: dict[str, Any] | None = None
+    """The environment's; None, too, where the road is not known."""
+
+
+class Episode(NamedTuple):
+    """The end of an episode."""
+
+    step: int
+    metrics: EpisodeMetrics
+    corrections: Sequence[tuple[int, Seen]] = ()
+    """Steps at which the human acted, and what was seen there."""
+    critic: Critic | None = None
+    """A copy that is not trained; None without corrections."""
+
+
+Entry = Steps | Episode
+Draw = Callable[[Entry], None]
 
 
 @contextmanager
@@ -124,8 +206,7 @@ def watched(run: TrainingRun, sink: Sink) -> Iterator[Callable[[EpisodeMetrics],
         with open_sink(sink, APPLICATION, make_blueprint(None, EPISODES)) as recording:
             yield TrainingLog(recording, EPISODES).draw
 
-    # Here, as signals are the main thread's.
-    with sigterm_as_interrupt():
+    with sigterm_as_interrupt():  # Here, as signals are the main thread's.
         background = Background(opened)
         watcher = Watcher(run, background.put)
         run.on_step = watcher.on_step
@@ -133,14 +214,14 @@ def watched(run: TrainingRun, sink: Sink) -> Iterator[Callable[[EpisodeMetrics],
             yield watcher.on_episode
         finally:
             run.on_step = None
-            watcher.close()
+            watcher.hand_over()
             background.close()
             if background.dropped:
                 print(f"{background.dropped} entries came faster than drawn", file=sys.stderr)
 
 
 class Watcher:
-    """Looks on at one run; ``put`` takes what is to be drawn, and must not block."""
+    """Watches one run; ``put`` takes what is to be drawn, and must not block."""
 
     def __init__(self, run: TrainingRun, put: Draw) -> None:
         self._run, self._put = run, put
@@ -159,17 +240,13 @@ class Watcher:
         self._entries.append(StepEntry(self._step, *actions, seen.speed_mps, reason))
         self._step += 1
         if self._pace.due(time.monotonic()):
-            self._hand_over(seen.observation, self._run.env.scene())
+            self.hand_over(seen.observation, self._run.env.scene())
         elif len(self._entries) >= STEPS_TOGETHER:
-            self._hand_over()
-
-    def close(self) -> None:
-        """Hand over what an episode that was broken off has left."""
-        self._hand_over()
+            self.hand_over()
 
     def on_episode(self, metrics: EpisodeMetrics) -> None:
         """Take an episode's end; no update is under way."""
-        self._hand_over()
+        self.hand_over()
         corrections, self._corrections = self._corrections, []
         critic = None
         if corrections:
@@ -177,7 +254,8 @@ class Watcher:
         stride = -(-len(corrections) // CORRECTIONS) or 1
         self._put(Episode(max(self._step - 1, 0), metrics, corrections[::stride], critic))
 
-    def _hand_over(self, *picture: Any) -> None:
+    def hand_over(self, *picture: Any) -> None:
+        """Pass on the steps so far, also those of an episode that was broken off."""
         entries, self._entries = self._entries, []
         if entries:
             self._put(Steps(entries, *picture))
@@ -186,7 +264,7 @@ class Watcher:
 class Background:
     """Opens a view, draws each entry in order, and closes it, in a thread of its own.
 
-    What any of it raises is told once, and ends the drawing, not the run.
+    An error in any of it is reported once, and ends the drawing, not the run.
     """
 
     def __init__(self, opened: Callable[[], AbstractContextManager[Draw]]) -> None:
@@ -218,25 +296,23 @@ class Background:
             why = error.why if isinstance(error, ViewerGone) else error
             print(f"viewer gone; the run is unharmed: {why}", file=sys.stderr, flush=True)
             for _ in entries:
-                pass  # The queue is emptied all the same: close() must not wait for ever.
+                pass  # Empty the queue all the same, or close() would wait for ever.
 
 
-@dataclass
 class Shown:
-    """What a view of sittings amounts to."""
+    """The entries of recorded sittings, and what they amount to."""
 
-    steps: int = 0
-    human_steps: int = 0
-    episodes: int = 0
-    without_road: int = 0
-    """Episodes whose scenario drives differently today: their road is not shown."""
-    _envs: dict[str, Any] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self.steps = self.human_steps = self.episodes = 0
+        self.without_road = 0
+        """Episodes whose scenario drives differently today: their road is not shown."""
+        self._envs: dict[str, Any] = {}
 
     def entries(self, paths: Iterable[Path]) -> Iterator[Entry]:
         """Everything in these recordings, end to end; each episode ends with its own entry."""
         for path in paths:
-            for _, episode in groupby(read_steps(path), key=lambda step: step.episode):
-                yield from self._episode(list(episode))
+            for _, steps in groupby(read_steps(path), key=lambda step: step.episode):
+                yield from self._episode(list(steps))
 
     def _episode(self, episode: list[Step]) -> Iterator[Entry]:
         road = self._drive_again(episode)
@@ -247,7 +323,6 @@ class Shown:
             yield Steps([entry], step.observation, road[number] if road else None)
             self.steps += 1
         human_steps = sum(step.human for step in episode)
-        # What only a learner knows is nan.
         known: dict[str, Any] = {
             "episode": self.episodes,
             "total_steps": self.steps,
@@ -257,6 +332,7 @@ class Shown:
             "interventions": sum(step.first for step in episode),
             "human_steps": human_steps,
         }
+        # What only a learner knows is nan.
         metrics = EpisodeMetrics(**{**dict.fromkeys(NAMES, math.nan), **known})
         yield Episode(self.steps - 1, metrics)
         self.human_steps += human_steps
@@ -276,3 +352,138 @@ class Shown:
             scenes.append(env.scene())
             observation, *_ = env.step(np.array([step.action], np.float32))
         return scenes
+
+
+@torch.no_grad()
+def q_advantage(critic: Critic, seen: Seen) -> float:
+    """Q'(s, a_human) - Q'(s, a_policy): eq. 21b's exponent, for the action that was overruled.
+
+    One picture at a time: that takes this thread alone, where a batch would bring a second pool of
+    threads beside the learner's.
+    """
+    picture = critic.embed(torch.from_numpy(seen.observation)[None])
+    actions = torch.tensor([seen.action.tolist(), seen.policy_action.tolist()])
+    human, policy = critic.value(picture.expand(2, -1), actions).tolist()
+    return human - policy
+
+
+def make_blueprint(scene: SeenScene | None, episodes: Sequence[Plot]) -> rrb.Blueprint:
+    """Lay out the views; the ground shown is fixed by the first scene (None: as rerun sees fit)."""
+    recent = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seq=-RECENT_STEPS),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    left = rrb.Vertical(
+        road_view(scene, "Road from above (blue: the policy drives, green: the human)"),
+        frames_view(),
+        rrb.StateTimelineView(
+            origin="driver",
+            name="Who drives: the policy, or the human, and why",
+            time_view=rrb.TimeAxis(view_range=ALL_OF_IT),
+        ),
+        *(plot_view(plot, recent) for plot in RECENT),
+        row_shares=[3, 1.6, 0.9, 1.2, 1.1],
+    )
+    right = rrb.Vertical(*map(plot_view, episodes))
+    return full_blueprint(left, right, [1, 1], TIMELINE)
+
+
+class TrainingLog:
+    """Draws one run, with the plots of whole ``episodes`` laid out."""
+
+    def __init__(self, recording: rr.RecordingStream, episodes: Sequence[Plot]) -> None:
+        self._recording, self._episodes = recording, episodes
+        self._driver = ""
+        self._ground: tuple[Any, ...] = ()
+        """What is drawn of the ground: recordings may be of several scenarios."""
+        self._returns: deque[float] = deque(maxlen=WINDOW)
+        self._successes: deque[float] = deque(maxlen=WINDOW)
+        style_lines(recording, LINES)
+        style_points(recording, {"advantage/of_the_human": HUMAN})
+        names, colours = list(DRIVERS), list(DRIVERS.values())
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=colours)
+        recording.log("driver", lanes, static=True)
+
+    def draw(self, entry: Entry) -> None:
+        """Draw what the loop has handed over."""
+        if isinstance(entry, Episode):
+            self._draw_episode(entry)
+            return
+        steps, policy, applied, speeds, reasons = zip(*entry.entries, strict=True)
+        self._columns("action/policy", steps, policy)
+        self._columns("action/applied", steps, applied)
+        self._columns("speed/ego", steps, speeds)
+        for step, reason in zip(steps, reasons, strict=True):
+            driver = reason or "policy"
+            if driver != self._driver:
+                self._driver = driver
+                self._stand_at(step)
+                self._recording.log("driver", rr.StateChange(state=driver))
+        if entry.frames is not None:
+            self._stand_at(steps[-1])
+            if entry.scene is not None:
+                self._draw_road(read_scene(entry.scene))
+            for name, frame in zip(("before", "now"), entry.frames, strict=True):
+                self._recording.log(f"frames/{name}", rr.Image(frame, color_model="L"))
+
+    def _draw_road(self, scene: SeenScene) -> None:
+        ground = (scene.roads, scene.path, scene.goal)
+        if ground != self._ground:
+            self._ground = ground
+            self._recording.send_blueprint(make_blueprint(scene, self._episodes))
+            draw_ground(self._recording, scene)
+        draw_cars(self._recording, scene, DRIVERS[self._driver])
+
+    def _draw_episode(self, episode: Episode) -> None:
+        metrics = episode.metrics
+        self._returns.append(metrics.episode_return)
+        self._successes.append(float(metrics.outcome == GOAL))
+        self._stand_at(episode.step)
+        self._recording.set_time("episode", sequence=metrics.episode)
+        for path, value in {
+            "return/episode": metrics.episode_return,
+            "return/mean_of_20": float(np.mean(self._returns)),
+            "success/mean_of_20": float(np.mean(self._successes)),
+            "success/validation": metrics.validation_success,
+            "loss/critic": metrics.critic_loss,
+            "loss/policy": metrics.policy_loss,
+            "loss/cloning": metrics.cloning_loss,
+            "priority/human": metrics.human_priority,
+            "priority/policy": metrics.policy_priority,
+            "human/share": metrics.human_steps / metrics.steps,
+        }.items():
+            if not math.isnan(value):
+                self._recording.log(path, rr.Scalars(value))
+        self._recording.log("status", _status(metrics))
+        self._recording.reset_time()
+        if episode.critic is not None:
+            steps = [step for step, _ in episode.corrections]
+            values = [q_advantage(episode.critic, seen) for _, seen in episode.corrections]
+            self._columns("advantage/of_the_human", steps, values)
+        flush(self._recording)  # A viewer that is gone takes everything without a word.
+
+    def _columns(self, path: str, steps: Sequence[int], values: Sequence[float]) -> None:
+        """Log many numbers in one call: a call for each would cost as much as this one."""
+        rr.send_columns(
+            path,
+            indexes=[rr.TimeColumn(TIMELINE, sequence=np.array(steps))],
+            columns=rr.Scalars.columns(scalars=np.array(values)),
+            recording=self._recording,
+        )
+
+    def _stand_at(self, step: int) -> None:
+        self._recording.reset_time()
+        self._recording.set_time(TIMELINE, sequence=step)
+
+
+def _status(metrics: EpisodeMetrics) -> rr.TextDocument:
+    lines = [
+        f"# episode {metrics.episode}: {metrics.outcome}",
+        f"{counted(metrics.total_steps, 'step')} in all, {metrics.steps} in this episode",
+        f"{counted(metrics.interventions, 'intervention')}, "
+        f"{counted(metrics.human_steps, 'step')} the human's",
+        f"{metrics.distance_m:.1f} m, return {metrics.episode_return:.1f}",
+    ]
+    if not math.isnan(metrics.validation_success):
+        lines.append(f"validation: success {metrics.validation_success:.0%}")
+    return rr.TextDocument("\n\n".join(lines), media_type="text/markdown")

@@ -29,7 +29,7 @@ from hil_tests.pictures import (
 )
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import HumanGuide
-from trainer.picture import drive_moments
+from trainer.pictures import drive_moments
 
 ROOT = Path(__file__).parents[2]
 READMES = sorted(

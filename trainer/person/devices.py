@@ -1,13 +1,20 @@
-"""Keyboard, gamepad and wheel through SDL (pygame): from its events to what the hands say."""
+"""Keyboard, gamepad and wheel through SDL (pygame), and the window that shows the drive."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pygame
+from numpy.typing import NDArray
 
+from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.interface import (
     KEY_HELP,
@@ -15,13 +22,12 @@ from trainer.person.interface import (
     WISH_HELP,
     WISHES,
     Moving,
-    Person,
     Reading,
     View,
     Wish,
 )
 from trainer.person.profile import SHIPPED, Profile, read_profile
-from trainer.person.window import Window
+from trainer.scenarios.scene import draw_scene
 
 WISH_KEYS: dict[int, Wish] = {
     pygame.K_p: "pause",
@@ -37,63 +43,43 @@ KEYS = {
     "congestion": {pygame.K_LEFT: -1.0, pygame.K_a: -1.0, pygame.K_RIGHT: 1.0, pygame.K_d: 1.0},
 }
 RATES_PER_S = {"left_turn": 5.0, "congestion": 2.5}
-"""How quickly a key presses: a pedal is down in 0.2 s; a wheel is turned by a tap, not thrown."""
+"""How quickly a key presses: a pedal is down in 0.2 s; a tap turns the wheel a little."""
+SIZE = (1040, 680)
+"""The drawn picture's; the window shows it larger or smaller."""
+SCREEN_SHARE = 0.9
+"""The window takes this much of a small screen: frame and desktop bars need some."""
+SCENE_SIZE = (736, 400)
+FRAME_SCALE = 3
+MARGIN = 16
+COLOURS = {
+    "background": (24, 27, 32),
+    "panel": (36, 41, 48),
+    "text": (232, 234, 237),
+    "dim": (150, 157, 166),
+    **BY_NAME,
+    "warning": (255, 110, 100),
+}
+UNSEEN = ("offscreen", "dummy", "evdev")
+"""Drivers that SDL falls back to where there is no screen: it would draw into memory."""
+CONTROL_TEXT = {"policy": "the policy drives", "human": "YOU drive", "returning": "handing back"}
 
 
-class WindowPerson:
-    """Hands before a window, and the window's keys: pause, restart, discard, quit.
-
-    Closing the window is quitting.
-    """
-
-    def __init__(self, hands: KeyboardHands | JoystickHands, window: Window) -> None:
-        self._hands, self._window = hands, window
-        self.help: tuple[str, ...] = (hands.help, WISH_HELP)
-        self.moving = hands.moving
-
-    @property
-    def present(self) -> bool:
-        """Whether the device is there."""
-        return self._hands.present
-
-    def poll(self, now_s: float) -> Reading:
-        """Take what SDL has heard since the last call."""
-        wishes: set[Wish] = set()
-        for event in pygame.event.get() if pygame.display.get_init() else ():
-            self._hands.handle(event)
-            if event.type == pygame.QUIT:
-                wishes.add("quit")
-            elif event.type == pygame.KEYDOWN and event.key in WISH_KEYS:
-                wishes.add(WISH_KEYS[event.key])
-        reading = self._hands.read(now_s)
-        return Reading(reading.action, reading.engaged, reading.wishes | wishes, reading.by_moving)
-
-    def show(self, view: View) -> None:
-        """Draw everything anew."""
-        self._window.show(view)
-
-    def close(self) -> None:
-        """Close the window, and SDL with it."""
-        self._window.close()
-
-
-def open_keyboard(arguments: argparse.Namespace) -> Person:
+def open_keyboard(arguments: argparse.Namespace) -> Window:
     """The keyboard and its window; raises UserError without a screen."""
-    return WindowPerson(KeyboardHands(arguments.scenario), Window())
+    return Window(KeyboardHands(arguments.scenario))
 
 
-def open_joystick(arguments: argparse.Namespace) -> Person:
+def open_joystick(arguments: argparse.Namespace) -> Window:
     """A gamepad or a wheel, with a window.
 
     Raises:
-        UserError: no screen, no such device, or a profile that is none.
+        UserError: no screen, no such device, or a wrong profile.
     """
     word = arguments.human
     path = Path(arguments.profile or SHIPPED_PROFILES[word])
     profile = read_profile(path)
-    window = Window()
-    hands = JoystickHands(profile, arguments.scenario)
-    if not hands.present:
+    window = Window(JoystickHands(profile, arguments.scenario))
+    if not window.present:
         there = ", ".join(joystick.get_name() for joystick in joysticks())
         window.close()
         raise UserError(
@@ -101,7 +87,7 @@ def open_joystick(arguments: argparse.Namespace) -> Person:
             f"{f'there is {there}' if there else 'none is plugged in'}; "
             f"`python -m trainer drive --human {word} --calibrate F.toml` makes a profile"
         )
-    return WindowPerson(hands, window)
+    return window
 
 
 def joysticks() -> list[Any]:
@@ -124,6 +110,9 @@ class KeyboardHands:
         self._action = 0.0
         self._read_s: float | None = None
 
+    def plug_in(self) -> None:
+        """It always is."""
+
     def handle(self, event: Any) -> None:
         """Follow the keys up and down."""
         if event.type == pygame.KEYDOWN:
@@ -132,8 +121,7 @@ class KeyboardHands:
         elif event.type == pygame.KEYUP:
             self._down.discard(event.key)
         elif event.type == pygame.WINDOWFOCUSLOST:
-            # The key's release would be told to another window.
-            self._down.clear()
+            self._down.clear()  # The key's release goes to another window.
 
     def read(self, now_s: float) -> Reading:
         """Engaged while any of the keys is down; the action ramps towards what they say."""
@@ -147,7 +135,7 @@ class KeyboardHands:
             return LET_GO
         target = min(max(sum(self._keys[key] for key in driving), -1.0), 1.0)
         if target * self._action < 0.0:
-            self._action = 0.0  # Turning round does not first undo.
+            self._action = 0.0  # The other direction begins at once, from rest.
         step = self._rate_per_s * since_s
         self._action += min(max(target - self._action, -step), step)
         return Reading(action=self._action, engaged=True)
@@ -167,18 +155,24 @@ class JoystickHands:
         if profile.take_over == "moving":
             how = "turn the wheel" if scenario == "congestion" else "press a pedal"
         self.help = f"{profile.name}: {how} to take over"
-        self._plug_in()
 
     @property
     def present(self) -> bool:
         """Whether it is plugged in."""
         return self._joystick is not None
 
+    def plug_in(self) -> None:
+        """Take the first device that the profile fits, if there is one."""
+        for joystick in joysticks():
+            if self._profile.match.lower() in joystick.get_name().lower():
+                self._joystick, self._instance = joystick, joystick.get_instance_id()
+                return
+
     def handle(self, event: Any) -> None:
         """Follow axes, buttons and plugs."""
         if event.type == pygame.JOYDEVICEADDED and not self.present:
-            self._plug_in()
-        elif self._joystick is None or getattr(event, "instance_id", None) != self._instance:
+            self.plug_in()
+        elif not self.present or getattr(event, "instance_id", None) != self._instance:
             return
         elif event.type == pygame.JOYAXISMOTION:
             self._places[event.axis] = float(event.value)
@@ -201,8 +195,167 @@ class JoystickHands:
         action = self._profile.action(self._scenario, self._places)
         return Reading(action, held, wishes, by_moving=self._profile.take_over == "moving")
 
-    def _plug_in(self) -> None:
-        for joystick in joysticks():
-            if self._profile.match.lower() in joystick.get_name().lower():
-                self._joystick, self._instance = joystick, joystick.get_instance_id()
-                return
+
+class Window:
+    """A person before a window: hands on a device, and the window's keys for the wishes.
+
+    Closing the window is quitting.
+
+    Raises:
+        UserError: there is no screen to open it on.
+    """
+
+    def __init__(self, hands: KeyboardHands | JoystickHands) -> None:
+        try:
+            with _quiet_stderr():
+                pygame.display.init()
+                driver = pygame.display.get_driver()
+                if driver in UNSEEN and "SDL_VIDEODRIVER" not in os.environ:
+                    raise pygame.error(f"SDL would draw {driver}")
+                pygame.joystick.init()
+                pygame.font.init()
+                width, height = pygame.display.get_desktop_sizes()[0]
+                size = _fitted(
+                    min(SCREEN_SHARE * width, SIZE[0]), min(SCREEN_SHARE * height, SIZE[1])
+                )
+                self._window = pygame.display.set_mode(size, pygame.RESIZABLE)
+        except pygame.error as error:
+            pygame.quit()
+            raise UserError(
+                f"no window can be opened ({error}): there is no screen here, or DISPLAY does not "
+                "name it; --human web needs none"
+            ) from None
+        pygame.display.set_caption("PHIL-TD3: at the wheel")
+        self._screen = pygame.Surface(SIZE)
+        self._fonts = {size: pygame.font.Font(None, size) for size in (20, 24, 38)}
+        hands.plug_in()
+        self._hands, self.moving = hands, hands.moving
+        self.help: tuple[str, ...] = (hands.help, WISH_HELP)
+
+    @property
+    def present(self) -> bool:
+        """Whether the device is there."""
+        return self._hands.present
+
+    def poll(self, now_s: float) -> Reading:
+        """Take what SDL has heard since the last call."""
+        wishes: set[Wish] = set()
+        for event in pygame.event.get() if pygame.display.get_init() else ():
+            self._hands.handle(event)
+            if event.type == pygame.QUIT:
+                wishes.add("quit")
+            elif event.type == pygame.KEYDOWN and event.key in WISH_KEYS:
+                wishes.add(WISH_KEYS[event.key])
+        reading = self._hands.read(now_s)
+        return Reading(reading.action, reading.engaged, reading.wishes | wishes, reading.by_moving)
+
+    def show(self, view: View) -> None:
+        """Draw everything anew."""
+        if not pygame.display.get_init():
+            return
+        self._screen.fill(COLOURS["background"])
+        self._blit(draw_scene(view.scene, ego=COLOURS[view.control]), (0, 0))
+        self._frames(view)
+        self._state(view)
+        self._bars(view)
+        for row, line in enumerate((*view.help, view.progress)):
+            colour = "text" if row < len(view.help) else "dim"
+            self._text(line, (MARGIN, 588 + 21 * row), colour)
+        room = self._window.get_size()
+        size = _fitted(*room)
+        drawn = self._screen
+        if size != SIZE:
+            drawn = pygame.transform.smoothscale(drawn, size)
+        self._window.fill(COLOURS["background"])
+        self._window.blit(drawn, ((room[0] - size[0]) // 2, (room[1] - size[1]) // 2))
+        pygame.display.flip()
+
+    def close(self) -> None:
+        """Close the window, and SDL with it."""
+        pygame.quit()
+
+    def _frames(self, view: View) -> None:
+        """What the policy sees, the older frame first."""
+        top = SCENE_SIZE[1] + MARGIN + 22
+        for place, (frame, when) in enumerate(zip(view.frames, ("0.1 s ago", "now"), strict=True)):
+            large = np.repeat(np.repeat(frame, FRAME_SCALE, axis=0), FRAME_SCALE, axis=1)
+            left = MARGIN + place * (large.shape[1] + MARGIN)
+            self._text(f"the policy sees, {when}", (left, top - 20), "dim")
+            self._blit(np.repeat(large[:, :, None], 3, axis=2), (left, top))
+
+    def _state(self, view: View) -> None:
+        """The right column: who is in control, and how the drive is going."""
+        left, top = SCENE_SIZE[0] + MARGIN, MARGIN
+        nobody = view.control == "policy" and view.policy_action is None
+        who = "nobody drives" if nobody else CONTROL_TEXT[view.control]
+        self._text(who, (left, top), view.control, 38)
+        late = f"{view.late_ticks} control periods began late" if view.late_ticks else ""
+        for y, line, colour, size in (
+            (44, f"{view.speed_mps:.1f} m/s", "text", 24),
+            (72, f"{view.distance_m:.1f} of {view.goal_m:.0f} m", "text", 24),
+            (100, f"{view.time_s:.1f} s", "text", 24),
+            (128, f"episode {view.episode}, step {view.step}", "text", 24),
+            (156, late, "warning", 20),
+            (220, "paused: P goes on" if view.paused else view.message, "warning", 24),
+        ):
+            self._text(line, (left, top + y), colour, size)
+
+    def _bars(self, view: View) -> None:
+        """The three actions, one above the other, -1 to 1."""
+        left, width = 2 * (MARGIN + 80 * FRAME_SCALE) + 2 * MARGIN, 400
+        words = ("left", "right") if view.scenario == "congestion" else ("brake", "throttle")
+        top = SCENE_SIZE[1] + MARGIN
+        self._text(words[0], (left, top), "dim")
+        self._text(words[1], (left + width, top), "dim", right=True)
+        rows = (
+            ("policy", view.policy_action or 0.0, "policy"),
+            ("you", view.human_action, "human"),
+            ("applied", view.applied_action, "applied"),
+        )
+        for row, (name, action, colour) in enumerate(rows):
+            y = top + 24 + 42 * row
+            box = pygame.Rect(left, y, width, 18)
+            pygame.draw.rect(self._screen, COLOURS["panel"], box)
+            reach = int(action * width / 2)
+            bar = pygame.Rect(left + width // 2 + min(reach, 0), y, abs(reach), 18)
+            pygame.draw.rect(self._screen, COLOURS[colour], bar)
+            bottom = (box.centerx, box.bottom - 1)
+            pygame.draw.line(self._screen, COLOURS["dim"], box.midtop, bottom)
+            self._text(f"{name} {action:+.2f}", (left, y + 20), "dim")
+
+    def _text(
+        self, text: str, place: tuple[int, int], colour: str, size: int = 20, right: bool = False
+    ) -> None:
+        drawn = self._fonts[size].render(text, True, COLOURS[colour])
+        x, y = place
+        self._screen.blit(drawn, (x - drawn.get_width() if right else x, y))
+
+    def _blit(self, picture: NDArray[np.uint8], place: tuple[int, int]) -> None:
+        """Put a picture uint8 [height, width, 3] on the screen."""
+        height, width = picture.shape[:2]
+        surface: Any = pygame.image.frombuffer(picture.tobytes(), (width, height), "RGB")
+        self._screen.blit(surface, place)
+
+
+def _fitted(width: float, height: float) -> tuple[int, int]:
+    """The largest size of the picture's shape that fits."""
+    scale = min(width / SIZE[0], height / SIZE[1])
+    return max(int(SIZE[0] * scale), 1), max(int(SIZE[1] * scale), 1)
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """Drop what any thread writes to stderr meanwhile: without a screen, SDL writes many lines."""
+    sys.stderr.flush()
+    try:
+        kept = os.dup(2)
+    except OSError:  # It is closed anyway.
+        yield
+        return
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

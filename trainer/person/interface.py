@@ -116,17 +116,15 @@ class Person(Protocol):
 
         Before an episode the loop waits for it; within one, an absent person has let go.
         """
-        ...
 
     def poll(self, now_s: float) -> Reading:
         """What the person does at ``now_s`` (``time.monotonic``); ``LET_GO`` without a device."""
-        ...
 
     def show(self, view: View) -> None:
-        """Show the newest view; it may leave out views that it has no time for."""
+        """Show the newest view, unless there is no time for it."""
 
     def close(self) -> None:
-        """Close device and display; twice is once."""
+        """Close device and display; a second call does nothing."""
 
 
 HUMANS = {
@@ -148,31 +146,19 @@ DEVICE_OPTIONS: dict[str, tuple[Any, tuple[str, ...]]] = {
 def add_person(parser: argparse.ArgumentParser) -> None:
     """Declare the person's options of ``drive`` and ``train``."""
     group = parser.add_argument_group(f"a person at the wheel (--human {'|'.join(HUMANS)})")
-    group.add_argument(
-        "--profile",
-        metavar="F.toml",
-        help="what the axes and buttons of --human gamepad or wheel mean (default: as shipped)",
-    )
-    group.add_argument(
-        "--host", help="the address at which --human web listens; by default this machine's alone"
-    )
-    group.add_argument(
-        "--port",
-        type=whole_number(0, 65535),
-        metavar="N",
-        help="the port of --human web; 0: any that is free",
-    )
-    group.add_argument(
-        "--speed",
-        type=positive_number,
-        metavar="X",
-        help="simulated seconds in one of yours: 0.5 is slow motion",
-    )
+    shipped = "what the axes and buttons of --human gamepad or wheel mean (default: as shipped)"
+    here = "the address at which --human web listens; by default this machine's alone"
+    port = "the port of --human web; 0: any that is free"
+    slow = "simulated seconds in one of yours: 0.5 is slow motion"
+    group.add_argument("--profile", metavar="F.toml", help=shipped)
+    group.add_argument("--host", help=here)
+    group.add_argument("--port", type=whole_number(0, 65535), metavar="N", help=port)
+    group.add_argument("--speed", type=positive_number, metavar="X", help=slow)
     group.set_defaults(**{name: default for name, (default, _) in DEVICE_OPTIONS.items()})
 
 
 def check_person_options(arguments: argparse.Namespace) -> None:
-    """Refuse what ``--human``, a device or not, has no use for; raises UserError."""
+    """Refuse an option that ``--human``, a device or not, has no use for; raises UserError."""
     for name, (default, devices) in DEVICE_OPTIONS.items():
         if getattr(arguments, name) != default and arguments.human not in devices:
             raise UserError(f"--{name} means nothing with --human {arguments.human}")

@@ -18,9 +18,9 @@ from trainer.person.interface import Moving, Wish
 SHIPPED = Path(__file__).parent / "profiles"
 Number = Annotated[int, msgspec.Meta(ge=0, le=63)]
 Place = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
-"""Where an axis is; SDL's go from -1 to 1."""
+"""Of an axis, as SDL gives it."""
 SHORTEST = 0.02
-"""The least way of a wheel or pedal: its noise must not be a full action."""
+"""The shortest travel of a wheel or pedal: its noise must not be a full action."""
 DeadZone = Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)]
 Share = Annotated[float, msgspec.Meta(gt=0.0, lt=1.0)]
 
@@ -30,12 +30,12 @@ class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     axis: Number
     left: Place = -1.0
-    """Where the action is -1. Short of the axis' end where a hand should not turn that far; the
-    larger of the two where the axis runs the other way round."""
+    """Where the action is -1: before the axis' end, where a hand should not turn that far. It is
+    larger than ``right`` where the axis is reversed."""
     centre: Place = 0.0
     right: Place = 1.0
     dead_zone: DeadZone = 0.02
-    """Share of the way from the centre in which nothing happens."""
+    """The share of the way from the centre in which nothing happens."""
 
     def __post_init__(self) -> None:
         if not (self.left < self.centre < self.right or self.left > self.centre > self.right):
@@ -103,11 +103,7 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_profile(path: Path) -> Profile:
-    """Read a profile.
-
-    Raises:
-        UserError: no such file, no TOML, or no profile; one line says where.
-    """
+    """Read a profile; UserError where there is none, or it is wrong: one line says where."""
     values = read_toml(path, "profile")
     try:
         return msgspec.convert(values, Profile)
@@ -170,7 +166,7 @@ class Found(NamedTuple):
 
 
 def calibrate(word: str, out: Path) -> None:
-    """Ask on the terminal, about the first device there is, and write the profile.
+    """Ask on the terminal about the first device there is, and write the profile.
 
     Raises:
         UserError: no device, no answer, or a file that cannot be written.
@@ -197,8 +193,7 @@ def calibrate(word: str, out: Path) -> None:
 def ask(joystick: Any, pump: Callable[[], object], say: Callable[[str], None]) -> str:
     """The profile, as TOML, from what the person does with the joystick (pygame's) when told.
 
-    ``pump`` lets SDL look at its devices. Raises UserError where there is no answer, or none that
-    makes sense.
+    ``pump`` lets SDL look at its devices. UserError: no answer, or a contradictory one.
     """
 
     def places() -> list[float]:

@@ -1,9 +1,9 @@
 """A sitting's recording: every step, kept from the moment it is taken.
 
-One MCAP file a sitting, ``sitting-0001.mcap`` and so on, whose messages are whole transitions
-(``Step``) in MessagePack. Each step is a chunk of its own and handed to the operating system at
-once, so whatever ends the process, at most one step is lost, the one that was being taken or an
-episode's last, which says whether the person discarded it; 30 minutes are about 12 MB. Nothing is
+One MCAP file a sitting, ``sitting-0001.mcap`` and so on; its messages are whole transitions
+(``Step``) in MessagePack. Each step is a chunk of its own, handed to the operating system at once.
+So whatever ends the process, at most one step is lost: the one that was being taken, or an
+episode's last, which says whether the person discarded it. 30 minutes are about 12 MB. Nothing is
 ever overwritten: sittings add up.
 """
 
@@ -30,7 +30,7 @@ from trainer.training.delayed import Store
 
 TOPIC = "person/step"
 WIRE = ("phil/", "view/")
-"""How the topics of the wire's recordings begin, and those of their copies for viewers."""
+"""Begin the topics of a recording of the wire, and their copies for viewers."""
 DIRECTORY = "sittings"
 """Where a training run keeps its recordings."""
 DISCARDED = "discarded"
@@ -90,11 +90,7 @@ class Step(msgspec.Struct, frozen=True):
 
 
 class Recorder:
-    """Writes a new sitting into a directory.
-
-    Raises:
-        UserError: the directory cannot be written.
-    """
+    """Writes a new sitting into a directory; UserError where that cannot be written."""
 
     def __init__(self, directory: Path) -> None:
         self.sitting = 1 + max(map(_number, sittings(directory)), default=0)
@@ -147,11 +143,7 @@ def _number(path: Path) -> int:
 
 
 def find_recordings(places: Sequence[Path]) -> list[Path]:
-    """The files that recordings, their directories and training runs name.
-
-    Raises:
-        UserError: one of them names none.
-    """
+    """The recordings in files, directories and training runs; UserError where a place has none."""
     found: list[Path] = []
     for place in places:
         here = [place] if place.is_file() else sittings(place) or sittings(place / DIRECTORY)
@@ -175,14 +167,12 @@ def read_steps(path: Path) -> Iterator[Step]:
             for record in records.walk():
                 if records.damaged_places:
                     return
-                if isinstance(record, Channel) and record.topic.startswith(WIRE):
-                    raise UserError(
-                        f"{path} is a recording of the wire, as `bridge record` makes them: "
-                        f"`python -m bridge view {path}` shows it"
-                    )
                 if isinstance(record, Channel) and record.topic != TOPIC:
-                    what = f"it holds {record.topic}"
-                    raise UserError(f"{path} is no recording of a sitting: {what}")
+                    what = f"no recording of a sitting: it holds {record.topic}"
+                    if record.topic.startswith(WIRE):
+                        what = "a recording of the wire, as `bridge record` makes them: "
+                        what += f"`python -m bridge view {path}` shows it"
+                    raise UserError(f"{path} is {what}")
                 if isinstance(record, Message):
                     yield msgspec.msgpack.decode(record.data, type=Step)
     except OSError as error:
@@ -228,9 +218,7 @@ def store_again(
             if step is episode[ticks_late]:
                 store.start_episode(known.observation)
             action = np.array([step.action], np.float32)
-            overruled = action
-            if step.policy_action is not None:
-                overruled = np.array([step.policy_action], np.float32)
+            policy = step.action if step.policy_action is None else step.policy_action
             by_person = Intervention(action, "person", step.first) if step.human else None
             store.add(
                 action,
@@ -238,7 +226,7 @@ def store_again(
                 known.next_observation,
                 step.terminated,
                 step.human,
-                overruled=overruled,
+                overruled=np.array([policy], np.float32),
                 penalised=penalises(by_person),
             )
             stored += 1
@@ -251,9 +239,9 @@ def demonstrate(
 ) -> int:
     """Give the model every recorded step in which the person was in control.
 
-    During a hand-over the model gets what the hands said, not the blend that was applied; on the
-    way back to the policy the hands have let go, and say nothing. Episodes that the person
-    discarded are left out, and ``left_out``: ``3`` for sitting 3, ``3:7`` for its episode 7.
+    During a hand-over the model gets the hands' action, not the blend that was applied; on the
+    way back to the policy the hands have let go. Episodes that the person discarded are left out,
+    and ``left_out``: ``3`` for sitting 3, ``3:7`` for its episode 7.
 
     Returns:
         How many take-overs the recordings hold; a whole episode driven alone is one.

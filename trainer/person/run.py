@@ -3,7 +3,7 @@
 The policy acts in the loop's thread, from a copy of the actor as of the last finished update. The
 next update begins in the first control period after the last one's end. An episode's steps are
 stored at its end, when it is known whether the person discards it. A run with a person is not
-repeatable anyway; all others learn as before.
+repeatable anyway.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -37,9 +37,9 @@ from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun, divergence_said
 
 NICENESS = 10
-"""The updates' thread, and those that torch starts from it, are nice to the person's loop."""
+"""Of the updates' thread, and those that torch starts from it: the person's loop goes first."""
 LOOK_S = 0.002
-"""How often it is asked whether an update is done, where that must be waited for."""
+"""Between two looks whether an update is done, where it must be waited for."""
 
 
 @contextmanager
@@ -48,20 +48,15 @@ def training_with_person(
 ) -> Iterator[PersonRun]:
     """A run with a person in it; everything is kept, whatever ends it."""
     check_settings(config)
-    person = open_person(arguments)
-    try:
+    with closing(open_person(arguments)) as person:
         make_directory(run_dir)
         training = PersonRun(config, run_dir, person, arguments.resume, arguments.speed)
         steps, human = training.recovered
         if steps:
-            print(
-                f"{steps} recorded steps after the checkpoint, {human} of them yours, are back",
-                file=sys.stderr,
-            )
+            back = f"{steps} recorded steps after the checkpoint, {human} of them yours, are back"
+            print(back, file=sys.stderr)
         yield training
         print(summary(training), file=sys.stderr)
-    finally:
-        person.close()
 
 
 def summary(training: PersonRun) -> str:
@@ -82,12 +77,9 @@ def summary(training: PersonRun) -> str:
 class PersonRun(TrainingRun):
     """``TrainingRun`` in a sitting; what an episode has shown is stored at its end.
 
-    Args:
-        config: what to train; it passed ``check_settings``.
-        run_dir: where everything goes; the recordings into ``sittings`` there.
-        person: hands and eyes; closed with the run.
-        resume: go on from the checkpoint, and from what was recorded after it.
-        speed: simulated seconds in one of the person's.
+    The recordings go into ``sittings`` in the run's directory, and a resumed run stores what was
+    recorded after its checkpoint. ``person`` is closed with the run; ``speed``: simulated seconds
+    in one of the person's.
     """
 
     def __init__(
@@ -170,19 +162,16 @@ class PersonRun(TrainingRun):
         self.save()
         self.sitting.close()
         if self.config.evaluate_every_steps:
-            print(
-                f"validating on {self.config.evaluation_runs} episodes; all is saved, "
-                "^C leaves it out",
-                file=sys.stderr,
-                flush=True,
-            )
+            runs = self.config.evaluation_runs
+            said = f"validating on {runs} episodes; all is saved, ^C leaves it out"
+            print(said, file=sys.stderr, flush=True)
         try:
             super()._validate(metrics, at_end)
         except KeyboardInterrupt:
             print("validation left out", file=sys.stderr)
 
     def _due(self, last_steps: int) -> bool:
-        return True  # Whenever it is done: a person's run has no other end than a sitting's.
+        return True  # A person's run has no other end than a sitting's.
 
     def _more_state(self) -> dict[str, Any]:
         return {"recorded": [self.sitting.recorder.sitting, self.sitting.recorder.index]}
@@ -216,16 +205,14 @@ class PersonGuide:
         """The sitting begins an episode by itself when the environment is reset."""
 
     def watch(self, observation: Observation, policy_action: Action) -> Intervention | None:
-        """What the person does about ``policy_action``: None lets it pass. Once a step.
+        """What is carried out instead of ``policy_action``; None lets it pass.
 
-        The action is the one that is carried out: in a hand-over neither the person's nor the
-        policy's, and the person's in the replay buffer.
+        In a hand-over that is neither the person's action nor the policy's; the replay buffer
+        takes it for the person's.
         """
         applied = self._sitting.decide(observation, float(policy_action[0]))
-        if not applied.human:
-            return None
         action = np.array([applied.action], np.float32)
-        return Intervention(action, "person", applied.first)
+        return Intervention(action, "person", applied.first) if applied.human else None
 
 
 class KeptBack:
@@ -236,11 +223,11 @@ class KeptBack:
         self._calls: list[Callable[[], None]] = []
 
     def start_episode(self, observation: Observation) -> None:
-        """Take an episode's first observation."""
+        """As ``Store.start_episode``, later."""
         self._calls.append(lambda: self._store.start_episode(observation))
 
     def add(self, *transition: Any, **guidance: Any) -> None:
-        """Take a transition; arguments as ``Store.add``."""
+        """As ``Store.add``, later."""
         self._calls.append(lambda: self._store.add(*transition, **guidance))
 
     def release(self, discarded: bool) -> None:

@@ -1,25 +1,133 @@
-"""One sitting: a person, a pace and a recording around what drives the environment."""
+"""One sitting: a person, a pace and a recording around an environment; and the command ``drive``.
+
+In ``drive`` a policy or the person drives, every step is recorded, and nothing is learned.
+"""
 
 from __future__ import annotations
 
+import argparse
 import time
-from collections.abc import Callable
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from msgspec import structs
 
-from trainer.person.interface import LET_GO, Person, Reading, View
+from edge_runtime.cli import add_public_key, examples, positive
+from edge_runtime.util import UserError, counted
+from trainer import seeds
+from trainer.drivers import load_driver, make_environment
+from trainer.human.guide import Driver
+from trainer.options import add_scenario, add_seed, add_threads, set_threads
+from trainer.person.interface import HUMANS, LET_GO, Person, View, add_person, open_person
 from trainer.person.recording import DISCARDED, Recorder, Step
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios.environment import Action, Observation
 from trainer.scenarios.environment import Step as EnvironmentStep
+from trainer.util import quit_on_signals
 
+EXAMPLE = examples(
+    "python -m trainer drive --human keyboard --out runs/drives",
+    "python -m trainer drive --policy runs/phil_1 --human wheel --profile my.toml \\\n"
+    "    --out runs/drives",
+    "python -m trainer drive --human wheel --calibrate my.toml",
+)
 REST_S = 1.0
 """Between two episodes: time to see how it ended, and to take the hands to rest."""
 STOPPED, RESTARTED = "stopped", "restarted"
 """Outcomes of an episode that the person ended; or ``recording.DISCARDED``."""
 LATE_S = 0.02
 """A period that begins later than this is counted: a fifth of it is about what a person feels."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_scenario(parser)
+    add = parser.add_argument
+    device = "the device that your hands are on"
+    add("--human", "--device", dest="human", choices=list(HUMANS), default="keyboard", help=device)
+    driver = "what drives until you take over: see `trainer evaluate` (default: you drive alone)"
+    add("--policy", metavar="POLICY", help=driver)
+    add_public_key(parser)
+    goal = parser.add_mutually_exclusive_group()
+    out = "the directory of the recordings; sittings add up there"
+    goal.add_argument("--out", metavar="REC_DIR", default="runs/drives", help=out)
+    ask = "instead of driving, ask for a wheel's or gamepad's axes and buttons, and write a profile"
+    goal.add_argument("--calibrate", metavar="F.toml", help=ask)
+    add("--episodes", type=positive, metavar="N", help="stop after so many (default: no end)")
+    add_seed(parser, "the episodes, which are others in every sitting")
+    add_person(parser)
+    add_threads(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Drive until the person quits; returns the exit status."""
+    if arguments.calibrate is not None:
+        if arguments.human not in ("gamepad", "wheel"):
+            raise UserError("--calibrate asks a --human gamepad or wheel")
+        from trainer.person.profile import calibrate
+
+        calibrate(arguments.human, Path(arguments.calibrate))
+        return 0
+    set_threads(arguments.threads)
+    env = make_environment(arguments.scenario)
+    policy = None
+    if arguments.policy is not None:
+        policy, _ = load_driver(arguments.policy, env, arguments.public_key)
+    with closing(open_person(arguments)) as person:
+        recorder = Recorder(Path(arguments.out))
+        made = Sitting(person, recorder, env, alone=policy is None, speed=arguments.speed)
+        with closing(made) as sitting, quit_on_signals(sitting.quit):
+            outcomes = drive(sitting, policy, arguments.seed, arguments.episodes)
+    print(
+        f"episodes: {_listed(outcomes) or 'none'}; {counted(recorder.index, 'step')}, "
+        f"{sitting.human_steps} of them yours in "
+        f"{counted(sitting.interventions, 'intervention')}; "
+        f"{counted(sitting.pacer.late, 'control period')} late"
+    )
+    if recorder.index:
+        print(recorder.path)
+    return 0
+
+
+def drive(
+    sitting: Sitting, policy: Driver | None, run_seed: int, episodes: int | None
+) -> Counter[str]:
+    """Drive until the person quits, or so many episodes (None: no end).
+
+    The policy drives until the person takes over; without one, the person drives alone. The seed
+    decides the episodes, which are others in every sitting.
+
+    Returns:
+        How often an episode ended how.
+    """
+    outcomes = Counter[str]()
+    number = sitting.recorder.sitting
+    while not sitting.stop and outcomes.total() != episodes:
+        seed = seeds.episode_seed(run_seed, seeds.SITTINGS, (number << 32) + sitting.episode)
+        try:
+            observation, _ = sitting.reset(seed)
+        except SittingOver:
+            break
+        if policy is not None:
+            policy.reset()
+        ended = False
+        while not ended:
+            policy_action = None if policy is None else float(policy.act(observation)[0])
+            applied = sitting.decide(observation, policy_action)
+            action = np.array([applied.action], np.float32)
+            observation, _, terminated, truncated, info = sitting.step(action)
+            ended = terminated or truncated
+        outcomes[sitting.rest(info["outcome"])] += 1
+        sitting.episode += 1
+        sitting.progress = _listed(outcomes)
+    return outcomes
+
+
+def _listed(outcomes: Counter[str]) -> str:
+    return ", ".join(f"{count} {word}" for word, count in outcomes.items())
 
 
 class SittingOver(Exception):  # noqa: N818 (no error: it was asked for)
@@ -50,7 +158,7 @@ class Sitting:
         """The last counts what the others leave out."""
         self._paused = False
         self._last_step: Step | None = None
-        """An ended episode's, until it is known whether the person discards it."""
+        """Of an episode that has ended, until it is known whether the person discards it."""
         self._frames: Observation | None = None
         """What the policy sees; None before the first episode, when there is nothing to show."""
         self._policy_action: float | None = None
@@ -60,21 +168,16 @@ class Sitting:
         return getattr(self.env, name)
 
     def reset(self, seed: int) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode as soon as the person is there.
-
-        Raises:
-            SittingOver: the person quits instead.
-        """
-        observation, info = self.env.reset(seed=seed)
+        """Start an episode as soon as the person is there; SittingOver where the person quits."""
+        self._frames, info = self.env.reset(seed=seed)
         self._forget(seed)
-        self._frames = observation
         while not self.person.present and not self.stop:
             self._idle("waiting for the person's device")
         if self.stop:
             raise SittingOver
         self._restart = self._discard = False
         self.pacer.restart()
-        return observation, info
+        return self._frames, info
 
     def decide(self, observation: Observation, policy_action: float | None) -> Applied:
         """Show what is, wait for the control period, and ask the hands as late as possible.
@@ -87,7 +190,7 @@ class Sitting:
         self.pacer.wait()
         self._read()
         if self._paused:
-            while self._paused and not (self.stop or self._restart or self._discard):
+            while self._paused and not self._to_end:
                 self._idle("")
             self._paused = False
             self.pacer.restart()
@@ -105,31 +208,24 @@ class Sitting:
         """One control period; it is recorded. The person may end the episode after it."""
         assert self._frames is not None
         observation, reward, terminated, truncated, info = self.env.step(action)
-        if not (terminated or truncated) and (self.stop or self._restart or self._discard):
+        if self._to_end and not (terminated or truncated):
             truncated = True
             info = {**info, "outcome": STOPPED if self.stop else RESTARTED}
         applied = self._applied
         step = Step(
+            **self._now(),
             sitting=self.recorder.sitting,
             index=self.recorder.index,
-            scenario=self.env.scenario,
             seed=self._seed,
-            episode=self.episode,
-            step=self._number,
             time_ns=self._read_ns,
-            time_s=self._number * self.env.config.control_period_s,
             frames=self._frames.tobytes(),
             next_frame=observation[1].tobytes(),
-            policy_action=self._policy_action,
-            human_action=self._reading.action,
             action=applied.action,
-            control=applied.control,
             human=applied.human,
             first=applied.first,
             reward=float(reward),
             terminated=terminated,
             truncated=truncated,
-            speed_mps=float(self.env.ego.speed),
             outcome=info.get("outcome", ""),
         )
         if terminated or truncated:
@@ -161,21 +257,13 @@ class Sitting:
         """Show what is, and a line on what is going on besides driving."""
         if self._frames is None or self.closed:
             return
-        env = self.env
         view = View(
-            scenario=env.scenario,
-            scene=env.scene(),
+            **self._now(),
+            scene=self.env.scene(),
             frames=self._frames,
-            policy_action=self._policy_action,
-            human_action=self._reading.action,
             applied_action=self._applied.action,
-            control=self._applied.control,
-            speed_mps=float(env.ego.speed),
-            distance_m=float(env.distance_m),
-            goal_m=float(env.config.goal_m),
-            episode=self.episode,
-            step=self._number,
-            time_s=self._number * env.config.control_period_s,
+            distance_m=float(self.env.distance_m),
+            goal_m=float(self.env.config.goal_m),
             late_ticks=self.pacer.late,
             paused=self._paused,
             progress=self.progress,
@@ -184,17 +272,35 @@ class Sitting:
         )
         self.person.show(view)
 
+    def _now(self) -> dict[str, Any]:
+        """What a view and a recorded step both say of the control period."""
+        return {
+            "scenario": self.env.scenario,
+            "episode": self.episode,
+            "step": self._number,
+            "time_s": self._number * self.env.config.control_period_s,
+            "policy_action": self._policy_action,
+            "human_action": self._reading.action,
+            "control": self._applied.control,
+            "speed_mps": float(self.env.ego.speed),
+        }
+
     def quit(self) -> bool:
         """Ask for the end of the sitting; False where it is over already."""
         self.stop = self.stop or not self.closed
         return not self.closed
 
     def close(self) -> None:
-        """Close the person's devices and the recording; twice is once."""
+        """Close the person's devices and the recording; a second call does nothing."""
         self.closed = True
         self.person.close()
         self._write_last_step()
         self.recorder.close()
+
+    @property
+    def _to_end(self) -> bool:
+        """Whether the person wants the episode to end."""
+        return self.stop or self._restart or self._discard
 
     def _write_last_step(self) -> None:
         """Record an episode's last step, which says whether it was discarded."""
@@ -207,8 +313,7 @@ class Sitting:
         """Nothing of an episode has happened yet."""
         self._seed, self._number = seed, 0
         self._take_over, self._intent = TakeOver(), Intent(self.person.moving)
-        self._reading: Reading = LET_GO
-        self._read_ns = 0
+        self._reading, self._read_ns = LET_GO, 0
         self._applied = Applied(0.0, "human" if self.alone else "policy", self.alone, False)
         self._policy_action = None
         self._human_steps = self._interventions = 0
@@ -233,34 +338,28 @@ class Sitting:
 
 
 class Pacer:
-    """Absolute deadlines, one a period: what is late once is not late for ever after.
+    """Absolute deadlines, one a period, so that one delay does not make every later period late.
 
     A delay of less than a period is caught up. After a longer one the deadlines begin anew: a car
     that leaps through what was missed cannot be driven.
     """
 
-    def __init__(
-        self,
-        period_s: float,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
+    def __init__(self, period_s: float) -> None:
         self.period_s = period_s
         self.late = 0
         """Periods that began too late."""
-        self._clock, self._sleep = clock, sleep
         self.restart()
 
     def restart(self) -> None:
         """Let the next period begin one period from now: after a pause, or a new episode."""
-        self._deadline_s = self._clock() + self.period_s
+        self._deadline_s = time.monotonic() + self.period_s
 
     def wait(self) -> None:
         """Wait for the next period to begin."""
-        # Python's main thread sleeps on through a signal that another thread took; a period is
-        # short enough to hear of it afterwards.
-        while (left_s := self._deadline_s - self._clock()) > 0.0:
-            self._sleep(left_s)
+        # A signal that another thread took does not wake Python's main thread. A period is short
+        # enough to notice it afterwards.
+        while (left_s := self._deadline_s - time.monotonic()) > 0.0:
+            time.sleep(left_s)
         self.late += -left_s > LATE_S
         if -left_s < self.period_s:
             self._deadline_s += self.period_s

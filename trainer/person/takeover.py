@@ -1,48 +1,38 @@
-"""What is in control, and what the car is told while that changes: a pure state machine.
+"""Who is in control: which page of the browser, and the person or the policy. Pure but for a lock.
 
-```
-state       the person holds     the person has let go
-policy      taking or human      policy
-taking      taking or human      returning or policy
-human       human                returning or policy
-returning   taking or human      returning or policy
-```
-
-Where a cell names two states, the second is reached when the action is no further from its goal
-than a hand-over may move it (``MAX_SLEW``); until then it moves by just that. So the car never
-jumps at a hand-over, and feels it within the first control period.
+Three parts, from the hands to the car: ``Seat`` says which page's hands count, ``Intent`` whether
+the person wants control, ``TakeOver`` what the car is told while that changes.
 """
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from trainer.person.interface import Control, Moving, Reading
+import msgspec
 
+from trainer.person.interface import LET_GO, WISHES, Control, Moving, Reading, Wish
+
+SILENCE_S = 0.5
+"""A driver who is not heard for this long has let go."""
 MAX_SLEW = 0.5
 """The most that the action changes in a control period of a hand-over. From full throttle to full
 brake takes four of them, 0.4 s: about what a foot needs from pedal to pedal."""
 State = Literal["policy", "taking", "human", "returning"]
-NEXT: dict[tuple[State, bool, bool], State] = {
-    ("policy", False, True): "policy",
-    ("policy", False, False): "policy",
-    ("policy", True, False): "taking",
-    ("policy", True, True): "human",
-    ("taking", True, False): "taking",
-    ("taking", True, True): "human",
-    ("taking", False, False): "returning",
-    ("taking", False, True): "policy",
-    ("human", True, False): "human",
-    ("human", True, True): "human",
-    ("human", False, False): "returning",
-    ("human", False, True): "policy",
-    ("returning", True, False): "taking",
-    ("returning", True, True): "human",
-    ("returning", False, False): "returning",
-    ("returning", False, True): "policy",
+NEXT: dict[tuple[State, bool], tuple[State, State]] = {
+    ("policy", True): ("taking", "human"),
+    ("policy", False): ("policy", "policy"),
+    ("taking", True): ("taking", "human"),
+    ("taking", False): ("returning", "policy"),
+    ("human", True): ("human", "human"),
+    ("human", False): ("returning", "policy"),
+    ("returning", True): ("taking", "human"),
+    ("returning", False): ("returning", "policy"),
 }
-"""(state, whether the person holds, whether the goal is within reach) -> state."""
+"""(state, whether the person holds) -> state while the goal is out of reach, state once it is
+within reach: no further away than a hand-over may move the action (``MAX_SLEW``). Until then the
+action moves by just that: the car never jumps at a hand-over, and feels it at once."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +61,7 @@ class TakeOver:
         # At an episode's start there is nothing to leave from but the policy's action.
         last = policy_action if self._applied is None else self._applied
         before = self.state
-        self.state = NEXT[before, holds, abs(goal - last) <= MAX_SLEW]
+        self.state = NEXT[before, holds][abs(goal - last) <= MAX_SLEW]
         handing_over = self.state in ("taking", "returning")
         self._applied = last + min(max(goal - last, -MAX_SLEW), MAX_SLEW) if handing_over else goal
         control: Control = "human" if self.state == "taking" else self.state
@@ -100,3 +90,93 @@ class Intent:
         elif now_s - self._resting_since_s >= self.moving.rest_s:
             self._moved = False
         return reading.engaged or self._moved
+
+
+class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a page says, at least every 100 ms; saying nothing is letting go."""
+
+    at_ms: Annotated[float, msgspec.Meta(ge=0.0, le=1e15)]
+    """The page's clock, sent back at once, so that the page knows the round trip."""
+    action: Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
+    engaged: bool
+    by_moving: bool = False
+    """Whether moving ``action`` takes over, too: a steering wheel."""
+    wishes: Annotated[tuple[Wish, ...], msgspec.Meta(max_length=len(WISHES))] = ()
+    seen: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """Number of the newest view that was drawn."""
+
+
+class Seat:
+    """One driver, the page that has been here longest; the others watch.
+
+    A hold, or a wheel that is turned, counts only after the page was heard with its hands off, and
+    after a silence it must be heard so again: a connection that comes back does not take over by
+    itself. The server's thread calls ``sit_down``, ``hear`` and ``get_up``, the loop's ``poll``.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pages: list[object] = []
+        self._wishes: set[Wish] = set()
+        self._said = LET_GO
+        self._tap: Reading | None = None
+        """Pressed since the last poll: a tap shorter than a control period counts for one."""
+        self._hands_were_off = False
+        self._heard_s = float("-inf")
+
+    def sit_down(self, page: object) -> None:
+        """A page has come."""
+        with self._lock:
+            self._pages.append(page)
+
+    def get_up(self, page: object) -> None:
+        """A page is gone; what its driver wished for still stands."""
+        with self._lock:
+            if self._pages[:1] == [page]:
+                self._let_go()
+            self._pages = [other for other in self._pages if other != page]
+
+    def is_driver(self, page: object) -> bool:
+        """Whether ``page`` has the wheel."""
+        with self._lock:
+            return self._pages[:1] == [page]
+
+    def is_heard(self, now_s: float) -> bool:
+        """Whether the driver can act."""
+        with self._lock:
+            return now_s - self._heard_s <= SILENCE_S
+
+    def hear(self, page: object, said: Input, now_s: float) -> bool:
+        """Take note of what ``page`` says; whether that counts."""
+        with self._lock:
+            if self._pages[:1] != [page]:
+                return False
+            if now_s - self._heard_s > SILENCE_S:
+                self._let_go()
+            self._heard_s = now_s
+            self._wishes |= set(said.wishes)
+            # Nothing is held, and a wheel that takes over by moving is at rest.
+            resting = not said.by_moving or abs(said.action) <= Moving.rest
+            self._hands_were_off |= resting and not said.engaged
+            if not self._hands_were_off:
+                return False
+            pressed = said.engaged and not self._said.engaged
+            self._said = Reading(said.action, said.engaged, by_moving=said.by_moving)
+            if pressed:
+                self._tap = self._said
+            return True
+
+    def poll(self, now_s: float) -> Reading:
+        """What the driver does at ``now_s``; each wish once."""
+        with self._lock:
+            said = self._said if now_s - self._heard_s <= SILENCE_S else LET_GO
+            if said is not LET_GO and not said.engaged and self._tap is not None:
+                said = self._tap
+            self._tap = None
+            wishes, self._wishes = frozenset(self._wishes), set()
+            return Reading(said.action, said.engaged, wishes, said.by_moving)
+
+    def _let_go(self) -> None:
+        self._said, self._tap = LET_GO, None
+        self._hands_were_off = False
+        self._heard_s = float("-inf")

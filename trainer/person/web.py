@@ -1,6 +1,6 @@
 """The browser cockpit (``--human web``): a small page behind a token, a WebSocket for each page.
 
-A thread of its own serves it; the loop only hands over. ``seat.py`` decides which page drives.
+A thread of its own serves it; the loop only hands over. ``Seat`` decides which page drives.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import errno
 import hmac
-import itertools
 import logging
 import secrets
 import socket
@@ -19,26 +18,30 @@ import threading
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from importlib.resources import files
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
+import numpy as np
 from aiohttp import WSCloseCode, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
-from trainer.person.interface import KEY_HELP, WISH_HELP, Moving, Person, Reading, View
-from trainer.person.seat import END, INPUT, MAX_INPUT_BYTES, Seat, encode_echo, encode_view
+from trainer.person.interface import KEY_HELP, WISH_HELP, Moving, Reading, View
+from trainer.person.takeover import Input, Seat
+from trainer.scenarios.scene import HEIGHT_M, VIEW, WIDTH_M
 
 TOKEN_BYTES = 16
+MAX_INPUT_BYTES = 1024
+"""A page's message is not longer; the longest honest one is a fifth of this."""
 KEEP_ALIVE_S = 10.0
 """How long a connection stays open for another request."""
 LOGGER = logging.getLogger(__name__)
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 GONE_S = 2.0
-"""A page that is not heard for this long is shown out, and the next one may drive."""
+"""A page that is not heard for this long is disconnected, and the next one may drive."""
 CLOSING_S = 0.5
 """How long a page may take to say good-bye."""
 VIEWS_UNDERWAY = 2
@@ -50,7 +53,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""The address holds the token: it shall not be kept, passed on, or framed."""
+"""The address holds the token: no browser may keep it, pass it on, or frame the page."""
 NO_TOKEN = "This address holds no token, or an old one: open the one that the trainer printed.\n"
 NO_NAME = "The cockpit has another name: open the address that the trainer printed.\n"
 Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
@@ -60,6 +63,10 @@ HEADERS_S = 5.0
 """A connection must show the token within this time."""
 BACKLOG = 16
 """Connections that are accepted at once; each needs a descriptor until the door refuses it."""
+INPUT = msgspec.json.Decoder(Input)
+_ENCODER = msgspec.json.Encoder(
+    enc_hook=lambda value: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+)
 
 
 @LOGGER.addFilter
@@ -68,11 +75,25 @@ def _is_ours(record: logging.LogRecord) -> bool:
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
 
 
-@dataclass
+def open_cockpit(arguments: argparse.Namespace) -> Cockpit:
+    """Serve the cockpit and print its address."""
+    host = arguments.host
+    cockpit = Cockpit(host, arguments.port, arguments.scenario)
+    if host not in LOOPBACK:
+        print(
+            f"warning: --host {host}: whoever reads this network's traffic can take the wheel; "
+            f"safer: leave it out, and ssh -L {cockpit.port}:127.0.0.1:{cockpit.port} from the "
+            "browser's machine",
+            file=sys.stderr,
+        )
+    print(f"cockpit: open {cockpit.url}", flush=True)
+    return cockpit
+
+
+@dataclass(eq=False)
 class Page:
     """One open page."""
 
-    number: int
     socket: web.WebSocketResponse
     sent: int = 0
     """Number of the newest view sent."""
@@ -103,8 +124,7 @@ class Cockpit:
         self._names = {*LOOPBACK, host.lower(), name.lower()}
         shown = f"[{name}]" if ":" in name else name
         self.url = f"http://{shown}:{self.port}/{self._token}/"
-        self._pages: dict[int, Page] = {}
-        self._numbers = itertools.count(1)
+        self._pages: list[Page] = []
         self._files = _page_files()
         self._shown = 0
         self._newest = (0, "")
@@ -153,13 +173,13 @@ class Cockpit:
         await site.start()
         await self._closing.wait()
         await site.stop()
-        good_byes = [_say_goodbye(page.socket) for page in self._pages.values()]
+        good_byes = [_say_goodbye(page.socket) for page in self._pages]
         await asyncio.gather(*good_byes, return_exceptions=True)
         await runner.cleanup()
 
     def _take_view(self, number: int, view: View, shown_s: float) -> None:
         self._newest = (number, encode_view(view, number, shown_s))
-        for page in self._pages.values():
+        for page in self._pages:
             page.wake.set()
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
@@ -203,16 +223,15 @@ class Cockpit:
             max_msg_size=MAX_INPUT_BYTES, compress=False, timeout=CLOSING_S
         )
         await socket.prepare(request)
-        page = Page(next(self._numbers), socket)
-        self._pages[page.number] = page
-        self.seat.sit_down(page.number)
+        page = Page(socket)
+        self._pages.append(page)
+        self.seat.sit_down(page)
         sender = asyncio.create_task(self._send_views(page))
         try:
             why = await self._hear(page)
-        finally:
-            # Before the good-byes, which take their time.
-            self.seat.get_up(page.number)
-            del self._pages[page.number]
+        finally:  # Before the good-byes, which take their time.
+            self.seat.get_up(page)
+            self._pages.remove(page)
             sender.cancel()
         await socket.close(code=why)
         return socket
@@ -230,15 +249,16 @@ class Cockpit:
                 said = INPUT.decode(message.data)
             except msgspec.MsgspecError:
                 return WSCloseCode.POLICY_VIOLATION
-            counts = self.seat.hear(page.number, said, time.monotonic())
+            counts = self.seat.hear(page, said, time.monotonic())
             page.seen = min(max(page.seen, said.seen), page.sent)
             page.wake.set()
-            driving = self.seat.is_driver(page.number)
-            refused = driving and not counts
+            driving = self.seat.is_driver(page)
+            refused = driving and not counts  # The hands must be off once.
+            echo = _encode("echo", at_ms=said.at_ms, driving=driving, refused=refused)
             try:
-                await page.socket.send_str(encode_echo(said.at_ms, driving, refused))
+                await page.socket.send_str(echo)
             except ConnectionError:
-                return WSCloseCode.GOING_AWAY  # To nobody: it was cut off while it spoke.
+                return WSCloseCode.GOING_AWAY  # The connection was cut while the page spoke.
 
     async def _send_views(self, page: Page) -> None:
         """Show the page the newest view, until it is gone, which `_hear` notices."""
@@ -252,58 +272,57 @@ class Cockpit:
                     await page.socket.send_str(message)
 
 
-def open_cockpit(arguments: argparse.Namespace) -> Person:
-    """Serve the cockpit and print its address."""
-    host = arguments.host
-    cockpit = Cockpit(host, arguments.port, arguments.scenario)
-    if host not in LOOPBACK:
-        print(
-            f"warning: --host {host}: whoever reads this network's traffic can take the wheel; "
-            f"safer: leave it out, and ssh -L {cockpit.port}:127.0.0.1:{cockpit.port} from the "
-            "browser's machine",
-            file=sys.stderr,
-        )
-    print(f"cockpit: open {cockpit.url}", flush=True)
-    return cockpit
-
-
 def _listen(host: str, port: int) -> socket.socket:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, address = found[0][0], found[0][4]
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-        listener = socket.create_server(address, family=family, dualstack_ipv6=both)
+        return socket.create_server(address, family=family, dualstack_ipv6=both)
     # A name that is none for DNS is a UnicodeError.
     except (OSError, OverflowError, UnicodeError) as error:
         reason = (getattr(error, "strerror", None) or str(error)).partition(" (while")[0]
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             reason += "; without --port any that is free will do"
         raise UserError(f"the cockpit cannot listen on {host} port {port}: {reason}") from error
-    return listener
+
+
+def _encode(kind: str, **fields: Any) -> str:
+    return _ENCODER.encode({"kind": kind, **fields}).decode()
+
+
+def encode_view(view: View, number: int, shown_s: float) -> str:
+    """View ``number``, from 1, which the loop gave at ``shown_s`` (``time.monotonic``).
+
+    ``frames`` are base64 of [2, 45, 80] bytes; ``ground`` is the part to show.
+    """
+    left_m, top_m = view.scene.get("view", VIEW)
+    fields = vars(view) | {"frames": view.frames.tobytes()}
+    ground = {"left_m": left_m, "top_m": top_m, "width_m": WIDTH_M, "height_m": HEIGHT_M}
+    return _encode("view", number=number, shown_s=shown_s, ground=ground, **fields)
 
 
 async def _say_goodbye(socket: web.WebSocketResponse) -> None:
-    await asyncio.wait_for(socket.send_str(END), CLOSING_S)
+    """Tell the page that the sitting is over, so that it does not come back."""
+    await asyncio.wait_for(socket.send_str(_encode("end")), CLOSING_S)
     await socket.close(code=WSCloseCode.GOING_AWAY, message=b"over")
 
 
 def _page_files() -> dict[str, bytes]:
-    folder = files("trainer.person") / "page"
-    found = {entry.name: entry.read_bytes() for entry in folder.iterdir() if "." in entry.name}
+    found = {path.name: path.read_bytes() for path in (Path(__file__).parent / "page").glob("*.*")}
     colours = "".join(f"--{name}: rgb{colour}; " for name, colour in BY_NAME.items())
     return {**found, "colours.css": f":root {{ {colours}}}".encode()}
 
 
 class Door(web.Server):
-    """Lets connections in; a stranger is one that has not shown the token yet.
+    """Limits the connections. Until one has shown the token, it is a stranger.
 
-    Where it is full, the stranger that has stood there longest goes; without one, the newcomer.
+    At the limit, the oldest stranger is cut off; where there is none, the newcomer.
     """
 
     def __init__(self, handler: Handler, **options: Any) -> None:
         super().__init__(handler, **options)
         self._inside: dict[asyncio.Transport, asyncio.TimerHandle] = {}
-        """Open connections in the order in which they came, and when they are shown out."""
+        """Open connections, oldest first, and the timer that cuts off a stranger."""
 
     def has_token(self, transport: asyncio.Transport | None) -> None:
         """A connection has shown the token: it may stay."""

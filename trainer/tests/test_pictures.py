@@ -10,7 +10,7 @@ from edge_runtime.cli import run_cli
 from trainer.__main__ import main
 from trainer.drivers import EXPERTS, TRIGGERS, make_environment
 from trainer.human.guide import HumanGuide
-from trainer.picture import HUMAN, POLICY, draw_moment, drive_moments
+from trainer.pictures import HUMAN, POLICY, draw_moment, drive_moments
 from trainer.training.metrics import NAMES
 
 

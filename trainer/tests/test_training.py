@@ -20,7 +20,7 @@ from trainer import seeds
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import ReplayBuffer
-from trainer.plots import moving_average, write_learning_curve
+from trainer.pictures import moving_average, write_learning_curve
 from trainer.training import validation
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.config import RunConfig

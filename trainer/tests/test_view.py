@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast, get_args
@@ -22,33 +21,30 @@ from bridge.rerun.sinks import Sink
 from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main
-from trainer.drawing import (
-    DRIVERS,
-    LINES,
-    Entry,
-    Episode,
-    Steps,
-    TrainingLog,
-    q_advantage,
-)
 from trainer.drivers import make_environment
 from trainer.human.guide import Intervention, Reason
 from trainer.learner.config import LearnerConfig
 from trainer.learner.networks import Critic
 from trainer.person.recording import Recorder, read_steps
-from trainer.person.tests.people import recorded_step
-from trainer.plots import CURVE_FILE
-from trainer.tests.drawn import values_in
+from trainer.person.tests.people import record, recorded_step
+from trainer.pictures import CURVE_FILE
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import Seen, TrainingRun
 from trainer.view import (
     CORRECTIONS,
+    DRIVERS,
+    LINES,
     MOST_WAITING,
     STEPS_TOGETHER,
     Background,
+    Entry,
+    Episode,
     Shown,
+    Steps,
+    TrainingLog,
     Watcher,
+    q_advantage,
     watched,
 )
 
@@ -65,6 +61,21 @@ QUICK = ["--episodes", "1", "--threads", "1", "--set", "evaluate_every_steps=0",
          "--set", "warmup_steps=100000"]  # fmt: skip
 """Options of a run that learns nothing."""
 TIMINGS = [name for name in NAMES if name.endswith("_s")]
+
+
+def values_in(rrd):
+    """What was logged, by entity: a list of (step or None, value)."""
+    found: dict[str, list[tuple[int | None, object]]] = {}
+    for chunk in RrdReader(str(rrd)).stream().to_chunks():
+        columns = chunk.to_record_batch().to_pydict()
+        steps = columns.get("step", [None] * chunk.num_rows)
+        for name, values in columns.items():
+            if name in ("Scalars:scalars", "StateChange:state"):
+                rows = found.setdefault(chunk.entity_path, [])
+                rows += [(step, value[0]) for step, value in zip(steps, values, strict=True)]
+            elif name not in ("step", "rerun.controls.RowId"):
+                found.setdefault(chunk.entity_path, [])
+    return {path: sorted(rows, key=lambda row: row[0] or 0) for path, rows in found.items()}
 
 
 def weights(run):
@@ -197,7 +208,7 @@ def test_an_episode_that_is_broken_off_is_handed_over():
     watcher = looking_on(kept)
     for _ in range(7):
         watcher.on_step(control_period(human=False))
-    watcher.close()
+    watcher.hand_over()
     assert sum(len(part.entries) for part in kept if isinstance(part, Steps)) == 7
 
 
@@ -284,26 +295,6 @@ def test_a_training_is_not_held_up_by_a_viewer_that_hangs(tmp_path, monkeypatch,
     assert (out / CURVE_FILE).exists()
 
 
-@pytest.mark.parametrize(
-    ("word", "part"),
-    [
-        ("window", "neither spawn nor serve"),
-        ("spawn", "no display"),
-        ("/dev/null/a.rrd", "/dev/null"),
-    ],
-)
-def test_a_wrong_word_is_one_line_before_anything_is_made(
-    word, part, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    out = tmp_path / "run"
-    assert run_cli(main, ["train", "--rerun", word, "--out", str(out)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
-    assert not out.exists()
-
-
 def test_rerun_is_loaded_only_when_it_is_asked_for(tmp_path):
     code = (
         "import sys; from trainer.__main__ import main; main(sys.argv[1:]); "
@@ -321,49 +312,36 @@ def test_the_command_writes_a_recording(tmp_path, one_thread):
     assert [path.name for path in tmp_path.glob("*.rrd*")] == ["run.rrd"]
 
 
-@dataclass
-class Driven:
-    """What was recorded."""
-
-    path: object
-    applied: list
-    human: list
+BRAKED = [0.5] * 5 + [-1.0] * 5 + [0.5] * 5
 
 
 def drive(directory, seeds=(4, 9), steps=15, sitting_policy=True, scenario="left_turn"):
-    """A sitting: the policy wants half throttle, the person brakes from step 5 to 9."""
+    """A recorded sitting: the policy wants half throttle, the person brakes from step 5 to 9."""
     env, recorder = make_environment(scenario), Recorder(directory)
-    applied, human = [], []
     for episode, seed in enumerate(seeds):
         observation, _ = env.reset(seed=seed)
         for number in range(steps):
-            taken = 5 <= number < 10
-            action = -1.0 if taken else 0.5
+            action, taken = BRAKED[number], 5 <= number < 10
             frames = observation
             observation, reward, *_ = env.step(np.array([action], np.float32))
-            step = recorded_step(recorder.sitting, recorder.index)
-            recorder.write(
-                msgspec.structs.replace(
-                    step, scenario=scenario, seed=seed, episode=episode, step=number,
-                    frames=frames.tobytes(), next_frame=observation[1].tobytes(),
-                    policy_action=0.5 if sitting_policy else None, action=action, human=taken,
-                    first=number == 5, reward=float(reward), speed_mps=float(env.ego.speed),
-                    outcome="restarted" if number == steps - 1 else "",
-                )
-            )  # fmt: skip
-            applied.append(action)
-            human.append(taken)
+            recorder.write(recorded_step(
+                recorder.sitting, recorder.index, scenario=scenario, seed=seed, episode=episode,
+                step=number, frames=frames.tobytes(), next_frame=observation[1].tobytes(),
+                policy_action=0.5 if sitting_policy else None, action=action, human=taken,
+                first=number == 5, reward=float(reward), speed_mps=float(env.ego.speed),
+                outcome="restarted" if number == steps - 1 else "",
+            ))  # fmt: skip
     recorder.close()
-    return Driven(recorder.path, applied, human)
+    return recorder.path
 
 
 def test_a_sitting_is_shown_whole(tmp_path, capsys):
-    driven = drive(tmp_path / "drives")
+    drive(tmp_path / "drives")
     out = tmp_path / "sitting.rrd"
     assert main(["view", str(tmp_path / "drives"), "--save", str(out)]) == 0
     assert capsys.readouterr().out == "2 episodes, 30 steps, 10 of them the person's\n"
     found = values_in(out)
-    assert [value for _, value in found["/action/applied"]] == driven.applied
+    assert [value for _, value in found["/action/applied"]] == 2 * BRAKED
     assert {value for _, value in found["/action/policy"]} == {0.5}
     assert found["/driver"] == [
         (0, "policy"), (5, "person"), (10, "policy"), (20, "person"), (25, "policy"),
@@ -384,22 +362,18 @@ def test_each_scenario_is_shown_on_its_own_ground(tmp_path):
 
 
 def test_a_road_that_would_be_driven_differently_is_not_made_up(tmp_path):
-    driven = drive(tmp_path)
-    other = Recorder(tmp_path)
-    for number, step in enumerate(read_steps(driven.path)):
-        changed = {"frames": bytes(7200)} if number == 7 else {}
-        other.write(msgspec.structs.replace(step, **changed))
-    other.close()
+    steps = list(read_steps(drive(tmp_path)))
+    steps[7] = msgspec.structs.replace(steps[7], frames=bytes(7200))
     shown = Shown()
-    entries = list(shown.entries([other.path]))
+    entries = list(shown.entries([record(tmp_path, steps)]))
     scenes = [entry.scene is not None for entry in entries if isinstance(entry, Steps)]
     assert scenes == [False] * 15 + [True] * 15
     assert shown.without_road == 1
 
 
 def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):
-    driven = drive(tmp_path, seeds=(4,), sitting_policy=False)
-    entries = list(Shown().entries([driven.path]))
+    path = drive(tmp_path, seeds=(4,), sitting_policy=False)
+    entries = list(Shown().entries([path]))
     steps = [entry.entries[0] for entry in entries if isinstance(entry, Steps)]
     assert all(math.isnan(step.policy_action) for step in steps)
     (episode,) = (entry for entry in entries if isinstance(entry, Episode))
@@ -410,16 +384,20 @@ def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (["none", "--save", "a.rrd"], "no recording in none"),
-        (["drives"], "no display for a window here"),
-        (["drives", "--save", "/dev/null/a.rrd"], "Not a directory"),
+        (["train", "--out", "run", "--rerun", "window"], "neither spawn nor serve"),
+        (["train", "--out", "run", "--rerun", "spawn"], "no display"),
+        (["train", "--out", "run", "--rerun", "/dev/null/a.rrd"], "/dev/null"),
+        (["view", "none", "--save", "a.rrd"], "no recording in none"),
+        (["view", "drives"], "no display for a window here"),
+        (["view", "drives", "--save", "/dev/null/a.rrd"], "Not a directory"),
     ],
 )
-def test_bad_input_is_one_line(words, part, capsys, tmp_path, monkeypatch):
+def test_bad_input_is_one_line_before_anything_is_made(words, part, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     drive(tmp_path / "drives", seeds=(4,), steps=2)
-    assert run_cli(main, ["view", *words]) == 2
+    assert run_cli(main, words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert part in line
+    assert [path.name for path in tmp_path.iterdir()] == ["drives"]

@@ -37,7 +37,7 @@ from trainer.options import (
     set_threads,
 )
 from trainer.person.interface import HUMANS, PERSON, add_person, check_person_options
-from trainer.plots import write_learning_curve
+from trainer.pictures import write_learning_curve
 from trainer.training.config import PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import CONFIG_FILE, TrainingRun

@@ -18,8 +18,8 @@ const WHO = {
   lost: ["Connection lost", "you have let go; looking for the trainer"],
   over: ["The sitting is over", "everything is saved"],
   policy: ["The policy drives", "hold a key, the pad or a button to take over"],
-  human: ["You drive", "let go to give back"],
-  returning: ["Giving back", "the action returns to the policy's"],
+  human: ["You drive", "let go to hand control back"],
+  returning: ["Handing back", "the action returns to the policy's"],
 };
 const LINK = { connecting: "connecting", live: "connected", lost: "connection lost", over: "ended" };
 

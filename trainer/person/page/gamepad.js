@@ -60,7 +60,7 @@ export class Gamepads {
     if (!this.scenario) return;
     // Absent where the page came over plain http from another machine.
     const pads = [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad?.connected);
-    // Whoever was there first stays, and so does who drives.
+    // The device in use stays in use.
     const pad = pads.find((other) => other.index === this.pad?.index) ?? pads[0] ?? null;
     if (pad?.id !== this.pad?.id || (pad && this.chosenFor !== this.scenario)) this.take(pad);
     this.pad = pad;

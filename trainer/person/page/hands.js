@@ -26,7 +26,7 @@ export class Keyboard {
       if (event.repeat) return;
       this.down.add(event.code);
       const first = this.way() * this.perSecond() * FIRST_S;
-      // Who turns round does not first undo.
+      // The other direction begins at once, from rest.
       if (this.action * first < 0 || Math.abs(this.action) < Math.abs(first)) this.action = first;
       changed();
     });
@@ -34,7 +34,7 @@ export class Keyboard {
       if (DRIVING.has(event.code) && !typing(event.target)) event.preventDefault();
       if (this.down.delete(event.code)) this.settle();
     });
-    // A page that is not looked at hears no key come up.
+    // A page without the focus hears no key come up.
     for (const gone of ["blur", "pagehide"]) addEventListener(gone, () => this.release());
     addEventListener("visibilitychange", () => document.hidden && this.release());
   }

@@ -10,7 +10,7 @@ const COLOURS = {
   traffic: "#eb8c28",
   glass: "rgba(10, 12, 15, 0.75)",
 };
-// Of who decides: the same in every view, and given with the page.
+// The colours of what decides are the same in every view: colours.css has them.
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`);
 const GOAL_HALF_M = 2.0;
 const HISTORY_STEPS = 100;

@@ -1,4 +1,4 @@
-"""A real Chromium for the cockpit's tests, and for its picture in the documentation.
+"""The cockpit's pages for tests: a WebSocket that talks as a page does, and a real Chromium.
 
 ``python -m trainer.person.tests.browser --picture docs/cockpit.png`` takes that picture.
 """
@@ -7,17 +7,140 @@ import asyncio
 import subprocess
 import sys
 import tempfile
+import time
 from contextlib import asynccontextmanager
+from dataclasses import replace
+from functools import cache
 
+import aiohttp
+
+from trainer.drivers import make_environment
+from trainer.person.interface import View
 from trainer.util import find_chromium
 
-PATIENCE_S = 20.0
+WAIT_S, PATIENCE_S = 5.0, 20.0
 DESKTOP = {"width": 1280, "height": 740}
+LIVE = "document.body.dataset.link === 'live'"
+READY = f"{LIVE} && document.getElementById('scenario').textContent"
+OVER = "document.body.dataset.link === 'over'"
+PERSON_DRIVES = "document.body.dataset.control === 'human'"
 POLICY_DRIVES = (
-    "document.body.dataset.control === 'policy' && document.body.dataset.link === 'live'"
+    f"document.body.dataset.control === 'policy' && {LIVE}"
     " && !document.getElementById('message').textContent"
 )
-PERSON_DRIVES = "document.body.dataset.control === 'human'"
+WHY = "document.getElementById('why').textContent"
+
+
+@cache
+def first_view(scenario: str = "left_turn") -> View:
+    """What a person sees of a scenario's first moment."""
+    env = make_environment(scenario)
+    frames, info = env.reset(seed=3)
+    return View(
+        scenario=scenario, scene=env.scene(), frames=frames,
+        policy_action=0.25, human_action=-0.5, applied_action=0.25, control="policy",
+        speed_mps=info["speed_mps"], distance_m=info["distance_m"], goal_m=env.config.goal_m,
+        episode=1, step=0, time_s=0.0,
+    )  # fmt: skip
+
+
+def view_of_step(step: int) -> View:
+    """The same, told apart by its step."""
+    return replace(first_view(), step=step)
+
+
+def origin(cockpit):
+    return f"http://127.0.0.1:{cockpit.port}"
+
+
+@asynccontextmanager
+async def page(cockpit, **more):
+    """A page's WebSocket."""
+    options = {"origin": origin(cockpit), **more}
+    async with (
+        aiohttp.ClientSession() as session,
+        session.ws_connect(cockpit.url + "socket", **options) as link,
+    ):
+        yield link
+
+
+async def say(link, engaged=False, action=0.0, **more):
+    """Say something as a page does; the echo."""
+    await link.send_json({"at_ms": 12.5, "action": action, "engaged": engaged, **more})
+    return await hear(link, "echo")
+
+
+async def hear(link, kind):
+    """The next message of a kind."""
+    while True:
+        message = await link.receive_json(timeout=WAIT_S)
+        if message["kind"] == kind:
+            return message
+
+
+def poll(cockpit):
+    return cockpit.poll(time.monotonic())
+
+
+async def reads(cockpit, condition):
+    """Poll until the reading is as wanted; that reading."""
+    async with asyncio.timeout(PATIENCE_S):
+        while not condition(reading := poll(cockpit)):
+            await asyncio.sleep(0.005)
+    return reading
+
+
+async def until(page, expression):
+    """Wait until a JavaScript expression is true.
+
+    playwright's own ``wait_for_function`` evaluates within the page, which the page's security
+    policy forbids.
+    """
+    async with asyncio.timeout(PATIENCE_S):
+        while not await page.evaluate(f"Boolean({expression})"):
+            await asyncio.sleep(0.01)
+
+
+class Tunnel:
+    """A TCP connection passed on to a port of this machine, until it is lost."""
+
+    def __init__(self, port):
+        self._to = port
+        self._ways = []
+
+    async def __aenter__(self):
+        self._server = await asyncio.start_server(self._join, "127.0.0.1")
+        self.port = self._server.sockets[0].getsockname()[1]
+        return self
+
+    async def __aexit__(self, *_):
+        self._server.close()
+        self.cut()
+
+    def cut(self):
+        """Close what is open; what comes afterwards is passed on."""
+        for _, writer in self._ways:
+            writer.transport.abort()
+        self._ways.clear()
+
+    def swallow(self):
+        """Pass on nothing of what is open, and close nothing either."""
+        for task, _ in self._ways:
+            task.cancel()
+
+    async def _join(self, reader, writer):
+        there = await asyncio.open_connection("127.0.0.1", self._to)
+        for source, sink in ((reader, there[1]), (there[0], writer)):
+            self._ways.append((asyncio.create_task(self._pass_on(source, sink)), sink))
+
+    @staticmethod
+    async def _pass_on(source, sink):
+        try:
+            while data := await source.read(65536):
+                sink.write(data)
+            sink.close()
+        except ConnectionError:
+            sink.transport.abort()
 
 
 @asynccontextmanager
@@ -40,23 +163,6 @@ async def open_browser(scripts=(), **options):
             await context.add_init_script(script)
         yield await context.new_page()
         await chromium.close()
-
-
-async def until(page, expression):
-    """Wait until a JavaScript expression is true.
-
-    playwright's own ``wait_for_function`` evaluates within the page, which the page's security
-    policy forbids.
-    """
-    async with asyncio.timeout(PATIENCE_S):
-        while not await page.evaluate(f"Boolean({expression})"):
-            await asyncio.sleep(0.01)
-
-
-async def touch(link, what, *points):
-    """One of the touch events Start, Move and End, by a page's DevTools link."""
-    places = [{"x": x, "y": y} for x, y in points]
-    await link.send("Input.dispatchTouchEvent", {"type": f"touch{what}", "touchPoints": places})
 
 
 async def quit_sitting(page):

@@ -2,11 +2,11 @@
 
 import asyncio
 import inspect
+from contextlib import closing
 
 import pytest
 
-from trainer.person.tests.browser import open_browser, until
-from trainer.person.tests.pages import READY, first_view
+from trainer.person.tests.browser import READY, first_view, open_browser, until
 from trainer.person.web import Cockpit
 from trainer.tests.conftest import one_thread
 from trainer.util import find_chromium
@@ -47,16 +47,14 @@ def runner():
 @pytest.fixture(scope="module")
 def browser(runner):
     context = open_browser([FAKE_PADS])
-    browser = runner.run(context.__aenter__())
-    yield browser
+    yield runner.run(context.__aenter__())
     runner.run(context.__aexit__(None, None, None))
 
 
 @pytest.fixture
 def cockpit():
-    cockpit = Cockpit()
-    yield cockpit
-    cockpit.close()
+    with closing(Cockpit()) as cockpit:
+        yield cockpit
 
 
 @pytest.fixture

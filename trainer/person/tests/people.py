@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from trainer.drivers import make_environment
 from trainer.person.interface import LET_GO, Moving, Reading, View, Wish
@@ -85,6 +86,15 @@ def make_sitting(directory: Path, person: Puppet, alone: bool = False) -> Sittin
     return Sitting(person, Recorder(directory), make_environment("left_turn"), alone, QUICK)
 
 
+def record(directory: Path, steps: Iterable[Step]) -> Path:
+    """Record the steps as a sitting; the recording."""
+    recorder = Recorder(directory)
+    for step in steps:
+        recorder.write(step)
+    recorder.close()
+    return recorder.path
+
+
 def picture(value: int) -> bytes:
     """A frame that is hard to compress, a different one for each value."""
     return np.random.default_rng(value).integers(0, 255, (45, 80), np.uint8).tobytes()
@@ -92,26 +102,12 @@ def picture(value: int) -> bytes:
 
 def recorded_step(sitting: int, index: int, **changes: Any) -> Step:
     """Step ``index`` of an episode that began with the sitting."""
-    values: dict[str, Any] = {
-        "sitting": sitting,
-        "index": index,
-        "scenario": "left_turn",
-        "seed": 1,
-        "episode": 0,
-        "step": index,
-        "time_ns": 10**9 + index * 10**8,
-        "time_s": 0.1 * index,
-        "frames": picture(index) + picture(index + 1),
-        "next_frame": picture(index + 2),
-        "policy_action": 0.25,
-        "human_action": -0.5,
-        "action": 0.25,
-        "control": "policy",
-        "human": False,
-        "first": False,
-        "reward": float(index),
-        "terminated": False,
-        "truncated": False,
-        "speed_mps": 3.0,
-    }
-    return Step(**{**values, **changes})
+    step = Step(
+        sitting=sitting, index=index, scenario="left_turn", seed=1, episode=0, step=index,
+        time_ns=10**9 + index * 10**8, time_s=0.1 * index,
+        frames=picture(index) + picture(index + 1), next_frame=picture(index + 2),
+        policy_action=0.25, human_action=-0.5, action=0.25, control="policy",
+        human=False, first=False, reward=float(index), terminated=False, truncated=False,
+        speed_mps=3.0,
+    )  # fmt: skip
+    return structs.replace(step, **changes)

@@ -7,21 +7,35 @@ import pytest
 
 from bridge.rerun import BY_NAME
 from trainer.person.interface import LET_GO
-from trainer.person.tests.browser import open_browser, touch, until
-from trainer.person.tests.pages import (
+from trainer.person.tests.browser import (
     LIVE,
+    OVER,
     READY,
-    TWO_HEARTBEATS,
     WHY,
-    YOU,
     Tunnel,
     first_view,
+    open_browser,
     page,
     poll,
     reads,
+    until,
 )
 
 pytestmark = pytest.mark.usefixtures("opened")
+
+TWO_HEARTBEATS = "new Promise((done) => setTimeout(done, 200))"
+YOU = "document.querySelector('.bar.human output').textContent"
+LEVEL = "document.getElementById('pad').className === 'level'"
+
+
+async def press_again(browser, cockpit):
+    """After a hold that does not count any more, let go and press again: that counts."""
+    await until(browser, f"{LIVE} && {WHY}.includes('press again')")
+    assert poll(cockpit) == LET_GO, "held all the while"
+    await browser.keyboard.up("ArrowUp")
+    await browser.keyboard.down("ArrowUp")
+    await reads(cockpit, lambda r: r.engaged)
+    await browser.keyboard.up("ArrowUp")
 
 
 async def test_a_held_key_takes_over_and_grows_and_its_release_lets_go(browser, cockpit):
@@ -46,7 +60,7 @@ async def test_the_space_bar_holds_without_driving_and_presses_no_button(browser
 
 async def test_in_the_congestion_left_and_right_steer(browser, cockpit):
     cockpit.show(first_view("congestion"))
-    await until(browser, "document.getElementById('pad').className === 'level'")
+    await until(browser, LEVEL)
     await browser.keyboard.down("ArrowLeft")
     await reads(cockpit, lambda r: r.action == -1.0)
     await browser.keyboard.up("ArrowLeft")
@@ -74,26 +88,26 @@ async def test_a_page_that_hangs_has_let_go_and_must_press_again(browser, cockpi
     await reads(cockpit, lambda r: r == LET_GO)
     assert not cockpit.present
     await busy
-    await until(browser, f"{WHY}.includes('press again')")
-    assert not poll(cockpit).engaged
-    await browser.keyboard.up("ArrowUp")
-    await browser.keyboard.down("ArrowUp")
-    await reads(cockpit, lambda r: r.engaged)
-    await browser.keyboard.up("ArrowUp")
+    await press_again(browser, cockpit)
 
 
 async def test_a_finger_on_the_pad_drives(browser, cockpit):
     link = await browser.context.new_cdp_session(browser)
+
+    async def touch(what, *points):
+        places = [{"x": x, "y": y} for x, y in points]
+        await link.send("Input.dispatchTouchEvent", {"type": f"touch{what}", "touchPoints": places})
+
     box = await browser.evaluate("document.getElementById('pad').getBoundingClientRect().toJSON()")
     x, middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    await touch(link, "Start", (x, middle))
+    await touch("Start", (x, middle))
     assert abs((await reads(cockpit, lambda r: r.engaged)).action) < 0.05
-    await touch(link, "Move", (x, middle - 0.45 * box["height"]))
+    await touch("Move", (x, middle - 0.45 * box["height"]))
     await reads(cockpit, lambda r: r.action == 1.0)
-    await touch(link, "Move", (x, middle + 0.225 * box["height"]))
+    await touch("Move", (x, middle + 0.225 * box["height"]))
     reading = await reads(cockpit, lambda r: r.action < 0.0)
     assert reading.action == pytest.approx(-0.5, abs=0.05)
-    await touch(link, "End")
+    await touch("End")
     await reads(cockpit, lambda r: r == LET_GO)
 
 
@@ -105,7 +119,6 @@ TOUCHED = [(844, 390), (667, 375), (932, 430), (390, 844), (360, 640), (1024, 76
 @pytest.mark.parametrize("size", TOUCHED, ids=str)
 async def test_a_thumb_finds_pad_and_buttons_beside_the_road(cockpit, size, scenario):
     width, height = size
-
     viewport = {"width": width, "height": height}
     async with open_browser(viewport=viewport, is_mobile=True, has_touch=True) as page:
         await page.goto(cockpit.url)
@@ -147,7 +160,7 @@ async def test_a_gamepads_triggers_drive_while_its_button_is_held(browser, cockp
 
 async def test_a_wheel_takes_over_by_moving_and_its_choices_are_kept(browser, cockpit):
     cockpit.show(first_view("congestion"))
-    await until(browser, "document.getElementById('pad').className === 'level'")
+    await until(browser, LEVEL)
     wheel = f"plug('G29', '', [-0.25, 0, 1, 1], {[0.0] * 24})"
     await browser.evaluate(wheel)
     reading = await reads(cockpit, lambda r: r.by_moving)
@@ -216,14 +229,13 @@ async def test_a_second_page_is_told_that_it_watches(browser, cockpit):
 
 async def test_the_end_of_the_sitting_is_told(browser, cockpit):
     cockpit.close()
-    await until(browser, "document.body.dataset.link === 'over'")
+    await until(browser, OVER)
     assert await browser.text_content("#who") == "The sitting is over"
 
 
 @pytest.mark.parametrize("how", ["closed", "silent"])
 async def test_a_lost_connection_is_letting_go_and_comes_back(browser, cockpit, how):
     """Through a tunnel, as over ``ssh -L``, that is cut or swallows everything."""
-
     async with Tunnel(cockpit.port) as tunnel:
         await browser.goto(cockpit.url.replace(str(cockpit.port), str(tunnel.port)))
         await until(browser, READY)
@@ -232,9 +244,4 @@ async def test_a_lost_connection_is_letting_go_and_comes_back(browser, cockpit, 
         tunnel.cut() if how == "closed" else tunnel.swallow()
         await reads(cockpit, lambda r: r == LET_GO)
         await until(browser, "document.body.dataset.link === 'lost'")
-        await until(browser, f"{LIVE} && {WHY}.includes('press again')")
-        assert poll(cockpit) == LET_GO, "held all the while"
-        await browser.keyboard.up("ArrowUp")
-        await browser.keyboard.down("ArrowUp")
-        await reads(cockpit, lambda r: r.engaged)
-        await browser.keyboard.up("ArrowUp")
+        await press_again(browser, cockpit)

@@ -11,23 +11,17 @@ import pytest
 
 from bridge import rerun
 from trainer.drivers import load_driver, make_environment
-from trainer.person.devices import JoystickHands, KeyboardHands, WindowPerson, pygame
+from trainer.person.devices import SIZE, JoystickHands, KeyboardHands, Window, pygame
 from trainer.person.interface import LET_GO
 from trainer.person.profile import SHIPPED, read_profile
-from trainer.person.tests.pages import first_view
+from trainer.person.tests.browser import first_view
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
-from trainer.person.window import SIZE, Window
 
 G29 = read_profile(SHIPPED / "g29.toml")
 
 
-def key(down: bool, code: int):
-    return pygame.event.Event(pygame.KEYDOWN if down else pygame.KEYUP, key=code)
-
-
-def press(hands, *codes, down=True):
-    for code in codes:
-        hands.handle(key(down, code))
+def press(hands, code, down=True):
+    hands.handle(pygame.event.Event(pygame.KEYDOWN if down else pygame.KEYUP, key=code))
 
 
 def test_a_held_key_takes_over_and_its_action_grows():
@@ -109,8 +103,10 @@ def test_keys_are_enough_to_drive(scenario, keys):
             wanted.append(float(expert.act(observation)[0]))
             pressed = keys_for(wanted[-3], action, keys, down)
             if pressed != down:
-                press(hands, *filter(None, [down]), down=False)
-                press(hands, *filter(None, [pressed]))
+                if down:
+                    press(hands, down, down=False)
+                if pressed:
+                    press(hands, pressed)
                 down = pressed
             now_s += 0.1
             action = hands.read(now_s).action
@@ -131,22 +127,18 @@ def wheel(monkeypatch):
     pygame.quit()
 
 
-def at_the_wheel(scenario: str) -> WindowPerson:
-    return WindowPerson(JoystickHands(G29, scenario), Window())
+def at_the_wheel(scenario: str) -> Window:
+    return Window(JoystickHands(G29, scenario))
 
 
-def read(device: WindowPerson):
+def read(device: Window):
     """SDL tells axes on the next look at its devices."""
     device.poll(time.monotonic())
     return device.poll(time.monotonic())
 
 
-def test_pedals_nobody_has_touched_are_not_half_pressed(wheel):
-    device = at_the_wheel("left_turn")
-    assert read(device).action == 0.0
-
-
 def test_axes_and_buttons_of_a_wheel(wheel):
+    assert read(at_the_wheel("left_turn")).action == 0.0, "untouched pedals are not half pressed"
     device = at_the_wheel("congestion")
     wheel.axis(0, 0.25)
     reading = read(device)
@@ -177,7 +169,7 @@ def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
 
 def test_another_device_is_not_taken_for_the_profiles(wheel):
     other = msgspec.structs.replace(G29, match="Thrustmaster")
-    assert not JoystickHands(other, "left_turn").present
+    assert not Window(JoystickHands(other, "left_turn")).present
 
 
 @pytest.fixture
@@ -187,7 +179,7 @@ def opened(monkeypatch):
 
     def opened(*screen):
         monkeypatch.setattr(pygame.display, "get_desktop_sizes", lambda: [screen])
-        return Window()
+        return Window(KeyboardHands("left_turn"))
 
     yield opened
     pygame.quit()

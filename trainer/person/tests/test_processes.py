@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from trainer.drivers import CHECKPOINT_FILE
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
 from trainer.person.takeover import MAX_SLEW
 from trainer.person.tests.browser import (
+    OVER,
     PERSON_DRIVES,
     POLICY_DRIVES,
     address,
@@ -45,10 +47,8 @@ class Training:
             command, **pipes, text=True, env={**os.environ, **environment}
         )
 
-    def __enter__(self) -> Training:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Kill it, if it is still there."""
         self.process.kill()
         self.process.communicate()
 
@@ -148,7 +148,7 @@ def xdotool(display, *words) -> int:
 
 
 def test_a_key_takes_over_at_once_and_everything_is_kept(tmp_path, display):
-    with Training(tmp_path / "run", "--human", "keyboard", **display) as training:
+    with closing(Training(tmp_path / "run", "--human", "keyboard", **display)) as training:
         training.wait_for_step(lambda step: step.step >= 2)
         began_ns = time.time_ns()
         done_ns = xdotool(display, "keydown", "Down")
@@ -175,7 +175,7 @@ def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
     if load_sdl() is None:
         pytest.skip("this pygame has no SDL of its own with virtual joysticks")
     run_dir = tmp_path / "run"
-    with train(run_dir) as training:
+    with closing(train(run_dir)) as training:
         training.wait_for_step(lambda step: step.step >= 2)
         began_ns = time.time_ns()
         done_ns = training.tell("axis 3 -1")
@@ -185,7 +185,7 @@ def test_a_wheel_takes_over_at_once_and_a_kill_loses_no_intervention(tmp_path):
     killed = newest_sitting(run_dir)
     assert_taken_over_at_once(killed, began_ns, done_ns)
 
-    with train(run_dir, "--resume") as training:
+    with closing(train(run_dir, "--resume")) as training:
         training.wait_for_step(lambda step: step.sitting == 2 and step.step >= 1)
         training.process.terminate()  # Which is quitting, too.
         status, errors = training.end()
@@ -213,9 +213,10 @@ def test_a_key_held_in_the_page_takes_over_in_the_training_process(tmp_path):
             await page.keyboard.up("ArrowDown")
             await until(page, POLICY_DRIVES)
             await quit_sitting(page)
-            await until(page, "document.body.dataset.link === 'over'")
+            await until(page, OVER)
 
-    with Training(tmp_path / "run", "--human", "web", "--set", "warmup_steps=8") as training:
+    web = Training(tmp_path / "run", "--human", "web", "--set", "warmup_steps=8")
+    with closing(web) as training:
         asyncio.run(sit(address(training.process)))
         status, errors = training.end()
     assert status == 0, errors

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -63,15 +65,10 @@ def test_within_the_dead_zone_nothing_happens_and_at_its_edge_nothing_jumps():
     assert steering.action(0.21) == pytest.approx(0.0125)
 
 
-@pytest.mark.parametrize("name", ["g29.toml", "gamepad.toml"])
-def test_what_is_shipped_is_at_rest_at_rest(name):
-    profile = read_profile(SHIPPED / name)
-    for scenario in ("left_turn", "congestion"):
+def test_what_is_shipped_is_at_rest_at_rest_and_the_g29s_pedals_and_wheel():
+    g29, pad = (read_profile(SHIPPED / name) for name in ("g29.toml", "gamepad.toml"))
+    for profile, scenario in product((g29, pad), ("left_turn", "congestion")):
         assert profile.action(scenario, {}) == 0.0
-
-
-def test_the_g29s_pedals_and_wheel():
-    g29 = read_profile(SHIPPED / "g29.toml")
     assert g29.action("left_turn", {2: -1.0, 3: 1.0}) == 1.0
     assert g29.action("left_turn", {2: 1.0, 3: -1.0}) == -1.0
     assert g29.action("congestion", {0: -0.25}) == -1.0
@@ -95,18 +92,14 @@ def test_the_g29s_pedals_and_wheel():
 )
 def test_a_wrong_profile_is_one_line(tmp_path, change, complaint):
     path = tmp_path / "wrong.toml"
+    path.write_text(GOOD)
+    assert read_profile(path).threshold == 0.15
     path.write_text(GOOD.replace(*change))
     with pytest.raises(UserError) as error:
         read_profile(path)
     assert complaint in str(error.value)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_a_good_one_is_read(tmp_path):
-    path = tmp_path / "good.toml"
-    path.write_text(GOOD)
-    assert read_profile(path).threshold == 0.15
 
 
 class Trembling:

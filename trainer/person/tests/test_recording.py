@@ -32,10 +32,10 @@ from trainer.person.recording import (
     steps_since,
     store_again,
 )
-from trainer.person.tests.people import recorded_step
+from trainer.person.tests.people import record, recorded_step
 
 
-def record(directory, count: int) -> list[Step]:
+def record_some(directory, count: int) -> list[Step]:
     """A sitting of so many steps, each of which is there before the next is taken."""
     recorder, steps = Recorder(directory), []
     for index in range(count):
@@ -44,13 +44,6 @@ def record(directory, count: int) -> list[Step]:
         assert list(read_steps(recorder.path)) == steps
     recorder.close()
     return steps
-
-
-def test_what_is_written_is_read(tmp_path):
-    steps = record(tmp_path, 5)
-    (path,) = sittings(tmp_path)
-    assert list(read_steps(path)) == steps
-    np.testing.assert_array_equal(steps[0].next_observation, steps[1].observation)
 
 
 def test_a_file_cut_anywhere_holds_every_step_before_the_cut(tmp_path):
@@ -69,7 +62,7 @@ def test_a_file_cut_anywhere_holds_every_step_before_the_cut(tmp_path):
 
 
 def test_a_damaged_byte_ends_the_reading_without_a_wrong_step(tmp_path):
-    steps = record(tmp_path, 4)
+    steps = record_some(tmp_path, 4)
     (path,) = sittings(tmp_path)
     data = path.read_bytes()
     for place in range(100, len(data) // 2, 61):
@@ -82,11 +75,9 @@ def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_p
     class Older(msgspec.Struct):
         time_ns: int = 1
 
-    recorder = Recorder(tmp_path)
-    recorder.write(cast(Step, Older()))
-    recorder.close()
+    path = record(tmp_path, [cast(Step, Older())])
     with pytest.raises(UserError, match="recorded by another version: Object missing"):
-        list(read_steps(recorder.path))
+        list(read_steps(path))
 
 
 def test_a_sitting_is_held_until_it_is_closed(tmp_path):
@@ -98,15 +89,16 @@ def test_a_sitting_is_held_until_it_is_closed(tmp_path):
         assert try_to_lock_file(other.fileno())
 
 
-def test_sittings_add_up_and_are_never_overwritten(tmp_path):
-    first, second = record(tmp_path, 2), record(tmp_path, 3)
+def test_what_is_written_is_read_and_sittings_add_up_and_are_never_overwritten(tmp_path):
+    first, second = record_some(tmp_path, 2), record_some(tmp_path, 3)
+    np.testing.assert_array_equal(first[0].next_observation, first[1].observation)
     paths = sittings(tmp_path)
     assert [path.name for path in paths] == ["sitting-0001.mcap", "sitting-0002.mcap"]
     assert [step for path in paths for step in read_steps(path)] == first + second
 
 
 def test_a_sitting_without_a_step_leaves_nothing_behind(tmp_path):
-    record(tmp_path / "rec", 0)
+    record_some(tmp_path / "rec", 0)
     assert sittings(tmp_path / "rec") == []
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot create"):
@@ -114,8 +106,8 @@ def test_a_sitting_without_a_step_leaves_nothing_behind(tmp_path):
 
 
 def test_recordings_are_found_by_file_directory_and_run_each_once(tmp_path):
-    record(tmp_path / "run" / "sittings", 1)
-    record(tmp_path / "run" / "sittings", 1)
+    record_some(tmp_path / "run" / "sittings", 1)
+    record_some(tmp_path / "run" / "sittings", 1)
     (path, other) = sittings(tmp_path / "run" / "sittings")
     assert find_recordings([other, tmp_path / "run", path.parent]) == [other, path]
     with pytest.raises(UserError, match="no recording"):
@@ -164,29 +156,24 @@ def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
         assert list(read_steps(recorder.path)) == [recorded_step(1, 0)]
 
 
-def shape(reward, intervention):
-    """A penalty of 100 for taking over."""
-    return reward - 100.0 * (intervention is not None and intervention.first)
-
-
 def penalises(intervention):
     return intervention is not None and intervention.first
+
+
+def shape(reward, intervention):
+    """A penalty of 100 for taking over."""
+    return reward - 100.0 * penalises(intervention)
 
 
 def episode(sitting: int, first: int, length: int, human: range):
     """A recorded episode whose steps in ``human`` are the person's."""
     return [
         recorded_step(
-            sitting,
-            first + step,
-            step=step,
-            human=step in human,
-            first=step == human.start and step in human,
-            action=0.1 * step,
-            terminated=step == length - 1,
+            sitting, first + step, step=step, action=0.1 * step, human=step in human,
+            first=step == human.start and step in human, terminated=step == length - 1,
         )
         for step in range(length)
-    ]
+    ]  # fmt: skip
 
 
 def assert_pictures(buffer, steps):
@@ -210,10 +197,7 @@ def test_steps_come_back_with_mask_action_reward_and_pictures():
         state["overruled"][:, 0], [np.float32(step.policy_action) for step in steps]
     )
     assert_pictures(buffer, steps)
-
-
-def test_an_episode_that_was_thrown_away_does_not_come_back():
-    steps = [*episode(1, 0, 4, range(1, 3)), *episode(1, 4, 3, range(0))]
+    # An episode that was thrown away does not come back.
     steps[3] = replace(steps[3], outcome=DISCARDED)
     buffer = ReplayBuffer(100)
     assert store_again(buffer, steps, shape, penalises) == (3, 0)
@@ -235,10 +219,7 @@ def test_behind_a_network_the_action_answers_an_older_picture():
 @pytest.mark.parametrize(("position", "left"), [((1, 0), 5), ((1, 2), 3), ((2, 0), 2), ((3, 0), 0)])
 def test_only_what_came_after_the_checkpoint(tmp_path, position, left):
     for sitting, count in ((1, 3), (2, 2)):
-        recorder = Recorder(tmp_path)
-        for step in episode(sitting, 0, count, range(0)):
-            recorder.write(step)
-        recorder.close()
+        record(tmp_path, episode(sitting, 0, count, range(0)))
     assert len(list(steps_since(tmp_path, position))) == left
 
 

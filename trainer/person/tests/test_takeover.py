@@ -1,12 +1,13 @@
-"""The take-over as a state machine: no jumps, at once, and every step that is not the policy's."""
+"""Who has the wheel, when a hold counts, and the hand-over: no jumps, at once, with its mask."""
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trainer.person.interface import Moving, Reading
-from trainer.person.takeover import MAX_SLEW, NEXT, Intent, TakeOver
+from trainer.person.interface import LET_GO, WISHES, Moving, Reading
+from trainer.person.takeover import MAX_SLEW, NEXT, SILENCE_S, Input, Intent, Seat, TakeOver
 
 ACTION = st.floats(-1.0, 1.0)
 STEPS = st.lists(st.tuples(ACTION, ACTION, st.booleans()), min_size=1, max_size=60)
@@ -32,7 +33,7 @@ def test_a_hand_over_never_jumps_and_all_but_the_policys_own_action_is_the_perso
 
 
 @given(STEPS, ACTION, ACTION)
-def test_whoever_holds_or_lets_go_for_long_is_followed_exactly(steps, policy, human):
+def test_a_person_who_holds_or_lets_go_for_long_is_followed_exactly(steps, policy, human):
     take_over = TakeOver()
     for step in steps:
         take_over.step(*step)
@@ -44,9 +45,9 @@ def test_whoever_holds_or_lets_go_for_long_is_followed_exactly(steps, policy, hu
 
 
 def test_the_table_has_every_row():
-    states = {state for state, _, _ in NEXT}
-    assert len(NEXT) == 4 * len(states)
-    assert set(NEXT.values()) == states
+    states = {state for state, _ in NEXT}
+    assert len(NEXT) == 2 * len(states)
+    assert {state for row in NEXT.values() for state in row} == states
 
 
 def test_on_the_way_back_the_steps_are_the_persons():
@@ -63,26 +64,20 @@ def wheel(action):
     return Reading(action=action, by_moving=True)
 
 
-def test_moving_the_wheel_takes_over_and_resting_gives_back():
+# Through the middle and out again is still in the person's hands.
+MOVED = [(wheel(0.1), 0.0, False), (wheel(0.2), 0.1, True), (wheel(0.1), 0.2, True),
+         (wheel(0.0), 0.3, True), (wheel(-0.1), 0.7, True), (wheel(0.01), 0.8, True),
+         (wheel(0.01), 1.3, True), (wheel(0.01), 1.5, False), (wheel(0.1), 1.6, False)]  # fmt: skip
+# A device that takes over by holding is not moved, and one that is gone lets go.
+HELD = [(Reading(action=1.0), 0.0, False), (Reading(action=0.0, engaged=True), 0.1, True),
+        (wheel(1.0), 0.2, True), (Reading(), 0.3, False)]  # fmt: skip
+
+
+@pytest.mark.parametrize("readings", [MOVED, HELD])
+def test_moving_or_holding_takes_over_and_resting_or_letting_go_hands_back(readings):
     intent = Intent(Moving(threshold=0.15, rest=0.05, rest_s=0.6))
-    assert not intent.update(wheel(0.1), 0.0)
-    assert intent.update(wheel(0.2), 0.1)
-    assert intent.update(wheel(0.1), 0.2)
-    # Through the middle and out again: still in the person's hands.
-    assert intent.update(wheel(0.0), 0.3)
-    assert intent.update(wheel(-0.1), 0.7)
-    assert intent.update(wheel(0.01), 0.8)
-    assert intent.update(wheel(0.01), 1.3)
-    assert not intent.update(wheel(0.01), 1.5)
-    assert not intent.update(wheel(0.1), 1.6)
-
-
-def test_a_device_that_takes_over_by_holding_is_not_moved_and_one_that_is_gone_lets_go():
-    intent = Intent(Moving())
-    assert not intent.update(Reading(action=1.0), 0.0)
-    assert intent.update(Reading(action=0.0, engaged=True), 0.1)
-    assert intent.update(wheel(1.0), 0.2)
-    assert not intent.update(Reading(), 0.3)
+    for reading, now_s, wants_control in readings:
+        assert intent.update(reading, now_s) == wants_control, now_s
 
 
 @given(st.lists(st.tuples(st.floats(-0.15, 0.15), st.floats(0.0, 1.0)), max_size=30))
@@ -91,3 +86,131 @@ def test_below_the_threshold_nothing_is_taken_over(moves):
     for action, waited_s in moves:
         now_s += waited_s
         assert not intent.update(wheel(action), now_s)
+
+
+OFF = Input(at_ms=0.0, action=0.0, engaged=False)
+HOLD = Input(at_ms=0.0, action=0.8, engaged=True)
+RESTING = Input(at_ms=0.0, action=0.03, engaged=False, by_moving=True)
+TURNED = Input(at_ms=0.0, action=0.8, engaged=False, by_moving=True)
+
+
+@pytest.fixture
+def seat():
+    seat = Seat()
+    seat.sit_down(1)
+    return seat
+
+
+def take_over(seat, page=1, now_s=0.0):
+    seat.hear(page, OFF, now_s)
+    return seat.hear(page, HOLD, now_s)
+
+
+def test_a_hold_is_read_at_once_and_silence_is_letting_go(seat):
+    assert take_over(seat)
+    reading = seat.poll(SILENCE_S)
+    assert (reading.engaged, reading.action) == (True, 0.8)
+    assert seat.poll(SILENCE_S + 1e-6) == LET_GO
+    assert not seat.is_heard(SILENCE_S + 1e-6)
+
+
+@pytest.mark.parametrize(("off", "on"), [(OFF, HOLD), (RESTING, TURNED)])
+def test_after_a_silence_the_hands_must_be_off_once_and_a_wheel_at_rest(seat, off, on):
+    assert not seat.hear(1, on, 0.0), "it came holding"
+    seat.hear(1, off, 0.0)
+    assert seat.hear(1, on, 0.1)
+    assert (seat.poll(0.1).action, seat.poll(0.1).by_moving) == (0.8, on.by_moving)
+    late_s = 0.1 + SILENCE_S + 0.1
+    assert not seat.hear(1, on, late_s)
+    assert seat.poll(late_s) == LET_GO
+    seat.hear(1, off, late_s + 0.1)
+    assert seat.hear(1, on, late_s + 0.2)
+    assert seat.poll(late_s + 0.2).action == 0.8
+
+
+def test_the_driver_going_is_letting_go_and_the_next_page_drives(seat):
+    seat.sit_down(2)
+    seat.sit_down(3)
+    take_over(seat)
+    assert not take_over(seat, page=2)
+    seat.get_up(3)
+    assert seat.poll(0.0).engaged, "a watcher going changes nothing"
+    seat.get_up(1)
+    assert seat.poll(0.0) == LET_GO
+    assert seat.is_driver(2)
+    assert not seat.hear(2, HOLD, 0.1), "held while it watched"
+    assert take_over(seat, page=2, now_s=0.2)
+
+
+def test_a_tap_between_two_polls_counts_for_one_and_a_hold_ends_with_its_release(seat):
+    take_over(seat)
+    seat.hear(1, OFF, 0.05)
+    assert seat.poll(0.1).action == 0.8
+    assert not seat.poll(0.2).engaged
+    take_over(seat, now_s=0.3)
+    assert seat.poll(0.3).engaged
+    seat.hear(1, HOLD, 0.35)
+    seat.hear(1, OFF, 0.36)
+    assert not seat.poll(0.4).engaged
+
+
+def test_a_wish_outlives_its_page_and_is_told_once_and_a_tap_is_lost_with_it(seat):
+    take_over(seat)
+    seat.hear(1, Input(at_ms=0.0, action=0.0, engaged=False, wishes=("quit",)), 0.05)
+    seat.get_up(1)
+    reading = seat.poll(0.1)
+    assert (reading.wishes, reading.engaged) == ({"quit"}, False)
+    assert not seat.poll(0.1).wishes
+
+
+PAGES = st.integers(1, 3)
+EVENTS = st.one_of(
+    st.tuples(st.just("sit_down"), PAGES),
+    st.tuples(st.just("get_up"), PAGES),
+    st.tuples(st.just("hear"), PAGES, st.booleans(), st.sets(st.sampled_from(WISHES))),
+    st.tuples(st.just("wait"), st.floats(0.0, 0.4)),
+)
+
+
+@given(st.lists(EVENTS, max_size=40))
+def test_only_the_driver_heard_lately_and_after_hands_off_ever_holds(events):
+    """The seat beside a plain account of the same events."""
+    seat, now_s = Seat(), 0.0
+    pages, told = [], []
+    heard: list[tuple[float, bool]] = []  # when, and whether engaged: of the present driver
+    wished = []
+    for kind, *what in events:
+        if kind == "wait":
+            now_s += what[0]
+        elif kind == "sit_down" and what[0] not in pages:
+            pages.append(what[0])
+            seat.sit_down(what[0])
+        elif kind == "get_up" and what[0] in pages:
+            heard = [] if pages[0] == what[0] else heard
+            pages.remove(what[0])
+            seat.get_up(what[0])
+        elif kind == "hear" and what[0] in pages:
+            page, engaged, wishes = what
+            said = Input(at_ms=0.0, action=0.5, engaged=engaged, wishes=tuple(wishes))
+            seat.hear(page, said, now_s)
+            if page == pages[0]:
+                heard.append((now_s, engaged))
+                wished += list(wishes)
+        reading = seat.poll(now_s)
+        told += list(reading.wishes)
+        assert reading.engaged == holds(heard, now_s)
+    assert set(told) == set(wished)
+    assert len(told) <= len(wished)
+
+
+def holds(heard, now_s):
+    """Whether the last of an unbroken row of messages holds, with hands off before it."""
+    if not heard or not heard[-1][1] or now_s - heard[-1][0] > SILENCE_S:
+        return False
+    row, later_s = [], heard[-1][0]
+    for time_s, engaged in reversed(heard):
+        if later_s - time_s > SILENCE_S:
+            break
+        row.append(engaged)
+        later_s = time_s
+    return not all(row)

@@ -17,22 +17,29 @@ import pytest
 from edge_runtime.util import UserError
 from trainer.person import web
 from trainer.person.interface import LET_GO, open_person
-from trainer.person.seat import MAX_INPUT_BYTES
-from trainer.person.tests.pages import (
+from trainer.person.tests.browser import (
     WAIT_S,
     first_view,
     hear,
     origin,
     page,
     poll,
+    reads,
     say,
-    until,
     view_of_step,
 )
-from trainer.person.web import VIEWS_UNDERWAY, Cockpit
+from trainer.person.web import MAX_INPUT_BYTES, VIEWS_UNDERWAY, Cockpit
 
 RESET = struct.pack("ii", 1, 0)
 """SO_LINGER that closes without a good-bye."""
+
+
+async def let_go(cockpit):
+    await reads(cockpit, lambda reading: not reading.engaged)
+
+
+async def absent(cockpit):
+    await reads(cockpit, lambda _: not cockpit.present)
 
 
 async def test_what_a_page_holds_is_polled_and_its_closing_is_letting_go(cockpit):
@@ -44,11 +51,11 @@ async def test_what_a_page_holds_is_polled_and_its_closing_is_letting_go(cockpit
         assert not (await say(link, True, -0.75))["refused"]
         reading = poll(cockpit)
         assert (reading.engaged, reading.action) == (True, -0.75)
-    await until(lambda: not poll(cockpit).engaged)
+    await let_go(cockpit)
     assert not cockpit.present
 
 
-async def test_a_page_that_falls_silent_has_let_go_and_is_shown_out(cockpit):
+async def test_a_page_that_falls_silent_has_let_go_and_is_disconnected(cockpit):
     async with page(cockpit) as link:
         await say(link)
         await say(link, True, 1.0)
@@ -69,24 +76,21 @@ async def test_a_second_page_watches_until_the_first_is_gone(cockpit):
             await say(first, True, 0.5)
             assert poll(cockpit).action == 0.5
             await first.close()
-            await until(lambda: not poll(cockpit).engaged)
+            await let_go(cockpit)
             assert (await say(watching))["driving"]
 
 
-async def test_a_view_arrives_whole(cockpit):
+async def test_a_view_arrives_whole_and_a_page_that_comes_later_sees_the_newest(cockpit):
+    expected = first_view()
     async with page(cockpit) as link:
-        cockpit.show(first_view())
+        cockpit.show(expected)
         view = await hear(link, "view")
-        expected = first_view()
         frames = np.frombuffer(base64.b64decode(view["frames"]), np.uint8)
         assert np.array_equal(frames.reshape(2, 45, 80), expected.frames)
         assert view["scene"] == json.loads(json.dumps(expected.scene))
         assert view["policy_action"] == 0.25
         assert view["ground"]["left_m"] == -30.0
         assert view["number"] == 1
-
-
-async def test_a_page_that_comes_later_sees_the_newest_view(cockpit):
     cockpit.show(view_of_step(1))
     cockpit.show(view_of_step(2))
     async with page(cockpit) as link:
@@ -110,19 +114,14 @@ async def test_a_slow_page_gets_fewer_views_and_never_old_ones(cockpit):
 
 async def test_a_page_that_reads_nothing_holds_nobody_up(cockpit):
     """Its views and echoes pile up in front of a closed window; the loop's thread goes on."""
-
     reader, writer = await asyncio.open_connection("127.0.0.1", cockpit.port, limit=256)
     path = cockpit.url.partition(str(cockpit.port))[2]
     request = (
-        f"GET {path}socket HTTP/1.1",
-        f"Host: 127.0.0.1:{cockpit.port}",
-        f"Origin: {origin(cockpit)}",
-        "Connection: Upgrade",
-        "Upgrade: websocket",
-        "Sec-WebSocket-Version: 13",
-        f"Sec-WebSocket-Key: {'A' * 22}==",
+        f"GET {path}socket HTTP/1.1\r\nHost: 127.0.0.1:{cockpit.port}\r\n"
+        f"Origin: {origin(cockpit)}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        f"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {'A' * 22}==\r\n\r\n"
     )
-    writer.write("".join(f"{line}\r\n" for line in (*request, "")).encode())
+    writer.write(request.encode())
     assert b"101" in await reader.readline()
     for step in range(2000):
         cockpit.show(view_of_step(step))
@@ -138,20 +137,18 @@ async def test_pages_that_are_cut_off_while_they_speak_are_no_error(cockpit, cap
                 await link.send_json({"at_ms": 1.0, "action": 0.0, "engaged": False})
             link.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             link._response.connection.transport.abort()
-    await until(lambda: not cockpit.present)
+    await absent(cockpit)
     cockpit.close()
     assert caplog.messages == []
 
 
 async def test_closing_tells_every_page_and_frees_the_port():
     cockpit = Cockpit()
-
     async with page(cockpit) as link:
         await say(link)
         cockpit.close()
         assert (await link.receive_json(timeout=WAIT_S))["kind"] == "end"
         assert (await link.receive(timeout=WAIT_S)).type is aiohttp.WSMsgType.CLOSE
-
     cockpit.close()
     cockpit.show(first_view())
     assert poll(cockpit) == LET_GO
@@ -199,7 +196,9 @@ async def test_without_the_token_nothing_is_shown(cockpit, path):
         (b"OPTIONS * HTTP/1.1", b"421 "),
     ],
 )
-def test_who_speaks_no_http_is_told_so_and_nobody_else(cockpit, caplog, words, answer):
+def test_a_client_that_speaks_no_http_is_told_so_and_the_log_stays_empty(
+    cockpit, caplog, words, answer
+):
     with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as link:
         link.sendall(words + b"\r\nHost: x\r\n\r\n")
         assert answer in link.recv(200)
@@ -207,12 +206,17 @@ def test_who_speaks_no_http_is_told_so_and_nobody_else(cockpit, caplog, words, a
     assert caplog.messages == []
 
 
+async def refusal(cockpit, **more):
+    """The status with which a page gets no socket."""
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+        async with page(cockpit, **more):
+            pass
+    return refused.value.status
+
+
 @pytest.mark.parametrize("from_where", ["http://evil.example", "null", None])
 async def test_another_sites_page_gets_no_socket(cockpit, from_where):
-    with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-        async with page(cockpit, origin=from_where):
-            pass
-    assert refusal.value.status == 403
+    assert await refusal(cockpit, origin=from_where) == 403
     assert not cockpit.present
 
 
@@ -240,7 +244,7 @@ async def test_nonsense_closes_the_connection_and_lets_go(cockpit, text):
         await (link.send_bytes if isinstance(text, bytes) else link.send_str)(text)
         while not (await link.receive(timeout=WAIT_S)).type.name.startswith("CLOS"):
             pass
-    await until(lambda: not poll(cockpit).engaged)
+    await let_go(cockpit)
     async with page(cockpit) as link:
         assert (await say(link))["driving"], "and it serves on"
 
@@ -260,9 +264,8 @@ def test_an_address_that_cannot_be_listened_on_is_a_plain_error(cockpit):
 
 def test_the_address_is_printed_and_listening_to_the_network_is_warned_of(capsys):
     for host, warned in (("127.0.0.1", False), ("0.0.0.0", True)):
-        person = open_web(host=host)
+        open_web(host=host).close()
         out, err = capsys.readouterr()
-        person.close()
         assert out.startswith("cockpit: open http://")
         assert ("warning: --host" in err) == warned
 
@@ -286,17 +289,15 @@ def few_descriptors():
 async def test_a_crowd_that_says_nothing_takes_no_descriptors_and_fills_no_log(
     cockpit, caplog, said
 ):
+    there = ("127.0.0.1", cockpit.port)
     with ExitStack() as idle:
         async with page(cockpit) as link:
             await say(link)
             for _ in range(CROWD):
-                stranger = idle.enter_context(
-                    socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S)
-                )
-                stranger.sendall(said)
-                await say(link)  # A page that falls silent is shown out.
+                idle.enter_context(socket.create_connection(there, WAIT_S)).sendall(said)
+                await say(link)  # A page that falls silent is disconnected.
             assert (await status_of(cockpit.url))[0] == 200
-            assert (await say(link))["driving"], "who was there first stays"
+            assert (await say(link))["driving"], "the page that was there first stays"
     cockpit.close()
     assert caplog.messages == []
 
@@ -305,19 +306,18 @@ async def test_a_full_house_of_pages_keeps_newcomers_out_and_lets_them_in_afterw
     cockpit, monkeypatch
 ):
     monkeypatch.setattr(web, "MAX_CONNECTIONS", 2)
-
     async with page(cockpit) as first, page(cockpit) as second:
         for link in (first, second):
             await say(link)
         with pytest.raises(aiohttp.ClientError):
             await status_of(cockpit.url)
         await say(first)
-    await until(lambda: not cockpit.present)
+    await absent(cockpit)
     assert (await status_of(cockpit.url))[0] == 200
 
 
 @pytest.mark.parametrize("said", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: "])
-def test_who_does_not_come_to_the_point_is_shown_out(cockpit, monkeypatch, said):
+def test_a_client_that_sends_no_whole_request_is_cut_off(cockpit, monkeypatch, said):
     monkeypatch.setattr(web, "HEADERS_S", 0.2)
     with socket.create_connection(("127.0.0.1", cockpit.port), WAIT_S) as stranger:
         stranger.sendall(said)
@@ -341,14 +341,10 @@ def test_a_connection_without_the_token_is_closed_with_the_answer(cockpit):
 )
 async def test_a_name_that_is_not_this_machines_is_refused(cockpit, host):
     """DNS rebinding: the other site's page would be of the same origin as the cockpit."""
-    name = host.format(port=cockpit.port)
-
-    status, text, _ = await status_of(cockpit.url, headers={"Host": name})
+    headers = {"Host": host.format(port=cockpit.port)}
+    status, text, _ = await status_of(cockpit.url, headers=headers)
     assert (status, "address" in text) == (421, True)
-    with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
-        async with page(cockpit, origin=f"http://{name}", headers={"Host": name}):
-            pass
-    assert refusal.value.status == 421
+    assert await refusal(cockpit, origin=f"http://{headers['Host']}", headers=headers) == 421
 
 
 @pytest.mark.parametrize("host", ["localhost:7", "LOCALHOST", "[::1]:80", "127.0.0.1"])

@@ -22,16 +22,9 @@ class Description(ctypes.Structure):
     """SDL_VirtualJoystickDesc, version 1 (SDL_joystick.h)."""
 
     _fields_ = [
-        ("version", ctypes.c_uint16),
-        ("type", ctypes.c_uint16),
-        ("naxes", ctypes.c_uint16),
-        ("nbuttons", ctypes.c_uint16),
-        ("nhats", ctypes.c_uint16),
-        ("vendor_id", ctypes.c_uint16),
-        ("product_id", ctypes.c_uint16),
-        ("padding", ctypes.c_uint16),
-        ("button_mask", ctypes.c_uint32),
-        ("axis_mask", ctypes.c_uint32),
+        *((name, ctypes.c_uint16) for name in ("version", "type", "naxes", "nbuttons", "nhats")),
+        *((name, ctypes.c_uint16) for name in ("vendor_id", "product_id", "padding")),
+        *((name, ctypes.c_uint32) for name in ("button_mask", "axis_mask")),
         ("name", ctypes.c_char_p),
         ("userdata", ctypes.c_void_p),
         ("callbacks", ctypes.c_void_p * 6),
