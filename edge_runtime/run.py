@@ -22,7 +22,7 @@ from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.loop import ControlLoop
 from edge_runtime.policy import load_policy
 from edge_runtime.policy_file import VERIFIED
-from edge_runtime.transport import is_tls, open_session
+from edge_runtime.transport import is_tls, look, open_session
 from edge_runtime.util import UserError, ending_signals
 from edge_runtime.wire import key
 
@@ -250,9 +250,7 @@ def why_no_state(
 ) -> str:
     """What keeps states away, on one line."""
     if not session.info.routers_zid():
-        from edge_runtime.link_probe import why_no_link
-
-        refusal = why_no_link(connect, tls)
+        _, refusal = look(connect, tls)
         if not session.info.routers_zid():  # it may have come meanwhile
             return refusal or f"{connect} gives no link yet"
     return f"{connect} is there, and has sent no state for vehicle id {vehicle_id} yet"

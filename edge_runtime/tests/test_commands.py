@@ -30,10 +30,9 @@ from edge_runtime.cli import (
 )
 from edge_runtime.commands import render_status
 from edge_runtime.config import Config, load_config
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import Simulator, exit_status, run_command
 from edge_runtime.tests.policies import write_policy
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 from edge_runtime.util import UserError
 
 

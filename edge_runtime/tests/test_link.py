@@ -13,9 +13,8 @@ import pytest
 from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
-from edge_runtime.link_probe import free_endpoint, why_no_link
 from edge_runtime.run import Waiting
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, look, open_session
 from edge_runtime.util import UserError
 from edge_runtime.wire import Health
 
@@ -205,11 +204,10 @@ def server(answer):
 
 
 def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
-    assert "host 'no-such-host.invalid' cannot be" in why_no_link(
-        "tcp/no-such-host.invalid:1", None
-    )
-    assert "host 'a..b' cannot be resolved" in why_no_link("tcp/a..b:7447", None)
-    assert "host 'a..b' cannot be resolved" in why_no_link("udp/a..b:7447", None)
+    for endpoint in ("tcp/no-such-host.invalid:1", "tcp/a..b:7447", "udp/a..b:7447"):
+        answers, why = look(endpoint, None)
+        assert not answers
+        assert f"host '{endpoint[4:].split(':')[0]}' cannot be resolved" in why
     with pytest.raises(UserError, match=r"host 'a\.\.b' of endpoint .* cannot be resolved"):
         open_session(listen="tcp/a..b:7447", mode="router")
 
@@ -217,17 +215,16 @@ def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
 def test_a_port_where_nobody_listens():
     endpoint = free_endpoint()
     port = endpoint.rsplit(":", 1)[1]
-    assert why_no_link(endpoint, None) == (
-        f"nobody listens on port {port} of 127.0.0.1 (connection refused)"
-    )
+    words = f"nobody listens on port {port} of 127.0.0.1 (connection refused)"
+    assert look(endpoint, None) == (False, words)
 
 
 def test_a_server_that_speaks_tls_and_one_that_speaks_something_else():
     alert = b"\x15\x03\x03\x00\x02\x02\x28"  # TLS 1.2, fatal, handshake failure
     with server(alert) as endpoint:
-        assert "listens with TLS and wants --tls" in why_no_link(endpoint, None)
+        assert "listens with TLS and wants --tls" in look(endpoint, None)[1]
     with server(b"SSH-2.0-OpenSSH_9.6\r\n") as endpoint:
-        assert "answers, but not as a simulator" in why_no_link(endpoint, None)
+        assert "answers, but not as a simulator" in look(endpoint, None)[1]
 
 
 def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(monkeypatch):

@@ -11,7 +11,6 @@ import pytest
 
 from edge_runtime.commands import ask
 from edge_runtime.files import Hold
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import (
     BLACK,
     PATIENCE_S,
@@ -22,6 +21,7 @@ from edge_runtime.tests.harness import (
     run_command,
     wait_until,
 )
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
 

@@ -18,13 +18,13 @@ import pytest
 
 from edge_runtime import log, loop, realtime
 from edge_runtime.controller import Controller, limit_rows
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.log import Flood
 from edge_runtime.loop import ControlLoop
 from edge_runtime.service import Notifier, look
 from edge_runtime.tests.harness import EdgeProcess, make_state, wait_until
 from edge_runtime.tests.policies import PEDAL
 from edge_runtime.tests.test_vehicle_base import BrokenVehicle
+from edge_runtime.transport import free_endpoint
 from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.wire import encode
 

@@ -14,8 +14,8 @@ import pytest
 
 import edge_runtime
 from edge_runtime.__main__ import script
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state
+from edge_runtime.transport import free_endpoint
 
 SOURCE = Path(edge_runtime.__file__).parent
 LOCK = SOURCE.parent / "requirements" / "edge-py38.txt"

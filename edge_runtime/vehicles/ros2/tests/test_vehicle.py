@@ -8,7 +8,6 @@ import time
 import pytest
 
 from edge_runtime.config import Config, Ros2Settings, load_config
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import (
     PATIENCE_S,
     EdgeProcess,
@@ -18,6 +17,7 @@ from edge_runtime.tests.harness import (
     wait_until,
 )
 from edge_runtime.tests.policies import write_policy
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import stream
 from edge_runtime.vehicles.core import Event, State
