@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 TLS_PROTOCOLS = ("tls", "quic")
-MODES = ("router", "peer", "client")
 
 # At Zenoh's default lease a peer that was stopped, or whose cable was cut, lives on for 10 s.
 LEASE_MS = 1000
@@ -78,13 +77,11 @@ def open_session(
 ) -> zenoh.Session:
     """Open a session that listens, connects, or both. Close it before the process ends.
 
-    `tls` is what `tls_for` gave; `access` is Zenoh's `access_control`, of tls.py; a session
-    that listens with TLS must have it.
+    `mode` is "router", "peer" or "client". `tls` is what `tls_for` gave. `access` is Zenoh's
+    `access_control`, of tls.py; a session that listens with TLS must have it.
     Raises UserError for a malformed endpoint, one that does not go with `tls`, a busy port, a
     link that either end refuses, and, in client mode, nobody there.
     """
-    if mode not in MODES:
-        raise ValueError(f"mode {mode!r} is none of {MODES}")
     listens = [listen] if isinstance(listen, str) else list(listen or [])
     if listens and tls is not None and access is None:
         raise ValueError("a TLS listener needs access control: any certificate could say all")
@@ -163,10 +160,10 @@ def look(endpoint: str, files: Optional[TlsFiles]) -> Tuple[bool, str]:
     protocol, host, port = _parts(endpoint)
     try:
         _address(endpoint)
-        if _kind(protocol) != socket.SOCK_STREAM:
-            return False, ""
     except OSError as error:
         return False, f"host {host!r} cannot be resolved ({error.strerror})"
+    if _kind(protocol) != socket.SOCK_STREAM:
+        return False, ""
     try:
         plain = socket.create_connection((host, port), timeout=_LOOK_S)
     except ConnectionRefusedError:
@@ -198,17 +195,12 @@ def _why_not_plain(plain: socket.socket) -> str:
 
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    speaks_tls = False
     try:
         context.wrap_socket(plain).close()
-        speaks_tls = True
-    except ssl.SSLError as error:
-        speaks_tls = "ALERT" in (error.reason or "")
-    except OSError:
-        pass
-    if speaks_tls:
-        return "listens with TLS and wants --tls, with tls/ for tcp/"
-    return "answers, but not as a simulator or a router does"
+    except OSError as error:
+        if "ALERT" not in (getattr(error, "reason", "") or ""):  # as an SSLError has it
+            return "answers, but not as a simulator or a router does"
+    return "listens with TLS and wants --tls, with tls/ for tcp/"
 
 
 def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:

@@ -11,14 +11,11 @@ import time
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Sequence
 
-import numpy as np
 import zenoh
 
 from edge_runtime import wire
 from edge_runtime.cli import run_cli
 from edge_runtime.commands import ask
-from edge_runtime.controller import Controller, Received, limit_rows
-from edge_runtime.tests.policies import PEDAL
 from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, Feedback, Health, State
 
@@ -200,25 +197,6 @@ def exit_status(main: Callable[[List[str]], int], arguments: List[str]) -> int:
         return run_cli(main, arguments)
     except SystemExit as end:
         return int(end.code or 0)
-
-
-GOOD = np.array([0.5], np.float32)
-QUICK_NS = 1_000_000
-
-
-def make(needs_rearm=False, actions=(PEDAL,), **options):
-    return Controller(limit_rows(actions, {}), needs_rearm, **options)
-
-
-def answer(controller, step, now_s, output=GOOD, **changes):
-    controller.begin(Received(make_state(step, **changes), now_s, 0), now_s)
-    return controller.finish(output, QUICK_NS, now_s + 0.001)
-
-
-def stop(controller):
-    answer(controller, 0, 0.0)
-    controller.tick(0.3)
-    return controller
 
 
 def render_table(events, states, after):

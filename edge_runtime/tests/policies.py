@@ -11,8 +11,14 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from onnx import TensorProto, helper, numpy_helper
 
-from edge_runtime.policy import policy_id_of
-from edge_runtime.policy_file import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
+from edge_runtime.policy import (
+    MANIFEST_KEY,
+    Action,
+    Manifest,
+    Observation,
+    encode_manifest,
+    policy_id_of,
+)
 
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.
@@ -67,7 +73,7 @@ def write_policy(
     return policy_id_of(data)
 
 
-def public_pem(key: Ed25519PrivateKey) -> bytes:
+def public_pem(key: Any) -> bytes:
     """The PEM file of the public half of a key."""
     return key.public_key().public_bytes(
         serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo

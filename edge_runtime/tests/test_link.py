@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 from types import SimpleNamespace
 from typing import Any, List
 
@@ -122,8 +123,8 @@ def test_nobody_there_is_nobody_else():
     presence.look()
     presence.look()
     assert presence.rivals == 0
-    assert not require_free(fail, "k", "hunter01")
-    assert require_free(Router().open, "k", "hunter01")
+    assert not require_free(fail, "hunter01")
+    assert require_free(Router().open, "hunter01")
 
 
 def make_link(session: Any) -> Link:
@@ -131,12 +132,12 @@ def make_link(session: Any) -> Link:
     return Link(session, "hunter01", manifest)
 
 
-def test_a_muted_link_sends_nothing():
+def test_a_link_that_gave_way_sends_nothing():
     session = FakeSession()
     link = make_link(session)
     link.send("health", HEALTH)
     assert session.sent == 1
-    link.mute()
+    link.gave_way = True
     link.send("health", HEALTH)
     assert session.sent == 1
 
@@ -172,7 +173,7 @@ def test_the_session_is_closed_even_where_nothing_can_be_undeclared():
 
 
 def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
-    session = FakeSession()
+    session, stop = FakeSession(), None
     policy = SimpleNamespace(manifest=SimpleNamespace(action=[], task=""))
 
     def fail(*_: Any) -> None:
@@ -182,7 +183,7 @@ def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
     monkeypatch.setattr(run, "open_session", lambda **_: session)
     monkeypatch.setattr(run, "Link", fail)
     with pytest.raises(OSError, match="no link"):
-        run._Runtime(Config())
+        run._drive(Config(), stop)  # type: ignore[arg-type]
     assert session.events == ["close"] * 2  # the one that asked for other runtimes, and its own
 
 
@@ -259,6 +260,7 @@ def test_one_that_is_linked_has_time_for_its_first_state(monkeypatch):
     said = threading.Event()
     monkeypatch.setattr(log, "event", lambda *_, **fields: said.set())
     one = Waiting(lambda: False, lambda: "why")
-    one.start(is_linked=True)
+    one.next_s = time.monotonic() + 5.0
+    one.start()
     assert not said.wait(0.3)
-    one.stop()
+    one.ended.set()

@@ -20,7 +20,7 @@ from edge_runtime.vehicles.ros2.names import check_settings
 
 ROOT = Path(edge_runtime.__file__).parent
 # Only who asks for them loads them.
-LAZY = {"commands", "files", "realtime", "tls", "vehicles"}
+LAZY = {"commands", "files", "tls", "vehicles"}
 _LOADED = """
 import json, sys
 {what}

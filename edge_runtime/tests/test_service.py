@@ -16,8 +16,8 @@ from typing import Any, List
 import numpy as np
 import pytest
 
-from edge_runtime import log, loop, realtime
-from edge_runtime.controller import Controller, limit_rows
+from edge_runtime import log, loop, service
+from edge_runtime.controller import Controller, shared_limits
 from edge_runtime.log import Flood
 from edge_runtime.loop import ControlLoop
 from edge_runtime.service import Notifier, look
@@ -57,11 +57,11 @@ def test_what_the_system_refuses_is_named_and_the_rest_applied(monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: asked.update(cpus=cpus))
-    monkeypatch.setattr(realtime, "_lock_memory", lambda _: asked.update(locked=True))
-    assert realtime.configure(50, [1], True) == ["realtime_priority"]
+    monkeypatch.setattr(service, "_lock_memory", lambda _: asked.update(locked=True))
+    assert service.claim_resources(50, [1], True) == ["realtime_priority"]
     assert asked == {"cpus": [1], "locked": True}
-    assert realtime.configure(0, [1, 7], False) == ["cpus"]
-    assert realtime.configure(0, [], False) == []
+    assert service.claim_resources(0, [1, 7], False) == ["cpus"]
+    assert service.claim_resources(0, [], False) == []
 
 
 def test_lines_as_text_and_the_fields_of_json(capfd):
@@ -204,7 +204,7 @@ def running():
     def start(notifier: Any, vehicle: Any = None) -> Any:
         policy: Any = FakePolicy()
         link: Any = FakeLink()
-        controller = Controller(limit_rows([PEDAL], {}), needs_rearm=False)
+        controller = Controller(shared_limits([PEDAL], {}), needs_rearm=False)
         control = ControlLoop(policy, controller, link, vehicle, notifier)
         control.start()
         main = threading.Thread(target=control.run)
