@@ -114,7 +114,6 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--allow-unsigned", action="store_true", default=None, help=text)
 
 
-_OF_VEHICLES = ("bus", "hunter", "similarity", "ros2")
 _TABLES: Dict[str, Type[msgspec.Struct]] = {
     "": Config,
     "hunter": HunterSettings,
@@ -172,17 +171,17 @@ def _check(config: Config) -> None:
     check_fits(check_endpoint(config.connect), config.tls is not None)
     check_vehicle_id(config.vehicle_id)
     check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
-    if any(getattr(config, name) != getattr(Config(), name) for name in _OF_VEHICLES):
+    of_vehicles = ("bus", "hunter", "similarity", "ros2")
+    if any(getattr(config, name) != getattr(Config(), name) for name in of_vehicles):
         from edge_runtime.vehicles.registry import check_settings  # The defaults need no check.
 
         check_settings(config)
     check_choice("log_level", config.log_level, log.LEVELS)
     check_choice("log_format", config.log_format, log.FORMATS)
-    if not 0 <= config.realtime_priority <= MAX_PRIORITY:
-        raise UserError(
-            f"realtime_priority {config.realtime_priority} is not valid:"
-            f" use 1 to {MAX_PRIORITY}, or 0 for none"
-        )
+    priority = config.realtime_priority
+    if not 0 <= priority <= MAX_PRIORITY:
+        words = f"use 1 to {MAX_PRIORITY}, or 0 for none"
+        raise UserError(f"realtime_priority {priority} is not valid: {words}")
     if any(cpu < 0 for cpu in config.cpus) or len(set(config.cpus)) < len(config.cpus):
         raise UserError(f"cpus {config.cpus} is not valid: list each processor once, like [2, 3]")
 

@@ -41,10 +41,8 @@ def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
     limits = {}
     for name, low, high in ((action.name, action.low, action.high) for action in actions):
         if vehicle and name not in vehicle:
-            raise UserError(
-                f"the vehicle has no {name!r}, which the policy acts on;"
-                f" it has {', '.join(sorted(vehicle))}"
-            )
+            has = ", ".join(sorted(vehicle))
+            raise UserError(f"the vehicle has no {name!r}, which the policy acts on; it has {has}")
         limit = vehicle.get(name) or ActionLimit(low, high, math.inf)
         limits[name] = limit._replace(low=max(low, limit.low), high=min(high, limit.high))
         if limits[name].low > limits[name].high:

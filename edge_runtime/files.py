@@ -87,9 +87,8 @@ def _checked(path: PathLike) -> Path:
     except FileNotFoundError:
         target = behind_link(path)
         if os.path.islink(path) and not target.parent.is_dir():  # a disk that is not there?
-            raise UserError(
-                f"cannot write {path}: it leads to {target.parent}, which does not exist"
-            ) from None
+            where = f"it leads to {target.parent}, which does not exist"
+            raise UserError(f"cannot write {path}: {where}") from None
         return target
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from None

@@ -43,7 +43,6 @@ OPSET = 17
 MAX_IR_VERSION = 8
 INPUT, OUTPUT = "frames", "action"
 _RANGE_TOLERANCE = 1e-5
-_WARM_UP_RUNS = 10
 
 
 class Observation(msgspec.Struct, frozen=True, kw_only=True):
@@ -108,32 +107,22 @@ def decode_manifest(text: str) -> Manifest:
     if schema != MANIFEST_SCHEMA:
         raise UserError(f"the manifest has schema {schema}, this runtime reads {MANIFEST_SCHEMA}")
     if period_s != CONTROL_PERIOD_S:
-        raise UserError(
-            f"the policy was made for a control period of {period_s} s,"
-            f" this runtime runs at {CONTROL_PERIOD_S} s"
-        )
+        raise UserError(f"its control period is {period_s} s, this runtime's {CONTROL_PERIOD_S} s")
     if manifest.observation != Observation():
-        raise UserError(
-            "the manifest's observation is not the wire's:"
-            f" {Observation()} is needed, {manifest.observation} was found"
-        )
+        found = f"{Observation()} is needed, {manifest.observation} was found"
+        raise UserError(f"the manifest's observation is not the wire's: {found}")
     names = [action.name for action in manifest.action]
     if not names or len(set(names)) != len(names):
         found = f"an action twice: {', '.join(names)}" if names else "no action"
         raise UserError(f"the manifest names {found}")
     for name, low, high in ((action.name, action.low, action.high) for action in manifest.action):
         if name not in ACTION_NAMES:
-            raise UserError(
-                f"the runtime does not know how to stop the action {name!r} safely;"
-                f" it knows {', '.join(ACTION_NAMES)}"
-            )
+            known = " and ".join(ACTION_NAMES)
+            raise UserError(f"the runtime does not know how to stop {name!r} safely, only {known}")
         if not -1.0 <= low < high <= 1.0:  # nor is NaN
             raise UserError(f"the range of {name} is {low} to {high}; it must lie in -1 to 1")
         if name == "pedal" and low != FULL_BRAKE:
-            raise UserError(
-                f"the range of pedal begins at {low}, not {FULL_BRAKE}: it could not brake"
-                " fully in a safe stop"
-            )
+            raise UserError(f"its pedal begins at {low}: it could not brake fully in a safe stop")
     return manifest
 
 
@@ -172,10 +161,8 @@ def load_policy(
     try:
         ir_version, opset, metadata = read_onnx(data)
         if opset != OPSET or ir_version > MAX_IR_VERSION:
-            raise UserError(
-                f"it has opset {opset} and IR version {ir_version};"
-                f" opset {OPSET} and IR version {MAX_IR_VERSION} or lower are needed"
-            )
+            needs = f"it needs opset {OPSET} and at most IR version {MAX_IR_VERSION}"
+            raise UserError(f"it has opset {opset} and IR version {ir_version}; {needs}")
         if MANIFEST_KEY not in metadata:
             raise UserError(f"it holds no manifest (metadata {MANIFEST_KEY}); export it again")
         manifest = decode_manifest(metadata[MANIFEST_KEY])
@@ -249,7 +236,7 @@ def _probe(policy: Policy) -> None:
             if not row.low - _RANGE_TOLERANCE <= value <= row.high + _RANGE_TOLERANCE:
                 outside = f"outside its manifest's {row.low} to {row.high}"
                 raise UserError(f"{words} {row.name} {value:.3f}, {outside}")
-    for _ in range(_WARM_UP_RUNS):
+    for _ in range(10):
         policy.act(frames)
 
 
@@ -305,10 +292,8 @@ def check_trust(
     if not signature_path.exists():
         if allow_unsigned:
             return UNSIGNED
-        raise UserError(
-            f"policy {path} is not signed ({signature_path.name} is missing);"
-            " sign it, or allow it with --allow-unsigned"
-        )
+        help_ = f"{signature_path.name} is missing; sign it, or allow it with --allow-unsigned"
+        raise UserError(f"policy {path} is not signed: {help_}")
     signature = read_bytes(signature_path, "signature")
     trust, beside = VERIFIED, Path(path).with_name(DEFAULT_PUBLIC_KEY.name)
     if public_key is None and allow_unsigned and beside.exists():
@@ -318,10 +303,8 @@ def check_trust(
     if public_key is None:
         if allow_unsigned:
             return UNVERIFIED
-        raise UserError(
-            f"no public key to verify {signature_path.name} with: name it with --public-key,"
-            f" or put it at {DEFAULT_PUBLIC_KEY}"
-        )
+        help_ = f"name it with --public-key, or put it at {DEFAULT_PUBLIC_KEY}"
+        raise UserError(f"no public key to verify {signature_path.name} with: {help_}")
     key_pem = read_bytes(public_key, "public key")
     try:
         verify(policy_bytes, signature, key_pem)
@@ -352,10 +335,7 @@ _KINDS: Dict[str, Tuple[Tuple[int, ...], Dict[int, str], Dict[int, str]]] = {
     ),
     "tensor": ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16), {}, {13: _OUTSIDE}),
 }
-_DATA_LOCATION = 14  # of a tensor: 0 is inside
-
-# Python would run out of stack first; a policy nests its graphs two or three deep.
-_MAX_DEPTH = 64
+_MAX_DEPTH = 64  # a policy nests its graphs two or three deep; Python's stack would end soon after
 
 
 def read_onnx(data: bytes) -> Tuple[int, int, Dict[str, str]]:
@@ -395,7 +375,7 @@ def _checked(message: memoryview, kind: str, depth: int = 0) -> List[Tuple[int, 
             _checked(_bytes(value), nested[number], depth + 1)
         elif number not in plain:
             what = refused.get(number, f"an unknown field {number}")
-        elif kind == "tensor" and number == _DATA_LOCATION and value != 0:
+        elif (kind, number) == ("tensor", 14) and value != 0:  # data_location; 0 is inside
             what = _OUTSIDE
         if what:
             raise UserError(f"the policy file holds {what}, which the runtime does not read")

@@ -58,8 +58,7 @@ EXAMPLE = r"""examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `run`."""
-    text = "settings; flags on the command line win over it"
-    parser.add_argument("--config", metavar="FILE.toml", help=text)
+    parser.add_argument("--config", metavar="FILE.toml", help="settings; flags win over it")
     add_flags(parser)
     add_trust(parser)
 

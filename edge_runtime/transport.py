@@ -42,10 +42,8 @@ def check_endpoint(endpoint: str) -> str:
     """The endpoint itself; UserError if it is not PROTOCOL/HOST:PORT."""
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or not 1 <= int(match.group(3)) <= 65535:
-        raise UserError(
-            f"endpoint {endpoint!r} is not valid: write it as {DEFAULT_ENDPOINT}"
-            " (tcp or udp; tls or quic with --tls)"
-        )
+        right = f"write it as {DEFAULT_ENDPOINT} (tcp or udp; tls or quic with --tls)"
+        raise UserError(f"endpoint {endpoint!r} is not valid: {right}")
     return endpoint
 
 
@@ -58,14 +56,11 @@ def check_fits(endpoint: str, with_tls: bool) -> None:
     """Raise UserError for a TLS endpoint without files, and for files with a plain endpoint."""
     if with_tls and not is_tls(endpoint):
         address = endpoint.split("/", 1)[1]
-        raise UserError(
-            f"endpoint {endpoint} would send plain text despite --tls: write tls/{address}"
-        )
+        right = f"write tls/{address}"
+        raise UserError(f"endpoint {endpoint} would send plain text despite --tls: {right}")
     if not with_tls and is_tls(endpoint):
-        raise UserError(
-            f"endpoint {endpoint} needs certificates: name a directory of"
-            " `python -m deploy certs` with --tls"
-        )
+        where = "name a directory of `python -m deploy certs` with --tls"
+        raise UserError(f"endpoint {endpoint} needs certificates: {where}")
 
 
 def open_session(
@@ -184,10 +179,8 @@ def _why_not_connected(endpoint: str, files: Optional[TlsFiles]) -> str:
         return why
     if endpoint.startswith("quic/"):  # such a link does not say why it fails
         why = why or "or one end does not believe the other's certificate"
-    return (
-        f"nobody answers at {endpoint}{why and f': {why}'}; start the simulator first, or name its"
-        " address with --connect"
-    )
+    help_ = "start the simulator first, or name its address with --connect"
+    return f"nobody answers at {endpoint}{why and f': {why}'}; {help_}"
 
 
 def _why_not_plain(plain: socket.socket) -> str:
@@ -220,10 +213,8 @@ def _why_not_tls(plain: socket.socket, host: str, files: TlsFiles) -> str:
         reason = (error.reason or str(error)).lower().replace("_", " ")
         if "alert" not in reason:
             return f"does not speak TLS ({reason})"
-        return (
-            f"refuses the certificate of {files.name} ({reason}): both need one authority, and"
-            " certificates that have not expired"
-        )
+        needs = "both need one authority, and certificates that have not expired"
+        return f"refuses the certificate of {files.name} ({reason}): {needs}"
     except OSError:  # A link that stays open, and silent, has been accepted.
         return "" if shaken else "answers, but not with TLS"
     return ""

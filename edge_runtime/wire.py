@@ -48,9 +48,7 @@ _VEHICLE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 def check_vehicle_id(vehicle_id: str) -> str:
     """The id itself; UserError if it could not be part of a key."""
     if not _VEHICLE_ID.fullmatch(vehicle_id):
-        raise UserError(
-            f"vehicle id {vehicle_id!r} is not valid: use 1 to 64 of A-Z a-z 0-9 _ -, like hunter1"
-        )
+        raise UserError(f"vehicle id {vehicle_id!r} is not valid: use 1 to 64 of A-Z a-z 0-9 _ -")
     return vehicle_id
 
 
