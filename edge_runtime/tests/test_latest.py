@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Dict, List, Tuple
 
 import pytest
 from hypothesis import given
@@ -22,7 +23,7 @@ DUPLICATE, STALE, FUTURE, FOREIGN = (
     Reason.DUPLICATE, Reason.STALE, Reason.FUTURE, Reason.FOREIGN_SESSION,
 )  # fmt: skip
 # Of each state that comes: session, episode, step, when, and why it is rejected.
-STORIES = {
+STORIES: Dict[str, List[Tuple]] = {
     "in order all are accepted": [(A, 0, step, step * 0.1, None) for step in range(9)],
     "old and equal states are rejected": [
         (A, 0, 5, 0.0, None), (A, 0, 5, 0.1, DUPLICATE), (A, 0, 4, 0.1, STALE),
