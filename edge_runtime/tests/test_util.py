@@ -11,22 +11,14 @@ from pathlib import Path
 
 import pytest
 
+from edge_runtime import util
 from edge_runtime.cli import run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
 from edge_runtime.files import Hold, check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.service import WINDOW, LatencyWindow
 from edge_runtime.tests.harness import run_command
-from edge_runtime.util import (
-    MAX_FILE_MIB,
-    UserError,
-    counted,
-    ending_signals,
-    printable,
-    read_bytes,
-    read_json,
-    read_toml,
-)
+from edge_runtime.util import UserError, printable, read_bytes
 
 
 def test_write_atomic_replaces_what_is_whole_and_leaves_nothing_else(tmp_path):
@@ -147,8 +139,8 @@ def test_the_latency_window_forgets():
 
 READERS = {
     "bytes": lambda path: read_bytes(path, "thing"),
-    "json": lambda path: read_json(path, "thing"),
-    "toml": lambda path: read_toml(path, "thing"),
+    "json": lambda path: util.read_json(path, "thing"),
+    "toml": lambda path: util.read_toml(path, "thing"),
     "config": lambda path: load_config(path, {}),
     "policy": lambda path: load_policy(path, allow_unsigned=True),
     "hold": lambda path: Hold(str(path)),
@@ -170,8 +162,8 @@ def test_what_is_no_regular_file_is_refused_and_not_waited_for(tmp_path, reader)
 def test_what_is_too_large_is_refused_before_it_is_read(tmp_path, reader):
     path = tmp_path / "hole"
     path.touch()
-    os.truncate(path, (MAX_FILE_MIB << 20) + 1)
-    with pytest.raises(UserError, match=f"is larger than {MAX_FILE_MIB} MiB"):
+    os.truncate(path, (util.MAX_FILE_MIB << 20) + 1)
+    with pytest.raises(UserError, match=f"is larger than {util.MAX_FILE_MIB} MiB"):
         READERS[reader](path)
 
 
@@ -188,7 +180,7 @@ def test_nested_thousands_deep_it_is_one_line(tmp_path, place):
 
     path.write_text(nested("[", "]") if place == "list" else nested('{"a":', "}"))
     with pytest.raises(UserError, match=r"thing .* is not JSON: "):
-        read_json(path, "thing")
+        util.read_json(path, "thing")
     path.write_text("a = " + (nested("[", "]") if place == "list" else nested("{a=", "}")))
     with pytest.raises(UserError, match=r"config file .* is no TOML: "):
         load_config(path, {})
@@ -212,7 +204,7 @@ def test_run_ends_with_one_line(make_policy, tmp_path):
 
 
 def test_one_is_not_many():
-    words = [counted(count, "safe stop") for count in range(3)]
+    words = [util.counted(count, "safe stop") for count in range(3)]
     assert words == ["0 safe stops", "1 safe stop", "2 safe stops"]
 
 
@@ -243,7 +235,7 @@ def all_at_default():
 
 
 def test_all_that_end_a_process_are_interrupts(all_at_default):
-    ending = ending_signals()
+    ending = util.ending_signals()
     assert {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM} <= ending
     assert {signal.SIGUSR1, signal.SIGALRM, signal.SIGABRT, signal.SIGPIPE} <= ending
     assert not {signal.SIGCHLD, signal.SIGCONT, signal.SIGTSTP, signal.SIGSEGV} & ending
@@ -251,8 +243,8 @@ def test_all_that_end_a_process_are_interrupts(all_at_default):
         for number in ending:
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(number)
-        assert ending_signals() == set()
-    assert ending_signals() == ending
+        assert util.ending_signals() == set()
+    assert util.ending_signals() == ending
 
 
 @pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda number, frame: None])
