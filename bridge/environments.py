@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.envs.registration import namespace
 from gymnasium.spaces import Box
 
-from edge_runtime.policy_file import Manifest, task_text
+from edge_runtime.policy import Manifest, task_text
 from edge_runtime.util import UserError
 from edge_runtime.wire import FRAMES_SHAPE
 

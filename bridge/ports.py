@@ -22,7 +22,7 @@ from bridge.environments import scene_of
 from bridge.inbound import EdgeCounts
 from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Stamps, encode_scene, scene_key
 from edge_runtime import tls as access
-from edge_runtime.policy_file import Manifest
+from edge_runtime.policy import Manifest
 from edge_runtime.tls import TlsFiles
 from edge_runtime.transport import only_own, open_session
 from edge_runtime.util import UserError

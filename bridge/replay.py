@@ -24,7 +24,7 @@ from bridge.ports import SimulatorPort, open_port
 from bridge.recording import Recording, choose_vehicle, heard_of
 from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
 from edge_runtime.config import NONE, Config, load_config
-from edge_runtime.controller import Controller, LimitRow, Order, Received, limit_rows
+from edge_runtime.controller import Controller, Limits, Order, Received, shared_limits
 from edge_runtime.files import write_json_out
 from edge_runtime.policy import Policy, infer, load_policy
 from edge_runtime.safety import MAX_INFERENCE_S, SILENCE_S, Event
@@ -300,17 +300,17 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     policy or cannot follow its scenario.
     """
     limits = vehicle_limits(drive.vehicle, config, policy.manifest.scenario)
-    rows = limit_rows(policy.manifest.action, limits)
-    return _Replay(drive, policy, rows, needs_rearm=drive.vehicle != NONE).run()
+    shared = shared_limits(policy.manifest.action, limits)
+    return _Replay(drive, policy, shared, needs_rearm=drive.vehicle != NONE).run()
 
 
 class _Replay:
     def __init__(
-        self, drive: RecordedDrive, policy: Policy, rows: Sequence[LimitRow], needs_rearm: bool
+        self, drive: RecordedDrive, policy: Policy, limits: Limits, needs_rearm: bool
     ) -> None:
         self._drive = drive
         self._policy = policy
-        self._rows = rows
+        self._limits = limits
         self._needs_rearm = needs_rearm
         self._restarts_s: Iterator[float] = iter(drive.runtime_starts_s[1:])
         self._next_restart_s = next(self._restarts_s, float("inf"))
@@ -332,7 +332,7 @@ class _Replay:
             self._next_restart_s = next(self._restarts_s, float("inf"))
 
     def _make_controller(self) -> Controller:
-        return Controller(self._rows, self._needs_rearm, task=self._policy.manifest.task)
+        return Controller(self._limits, self._needs_rearm, task=self._policy.manifest.task)
 
     def _answer(self, state: State, exchange: Exchange) -> None:
         self._pass_time(exchange.begun_s)
@@ -341,7 +341,7 @@ class _Replay:
             self._controller.rearm(exchange.arrived_s)
         arrived_ns = round(exchange.arrived_s * 1e9)
         self._controller.begin(Received(state, exchange.arrived_s, arrived_ns), exchange.begun_s)
-        output = infer(self._policy, state.frames_array()).output
+        output, _ = infer(self._policy, state.frames_array())
         self._pass_time(exchange.finished_s)
         first, *later = exchange.answers
         self._controller.vehicle_fault = self._new_fault([first])

@@ -28,7 +28,7 @@ from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.virtual_link import Decision
 from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
 from edge_runtime.files import write_json_out
-from edge_runtime.policy_file import Manifest
+from edge_runtime.policy import Manifest
 from edge_runtime.run import rearm_command
 from edge_runtime.tls import tls_for
 from edge_runtime.transport import DEFAULT_ENDPOINT

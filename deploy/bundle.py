@@ -30,8 +30,7 @@ from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, gather, loc
 from edge_runtime.cli import examples
 from edge_runtime.config import NONE, Config, load_config
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.policy import Policy, load_policy
-from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
+from edge_runtime.policy import DEFAULT_PUBLIC_KEY, Policy, load_policy
 from edge_runtime.tls import (
     CA_FILE,
     CERTIFICATE_FILE,

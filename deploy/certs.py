@@ -32,7 +32,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from edge_runtime.cli import Command, examples, whole_number
 from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
-from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
+from edge_runtime.policy import DEFAULT_PUBLIC_KEY
 from edge_runtime.tls import (
     CA_FILE,
     CERTIFICATE_FILE,

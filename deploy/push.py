@@ -20,7 +20,7 @@ from deploy.installer.layout import DEFAULT_ROOT
 from deploy.installer.systemd import WAYS
 from deploy.installer.verify import Manifest
 from edge_runtime.cli import examples
-from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
+from edge_runtime.policy import DEFAULT_PUBLIC_KEY
 from edge_runtime.util import UserError
 
 _UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")

@@ -23,7 +23,6 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 _LARGEST = 2**63 - 1  # as the seeds of numpy and torch must be
 _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-_WITHOUT_DEFAULT = (None, False, argparse.SUPPRESS)
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -41,7 +40,7 @@ class HelpFormatter(argparse.HelpFormatter):
     def _get_help_string(self, action: argparse.Action) -> Optional[str]:
         text = action.help or ""
         # By identity: 0 is a default worth showing, though it equals False.
-        hidden = any(action.default is nothing for nothing in _WITHOUT_DEFAULT)
+        hidden = any(action.default is nothing for nothing in (None, False, argparse.SUPPRESS))
         if hidden or action.default == [] or "(default: " in text or "%(default)" in text:
             return text
         return f"{text} (default: %(default)s)".strip()
@@ -117,14 +116,12 @@ def dispatch(parser: ArgumentParser, commands: Dict[str, Tuple[str, str]], argv:
     parsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     chosen: Any = None
     for name, (place, summary) in commands.items():
-        one = parsers.add_parser(
-            name, help=summary, description=f"{summary[0].upper()}{summary[1:]}."
-        )
+        text = f"{summary[0].upper()}{summary[1:]}."
+        one = parsers.add_parser(name, help=summary, description=text)
         if name == word:
             module, _, member = place.partition(":")
             chosen = import_module(module)
-            if member:
-                chosen = getattr(chosen, member)
+            chosen = getattr(chosen, member) if member else chosen
             one.epilog = chosen.EXAMPLE
             chosen.add_arguments(one)
     arguments = parser.parse_args(argv or ["--help"])
@@ -175,10 +172,9 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
     limits = f", at least {least}" if most == _LARGEST else f" from {least} to {most}"
 
     def read(text: str) -> int:
-        try:
+        value = least - 1
+        with contextlib.suppress(ValueError):
             value = int(text)
-        except ValueError:
-            value = least - 1
         if value > _LARGEST:
             raise argparse.ArgumentTypeError(f"{text!r} is larger than 2**63 - 1")
         if not least <= value <= most:
@@ -192,10 +188,9 @@ def number(limits: str, fits: Callable[[float], bool]) -> Callable[[str], float]
     """A type: a finite number that ``fits``; ``limits`` says in words which do."""
 
     def read(text: str) -> float:
-        try:
+        value = math.nan
+        with contextlib.suppress(ValueError):
             value = float(text)
-        except ValueError:
-            value = math.nan
         if not (math.isfinite(value) and fits(value)):
             raise argparse.ArgumentTypeError(f"{text!r} is not {limits}")
         return value
@@ -217,10 +212,9 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
     So sessions are closed and files are finished. Outside of the main thread it does nothing.
     """
-    in_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in ending_signals()} if in_main else {}
-    for number in before:
-        signal.signal(number, _interrupt)
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.signal(number, _interrupt) for number in ending_signals()}
     try:
         yield
     finally:

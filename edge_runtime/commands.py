@@ -5,18 +5,19 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-from typing import TYPE_CHECKING, Any, Callable, Dict, List, Optional, Tuple
+from typing import Any, Callable, Dict, List, Optional, Tuple
+
+import msgspec
 
 from edge_runtime.cli import Command, examples
 from edge_runtime.config import Config, add_flags, add_trust
-from edge_runtime.files import check_writable, write_json
+from edge_runtime.files import check_writable, write_json_out
+from edge_runtime.policy import infer, load_policy, probe_frames
+from edge_runtime.service import LatencyWindow
 from edge_runtime.tls import OPERATOR, TlsFiles, check_name, common_name, tls_for
 from edge_runtime.transport import check_endpoint, open_session
 from edge_runtime.util import UserError, parse_json, printable
 from edge_runtime.wire import CONTROL_PERIOD_S, key
-
-if TYPE_CHECKING:
-    from edge_runtime.policy import Policy
 
 _RUNS = 300
 _TIMEOUT_S = 2.0
@@ -31,47 +32,30 @@ def _add_check(parser: argparse.ArgumentParser) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     """Print the report as JSON. Raises UserError where the policy may not drive."""
-    if arguments.out is not None:
-        check_writable(arguments.out)
-    from edge_runtime.policy import load_policy  # Here: an operator's commands need no onnxruntime.
-
+    check_writable(arguments.out)
     policy = load_policy(arguments.policy, arguments.public_key, arguments.allow_unsigned)
-    report = _report(policy)
-    limit_ms = CONTROL_PERIOD_S * 1000
-    if report["inference_ms"]["p99"] > limit_ms:
+    window = LatencyWindow()
+    for frames in itertools.islice(itertools.cycle(probe_frames()), _RUNS):
+        window.add(infer(policy, frames)[1])
+    inference_ms, limit_ms = window.summary_ms(), CONTROL_PERIOD_S * 1000
+    if inference_ms["p99"] > limit_ms:
         raise UserError(
             f"policy {arguments.policy} may not drive: its inference takes"
-            f" {report['inference_ms']['p99']:.0f} ms (p99) here, {limit_ms:.0f} ms is the limit"
+            f" {inference_ms['p99']:.0f} ms (p99) here, {limit_ms:.0f} ms is the limit"
         )
-    print(json.dumps(report, indent=2))
-    if arguments.out is not None:
-        write_json(arguments.out, report)
-    return 0
+    import onnxruntime  # Here: an operator's commands need none.
 
-
-def _report(policy: Policy) -> Dict[str, Any]:
-    import msgspec
-    import onnxruntime
-
-    return {
+    report = {
         "policy_id": policy.policy_id,
         "trust": policy.trust,
         "manifest": msgspec.to_builtins(policy.manifest),
-        "inference_ms": _measure_latency(policy),
+        "inference_ms": inference_ms,
         "inference_runs": _RUNS,
         "onnxruntime": onnxruntime.__version__,
     }
-
-
-def _measure_latency(policy: Policy) -> Dict[str, float]:
-    """p50, p99 and max of the inference on this machine, in milliseconds."""
-    from edge_runtime.policy import infer, probe_frames
-    from edge_runtime.service import LatencyWindow
-
-    window = LatencyWindow()
-    for frames in itertools.islice(itertools.cycle(probe_frames()), _RUNS):
-        window.add(infer(policy, frames).duration_ns)
-    return window.summary_ms()
+    print(json.dumps(report, indent=2))
+    write_json_out(arguments.out, report)
+    return 0
 
 
 def _add_operator(parser: argparse.ArgumentParser) -> None:
@@ -87,16 +71,14 @@ def _add_status(parser: argparse.ArgumentParser) -> None:
 
 def _status(arguments: argparse.Namespace) -> int:
     """Print the runtime's status as a table, or as JSON."""
-    if arguments.out is not None:
-        check_writable(arguments.out)
+    check_writable(arguments.out)
     tls = tls_for(arguments.tls, check_endpoint(arguments.connect))
     reply = ask(arguments.connect, arguments.vehicle_id, "status", tls)
     try:
         print(json.dumps(reply, indent=2) if arguments.json else render_status(reply))
     except (LookupError, TypeError, ValueError, AttributeError):
         raise UserError(_STRANGER.format(arguments.vehicle_id)) from None
-    if arguments.out is not None:
-        write_json(arguments.out, reply)
+    write_json_out(arguments.out, reply)
     return 0
 
 
@@ -128,21 +110,16 @@ def ask(
                 return answer
     finally:
         session.close()
+    # A query without the right to it looks the same from here as a runtime that is not there.
+    hint = f"; or the certificate of {tls.name} may not ask for its {topic}" if tls else ""
     raise UserError(
         f"no edge runtime with vehicle id {vehicle_id} is connected to {connect};"
-        " start one, or name it with --vehicle-id" + _hint(tls, topic)
+        f" start one, or name it with --vehicle-id{hint}"
     )
 
 
-def _hint(tls: Optional[TlsFiles], topic: str) -> str:
-    """A query without the right to it looks the same from here as a runtime that is not there."""
-    return "" if tls is None else f"; or the certificate of {tls.name} may not ask for its {topic}"
-
-
-_Row = Tuple[str, Callable[[Dict[str, Any]], str]]
-
 # What a row says of a reply; a runtime of an earlier version may not tell all of it.
-_ROWS: List[_Row] = [
+_ROWS: List[Tuple[str, Callable[[Dict[str, Any]], str]]] = [
     ("vehicle", lambda s: f"{s['vehicle_id']}, driver {s['vehicle']}"),
     ("mode", lambda s: _mode(s)),
     ("states", lambda s: f"{s['accepted']} accepted, {s['superseded']} superseded by newer ones"),

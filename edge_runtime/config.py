@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from typing import Any, Dict, List, Optional, Sequence, Tuple, Type
 
 import msgspec
@@ -86,10 +87,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 _FLAGS: Dict[str, Tuple[str, str]] = {
     "policy": ("POLICY.onnx", "the policy file"),
     "connect": ("PROTOCOL/HOST:PORT", "where the simulator listens"),
-    "tls": (
-        "DIR",
-        "ca.pem, cert.pem, key.pem of this party (python -m deploy certs); endpoint tls/...",
-    ),
+    "tls": ("DIR", "this party's ca.pem, cert.pem, key.pem (deploy certs); endpoint tls/..."),
     "vehicle_id": ("ID", "the vehicle's part of the Zenoh keys"),
     "vehicle": ("|".join(VEHICLE_NAMES), "the vehicle to move besides"),
     "bus": ("INTERFACE:CHANNEL", "with --vehicle hunter: its CAN bus, as python-can names it"),
@@ -112,15 +110,10 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     from edge_runtime.cli import add_public_key  # Here: only a command line needs it.
 
     add_public_key(parser)
-    parser.add_argument(
-        "--allow-unsigned",
-        action="store_true",
-        default=None,
-        help="also take a policy whose origin cannot be verified",
-    )
+    text = "also take a policy whose origin cannot be verified"
+    parser.add_argument("--allow-unsigned", action="store_true", default=None, help=text)
 
 
-_OF_VEHICLES = ("bus", "hunter", "similarity", "ros2")
 _TABLES: Dict[str, Type[msgspec.Struct]] = {
     "": Config,
     "hunter": HunterSettings,
@@ -137,12 +130,17 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     the value stands in the file, the error names it.
     """
     given = {name: value for name, value in flags.items() if value is not None}
-    from_file = Config() if path is None else _read(path)
+    from_file = Config()
+    if path is not None:
+        try:
+            from_file = msgspec.convert(read_toml(path, "config file"), Config)
+        except msgspec.ValidationError as error:
+            raise UserError(f"config file {path}: {_explain(str(error))}") from None
     config = msgspec.structs.replace(from_file, **given)
     try:
         _check(config)
     except UserError as error:
-        if path is None or not _is_wrong(from_file):
+        if path is None or _is_valid(from_file):
             raise  # the flag is wrong, not the file
         raise UserError(f"config file {path}: {error}") from None
     # `--bus` on the command line needs a vehicle; in the file it may be set while that is off.
@@ -151,28 +149,18 @@ def load_config(path: Optional[PathLike], flags: Dict[str, Any]) -> Config:
     return config
 
 
-def _read(path: PathLike) -> Config:
-    tables = read_toml(path, "config file")
-    try:
-        return msgspec.convert(tables, Config)
-    except msgspec.ValidationError as error:
-        raise UserError(f"config file {path}: {_explain(str(error))}") from None
-
-
 def _explain(text: str) -> str:
     """The sentence of msgspec with the key in front, and for an unknown key the known ones."""
     sentence, _, place = text.partition(" - at ")
     table = place.strip("`").replace("$.", "")
     if "unknown field" in text:
-        known = _TABLES.get(table)
-        sentence += f"; known are {', '.join(known.__struct_fields__)}" if known else ""
+        sentence += f"; known are {', '.join(_TABLES[table].__struct_fields__)}"
     return f"{table}: {sentence}" if table else sentence
 
 
-def _is_wrong(config: Config) -> bool:
-    try:
+def _is_valid(config: Config) -> bool:
+    with contextlib.suppress(UserError):
         _check(msgspec.structs.replace(config, policy=config.policy or "any"))
-    except UserError:
         return True
     return False
 
@@ -183,18 +171,17 @@ def _check(config: Config) -> None:
     check_fits(check_endpoint(config.connect), config.tls is not None)
     check_vehicle_id(config.vehicle_id)
     check_choice("vehicle", config.vehicle, VEHICLE_NAMES)
-    defaults = Config()
-    if any(getattr(config, name) != getattr(defaults, name) for name in _OF_VEHICLES):
+    of_vehicles = ("bus", "hunter", "similarity", "ros2")
+    if any(getattr(config, name) != getattr(Config(), name) for name in of_vehicles):
         from edge_runtime.vehicles import check_settings  # The defaults need no check.
 
         check_settings(config)
     check_choice("log_level", config.log_level, log.LEVELS)
     check_choice("log_format", config.log_format, log.FORMATS)
-    if not 0 <= config.realtime_priority <= MAX_PRIORITY:
-        raise UserError(
-            f"realtime_priority {config.realtime_priority} is not valid:"
-            f" use 1 to {MAX_PRIORITY}, or 0 for none"
-        )
+    priority = config.realtime_priority
+    if not 0 <= priority <= MAX_PRIORITY:
+        words = f"use 1 to {MAX_PRIORITY}, or 0 for none"
+        raise UserError(f"realtime_priority {priority} is not valid: {words}")
     if any(cpu < 0 for cpu in config.cpus) or len(set(config.cpus)) < len(config.cpus):
         raise UserError(f"cpus {config.cpus} is not valid: list each processor once, like [2, 3]")
 

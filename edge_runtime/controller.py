@@ -18,73 +18,65 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, SAFE_STOP, State
 
 if TYPE_CHECKING:
-    from edge_runtime.policy_file import Action
+    from edge_runtime.policy import Action
 
 
 class ActionLimit(NamedTuple):
-    """What a vehicle lets one action be: its range, and the fastest change (inf: at once)."""
+    """What one action may be: its range, and the fastest change (inf: at once)."""
 
     low: float
     high: float
     slew_per_s: float
 
 
-class LimitRow(NamedTuple):
-    """What one action of the policy may be on this vehicle."""
-
-    name: str
-    low: float
-    high: float
-    slew_per_s: float
+Limits = Dict[str, ActionLimit]  # by the action's name
 
 
-def limit_rows(actions: Sequence[Action], limits: Dict[str, ActionLimit]) -> List[LimitRow]:
+def shared_limits(actions: Sequence[Action], vehicle: Limits) -> Limits:
     """The manifest's range cut to the vehicle's, for each action in the policy's order.
 
     An empty table (no vehicle) leaves the manifest's range and any speed of change.
     Raises UserError where a vehicle lacks an action of the policy.
     """
-    rows = []
+    limits = {}
     for name, low, high in ((action.name, action.low, action.high) for action in actions):
-        if limits and name not in limits:
-            raise UserError(
-                f"the vehicle has no {name!r}, which the policy acts on;"
-                f" it has {', '.join(sorted(limits))}"
-            )
-        limit = limits[name] if limits else ActionLimit(low, high, math.inf)
-        row = LimitRow(name, max(low, limit.low), min(high, limit.high), limit.slew_per_s)
-        if row.low > row.high:
+        if vehicle and name not in vehicle:
+            has = ", ".join(sorted(vehicle))
+            raise UserError(f"the vehicle has no {name!r}, which the policy acts on; it has {has}")
+        limit = vehicle.get(name) or ActionLimit(low, high, math.inf)
+        limits[name] = limit._replace(low=max(low, limit.low), high=min(high, limit.high))
+        if limits[name].low > limits[name].high:
             raise UserError(f"the policy's and the vehicle's range of {name!r} do not meet")
-        rows.append(row)
-    return rows
+    return limits
 
 
 def limit_action(
-    wanted: Sequence[float], last: Sequence[float], rows: Sequence[LimitRow], elapsed_s: float
+    wanted: Sequence[float], last: Sequence[float], limits: Limits, elapsed_s: float
 ) -> List[float]:
-    """`wanted` within each row's range, and as near to `last` as the time between them demands.
+    """`wanted` within each range, and as near to `last` as the time between them demands.
 
     More than a control period counts as one: a vehicle need not leap after a pause. A limit that
     does not bite leaves the number as it is, to the last bit.
     """
     elapsed_s = min(max(elapsed_s, 0.0), CONTROL_PERIOD_S)
     limited = []
-    for value, previous, row in zip(wanted, last, rows):
-        if row.slew_per_s < math.inf:
-            most = row.slew_per_s * elapsed_s
+    for value, previous, limit in zip(wanted, last, limits.values()):
+        if limit.slew_per_s < math.inf:
+            most = limit.slew_per_s * elapsed_s
             value = min(max(value, previous - most), previous + most)
-        limited.append(min(max(value, row.low), row.high))
+        limited.append(min(max(value, limit.low), limit.high))
     return limited
 
 
-def neutral_action(rows: Sequence[LimitRow]) -> List[float]:
+def neutral_action(limits: Limits) -> List[float]:
     """Where the limits start before the first command: 0, or the nearest the range allows."""
-    return [min(max(0.0, row.low), row.high) for row in rows]
+    return [min(max(0.0, limit.low), limit.high) for limit in limits.values()]
 
 
-def stop_action(last: Sequence[float], rows: Sequence[LimitRow]) -> List[float]:
+def stop_action(last: Sequence[float], limits: Limits) -> List[float]:
     """Full brake at once for a pedal; the last value for a steering."""
-    return [row.low if row.name == "pedal" else value for value, row in zip(last, rows)]
+    pairs = zip(limits.items(), last)
+    return [limit.low if name == "pedal" else value for (name, limit), value in pairs]
 
 
 class Received(NamedTuple):
@@ -112,11 +104,7 @@ class Controller:
     """
 
     def __init__(
-        self,
-        rows: Sequence[LimitRow],
-        needs_rearm: bool,
-        armed_at_start: bool = True,
-        task: str = "",
+        self, limits: Limits, needs_rearm: bool, armed_at_start: bool = True, task: str = ""
     ) -> None:
         self.safety = Safety()
         self.deadline_misses = 0
@@ -124,9 +112,9 @@ class Controller:
         self._policy_is_dead = False
         self._task = task  # the policy's; states that name another one are a fault
         self._latched_fault = ""  # what stopped it, until it is re-armed
-        self._rows = rows
+        self._limits = limits
         self._needs_rearm = needs_rearm
-        self._last_action = neutral_action(rows)
+        self._last_action = neutral_action(limits)
         self._ordered_s = -math.inf  # when that was said
         self._newest: Optional[Received] = None
         self._begun_s: Optional[float] = None
@@ -173,7 +161,8 @@ class Controller:
         if now_s - self._newest.arrived_s > CONTROL_PERIOD_S:
             self.deadline_misses += 1
         wanted: List[float] = []
-        if output is not None and (output.dtype, output.shape) == (np.float32, (len(self._rows),)):
+        form = (np.float32, (len(self._limits),))
+        if output is not None and (output.dtype, output.shape) == form:
             wanted = output.tolist()
         self._apply(self._event_of(wanted))
         if self.safety.mode is Mode.SAFE_STOP:
@@ -183,7 +172,7 @@ class Controller:
             # A vehicle that is told to drive on would do so until its own watchdog ends it.
             return self._stop_order(inference_ns, now_s)._replace(reason=Event.FINAL.value)
         elapsed_s = now_s - self._ordered_s
-        self._last_action = limit_action(wanted, self._last_action, self._rows, elapsed_s)
+        self._last_action = limit_action(wanted, self._last_action, self._limits, elapsed_s)
         self._ordered_s = now_s
         return Order(self._newest, DRIVE, self._last_action, "", inference_ns)
 
@@ -276,7 +265,7 @@ class Controller:
 
     def _stop_order(self, inference_ns: int, now_s: float) -> Order:
         assert self._newest is not None  # a safe stop is an answer to a state
-        self._last_action = stop_action(self._last_action, self._rows)
+        self._last_action = stop_action(self._last_action, self._limits)
         self._ordered_s = now_s
         return Order(self._newest, SAFE_STOP, self._last_action, self.safety.reason, inference_ns)
 

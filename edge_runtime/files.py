@@ -9,8 +9,8 @@ import contextlib
 import fcntl
 import json
 import os
+import secrets
 import stat
-import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO, Optional
 
@@ -26,19 +26,16 @@ def write_atomic(path: PathLike, data: bytes | memoryview) -> None:
     """
     target = _checked(path)
     make_directory(target.parent)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:
-        descriptor, temporary = tempfile.mkstemp(dir=str(target.parent), prefix=f".{target.name}.")
-    except OSError as error:
-        raise UserError(f"cannot write {target}: {error.strerror}") from None
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
+        with temporary.open("xb") as stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp gives 0600, open() would not
         os.replace(temporary, target)
     except BaseException as error:
-        os.unlink(temporary)
+        with contextlib.suppress(FileNotFoundError):
+            temporary.unlink()
         if isinstance(error, OSError):
             raise UserError(f"cannot write {target}: {error.strerror}") from None
         raise
@@ -49,11 +46,13 @@ def behind_link(path: PathLike) -> Path:
     return Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
 
 
-def check_writable(path: PathLike) -> None:
-    """Raise UserError now if `write_atomic(path)` would fail later, after the long work.
+def check_writable(path: Optional[PathLike]) -> None:
+    """Raise UserError now if `write_json_out(path)` would fail later, after the long work.
 
     It makes nothing: whatever else is wrong with the command leaves no empty directory behind.
     """
+    if path is None:
+        return
     target = _checked(path)
     directory = next(place for place in target.absolute().parents if os.path.exists(place))
     if not directory.is_dir():
@@ -88,9 +87,8 @@ def _checked(path: PathLike) -> Path:
     except FileNotFoundError:
         target = behind_link(path)
         if os.path.islink(path) and not target.parent.is_dir():  # a disk that is not there?
-            raise UserError(
-                f"cannot write {path}: it leads to {target.parent}, which does not exist"
-            ) from None
+            where = f"it leads to {target.parent}, which does not exist"
+            raise UserError(f"cannot write {path}: {where}") from None
         return target
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from None
@@ -101,12 +99,6 @@ def _checked(path: PathLike) -> Path:
     if not stat.S_ISREG(mode):
         raise UserError(f"cannot write {path}: it is no regular file")
     return behind_link(path)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def lock_file(descriptor: int) -> None:

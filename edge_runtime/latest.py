@@ -67,47 +67,38 @@ class LatestState:
         return rejection
 
     def _judge(self, state: State, now_s: float) -> Optional[Rejection]:
-        if state.session == self._session:
+        session = state.session
+        if session == self._session:
             # Even a stale message shows that this simulator is there.
             self._heard_s = now_s
         elif now_s - self._heard_s < TAKEOVER_SILENCE_S:
-            words = f"session {state.session!r} while {self._session!r} is not silent"
+            words = f"session {session!r} while {self._session!r} is not silent"
             return Rejection(Reason.FOREIGN_SESSION, words)
-        last = self._lasts.get(state.session)
-        if last is None:
-            return self._judge_session(state.session)
-        position = (state.episode, state.step)
-        if position > last.position:
-            return _judge_skip(position, last, now_s)
-        reason = Reason.DUPLICATE if position == last.position else Reason.STALE
-        return _rejection(reason, position, last)
-
-    def _judge_session(self, session: str) -> Optional[Rejection]:
-        """Reject one that is over, and any other where there were too many to know that."""
+        last = self._lasts.get(session)
+        if last is not None:
+            return _judge_position((state.episode, state.step), last, now_s)
         if hash(session) in self._forgotten:
             return Rejection(Reason.STALE, f"session {session!r} ended many simulators ago")
-        if len(self._forgotten) >= MAX_FORGOTTEN_SESSIONS:
+        if len(self._forgotten) >= MAX_FORGOTTEN_SESSIONS:  # then nobody knows if it is over
             words = f"there were {len(self._forgotten)} simulators before; start the runtime again"
             return Rejection(Reason.FOREIGN_SESSION, words)
         return None
 
 
-def _judge_skip(position: Position, last: _Last, now_s: float) -> Optional[Rejection]:
-    """Reject what no simulator can have reached since its last accepted state."""
+def _judge_position(position: Position, last: _Last, now_s: float) -> Optional[Rejection]:
+    """Reject what is not newer, and what no simulator can have reached since its last state."""
     elapsed_s = now_s - last.accepted_s
     episodes = position[0] - last.position[0]
     steps = position[1] - (last.position[1] if episodes == 0 else 0)
-    if (
+    if position <= last.position:
+        reason = Reason.DUPLICATE if position == last.position else Reason.STALE
+    elif (
         episodes > MAX_SKIPPED_EPISODES + SKIPPED_EPISODES_PER_S * elapsed_s
         or steps > MAX_SKIPPED_STEPS + SKIPPED_STEPS_PER_S * elapsed_s
     ):
-        return _rejection(Reason.FUTURE, position, last)
-    return None
-
-
-def _rejection(reason: Reason, position: Position, last: _Last) -> Rejection:
-    return Rejection(
-        reason,
-        f"episode {position[0]} step {position[1]}"
-        f" after episode {last.position[0]} step {last.position[1]}",
-    )
+        reason = Reason.FUTURE
+    else:
+        return None
+    (old_episode, old_step), (episode, step) = last.position, position
+    words = f"episode {episode} step {step} after episode {old_episode} step {old_step}"
+    return Rejection(reason, words)

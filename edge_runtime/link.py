@@ -24,7 +24,7 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_PAYLOAD_BYTES, Health, Message, encode, key
 
 if TYPE_CHECKING:
-    from edge_runtime.policy_file import Manifest
+    from edge_runtime.policy import Manifest
 
 OpenClient = Callable[[], zenoh.Session]
 
@@ -42,11 +42,10 @@ class Link:
 
     def __init__(self, session: zenoh.Session, vehicle_id: str, manifest: Manifest) -> None:
         self.vehicle_id = vehicle_id
-        self._session = session
-        self._manifest = manifest
+        self._session, self._manifest = session, manifest
         self._declared: List[Any] = []
         self._presence: Optional[Presence] = None
-        self._muted = False
+        self.gave_way = False  # another runtime speaks for this vehicle
         self._publishers = {
             # DROP: a full queue must never hold the control loop, and the next message is better.
             topic: session.declare_publisher(
@@ -72,9 +71,8 @@ class Link:
             on_state(bytes(MAX_PAYLOAD_BYTES + 1) if is_huge else bytes(sample.payload))
 
         def status_asked(query: zenoh.Query) -> None:
-            manifest = msgspec.to_builtins(self._manifest)
-            about = {"version": __version__, "manifest": manifest}
-            _reply(query, {**msgspec.to_builtins(health()), **about})
+            about = {"version": __version__, "manifest": self._manifest}
+            _reply(query, msgspec.to_builtins({**msgspec.structs.asdict(health()), **about}))
 
         def rearm_asked(query: zenoh.Query) -> None:
             # `phil/**` asks what is there: a look at everything is no permission to move.
@@ -91,25 +89,29 @@ class Link:
             session.declare_queryable(rearm_key, rearm_asked),
         ]
 
-    def appear(self, open_client: OpenClient, give_way: Callable[[], None]) -> None:
-        """Show that it is alive, and look for others with this vehicle id."""
+    def appear(self, open_client: OpenClient, stop: Callable[[], None]) -> None:
+        """Show that it is alive, and look for others with this vehicle id.
+
+        To an elder one this one gives way: it sends nothing more, and `stop` is called.
+        """
+
+        def give_way() -> None:
+            self.gave_way = True
+            stop()
+
         alive = key(self.vehicle_id, "alive")
         self._presence = Presence(self._session, alive, open_client, give_way)
         self._declared.append(self._presence)
-        self._presence.start()
+        self._presence.thread.start()
 
     @property
     def rivals(self) -> int:
         """How many other runtimes were seen under this vehicle id."""
         return self._presence.rivals if self._presence else 0
 
-    def mute(self) -> None:
-        """Send nothing more: another runtime speaks for this vehicle."""
-        self._muted = True
-
     def send(self, topic: str, message: Message) -> None:
         """Publish a message. A failure is logged: the receiver's own watchdog handles it."""
-        if self._muted:
+        if self.gave_way:
             return
         try:
             self._publishers[topic].put(encode(message))
@@ -129,9 +131,8 @@ def _at_once(callback: Callable[[zenoh.Sample], None]) -> Any:
     """Zenoh's own thread calls it: no second thread to wake, and no queue of old states between.
 
     The callback must be quick, for nothing else is received meanwhile. A native thread that calls
-    into Python is given a new Python state, which is taken down when the call returns: tens of
-    microseconds of each call. One PyGILState_Ensure that is never released keeps it. These threads
-    live as long as the session, so nothing piles up.
+    into Python builds a Python state and takes it down for each call: tens of microseconds. One
+    PyGILState_Ensure that is never released keeps it, as long as the thread and its session live.
     """
     thread = threading.local()
 
@@ -148,16 +149,17 @@ def _reply(query: zenoh.Query, value: Dict[str, Any]) -> None:
     query.reply(query.key_expr, json.dumps(value).encode(), encoding="application/json")
 
 
-def require_free(open_client: OpenClient, alive_key: str, vehicle_id: str) -> bool:
+def require_free(open_client: OpenClient, vehicle_id: str) -> bool:
     """Whether a router answers. Raises UserError where another runtime has this vehicle id.
 
     Two peers do not hear each other through a router, so a client asks it. The token of a process
     that was just killed may stay for a lease: one that is found must outlast it.
     """
-    found = _ask(open_client, f"{alive_key}/**")
+    selector = f"{key(vehicle_id, 'alive')}/**"
+    found = _ask(open_client, selector)
     if found:
         time.sleep(_LEFTOVER_S)
-        found = _ask(open_client, f"{alive_key}/**")
+        found = _ask(open_client, selector)
     if found:
         raise taken(vehicle_id)
     return found is not None
@@ -180,17 +182,11 @@ class Presence:
     """
 
     def __init__(
-        self,
-        session: zenoh.Session,
-        alive_key: str,
-        open_client: OpenClient,
-        give_way: Callable[[], None],
+        self, session: zenoh.Session, alive_key: str, open_client: OpenClient, give_way: Callable
     ) -> None:
         self.rivals = 0
-        self._session = session
-        self._key = alive_key
-        self._open_client = open_client
-        self._give_way: Optional[Callable[[], None]] = give_way
+        self._session, self._key, self._open_client = session, alive_key, open_client
+        self._give_way: Optional[Callable] = give_way
         self._known: Set[str] = set()
         self._seen_before: Set[str] = set()
         self._looks = 0
@@ -198,17 +194,12 @@ class Presence:
         self._tokens: List[Any] = []
         self._declare()
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
-
-    def start(self) -> None:
-        """Begin to look for changes."""
-        self._thread.start()
+        self.thread = threading.Thread(target=self._run, name="presence", daemon=True)
 
     def refresh(self) -> bool:
         """Declare the tokens again if other routers are there than the last time."""
-        routers = self._seen_routers()
-        changed, self._routers = routers != self._routers, routers
-        if not changed or not routers:
+        before, self._routers = self._routers, self._seen_routers()
+        if not self._routers or self._routers == before:
             return False
         for token in self._tokens:
             token.undeclare()
@@ -219,30 +210,29 @@ class Presence:
         """Look for other claims; give way to an elder one that is seen for the second time."""
         found = _ask(self._open_client, f"{self._key}/*") or []
         claims = {key.rsplit("/", 1)[1] for key in found} - {self.claim}
-        for claim in sorted((claims & self._seen_before) - self._known):
+        seen_twice = claims & self._seen_before
+        for claim in sorted(seen_twice - self._known):
             self._known.add(claim)
             self.rivals += 1
             log.event("error", "another_edge", claim=claim, elder=claim < self.claim)
-        elders = {claim for claim in claims & self._seen_before if claim < self.claim}
         self._seen_before = claims
         self._looks += 1
-        if elders and self._give_way is not None:
+        if self._give_way is not None and any(claim < self.claim for claim in seen_twice):
             give_way, self._give_way = self._give_way, None
             give_way()
 
     def undeclare(self) -> None:
         """Stop looking and take the tokens away."""
         self._stopping.set()
-        if self._thread.is_alive() and self._thread is not threading.current_thread():
-            self._thread.join(_JOIN_S)
+        if self.thread.is_alive() and self.thread is not threading.current_thread():
+            self.thread.join(_JOIN_S)
         for token in self._tokens:
             token.undeclare()
 
     def _declare(self) -> None:
         # Wall clock, because two boards compare it; the rest tells two of one moment apart.
         self.claim = f"{time.time_ns():016x}-{os.urandom(4).hex()}"
-        self._seen_before = set()
-        self._looks = 0
+        self._seen_before, self._looks = set(), 0
         self._tokens = [
             self._session.liveliness().declare_token(key)
             for key in (self._key, f"{self._key}/{self.claim}")
@@ -266,7 +256,7 @@ class Presence:
 
 
 def wait_for_router(session: zenoh.Session) -> None:
-    """For 0.2 s at most, so that the tokens are not declared twice. One is known to answer."""
+    """Wait 0.2 s at most, so that the tokens are not declared twice. One is known to answer."""
     end_s = time.monotonic() + _CONNECT_S
     while not session.info.routers_zid() and time.monotonic() < end_s:
         time.sleep(0.002)

@@ -26,7 +26,7 @@ _FLOOD_PERIOD_S = 1.0
 def configure(level: str, log_format: str = "text") -> None:
     """Send lines of at least `level` to stderr."""
     stream = logging.StreamHandler()
-    stream.setFormatter(_JsonFormatter() if log_format == "json" else _TextFormatter())
+    stream.setFormatter(_Formatter(as_json=log_format == "json"))
     close()
     _LOGGER.handlers = [_Background(stream)]
     _LOGGER.propagate = False
@@ -72,26 +72,22 @@ class _Background(logging.Handler):
             self._target.handle(record)
 
 
-class _TextFormatter(logging.Formatter):
+class _Formatter(logging.Formatter):
+    def __init__(self, as_json: bool) -> None:
+        super().__init__()
+        self._as_json = as_json
+
     def format(self, record: logging.LogRecord) -> str:
-        pairs = "".join(
-            f" {label}={_quoted(value)}" for label, value in getattr(record, "fields", {}).items()
-        )
-        return f"{_time(record)} {record.levelname} {record.getMessage()}{pairs}"
-
-
-class _JsonFormatter(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        level, event = record.levelname.lower(), record.getMessage()
-        line = {"time": _time(record), "level": level, "event": event}
-        # Twice, so that the line begins with them and no field can take their place.
-        return json.dumps({**line, **getattr(record, "fields", {}), **line}, default=str)
-
-
-def _time(record: logging.LogRecord) -> str:
-    # Boards and workstations sit in one time zone: UTC.
-    seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-    return f"{seconds}.{int(record.msecs):03d}Z"
+        # Boards and workstations sit in one time zone: UTC.
+        seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
+        at, level, name = f"{seconds}.{int(record.msecs):03d}Z", record.levelname, record.msg
+        fields = getattr(record, "fields", {})
+        if self._as_json:
+            line = {"time": at, "level": level.lower(), "event": name}
+            # Twice, so that the line begins with them and no field can take their place.
+            return json.dumps({**line, **fields, **line}, default=str)
+        pairs = (f" {label}={_quoted(value)}" for label, value in fields.items())
+        return f"{at} {level} {name}{''.join(pairs)}"
 
 
 def _quoted(value: Any) -> str:
@@ -102,10 +98,7 @@ def _quoted(value: Any) -> str:
 
 
 class Flood:
-    """Lets the first of each kind through, then one a second. Kinds must be few: all are kept.
-
-    Pure: time is passed in.
-    """
+    """Lets the first of each kind through, then one a second. Kinds must be few: all are kept."""
 
     def __init__(self) -> None:
         self._next_s: Dict[str, float] = {}

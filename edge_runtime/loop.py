@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # Loaded only where they are used.
     from edge_runtime.files import Hold
     from edge_runtime.vehicles.base import VehicleRunner
 
-_HEALTH_PERIOD_S = 1.0 / TOPICS["health"].rate_hz
+_HEALTH_PERIOD_S = 1.0 / TOPICS["health"]
 _JOIN_S = 0.5
 _RETRY_S = 0.1
 # A policy that computes so long will not end: only a new process helps.
@@ -55,19 +55,14 @@ class ControlLoop:
     ) -> None:
         self._policy, self._controller, self._link = policy, controller, link
         self._vehicle, self._notifier = vehicle, notifier
-        self._hold = hold
-        self._rearm_command = rearm_command
-        self._board = BoardWatch()
-        self._latest = LatestState()
-        self._inference_window = LatencyWindow()
-        self._command_window = LatencyWindow()
-        self._flood = Flood()
+        self._hold, self._rearm_command = hold, rearm_command
+        self._board, self._latest, self._flood = BoardWatch(), LatestState(), Flood()
+        self._inference_window, self._command_window = LatencyWindow(), LatencyWindow()
         self._busy_since_s: Optional[float] = None
         self._slot: Optional[Received] = None
         self._superseded = 0
         self._stopping = False
-        self._logged = Safety()
-        self._logged_wait = False
+        self._logged, self._logged_wait = Safety(), False
         self._started_s = time.monotonic()
         # Reentrant, because the signal handler calls `stop` in the main thread at any moment.
         self._lock = threading.RLock()
@@ -186,13 +181,13 @@ class ControlLoop:
                 received, self._slot = self._slot, None
                 self._busy_since_s = time.monotonic()
                 self._controller.begin(received, self._busy_since_s)
-            inference = infer(self._policy, received.state.frames_array())
+            output, inference_ns = infer(self._policy, received.state.frames_array())
             with self._lock:
                 self._busy_since_s = None
-                self._inference_window.add(inference.duration_ns)
+                self._inference_window.add(inference_ns)
                 self._look_at_vehicle(time.monotonic())
                 now_s = time.monotonic()
-                order = self._controller.finish(*inference, now_s)
+                order = self._controller.finish(output, inference_ns, now_s)
                 self._send(order)
                 if order is not None:
                     took_s = time.monotonic() - received.arrived_s

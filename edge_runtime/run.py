@@ -11,20 +11,18 @@ import signal
 import threading
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Callable, Dict, Optional, Tuple
+from typing import TYPE_CHECKING, Any, Callable, Dict, Optional
 
 import zenoh
 
 from edge_runtime import log, service
 from edge_runtime.config import NONE, Config, add_flags, add_trust, load_config
-from edge_runtime.controller import Controller, limit_rows
+from edge_runtime.controller import Controller, shared_limits
 from edge_runtime.link import Link, require_free, taken, wait_for_router
 from edge_runtime.loop import ControlLoop
-from edge_runtime.policy import load_policy
-from edge_runtime.policy_file import VERIFIED
-from edge_runtime.transport import is_tls, open_session
-from edge_runtime.util import UserError, ending_signals
-from edge_runtime.wire import key
+from edge_runtime.policy import VERIFIED, load_policy
+from edge_runtime.transport import is_tls, look, open_session
+from edge_runtime.util import ending_signals
 
 if TYPE_CHECKING:  # Loaded only where they are used.
     from edge_runtime.files import Hold
@@ -60,8 +58,7 @@ EXAMPLE = r"""examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `run`."""
-    text = "settings; flags on the command line win over it"
-    parser.add_argument("--config", metavar="FILE.toml", help=text)
+    parser.add_argument("--config", metavar="FILE.toml", help="settings; flags win over it")
     add_flags(parser)
     add_trust(parser)
 
@@ -72,10 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = load_config(arguments.config, flags)
     log.configure(config.log_level, config.log_format)
     try:
-        stop = _StopSignal()
-        runtime = _Runtime(config)
-        stop.on_stop = runtime.loop.stop
-        if not runtime.drive(stop):
+        if not _drive(config, _StopSignal()):
             # The policy's thread hangs in native code, and would hold the interpreter's exit.
             log.close()
             os._exit(0)
@@ -84,124 +78,99 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class _Runtime:
-    """All that one run is made of. UserError, and nothing left open, where it cannot be made."""
+def _drive(config: Config, stop: _StopSignal) -> bool:
+    """Drive until it is told to stop; False where a thread hangs.
 
-    def __init__(self, config: Config) -> None:
-        tls, access = _certificate(config)
-        if config.realtime_priority or config.cpus or config.lock_memory:
-            from edge_runtime import realtime
+    Raises UserError, and leaves nothing open, where the run cannot be made, and where it gave way.
+    """
+    tls: Optional[TlsFiles] = None
+    access: Optional[Dict[str, Any]] = None
+    if config.tls is not None:
+        from edge_runtime.tls import EDGE, check_name, common_name, load_tls, rules_for_edge
 
-            realtime.configure(config.realtime_priority, config.cpus, config.lock_memory)
-        self._config = config
-        self._policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
-        manifest = self._policy.manifest
-        # Both of its sessions hear only what this vehicle's edge may hear.
-        connected = partial(open_session, connect=config.connect, tls=tls, access=access)
-        self._open_client = partial(connected, mode="client")
-        self._notifier = service.Notifier()
-        self._rival: Optional[UserError] = None
-        with contextlib.ExitStack() as undo:
-            vehicle: Optional[Vehicle] = None
-            if config.vehicle != NONE:
-                from edge_runtime.vehicles import make_vehicle
+        tls, access = load_tls(config.tls), rules_for_edge(config.vehicle_id)
+        check_name(tls.name, common_name(EDGE, config.vehicle_id))
+        log.event("info", "certificate", of=tls.name, expires=f"{tls.expires:%Y-%m-%dT%H:%MZ}")
+    service.claim_resources(config.realtime_priority, config.cpus, config.lock_memory)
+    policy = load_policy(str(config.policy), config.public_key, config.allow_unsigned)
+    # Both of its sessions hear only what this vehicle's edge may hear.
+    connected = partial(open_session, connect=config.connect, tls=tls, access=access)
+    open_client = partial(connected, mode="client")
+    notifier = service.Notifier()
+    with contextlib.ExitStack() as undo:
+        vehicle: Optional[Vehicle] = None
+        if config.vehicle != NONE:
+            from edge_runtime.vehicles import make_vehicle
 
-                vehicle = make_vehicle(config.vehicle, config, manifest.scenario)
-                undo.callback(vehicle.close)
-            rows = limit_rows(manifest.action, vehicle.limits if vehicle else {})
-            self._controller = Controller(
-                rows, vehicle is not None, config.armed_at_start, manifest.task
-            )
-            hold: Optional[Hold] = None
-            if config.hold is not None:
-                from edge_runtime.files import Hold
+            vehicle = make_vehicle(config.vehicle, config, policy.manifest.scenario)
+            undo.callback(vehicle.close)
+        limits = shared_limits(policy.manifest.action, vehicle.limits if vehicle else {})
+        controller = Controller(
+            limits, vehicle is not None, config.armed_at_start, policy.manifest.task
+        )
+        hold: Optional[Hold] = None
+        if config.hold is not None:
+            from edge_runtime.files import Hold
 
-                hold = Hold(config.hold)
-            alive = key(config.vehicle_id, "alive")
-            self._has_router = require_free(self._open_client, alive, config.vehicle_id)
-            self._session = connected(mode="peer")
-            undo.callback(self._session.close)  # An open one would hang the process at its exit.
-            self._link = Link(self._session, config.vehicle_id, manifest)
-            self._runner: Optional[VehicleRunner] = None
-            if vehicle is not None:
-                from edge_runtime.vehicles.base import VehicleRunner
+            hold = Hold(config.hold)
+        has_router = require_free(open_client, config.vehicle_id)
+        session = connected(mode="peer")
+        undo.callback(session.close)  # An open one would hang the process at its exit.
+        link = Link(session, config.vehicle_id, policy.manifest)
+        runner: Optional[VehicleRunner] = None
+        if vehicle is not None:
+            from edge_runtime.vehicles.base import VehicleRunner
 
-                names = [action.name for action in manifest.action]
-                self._runner = VehicleRunner(vehicle, names, partial(self._link.send, "feedback"))
-            self.loop = ControlLoop(
-                self._policy,
-                self._controller,
-                self._link,
-                self._runner,
-                self._notifier,
-                hold,
-                rearm_command(config.connect, config.vehicle_id),
-            )
-            undo.pop_all()
-        why = partial(why_no_state, self._session, config.connect, config.vehicle_id, tls)
-        self._waiting = Waiting(self.loop.has_heard, why)
-        # What is loaded stays: the collector need not look at it again in the middle of a drive.
-        gc.collect()
-        gc.freeze()
-
-    def drive(self, stop: _StopSignal) -> bool:
-        """Until it is told to stop; False where a thread hangs. UserError where it gave way."""
-        config, policy = self._config, self._policy
-        try:
-            if self._runner is not None:
-                self._runner.start(config.armed_at_start)
-            self.loop.start()
-            if self._has_router:
-                wait_for_router(self._session)
-            self._link.appear(self._open_client, self._give_way)
-            if policy.trust != VERIFIED:
-                log.event("warning", "policy_not_verified", trust=policy.trust)
-            print(
-                f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
-                f" connect={config.connect} policy_id={policy.policy_id}",
-                flush=True,
-            )
-            self._waiting.start(bool(self._session.info.routers_zid()))
-            self._notifier.tell(f"READY=1\nSTATUS={self._controller.safety.mode.value}")
-            if not stop.came:
-                self.loop.run()
-        finally:
-            self._waiting.stop()
-            self._notifier.tell("STOPPING=1")
-            ended = self.loop.close()
-            if self._runner is not None:
-                self._runner.close()
-            self._link.close()
-            health = self.loop.health()
-            log.event(
-                "info",
-                "ended",
-                accepted=health.accepted,
-                rejected=sum(health.rejected.values()),
-                deadline_misses=health.deadline_misses,
-                safe_stops=health.safe_stops,
-                uptime_s=round(health.uptime_s, 1),
-            )
-        if self._rival is not None:
-            raise self._rival
-        return ended
-
-    def _give_way(self) -> None:
-        self._rival = taken(self._config.vehicle_id)
-        self._link.mute()
-        self.loop.stop()
-
-
-def _certificate(config: Config) -> Tuple[Optional[TlsFiles], Optional[Dict[str, Any]]]:
-    """The files of --tls, and Zenoh's access control for their party; None each without it."""
-    if config.tls is None:
-        return None, None
-    from edge_runtime import tls
-
-    files = tls.load_tls(config.tls)
-    tls.check_name(files.name, tls.common_name(tls.EDGE, config.vehicle_id))
-    log.event("info", "certificate", of=files.name, expires=f"{files.expires:%Y-%m-%dT%H:%MZ}")
-    return files, tls.rules_for_edge(config.vehicle_id)
+            runner = VehicleRunner(vehicle, list(limits), partial(link.send, "feedback"))
+        rearm = rearm_command(config.connect, config.vehicle_id)
+        loop = ControlLoop(policy, controller, link, runner, notifier, hold, rearm)
+        undo.pop_all()
+    stop.on_stop = loop.stop
+    why = partial(why_no_state, session, config.connect, config.vehicle_id, tls)
+    waiting = Waiting(loop.has_heard, why)
+    # What is loaded stays: the collector need not look at it again in the middle of a drive.
+    gc.collect()
+    gc.freeze()
+    try:
+        if runner is not None:
+            runner.start(config.armed_at_start)
+        loop.start()
+        if has_router:
+            wait_for_router(session)
+        link.appear(open_client, loop.stop)
+        if policy.trust != VERIFIED:
+            log.event("warning", "policy_not_verified", trust=policy.trust)
+        print(
+            f"ready vehicle_id={config.vehicle_id} vehicle={config.vehicle}"
+            f" connect={config.connect} policy_id={policy.policy_id}",
+            flush=True,
+        )
+        if session.info.routers_zid():  # then its first state may take as long
+            waiting.next_s = time.monotonic() + _WAITING_PERIOD_S
+        waiting.start()
+        notifier.tell(f"READY=1\nSTATUS={controller.safety.mode.value}")
+        if not stop.came:
+            loop.run()
+    finally:
+        waiting.ended.set()
+        notifier.tell("STOPPING=1")
+        ended = loop.close()
+        if runner is not None:
+            runner.close()
+        link.close()
+        health = loop.health()
+        log.event(
+            "info",
+            "ended",
+            accepted=health.accepted,
+            rejected=sum(health.rejected.values()),
+            deadline_misses=health.deadline_misses,
+            safe_stops=health.safe_stops,
+            uptime_s=round(health.uptime_s, 1),
+        )
+    if link.gave_way:
+        raise taken(config.vehicle_id)
+    return ended
 
 
 def rearm_command(connect: str, vehicle_id: str) -> str:
@@ -210,38 +179,29 @@ def rearm_command(connect: str, vehicle_id: str) -> str:
     return f"python -m edge_runtime rearm --connect {connect} --vehicle-id {vehicle_id}{tls}"
 
 
-class Waiting:
-    """`look` says it where that is due; `start` has a thread look: a name server takes its time."""
+class Waiting(threading.Thread):
+    """Logs what is waited for, until a state comes or `ended` is set. A name server takes time."""
 
     def __init__(self, has_heard: Callable[[], bool], why: Callable[[], str]) -> None:
-        self._has_heard = has_heard
-        self._why = why
-        self._next_s = -math.inf
-        self._ended = threading.Event()
+        super().__init__(name="waiting", daemon=True)
+        self.next_s = -math.inf
+        self.ended = threading.Event()
+        self._has_heard, self._why = has_heard, why
 
     def look(self, now_s: float) -> bool:
         """Say what is waited for, at once and every 5 s; False once a state was heard."""
         if self._has_heard():
             return False
-        if now_s >= self._next_s:
-            self._next_s = now_s + _WAITING_PERIOD_S
+        if now_s >= self.next_s:
+            self.next_s = now_s + _WAITING_PERIOD_S
             why = self._why()
             if why and not self._has_heard():
                 log.event("info", "waiting", why=why)
         return True
 
-    def start(self, is_linked: bool) -> None:
-        """Look until a state comes, or `stop`. One that is linked has 5 s for its first state."""
-        if is_linked:
-            self._next_s = time.monotonic() + _WAITING_PERIOD_S
-        threading.Thread(target=self._run, name="waiting", daemon=True).start()
-
-    def stop(self) -> None:
-        """Say nothing more. Never waits."""
-        self._ended.set()
-
-    def _run(self) -> None:
-        while self.look(time.monotonic()) and not self._ended.wait(_POLL_S):
+    def run(self) -> None:
+        """Look again and again."""
+        while self.look(time.monotonic()) and not self.ended.wait(_POLL_S):
             pass
 
 
@@ -250,9 +210,7 @@ def why_no_state(
 ) -> str:
     """What keeps states away, on one line."""
     if not session.info.routers_zid():
-        from edge_runtime.link_probe import why_no_link
-
-        refusal = why_no_link(connect, tls)
+        _, refusal = look(connect, tls)
         if not session.info.routers_zid():  # it may have come meanwhile
             return refusal or f"{connect} gives no link yet"
     return f"{connect} is there, and has sent no state for vehicle id {vehicle_id} yet"

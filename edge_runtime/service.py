@@ -1,4 +1,5 @@
-"""What the runtime tells of itself: to systemd (sd_notify(3), Type=notify), and in its health.
+"""The runtime as a service: what it tells systemd (sd_notify(3), Type=notify) and its health of
+itself, and its priority, processors and memory.
 
 The board's sensors are Linux's; elsewhere they are unknown.
 """
@@ -6,12 +7,14 @@ The board's sensors are Linux's; elsewhere they are unknown.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import resource
 import socket
 import threading
 from collections import deque
 from pathlib import Path
-from typing import Deque, Dict, Mapping, NamedTuple, Optional
+from typing import Any, Callable, Deque, Dict, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -19,8 +22,7 @@ from edge_runtime import log
 
 WINDOW = 1024
 _LOOK_PERIOD_S = 2.0
-_THERMAL = Path("/sys/class/thermal")
-_STATM = Path("/proc/self/statm")
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 class Notifier:
@@ -29,21 +31,25 @@ class Notifier:
     Never waits: a message for which systemd has no room is dropped.
     """
 
-    def __init__(self, environment: Optional[Mapping[str, str]] = None) -> None:
-        environment = os.environ if environment is None else environment
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        self.watchdog_period_s: Optional[float] = None
+        """Half of the time that systemd waits; None where it does not watch this process."""
+        with contextlib.suppress(ValueError):
+            timeout_us = int(environment.get("WATCHDOG_USEC", "0"))
+            pid = int(environment.get("WATCHDOG_PID", os.getpid()))
+            if timeout_us > 0 and pid == os.getpid():
+                self.watchdog_period_s = timeout_us / 2e6
         address = environment.get("NOTIFY_SOCKET", "")
-        self.watchdog_period_s = _watchdog_period_s(environment)
-        self._address: Optional[str] = None
+        # "@" stands for the NUL byte with which an abstract address begins.
+        self._address = "\0" + address[1:] if address.startswith("@") else address
         self._socket: Optional[socket.socket] = None
-        if address[:1] in ("/", "@"):
-            # "@" stands for the NUL byte with which an abstract address begins.
-            self._address = "\0" + address[1:] if address[0] == "@" else address
+        if self._address.startswith(("/", "\0")):
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.setblocking(False)
 
     def tell(self, text: str) -> None:
         """Send a state of sd_notify(3), like `READY=1`; never waits."""
-        if self._socket is None or self._address is None:
+        if self._socket is None:
             return
         try:
             self._socket.sendto(text.encode(), self._address)
@@ -55,16 +61,6 @@ class Notifier:
             log.event("warning", "systemd_not_told", detail=error)
 
 
-def _watchdog_period_s(environment: Mapping[str, str]) -> Optional[float]:
-    """Half of the time that systemd waits; None where it does not watch this process."""
-    try:
-        timeout_us = int(environment.get("WATCHDOG_USEC", "0"))
-        pid = int(environment.get("WATCHDOG_PID", os.getpid()))
-    except ValueError:
-        return None
-    return timeout_us / 2e6 if timeout_us > 0 and pid == os.getpid() else None
-
-
 class Board(NamedTuple):
     """One look. `temperature_c`: the hottest sensor in degrees Celsius, None without any."""
 
@@ -73,26 +69,16 @@ class Board(NamedTuple):
     rss_mb: float = 0.0
 
 
-def look(thermal: Path = _THERMAL, statm: Path = _STATM) -> Board:
+def look(thermal: str = "/sys/class/thermal", statm: str = "/proc/self/statm") -> Board:
     """Read the sensors now. Some take milliseconds to answer: never in the control thread."""
-    return Board(_hottest_c(thermal), os.getloadavg()[0], _rss_mb(statm))
-
-
-def _hottest_c(thermal: Path) -> Optional[float]:
-    values_c = []
-    for sensor in thermal.glob("thermal_zone*/temp"):
+    temperatures_c, rss_mb = [], 0.0
+    for sensor in Path(thermal).glob("thermal_zone*/temp"):
         # A sensor that is switched off answers with an error.
         with contextlib.suppress(OSError, ValueError):
-            values_c.append(int(sensor.read_text()) / 1000.0)
-    return max(values_c, default=None)
-
-
-def _rss_mb(statm: Path) -> float:
-    try:
-        pages = int(statm.read_text().split()[1])
-    except (OSError, ValueError, IndexError):
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+            temperatures_c.append(int(sensor.read_text()) / 1000.0)
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        rss_mb = int(Path(statm).read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    return Board(max(temperatures_c, default=None), os.getloadavg()[0], rss_mb)
 
 
 class BoardWatch:
@@ -101,8 +87,7 @@ class BoardWatch:
     def __init__(self) -> None:
         self.last = look()
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="board", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._run, name="board", daemon=True).start()
 
     def close(self) -> None:
         """End the thread, without waiting for a sensor that hangs."""
@@ -129,3 +114,49 @@ class LatencyWindow:
             return {"p50": 0.0, "p99": 0.0, "max": 0.0}
         p50, p99, top = np.percentile(np.array(self._durations_ns) / 1e6, [50, 99, 100])
         return {"p50": float(p50), "p99": float(p99), "max": float(top)}
+
+
+def claim_resources(priority: int, cpus: Sequence[int], lock_memory: bool) -> List[str]:
+    """Apply what is asked for (0, empty and False ask for nothing), before a thread is started.
+
+    The threads of Zenoh, of the policy and of the vehicle inherit what the main thread has. What
+    the system refuses is logged, one line each, and its name is in the list returned.
+    """
+    usable = ",".join(map(str, sorted(os.sched_getaffinity(0))))
+    rows: Sequence[Tuple[str, Any, Callable[[Any], None], str]] = (
+        # FIFO: it runs until it waits. Linux itself leaves 5 % of each second to all others.
+        ("realtime_priority", priority,
+         lambda it: os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(it)),
+         "allow it with LimitRTPRIO=99 in the service, CAP_SYS_NICE, or ulimit -r 99"),
+        ("cpus", cpus, _set_cpus, f"this process may use {usable}"),
+        ("lock_memory", lock_memory, _lock_memory,
+         "allow it with LimitMEMLOCK=infinity in the service, CAP_IPC_LOCK, or ulimit -l"),
+    )  # fmt: skip
+    refused = []
+    for key, value, apply, words in rows:
+        try:
+            if value:
+                apply(value)
+        except (OSError, ValueError, AttributeError) as error:
+            log.event("warning", "not_permitted", key=key, value=value, detail=error, help=words)
+            refused.append(key)
+    return refused
+
+
+def _set_cpus(cpus: Sequence[int]) -> None:
+    missing = set(cpus) - os.sched_getaffinity(0)
+    if missing:  # the kernel would silently take those that exist
+        raise ValueError(f"no processor {sorted(missing)} for this process")
+    os.sched_setaffinity(0, cpus)
+
+
+def _lock_memory(_: object) -> None:
+    """Keep every page that is ever touched; pages that nobody touches take no room."""
+    soft, _hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
+        # With a limit it would succeed now, and an allocation would fail in mid-drive.
+        raise PermissionError(f"at most {soft // 1024} KiB may be locked")
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))

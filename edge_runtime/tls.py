@@ -19,13 +19,8 @@ from edge_runtime.wire import check_vehicle_id
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-    from cryptography.x509 import Certificate
 
 CA_FILE, CERTIFICATE_FILE, KEY_FILE = "ca.pem", "cert.pem", "key.pem"
-
-# Nothing for others, and no writing for the group. A group may read: systemd hands a service its
-# credentials so.
-_OPEN_MODE = 0o027
 
 
 class TlsFiles(NamedTuple):
@@ -34,10 +29,8 @@ class TlsFiles(NamedTuple):
     ca: str
     certificate: str
     key: str
-    name: str
-    """The certificate's common name, as in `edge-hunter01`: what access control goes by."""
-    expires: datetime.datetime
-    """UTC."""
+    name: str  # the certificate's common name, as in `edge-hunter01`: access control goes by it
+    expires: datetime.datetime  # UTC
 
     def zenoh_rows(self) -> Dict[str, Any]:
         """Zenoh's `transport/link/tls`: mutual, names verified, links closed when they expire."""
@@ -77,44 +70,38 @@ def load_tls(directory: PathLike) -> TlsFiles:
     if not folder.is_dir():
         raise UserError(f"--tls {directory} is no directory; `python -m deploy certs` makes one")
     ca_path, path, key_path = (folder / name for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE))
-    ca, certificate = (_read_certificate(each) for each in (ca_path, path))
-    key = read_private_key(key_path)
-    if key_path.stat().st_mode & _OPEN_MODE:
+    certificates = {}
+    for each in (ca_path, path):
+        data = read_bytes(each, "certificate")
+        try:
+            certificates[each] = x509.load_pem_x509_certificate(data)
+        except ValueError:
+            raise UserError(f"{each} is not a certificate in PEM") from None
+    certificate, key = certificates[path], read_private_key(key_path)
+    # A group may read, not write: systemd hands a service its credentials so.
+    if key_path.stat().st_mode & 0o027:
         raise UserError(f"private key {key_path} is open to others; close it: chmod 600 {key_path}")
     if key.public_key() != certificate.public_key():
         raise UserError(f"private key {key_path} does not fit {CERTIFICATE_FILE} beside it")
     try:
-        certificate.verify_directly_issued_by(ca)
+        certificate.verify_directly_issued_by(certificates[ca_path])
     except (ValueError, TypeError, InvalidSignature):
         raise UserError(f"{path} was not issued by the authority in {CA_FILE} beside it") from None
-    _check_dates(path, certificate)
-    _check_dates(ca_path, ca)
+    now = datetime.datetime.now(datetime.timezone.utc)
+    for each in (path, ca_path):
+        dated = certificates[each]
+        begins, ends = dated.not_valid_before_utc, dated.not_valid_after_utc
+        if now >= ends:
+            raise UserError(f"{each} expired at {ends:%Y-%m-%d %H:%M} UTC; make a new one")
+        if now < begins:
+            raise UserError(
+                f"{each} is valid from {begins:%Y-%m-%d %H:%M} UTC on, and the clock here says"
+                f" {now:%Y-%m-%d %H:%M} UTC; is the clock set?"
+            )
     names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
     name = str(names[0].value) if names else ""
     paths = (str(ca_path), str(path), str(key_path))
     return TlsFiles(*paths, name, certificate.not_valid_after_utc)
-
-
-def _read_certificate(path: Path) -> Certificate:
-    from cryptography.x509 import load_pem_x509_certificate
-
-    data = read_bytes(path, "certificate")
-    try:
-        return load_pem_x509_certificate(data)
-    except ValueError:
-        raise UserError(f"{path} is not a certificate in PEM") from None
-
-
-def _check_dates(path: Path, certificate: Certificate) -> None:
-    now = datetime.datetime.now(datetime.timezone.utc)
-    begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-    if now >= ends:
-        raise UserError(f"{path} expired at {ends:%Y-%m-%d %H:%M} UTC; make a new one")
-    if now < begins:
-        raise UserError(
-            f"{path} is valid from {begins:%Y-%m-%d %H:%M} UTC on, and the clock here says"
-            f" {now:%Y-%m-%d %H:%M} UTC; is the clock set?"
-        )
 
 
 def read_private_key(path: PathLike) -> Any:
@@ -149,17 +136,12 @@ class Rights(NamedTuple):
 
     publishes: Tuple[str, ...] = ()
     reads: Tuple[str, ...] = ()
-    answers: Tuple[str, ...] = ()
-    """Queries that it replies to."""
+    answers: Tuple[str, ...] = ()  # queries that it replies to
     asks: Tuple[str, ...] = ()
-    shows: Tuple[str, ...] = ()
-    """Liveliness tokens of its own."""
-    watches: Tuple[str, ...] = ()
-    """Liveliness tokens of others."""
-    all_vehicles: bool = False
-    """Its rights hold for every vehicle, not for its own alone."""
-    listens: bool = False
-    """Others connect to it: its certificate is a server's, too."""
+    shows: Tuple[str, ...] = ()  # liveliness tokens of its own
+    watches: Tuple[str, ...] = ()  # liveliness tokens of others
+    all_vehicles: bool = False  # its rights hold for every vehicle, not for its own alone
+    listens: bool = False  # others connect to it: its certificate is a server's, too
 
 
 # `scene` and `simulator` are the bridge's: the picture for viewers, and its own token. `alive/**`
@@ -209,14 +191,12 @@ def rules_for_listener(vehicle_ids: Sequence[str]) -> Dict[str, Any]:
 
     All else is denied: other names, other keys, and `delete` for everybody.
     """
-    parties: List[Tuple[str, Optional[str]]] = [
-        (role, None) for role in ROLES if ROLES[role].all_vehicles
-    ]
-    for vehicle_id in dict.fromkeys(vehicle_ids):
-        parties += [(role, vehicle_id) for role in ROLES if not ROLES[role].all_vehicles]
-    return _access_control(
-        {common_name(role, vehicle_id): _rules(role, vehicle_id) for role, vehicle_id in parties}
-    )
+    parties: Dict[str, List[Dict[str, Any]]] = {}
+    for vehicle_id in (None, *dict.fromkeys(vehicle_ids)):
+        for role, rights in ROLES.items():
+            if rights.all_vehicles == (vehicle_id is None):
+                parties[common_name(role, vehicle_id)] = _rules(role, vehicle_id)
+    return _access_control(parties)
 
 
 def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
@@ -226,11 +206,8 @@ def rules_for_edge(vehicle_id: str) -> Dict[str, Any]:
     its certificate is a server's, too, and of the same authority.
     """
     # The same rules as the edge itself applies them: what it may send leaves here.
-    turn = {"ingress": "egress", "egress": "ingress"}
-    rules = [
-        {**rule, "flows": [turn[flow] for flow in rule["flows"]]}
-        for rule in _rules(EDGE, vehicle_id)
-    ]
+    turn = {"ingress": ["egress"], "egress": ["ingress"]}
+    rules = [{**rule, "flows": turn[rule["flows"][0]]} for rule in _rules(EDGE, vehicle_id)]
     return _access_control({common_name(SIMULATOR, vehicle_id): rules, ROUTER: rules})
 
 

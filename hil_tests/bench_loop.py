@@ -24,9 +24,8 @@ from bridge.report import markdown_table
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, positive
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.policy import load_policy
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 from hil_tests.sweep import simulate

@@ -31,7 +31,7 @@ from deploy.installer.systemd import MAIN_UNIT
 from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel
 from edge_runtime.cli import examples, positive, sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
-from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 

@@ -219,8 +219,7 @@ def _installed(name: str) -> str | None:
 
 
 def _loopback() -> str:
-    from edge_runtime.link_probe import free_endpoint
-    from edge_runtime.transport import open_session
+    from edge_runtime.transport import free_endpoint, open_session
 
     came = threading.Event()
     endpoint = free_endpoint()

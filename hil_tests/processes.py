@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from edge_runtime.commands import ask
-from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 
 Item = TypeVar("Item")

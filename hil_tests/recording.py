@@ -16,7 +16,7 @@ from pathlib import Path
 from bridge.recording import Recording
 from edge_runtime.cli import ArgumentParser, examples
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError, read_bytes
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, run_command, wait_until
 

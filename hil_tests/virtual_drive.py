@@ -28,7 +28,7 @@ NAME, MODEL, SESSION = "hunter", "2.0", "virtual"
 PERIOD_MS = round(1e3 * CONTROL_PERIOD_S)
 STREAM_MS, STREAM_PHASE_MS = 20, 10
 CHASSIS_MS = 20
-FEEDBACK_MS = round(1000 / TOPICS["feedback"].rate_hz)
+FEEDBACK_MS = round(1000 / TOPICS["feedback"])
 FEEDBACK_PHASE_MS = FEEDBACK_MS // 2
 """So the newest feedback at a tick is half a period old, as it is on average in life."""
 STEP_MS = 5

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edge_runtime.policy_file import Action
+from edge_runtime.policy import Action
 from edge_runtime.util import UserError
 from trainer.human.congestion import CongestionExpert, CongestionTrigger
 from trainer.human.guide import Driver, Trigger

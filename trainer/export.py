@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from edge_runtime.cli import examples
 from edge_runtime.files import check_writable, write_atomic
-from edge_runtime.policy import policy_id_of
-from edge_runtime.policy_file import (
+from edge_runtime.policy import (
     MANIFEST_KEY,
     SIGNATURE_SUFFIX,
     Manifest,
     Observation,
     encode_manifest,
+    policy_id_of,
 )
 from edge_runtime.tls import read_signing_key
 from edge_runtime.util import UserError

@@ -7,7 +7,7 @@ import shlex
 import pytest
 
 from bridge.tests.harness import LEFT_TURN, TOY
-from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import free_endpoint
 
 ROWS = [
     ("simulate --env phil/Nowhere-v0", "Nowhere"),

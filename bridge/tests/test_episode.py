@@ -19,10 +19,9 @@ from bridge.tests.harness import (
     wait_until_driving,
 )
 from bridge.virtual_link import NO_COMMAND, Decision
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import PEDAL, STEERING, write_policy
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 from edge_runtime.wire import Command, decode_command
 
 

@@ -9,8 +9,7 @@ import time
 import pytest
 
 from bridge.ports import ANY_VEHICLE, SimulatorPort, open_listener
-from edge_runtime.link_probe import free_endpoint
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 from edge_runtime.wire import TOPICS
 
 HEARS_S = 0.3

@@ -33,10 +33,9 @@ from bridge.tests.harness import (
 )
 from bridge.tests.test_inbound import health
 from edge_runtime.config import Config
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 from edge_runtime.util import UserError
 from edge_runtime.wire import FRAMES_BYTES, MAX_PAYLOAD_BYTES, State, decode_state, encode
 

@@ -17,8 +17,8 @@ from bridge.tests.harness import (
     start_edge,
 )
 from edge_runtime.commands import ask
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import make_state, wait_until
+from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import encode
 
 SPEC = "40ms+-5ms,loss=10%,duplicate=10%"

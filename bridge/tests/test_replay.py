@@ -10,8 +10,8 @@ from bridge.messages import Heard
 from bridge.record import RecordingWriter
 from bridge.tests.harness import BridgeProcess, bridge_status, make_command, make_policy, start_edge
 from bridge.tests.test_inbound import health
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import BLACK, WHITE, make_state
+from edge_runtime.transport import free_endpoint
 from edge_runtime.wire import FRAMES_BYTES, encode
 
 EPOCH_NS = 1_700_000_000 * 10**9

@@ -26,7 +26,7 @@ from bridge.tests.harness import (
     wait_until_driving_steadily,
 )
 from edge_runtime.__main__ import main as edge_main
-from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import free_endpoint
 
 RESULT = EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, 0.0, 123)
 

@@ -36,10 +36,9 @@ from bridge.tests.harness import (
     start_edge,
     start_simulate,
 )
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests import ros2_side
 from edge_runtime.tests.harness import make_state, wait_until
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import CARS
 from edge_runtime.vehicles.ros2 import topic_key

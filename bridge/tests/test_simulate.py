@@ -26,8 +26,7 @@ from bridge.tests.harness import (
     wait_until_driving,
     wait_until_driving_steadily,
 )
-from edge_runtime.link_probe import free_endpoint
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 
 CONTRACT_KEYS = {
     *("scenario", "condition", "episodes", "policy_id", "seed", "success_rate", "collision_rate"),

@@ -24,8 +24,8 @@ from bridge.tests.harness import (
     start_edge,
     start_simulate,
 )
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import (
     CONTROL_PERIOD_S,

@@ -26,8 +26,8 @@ from bridge.tests.harness import (
     start_simulate,
 )
 from bridge.tests.toy import ToyEnv
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import make_state, wait_until
+from edge_runtime.transport import free_endpoint
 
 
 def verify(recording):

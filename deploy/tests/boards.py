@@ -20,8 +20,8 @@ import numpy
 from deploy.bundle import NAME, Inputs, Made, build_installer, make_bundle
 from deploy.certs import write_key_pair
 from deploy.installer.verify import Target
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.policies import public_pem, write_policy
+from edge_runtime.transport import free_endpoint
 
 QUICK = ("--settle", "0.2")
 HERE = Target(

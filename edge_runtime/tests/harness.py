@@ -8,17 +8,15 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Sequence
 
-import numpy as np
 import zenoh
 
 from edge_runtime import wire
 from edge_runtime.cli import run_cli
 from edge_runtime.commands import ask
-from edge_runtime.controller import Controller, Received, limit_rows
-from edge_runtime.tests.policies import PEDAL
 from edge_runtime.transport import open_session
 from edge_runtime.wire import Command, Feedback, Health, State
 
@@ -30,17 +28,11 @@ BLACK, WHITE = 0, 255
 def make_state(step: int, **changes: Any) -> State:
     """A valid black state; `changes` replace its fields."""
     fields: Dict[str, Any] = {
-        "session": "simulator-a",
-        "episode": 0,
-        "step": step,
-        "sim_time_s": step * wire.CONTROL_PERIOD_S,
-        "sent_ns": time.time_ns(),
-        "frames": bytes([BLACK]) * wire.FRAMES_BYTES,
-        "speed_mps": 1.0,
-        "final": False,
-    }
-    fields.update(changes)
-    return State(**fields)
+        "session": "simulator-a", "episode": 0, "step": step,
+        "sim_time_s": step * wire.CONTROL_PERIOD_S, "sent_ns": time.time_ns(),
+        "frames": bytes([BLACK]) * wire.FRAMES_BYTES, "speed_mps": 1.0, "final": False,
+    }  # fmt: skip
+    return State(**{**fields, **changes})
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
@@ -102,22 +94,19 @@ class Simulator:
         self.health: List[Health] = []
         self.feedback: List[Feedback] = []
         self._session = open_session(listen=endpoint, mode="router")
-        handlers = {
-            "command": lambda sample: self._keep(sample, wire.decode_command, self.commands.put),
-            "health": lambda sample: self._keep(sample, wire.decode_health, self.health.append),
-            "feedback": lambda sample: self._keep(
-                sample, wire.decode_feedback, self.feedback.append
-            ),
+        kept: Dict[str, Any] = {
+            "command": (wire.decode_command, self.commands.put),
+            "health": (wire.decode_health, self.health.append),
+            "feedback": (wire.decode_feedback, self.feedback.append),
         }
-        self._subscribers = [
-            self._session.declare_subscriber(wire.key(vehicle_id, topic), handler)
-            for topic, handler in handlers.items()
+        self._subscribers: List[Any] = [
+            self._session.declare_subscriber(wire.key(vehicle_id, topic), partial(self._keep, *how))
+            for topic, how in kept.items()
         ]
         self.alive = threading.Event()
+        alive = wire.key(vehicle_id, "alive")
         self._subscribers.append(
-            self._session.liveliness().declare_subscriber(
-                wire.key(vehicle_id, "alive"), self._note_alive, history=True
-            )
+            self._session.liveliness().declare_subscriber(alive, self._note_alive, history=True)
         )
 
     def wait_for_edge(self) -> None:
@@ -150,10 +139,7 @@ class Simulator:
 
     def drain(self) -> List[Command]:
         """All commands that came so far."""
-        found = []
-        while not self.commands.empty():
-            found.append(self.commands.get_nowait())
-        return found
+        return [self.commands.get_nowait() for _ in range(self.commands.qsize())]
 
     def query(self, topic: str) -> Dict[str, Any]:
         """The status or rearm query, as an operator's command asks it."""
@@ -170,28 +156,19 @@ class Simulator:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _keep(self, sample: Any, decode: Callable, keep: Callable) -> None:
+    def _keep(self, decode: Callable, keep: Callable, sample: Any) -> None:
         message = decode(bytes(sample.payload))
         assert not isinstance(message, wire.Rejection), message
         keep(message)
 
     def _note_alive(self, sample: Any) -> None:
-        if str(sample.kind).endswith("PUT"):
-            self.alive.set()
-        else:
-            self.alive.clear()
+        (self.alive.set if str(sample.kind).endswith("PUT") else self.alive.clear)()
 
 
 def run_command(*arguments: str, cwd: Optional[Path] = None) -> subprocess.CompletedProcess:
     """`python -m edge_runtime ARGUMENTS` to its end."""
-    return subprocess.run(
-        [sys.executable, "-m", "edge_runtime", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        cwd=cwd,
-        check=False,
-    )
+    command = [sys.executable, "-m", "edge_runtime", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=cwd, check=False)
 
 
 def exit_status(main: Callable[[List[str]], int], arguments: List[str]) -> int:
@@ -200,25 +177,6 @@ def exit_status(main: Callable[[List[str]], int], arguments: List[str]) -> int:
         return run_cli(main, arguments)
     except SystemExit as end:
         return int(end.code or 0)
-
-
-GOOD = np.array([0.5], np.float32)
-QUICK_NS = 1_000_000
-
-
-def make(needs_rearm=False, actions=(PEDAL,), **options):
-    return Controller(limit_rows(actions, {}), needs_rearm, **options)
-
-
-def answer(controller, step, now_s, output=GOOD, **changes):
-    controller.begin(Received(make_state(step, **changes), now_s, 0), now_s)
-    return controller.finish(output, QUICK_NS, now_s + 0.001)
-
-
-def stop(controller):
-    answer(controller, 0, 0.0)
-    controller.tick(0.3)
-    return controller
 
 
 def render_table(events, states, after):

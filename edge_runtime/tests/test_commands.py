@@ -16,24 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import edge_runtime
-from edge_runtime import log
+from edge_runtime import cli, log
 from edge_runtime.__main__ import main
-from edge_runtime.cli import (
-    ArgumentParser,
-    not_negative,
-    not_negative_number,
-    positive,
-    positive_number,
-    seconds,
-    share,
-    whole_number,
-)
 from edge_runtime.commands import render_status
 from edge_runtime.config import Config, load_config
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import Simulator, exit_status, run_command
 from edge_runtime.tests.policies import write_policy
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 from edge_runtime.util import UserError
 
 
@@ -220,7 +209,7 @@ def test_a_stranger_that_answers_for_the_runtime_is_one_line(answer):
 
 
 def test_help_shows_every_default_that_says_something() -> None:
-    parser = ArgumentParser(prog="x")
+    parser = cli.ArgumentParser(prog="x")
     parser.add_argument("--seed", type=int, default=0, help="of everything")
     parser.add_argument("--rate", default=1.5, help="in Hz")
     parser.add_argument("--out", default=None, help="file")
@@ -303,7 +292,7 @@ def test_a_process_without_stdout_is_no_error():
 
 @given(st.integers(-5, 20), st.integers(-3, 3), st.integers(0, 10))
 def test_a_whole_number_is_taken_within_its_limits_only(value, least, width):
-    kind = whole_number(least, least + width)
+    kind = cli.whole_number(least, least + width)
     if least <= value <= least + width:
         assert kind(str(value)) == value
     else:
@@ -312,25 +301,26 @@ def test_a_whole_number_is_taken_within_its_limits_only(value, least, width):
 
 
 def test_the_limits_themselves_are_taken():
-    assert (positive("1"), not_negative("0"), not_negative(str(2**63 - 1))) == (1, 0, 2**63 - 1)
-    assert (positive_number("1e-9"), not_negative_number("0")) == (1e-9, 0.0)
-    assert (seconds("0.5"), share("1")) == (0.5, 1.0)
+    assert (cli.positive("1"), cli.not_negative("0")) == (1, 0)
+    assert cli.not_negative(str(2**63 - 1)) == 2**63 - 1
+    assert (cli.positive_number("1e-9"), cli.not_negative_number("0")) == (1e-9, 0.0)
+    assert (cli.seconds("0.5"), cli.share("1")) == (0.5, 1.0)
 
 
 @pytest.mark.parametrize(
     ("kind", "text", "line"),
     [
-        (positive, "0", "'0' is not a whole number, at least 1"),
-        (positive, "1.5", "'1.5' is not a whole number, at least 1"),
-        (not_negative, "-1", "'-1' is not a whole number, at least 0"),
-        (not_negative, "many", "'many' is not a whole number, at least 0"),
-        (not_negative, str(2**63), f"'{2**63}' is larger than 2**63 - 1"),
-        (positive_number, "0", "'0' is not a finite number above 0"),
-        (positive_number, "inf", "'inf' is not a finite number above 0"),
-        (not_negative_number, "nan", "'nan' is not a finite number, at least 0"),
-        (seconds, "-0.1", "'-0.1' is not a finite number of seconds, at least 0"),
-        (share, "1.01", "'1.01' is not a share above 0 and at most 1"),
-        (share, "half", "'half' is not a share above 0 and at most 1"),
+        (cli.positive, "0", "'0' is not a whole number, at least 1"),
+        (cli.positive, "1.5", "'1.5' is not a whole number, at least 1"),
+        (cli.not_negative, "-1", "'-1' is not a whole number, at least 0"),
+        (cli.not_negative, "many", "'many' is not a whole number, at least 0"),
+        (cli.not_negative, str(2**63), f"'{2**63}' is larger than 2**63 - 1"),
+        (cli.positive_number, "0", "'0' is not a finite number above 0"),
+        (cli.positive_number, "inf", "'inf' is not a finite number above 0"),
+        (cli.not_negative_number, "nan", "'nan' is not a finite number, at least 0"),
+        (cli.seconds, "-0.1", "'-0.1' is not a finite number of seconds, at least 0"),
+        (cli.share, "1.01", "'1.01' is not a share above 0 and at most 1"),
+        (cli.share, "half", "'half' is not a share above 0 and at most 1"),
     ],
 )
 def test_what_is_wrong_is_said_in_words(kind, text, line):

@@ -7,7 +7,7 @@ looks at the table: a command to drive is held against the facts alone.
 from __future__ import annotations
 
 import math
-from typing import List, Optional
+from typing import Optional
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
-from edge_runtime.controller import ActionLimit, Controller, LimitRow, Order, Received, limit_rows
+from edge_runtime.controller import ActionLimit, Controller, Order, Received, shared_limits
 from edge_runtime.tests.harness import make_state
 from edge_runtime.tests.policies import PEDAL, STEERING
 
@@ -41,8 +41,8 @@ class AnyHistory(RuleBasedStateMachine):
 
     @initialize()
     def start(self) -> None:
-        self.rows: List[LimitRow] = limit_rows([PEDAL, STEERING], SLOW if self.vehicle else {})
-        self.controller = Controller(self.rows, self.vehicle, self.armed_at_start)
+        self.limits = shared_limits([PEDAL, STEERING], SLOW if self.vehicle else {})
+        self.controller = Controller(self.limits, self.vehicle, self.armed_at_start)
         self.now_s = 100.0
         self.step = 0
         self.session = 0
@@ -151,16 +151,16 @@ class AnyHistory(RuleBasedStateMachine):
         elif order.reason == "final_state":  # the vehicle stands, and nothing has gone wrong
             assert self.vehicle
             assert not self._is_stopped()
-            assert order.action[0] == self.rows[0].low
+            assert order.action[0] == self.limits["pedal"].low
             order = order._replace(mode="standby")
         else:
             assert order.mode == "safe_stop"
             assert order.reason
-            assert order.action[0] == self.rows[0].low
+            assert order.action[0] == self.limits["pedal"].low
             if self.stop_s is not None:
                 assert self.now_s - self.stop_s <= T + 1e-4
             self.permitted = self.permitted and self._is_stopped()
-        for value, row in zip(order.action, self.rows):
+        for value, row in zip(order.action, self.limits.values()):
             assert row.low <= value <= row.high
         self.last, self.last_s = order, self.now_s
         self.last_is_final = order.answers.state.final
@@ -173,7 +173,7 @@ class AnyHistory(RuleBasedStateMachine):
         assert self.now_s - order.answers.arrived_s <= SILENT_S
         before = self.last.action if self.last else [0.0, 0.0]
         since_s = self.now_s - self.last_s
-        for value, last, row in zip(order.action, before, self.rows):
+        for value, last, row in zip(order.action, before, self.limits.values()):
             assert math.isfinite(value)
             if row.slew_per_s < math.inf:
                 assert abs(value - last) <= row.slew_per_s * min(since_s, T) + 1e-9

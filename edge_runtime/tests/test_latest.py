@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from collections import Counter
+from typing import Dict, List, Tuple
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,78 +18,60 @@ def reason_of(latest, state, now_s):
     return rejection and rejection.reason
 
 
-def test_in_order_all_are_accepted():
-    latest = LatestState()
-    assert [latest.offer(make_state(step), step * 0.1) for step in range(9)] == [None] * 9
-    assert (latest.accepted, latest.rejected) == (9, {})
+A, B = "simulator-a", "simulator-b"
+DUPLICATE, STALE, FUTURE, FOREIGN = (
+    Reason.DUPLICATE, Reason.STALE, Reason.FUTURE, Reason.FOREIGN_SESSION,
+)  # fmt: skip
+# Of each state that comes: session, episode, step, when, and why it is rejected.
+STORIES: Dict[str, List[Tuple]] = {
+    "in order all are accepted": [(A, 0, step, step * 0.1, None) for step in range(9)],
+    "old and equal states are rejected": [
+        (A, 0, 5, 0.0, None), (A, 0, 5, 0.1, DUPLICATE), (A, 0, 4, 0.1, STALE),
+        (A, 1, 0, 0.2, None), (A, 0, 9, 0.3, STALE),
+    ],
+    "a second simulator waits for silence": [
+        (A, 0, 0, 0.0, None), (B, 0, 0, 0.19, FOREIGN), (A, 0, 1, 0.19, None),
+        (B, 0, 0, 0.3, FOREIGN), (B, 0, 1, 0.39, None), (A, 0, 2, 0.4, FOREIGN),
+    ],
+    "a foreign state does not end the silence": [
+        (A, 0, 0, 0.0, None), (B, 0, 0, 0.1, FOREIGN), (B, 0, 0, TAKEOVER_SILENCE_S, None),
+    ],
+    "a stale message still shows that its simulator is there": [
+        (A, 0, 3, 0.0, None), (A, 0, 3, 0.15, DUPLICATE), (B, 0, 0, 0.25, FOREIGN),
+    ],
+    "a delayed message of an earlier simulator does not go back": [
+        (A, 0, 7, 0.0, None), (B, 0, 0, 1.0, None), (A, 0, 7, 2.0, DUPLICATE), (A, 0, 8, 2.0, None),
+    ],
+    "no state from further ahead than a simulator can be, and none of them counts": [
+        (A, 2, 5, 10.0, None), (A, 2, 10_006, 10.0, FUTURE), (A, 3, 10_001, 10.0, FUTURE),
+        (A, 13, 0, 10.0, FUTURE), (A, 2, 6, 10.0, None), (A, 2, 10_006, 10.0, None),
+        (A, 12, 10_000, 10.0, None),
+    ],
+    "after an outage a simulator may be far ahead": [
+        (A, 0, 0, 0.0, None), (A, 0, 20_001, 100.0, FUTURE), (A, 0, 20_000, 100.0, None),
+        (A, 31, 0, 120.0, FUTURE), (A, 30, 0, 120.0, None),
+    ],
+    "the first state of a session may stand anywhere": [(A, 10**9, 10**12, 0.0, None)],
+    "sixteen past sessions may come back with newer states": [
+        *((f"s{number}", 0, 0, number * 1.0, None) for number in range(17)),
+        ("s1", 0, 0, 20.0, DUPLICATE), ("s1", 0, 1, 21.0, None),
+    ],
+    "a session that is heard again is remembered longest": [
+        *((f"s{number}", 0, 0, number * 1.0, None) for number in range(16)),
+        ("s0", 0, 1, 16.0, None), ("new", 0, 0, 17.0, None), ("s0", 0, 1, 18.0, DUPLICATE),
+        ("s0", 0, 2, 19.0, None), ("s1", 0, 2, 20.0, STALE),
+    ],
+}  # fmt: skip
 
 
-def test_old_and_equal_states_are_rejected_and_counted():
-    latest = LatestState()
-    latest.offer(make_state(5), 0.0)
-    assert reason_of(latest, make_state(5), 0.1) is Reason.DUPLICATE
-    assert reason_of(latest, make_state(4), 0.1) is Reason.STALE
-    assert reason_of(latest, make_state(0, episode=1), 0.2) is None
-    assert reason_of(latest, make_state(9), 0.3) is Reason.STALE
-    assert latest.rejected == {"duplicate": 1, "stale": 2}
-
-
-def test_a_second_simulator_waits_for_silence():
-    latest = LatestState()
-    other = "simulator-b"
-    latest.offer(make_state(0), 0.0)
-    assert reason_of(latest, make_state(0, session=other), 0.19) is Reason.FOREIGN_SESSION
-    latest.offer(make_state(1), 0.19)
-    assert reason_of(latest, make_state(0, session=other), 0.3) is Reason.FOREIGN_SESSION
-    assert reason_of(latest, make_state(1, session=other), 0.39) is None
-    assert reason_of(latest, make_state(2), 0.4) is Reason.FOREIGN_SESSION
-
-
-def test_a_foreign_state_does_not_end_the_silence():
-    latest = LatestState()
-    latest.offer(make_state(0), 0.0)
-    for tenth in range(1, 2):
-        latest.offer(make_state(0, session="simulator-b"), tenth / 10)
-    assert latest.offer(make_state(0, session="simulator-b"), TAKEOVER_SILENCE_S) is None
-
-
-def test_a_stale_message_still_shows_that_its_simulator_is_there():
-    latest = LatestState()
-    latest.offer(make_state(3), 0.0)
-    latest.offer(make_state(3), 0.15)
-    assert reason_of(latest, make_state(0, session="b"), 0.25) is Reason.FOREIGN_SESSION
-
-
-def test_a_delayed_message_of_an_earlier_simulator_does_not_go_back():
-    latest = LatestState()
-    latest.offer(make_state(7), 0.0)
-    latest.offer(make_state(0, session="b"), 1.0)
-    assert reason_of(latest, make_state(7), 2.0) is Reason.DUPLICATE
-    assert reason_of(latest, make_state(8), 2.0) is None
-
-
-def test_no_state_from_further_ahead_than_a_simulator_can_be():
-    latest = LatestState()
-    latest.offer(make_state(5, episode=2), 10.0)
-    for state in (make_state(10_006, episode=2), make_state(10_001, episode=3)):
-        assert reason_of(latest, state, 10.0) is Reason.FUTURE
-    assert reason_of(latest, make_state(0, episode=13), 10.0) is Reason.FUTURE
-    assert reason_of(latest, make_state(6, episode=2), 10.0) is None  # and none of them counts
-    assert reason_of(latest, make_state(10_006, episode=2), 10.0) is None
-    assert reason_of(latest, make_state(10_000, episode=12), 10.0) is None
-
-
-def test_after_an_outage_a_simulator_may_be_far_ahead():
-    latest = LatestState()
-    latest.offer(make_state(0), 0.0)
-    assert reason_of(latest, make_state(20_001), 100.0) is Reason.FUTURE
-    assert reason_of(latest, make_state(20_000), 100.0) is None
-    assert reason_of(latest, make_state(0, episode=31), 120.0) is Reason.FUTURE
-    assert reason_of(latest, make_state(0, episode=30), 120.0) is None
-
-
-def test_the_first_state_of_a_session_may_stand_anywhere():
-    assert LatestState().offer(make_state(10**12, episode=10**9), 0.0) is None
+@pytest.mark.parametrize("story", STORIES)
+def test_which_states_are_accepted(story):
+    latest, reasons = LatestState(), [reason for *_, reason in STORIES[story]]
+    for session, episode, step, now_s, reason in STORIES[story]:
+        state = make_state(step, session=session, episode=episode)
+        assert reason_of(latest, state, now_s) is reason, (session, episode, step)
+    assert latest.accepted == reasons.count(None)
+    assert latest.rejected == Counter(reason.value for reason in reasons if reason)
 
 
 def test_a_rejection_says_both_places():
@@ -95,25 +80,6 @@ def test_a_rejection_says_both_places():
     rejection = latest.offer(make_state(3, episode=1), 0.1)
     assert rejection is not None
     assert rejection.detail == "episode 1 step 3 after episode 1 step 7"
-
-
-def test_sixteen_past_sessions_may_come_back_with_newer_states():
-    latest = LatestState()
-    for number in range(17):
-        assert latest.offer(make_state(0, session=f"s{number}"), number * 1.0) is None
-    assert reason_of(latest, make_state(0, session="s1"), 20.0) is Reason.DUPLICATE
-    assert reason_of(latest, make_state(1, session="s1"), 21.0) is None
-
-
-def test_a_session_that_is_heard_again_is_remembered_longest():
-    latest = LatestState()
-    for number in range(16):
-        latest.offer(make_state(0, session=f"s{number}"), number * 1.0)
-    latest.offer(make_state(1, session="s0"), 16.0)
-    latest.offer(make_state(0, session="new"), 17.0)
-    assert reason_of(latest, make_state(1, session="s0"), 18.0) is Reason.DUPLICATE
-    assert reason_of(latest, make_state(2, session="s0"), 19.0) is None
-    assert reason_of(latest, make_state(2, session="s1"), 20.0) is Reason.STALE
 
 
 @pytest.mark.parametrize("take_overs", [17, 100, 2000])
@@ -135,10 +101,8 @@ def test_too_many_sessions_end_in_no_new_one_rather_than_in_an_old_one(monkeypat
         assert latest.offer(make_state(0, session=f"s{number}"), number * 1.0) is None
     rejection = latest.offer(make_state(0, session="s19"), 30.0)
     assert rejection is not None
-    assert (rejection.reason, "start the runtime again" in rejection.detail) == (
-        Reason.FOREIGN_SESSION,
-        True,
-    )
+    assert rejection.reason is FOREIGN
+    assert "start the runtime again" in rejection.detail
     assert reason_of(latest, make_state(1, session="s18"), 31.0) is None  # it goes on
     assert reason_of(latest, make_state(0, session="s0"), 32.0) is Reason.STALE
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 from types import SimpleNamespace
 from typing import Any, List
 
@@ -13,9 +14,8 @@ import pytest
 from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
-from edge_runtime.link_probe import free_endpoint, why_no_link
 from edge_runtime.run import Waiting
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, look, open_session
 from edge_runtime.util import UserError
 from edge_runtime.wire import Health
 
@@ -123,8 +123,8 @@ def test_nobody_there_is_nobody_else():
     presence.look()
     presence.look()
     assert presence.rivals == 0
-    assert not require_free(fail, "k", "hunter01")
-    assert require_free(Router().open, "k", "hunter01")
+    assert not require_free(fail, "hunter01")
+    assert require_free(Router().open, "hunter01")
 
 
 def make_link(session: Any) -> Link:
@@ -132,12 +132,12 @@ def make_link(session: Any) -> Link:
     return Link(session, "hunter01", manifest)
 
 
-def test_a_muted_link_sends_nothing():
+def test_a_link_that_gave_way_sends_nothing():
     session = FakeSession()
     link = make_link(session)
     link.send("health", HEALTH)
     assert session.sent == 1
-    link.mute()
+    link.gave_way = True
     link.send("health", HEALTH)
     assert session.sent == 1
 
@@ -173,7 +173,7 @@ def test_the_session_is_closed_even_where_nothing_can_be_undeclared():
 
 
 def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
-    session = FakeSession()
+    session, stop = FakeSession(), None
     policy = SimpleNamespace(manifest=SimpleNamespace(action=[], task=""))
 
     def fail(*_: Any) -> None:
@@ -183,7 +183,7 @@ def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
     monkeypatch.setattr(run, "open_session", lambda **_: session)
     monkeypatch.setattr(run, "Link", fail)
     with pytest.raises(OSError, match="no link"):
-        run._Runtime(Config())
+        run._drive(Config(), stop)  # type: ignore[arg-type]
     assert session.events == ["close"] * 2  # the one that asked for other runtimes, and its own
 
 
@@ -205,11 +205,10 @@ def server(answer):
 
 
 def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
-    assert "host 'no-such-host.invalid' cannot be" in why_no_link(
-        "tcp/no-such-host.invalid:1", None
-    )
-    assert "host 'a..b' cannot be resolved" in why_no_link("tcp/a..b:7447", None)
-    assert "host 'a..b' cannot be resolved" in why_no_link("udp/a..b:7447", None)
+    for endpoint in ("tcp/no-such-host.invalid:1", "tcp/a..b:7447", "udp/a..b:7447"):
+        answers, why = look(endpoint, None)
+        assert not answers
+        assert f"host '{endpoint[4:].split(':')[0]}' cannot be resolved" in why
     with pytest.raises(UserError, match=r"host 'a\.\.b' of endpoint .* cannot be resolved"):
         open_session(listen="tcp/a..b:7447", mode="router")
 
@@ -217,17 +216,16 @@ def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
 def test_a_port_where_nobody_listens():
     endpoint = free_endpoint()
     port = endpoint.rsplit(":", 1)[1]
-    assert why_no_link(endpoint, None) == (
-        f"nobody listens on port {port} of 127.0.0.1 (connection refused)"
-    )
+    words = f"nobody listens on port {port} of 127.0.0.1 (connection refused)"
+    assert look(endpoint, None) == (False, words)
 
 
 def test_a_server_that_speaks_tls_and_one_that_speaks_something_else():
     alert = b"\x15\x03\x03\x00\x02\x02\x28"  # TLS 1.2, fatal, handshake failure
     with server(alert) as endpoint:
-        assert "listens with TLS and wants --tls" in why_no_link(endpoint, None)
+        assert "listens with TLS and wants --tls" in look(endpoint, None)[1]
     with server(b"SSH-2.0-OpenSSH_9.6\r\n") as endpoint:
-        assert "answers, but not as a simulator" in why_no_link(endpoint, None)
+        assert "answers, but not as a simulator" in look(endpoint, None)[1]
 
 
 def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(monkeypatch):
@@ -262,6 +260,7 @@ def test_one_that_is_linked_has_time_for_its_first_state(monkeypatch):
     said = threading.Event()
     monkeypatch.setattr(log, "event", lambda *_, **fields: said.set())
     one = Waiting(lambda: False, lambda: "why")
-    one.start(is_linked=True)
+    one.next_s = time.monotonic() + 5.0
+    one.start()
     assert not said.wait(0.3)
-    one.stop()
+    one.ended.set()

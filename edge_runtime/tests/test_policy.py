@@ -1,28 +1,30 @@
+"""Which policies may drive; and no byte of one, nor of its signature, can change: all are tried."""
+
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import random
 import re
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
-from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from onnx import helper
+from onnx import TensorProto, helper
 
-import edge_runtime
-from edge_runtime import policy_file
-from edge_runtime.policy import infer, load_policy
-from edge_runtime.policy_file import task_text
+from edge_runtime import policy as module
+from edge_runtime.policy import MANIFEST_KEY, infer, load_policy, read_onnx, verify
+from edge_runtime.tests.harness import run_command
 from edge_runtime.tests.policies import PEDAL, STEERING, public_pem, write_policy
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_TEXT_CHARS
 
-KEY = Ed25519PrivateKey.generate()
+POLICIES = Path(module.__file__).parents[1] / "results" / "policies"
 
 
 def action(name, low=-1.0, high=1.0):
@@ -38,7 +40,7 @@ def refused(path, match, **options):
 def test_a_signed_policy_drives(make_policy):
     signed = make_policy("mean")
     policy = load_policy(signed.path, signed.public_key)
-    assert policy.trust == policy_file.VERIFIED
+    assert policy.trust == module.VERIFIED
     assert policy.policy_id == signed.policy_id
     for level in (0, 51, 255):
         action = policy.act(np.full((2, 45, 80), level, np.uint8))
@@ -55,7 +57,7 @@ def test_an_answer_of_another_shape_than_one_row_of_actions_is_none(tmp_path, sh
     white = np.full((2, 45, 80), 255, np.uint8)
     with pytest.raises(UserError, match=re.escape(f"float32 {list(shape)}")):
         policy.act(white)
-    assert infer(policy, white).output is None
+    assert infer(policy, white)[0] is None
 
 
 def test_two_files_that_act_differently_never_share_an_id(tmp_path):
@@ -75,11 +77,10 @@ def test_two_files_that_act_differently_never_share_an_id(tmp_path):
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 def test_a_policy_from_before_with_an_id_in_its_manifest_still_drives(scenario):
-    root = Path(edge_runtime.__file__).parents[1] / "results" / "policies"
-    path = root / f"{scenario}.onnx"
+    path = POLICIES / f"{scenario}.onnx"
     assert b'"policy_id":' in path.read_bytes()
-    policy = load_policy(path, root / "policy.pub")
-    assert policy.trust == policy_file.VERIFIED
+    policy = load_policy(path, POLICIES / "policy.pub")
+    assert policy.trust == module.VERIFIED
     assert policy.policy_id == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -87,7 +88,7 @@ def test_the_task_is_scenario_and_actions_and_fits_the_wire(tmp_path):
     write_policy(tmp_path / "p.onnx", value=0.1, actions=(PEDAL, action("steering", -0.5, 0.25)))
     manifest = load_policy(tmp_path / "p.onnx", allow_unsigned=True).manifest
     assert manifest.task == "left_turn, pedal -1 to 1, steering -0.5 to 0.25"
-    assert len(task_text("s" * 300, [])) == MAX_TEXT_CHARS
+    assert len(module.task_text("s" * 300, [])) == MAX_TEXT_CHARS
 
 
 def test_two_actions(tmp_path):
@@ -133,11 +134,7 @@ def test_a_key_that_is_none_is_refused(make_policy, tmp_path):
     key = tmp_path / "bad.pub"
     key.write_bytes(b"not a key")
     refused(signed.path, "not a PEM public key", public_key=key)
-    key.write_bytes(
-        X25519PrivateKey.generate()
-        .public_key()
-        .public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
-    )
+    key.write_bytes(public_pem(X25519PrivateKey.generate()))
     refused(signed.path, "not an Ed25519 key", public_key=key)
     refused(signed.path, "does not exist", public_key=tmp_path / "absent.pub")
 
@@ -146,10 +143,10 @@ def test_trust_without_a_key_or_signature(make_policy, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     signed = make_policy()
     refused(signed.path, "no public key")
-    assert load_policy(signed.path, allow_unsigned=True).trust == policy_file.UNVERIFIED
+    assert load_policy(signed.path, allow_unsigned=True).trust == module.UNVERIFIED
     write_policy(tmp_path / "plain.onnx")
     refused(tmp_path / "plain.onnx", "not signed")
-    assert load_policy(tmp_path / "plain.onnx", allow_unsigned=True).trust == policy_file.UNSIGNED
+    assert load_policy(tmp_path / "plain.onnx", allow_unsigned=True).trust == module.UNSIGNED
 
 
 def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path, monkeypatch):
@@ -157,7 +154,7 @@ def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path,
     signed = make_policy()
     (tmp_path / "keys").mkdir()
     signed.public_key.rename(tmp_path / "keys" / "policy.pub")
-    assert load_policy(signed.path).trust == policy_file.VERIFIED
+    assert load_policy(signed.path).trust == module.VERIFIED
 
 
 def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
@@ -171,8 +168,8 @@ def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
     signed = make_policy()
     refused(signed.path, f"public key {mine}: .* --public-key", allow_unsigned=True)
     beside = signed.public_key.rename(tmp_path / "policy.pub")
-    assert load_policy(signed.path, allow_unsigned=True).trust == policy_file.BESIDE
-    assert load_policy(signed.path, beside).trust == policy_file.VERIFIED
+    assert load_policy(signed.path, allow_unsigned=True).trust == module.BESIDE
+    assert load_policy(signed.path, beside).trust == module.VERIFIED
     for options in ({}, {"public_key": mine, "allow_unsigned": True}):
         refused(signed.path, f"public key {mine}: .* --public-key", **options)
     mine.unlink()
@@ -243,8 +240,249 @@ def test_what_onnxruntime_prints_stays_off_stdout(tmp_path, monkeypatch, capfd):
 def test_foreign_files_are_refused(tmp_path, content):
     (tmp_path / "p.onnx").write_bytes(content)
     refused(tmp_path / "p.onnx", "not a whole ONNX file", allow_unsigned=True)
-
-
-def test_absent_files_and_directories_are_refused(tmp_path):
     refused(tmp_path / "absent.onnx", "does not exist")
     refused(tmp_path, "is a directory")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("policy") / "slow.onnx"
+    write_policy(path, "slow")
+    return path
+
+
+def test_it_reads_what_the_onnx_package_wrote(written):
+    ir_version, opset, metadata = read_onnx(written.read_bytes())
+    assert (ir_version, opset) == (8, 17)
+    assert module.decode_manifest(metadata[MANIFEST_KEY]).scenario == "left_turn"
+
+
+def refused_or_without_manifest(data: bytes) -> bool:
+    try:
+        return MANIFEST_KEY not in read_onnx(data)[2]
+    except UserError:
+        return True
+
+
+def test_every_truncation_is_refused(written):
+    """A cut between two fields can leave a whole model, but then the manifest is gone."""
+    data = written.read_bytes()
+    assert not refused_or_without_manifest(data)
+    for length in range(len(data)):
+        assert refused_or_without_manifest(data[:length]), length
+
+
+@given(st.binary(max_size=200))
+def test_foreign_bytes_raise_only_user_errors(data):
+    assert refused_or_without_manifest(data)
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_damaged_bytes_raise_only_user_errors(written, data):
+    damaged = bytearray(written.read_bytes())
+    damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
+    with contextlib.suppress(UserError):
+        read_onnx(bytes(damaged))
+
+
+def outside(tensor):
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="../elsewhere.bin")
+    return tensor
+
+
+def weight():
+    return helper.make_tensor("w", TensorProto.FLOAT, [1], [1.0])
+
+
+def sparse_weight():
+    return helper.make_sparse_tensor(
+        outside(helper.make_tensor("w", TensorProto.FLOAT, [1], [1.0])),
+        helper.make_tensor("places", TensorProto.INT64, [1], [0]),
+        [2],
+    )
+
+
+def loop_body(model):
+    """The graph that stands inside of another one's attribute."""
+    (loop,) = (node for node in model.graph.node if node.op_type == "Loop")
+    return loop.attribute[0].g
+
+
+def constant(**value):
+    return helper.make_node("Constant", [], ["c"], **value)
+
+
+HIDDEN = {
+    "in an initializer": (lambda m: outside(m.graph.initializer[0]), "another file"),
+    "in an initializer that says so and names no file": (
+        lambda m: setattr(m.graph.initializer[0], "data_location", TensorProto.EXTERNAL),
+        "another file",
+    ),
+    "in a constant": (
+        lambda m: m.graph.node.append(constant(value=outside(weight()))), "another file",
+    ),
+    "in a nested graph": (
+        lambda m: loop_body(m).initializer.append(outside(weight())), "another file",
+    ),
+    "in a constant of a nested graph": (
+        lambda m: loop_body(m).node.append(constant(value=outside(weight()))), "another file",
+    ),
+    "in a sparse initializer": (
+        lambda m: m.graph.sparse_initializer.append(sparse_weight()), "sparse weights",
+    ),
+    "in a sparse initializer of a nested graph": (
+        lambda m: loop_body(m).sparse_initializer.append(sparse_weight()), "sparse weights",
+    ),
+    "in a sparse constant": (
+        lambda m: m.graph.node.append(constant(sparse_value=sparse_weight())), "sparse weights",
+    ),
+    "in a list of sparse tensors": (
+        lambda m: m.graph.node.append(constant(values=[sparse_weight()])), "sparse weights",
+    ),
+    "in a function of the model": (
+        lambda m: m.functions.append(
+            helper.make_function(
+                "mine", "f", [], ["c"], [constant(value=outside(weight()))],
+                [helper.make_opsetid("", 17)],
+            )
+        ),
+        "functions of its own",
+    ),
+    "in a graph for training": (
+        lambda m: m.training_info.add().algorithm.initializer.append(outside(weight())),
+        "graphs for training",
+    ),
+    "nowhere, in a model that names no operator set": (
+        lambda m: m.ClearField("opset_import"), "names no operator set",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("place", HIDDEN)
+def test_weights_that_may_lie_outside_the_file_are_refused(written, place):
+    hide, what = HIDDEN[place]
+    model = onnx.load(str(written))
+    hide(model)
+    with pytest.raises(UserError, match=what):
+        read_onnx(model.SerializeToString())
+
+
+def test_weights_that_say_they_are_inside_are_read(written):
+    model = onnx.load(str(written))
+    model.graph.initializer[0].data_location = TensorProto.DEFAULT
+    assert read_onnx(model.SerializeToString())[1] == 17
+
+
+def varint(number: int) -> bytes:
+    out = b""
+    while number > 127:
+        out += bytes([number & 127 | 128])
+        number >>= 7
+    return out + bytes([number])
+
+
+@pytest.mark.parametrize(
+    ("added", "what"),
+    [
+        # Protobuf takes 32 bits of a tag: there this is field 25, the model's functions.
+        (varint((1 << 32) + (25 << 3) + 2) + b"\0", "unknown field"),
+        (b"\x38\x01", "a number where bytes were expected"),  # field 7, the graph
+        (None, "2 graphs"),  # the file once more: a protobuf library merges them into one
+    ],
+)
+def test_what_protobuf_would_read_in_another_way_is_refused(written, added, what):
+    data = written.read_bytes()
+    with pytest.raises(UserError, match=what):
+        read_onnx(data + (data if added is None else added))
+
+
+def test_endless_nesting_ends():
+    data = b""
+    for _ in range(300):
+        data = b"\x0a" + varint(len(data)) + data  # graph.node
+    assert refused_or_without_manifest(b"\x08\x08\x3a" + varint(len(data)) + data)
+
+
+GROUP_ORDER = 2**252 + 27742317777372353535851937790883648493  # of Ed25519, RFC 8032
+
+
+@pytest.fixture
+def signed(tmp_path):
+    """A small policy's bytes, its signature and the public key."""
+    key = Ed25519PrivateKey.generate()
+    path = tmp_path / "p.onnx"
+    write_policy(path, key=key)
+    return path.read_bytes(), Path(f"{path}.sig").read_bytes(), public_pem(key)
+
+
+def is_accepted(policy, signature, public_key):
+    try:
+        verify(policy, signature, public_key)
+    except UserError:
+        return False
+    return True
+
+
+def changed(data, place, flip):
+    return data[:place] + bytes([data[place] ^ flip]) + data[place + 1 :]
+
+
+def test_every_byte_of_a_small_policy_counts(signed):
+    data, signature, public_key = signed
+    assert is_accepted(data, signature, public_key)
+    draw = random.Random(1)
+    for place in range(len(data)):
+        flip = draw.randint(1, 255)
+        assert not is_accepted(changed(data, place, flip), signature, public_key), (place, flip)
+
+
+def test_every_bit_of_the_signature_counts(signed):
+    data, signature, public_key = signed
+    for place in range(len(signature)):
+        for bit in range(8):
+            assert not is_accepted(data, changed(signature, place, 1 << bit), public_key), place
+
+
+def test_a_second_form_of_the_same_signature_is_refused(signed):
+    """S plus the group's order solves the same equation; it must not pass as another file."""
+    data, signature, public_key = signed
+    number = int.from_bytes(signature[32:], "little") + GROUP_ORDER
+    assert not is_accepted(data, signature[:32] + number.to_bytes(32, "little"), public_key)
+
+
+def test_bytes_more_less_or_elsewhere_are_refused(signed):
+    data, signature, public_key = signed
+    half = len(data) // 2
+    for other in (b"", data[:-1], data[1:], data + b"\0", b"\0" + data, data[half:] + data[:half]):
+        assert not is_accepted(other, signature, public_key)
+
+
+def test_the_kept_policy_in_all_its_regions():
+    """Two megabytes: every byte at both ends (header, manifest), the weights in between drawn."""
+    data = (POLICIES / "left_turn.onnx").read_bytes()
+    signature = (POLICIES / "left_turn.onnx.sig").read_bytes()
+    public_key = (POLICIES / "policy.pub").read_bytes()
+    assert is_accepted(data, signature, public_key)
+    draw = random.Random(2)
+    stride = len(data) // 50
+    places = {*range(40), *range(len(data) - 40, len(data))}
+    places |= {start + draw.randrange(stride) for start in range(0, len(data) - stride, stride)}
+    for place in sorted(places):
+        assert not is_accepted(changed(data, place, 1 << draw.randrange(8)), signature, public_key)
+
+
+@pytest.mark.parametrize("region", ["graph", "manifest", "signature"])
+def test_the_check_command_refuses_it(make_policy, region):
+    signed = make_policy()
+    path = Path(f"{signed.path}.sig") if region == "signature" else signed.path
+    data = path.read_bytes()
+    place = {"graph": 12, "manifest": data.find(b"algorithm"), "signature": 40}[region]
+    assert place >= 0
+    path.write_bytes(changed(data, place, 1))
+    result = run_command("check", str(signed.path), "--public-key", str(signed.public_key))
+    assert (result.returncode, result.stdout) == (2, "")
+    assert "the file was changed" in result.stderr
+    assert result.stderr.count("\n") == 1

@@ -17,10 +17,9 @@ import zenoh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests import ros2_side as second
 from edge_runtime.tests.harness import wait_until
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, open_session
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import ros2
 from edge_runtime.vehicles.ros2 import node as ros

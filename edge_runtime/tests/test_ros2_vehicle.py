@@ -11,7 +11,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from edge_runtime.config import Config, Ros2Settings, load_config
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import (
     PATIENCE_S,
     EdgeProcess,
@@ -23,6 +22,7 @@ from edge_runtime.tests.harness import (
 from edge_runtime.tests.policies import write_policy
 from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, PEDAL, SPEC, STREAM_S, Ros2Rig
 from edge_runtime.tests.ros2_side import ODOMETRY, RosHunter, serialize
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.vehicles import vehicle_limits
 from edge_runtime.vehicles.core import Event, State

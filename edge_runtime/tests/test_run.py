@@ -11,7 +11,6 @@ import pytest
 
 from edge_runtime.commands import ask
 from edge_runtime.files import Hold
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import (
     BLACK,
     PATIENCE_S,
@@ -22,6 +21,7 @@ from edge_runtime.tests.harness import (
     run_command,
     wait_until,
 )
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
 
@@ -317,14 +317,9 @@ def test_of_two_runtimes_that_meet_later_the_younger_gives_way(make_policy):
         assert left.end() == 0
 
 
-def test_it_waits_for_a_simulator_and_ends_without_one(make_policy):
-    with EdgeProcess(*make_policy().flags, "--connect", free_endpoint()) as edge:
-        assert edge.ready_line.startswith("ready ")
-        assert edge.end() == 0
-
-
-def test_it_says_at_once_and_again_what_it_waits_for(make_policy):
+def test_it_says_at_once_and_again_what_it_waits_for_and_ends_without_a_simulator(make_policy):
     with EdgeProcess(*make_policy().flags, "--connect", "tcp/127.0.0.1:1") as edge:
+        assert edge.ready_line.startswith("ready ")
         assert edge.process.stderr is not None
         waits = (line for line in edge.process.stderr if " waiting " in line)
         begun_s = time.monotonic()
@@ -354,14 +349,11 @@ def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
             time.sleep(3 * CONTROL_PERIOD_S)
 
 
-def test_without_a_lock_nothing_is_held(tmp_path):
+def test_without_a_lock_nothing_is_held_but_what_cannot_be_read_is_not_taken_for_free(tmp_path):
     file = tmp_path / "hold"
     assert not Hold(str(file)).is_on()
     file.touch()
     assert not Hold(str(file)).is_on()
-
-
-def test_one_that_cannot_be_read_is_not_taken_for_free(tmp_path):
     with pytest.raises(UserError, match="cannot be read: Is a directory"):
         Hold(str(tmp_path))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
 import os
@@ -16,15 +17,15 @@ from typing import Any, List
 import numpy as np
 import pytest
 
-from edge_runtime import log, loop, realtime
-from edge_runtime.controller import Controller, limit_rows
-from edge_runtime.link_probe import free_endpoint
+from edge_runtime import log, loop, service
+from edge_runtime.controller import Controller, shared_limits
 from edge_runtime.log import Flood
 from edge_runtime.loop import ControlLoop
 from edge_runtime.service import Notifier, look
 from edge_runtime.tests.harness import EdgeProcess, make_state, wait_until
 from edge_runtime.tests.policies import PEDAL
 from edge_runtime.tests.test_vehicle_base import BrokenVehicle
+from edge_runtime.transport import free_endpoint
 from edge_runtime.vehicles.base import VehicleRunner
 from edge_runtime.wire import encode
 
@@ -57,11 +58,11 @@ def test_what_the_system_refuses_is_named_and_the_rest_applied(monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: asked.update(cpus=cpus))
-    monkeypatch.setattr(realtime, "_lock_memory", lambda _: asked.update(locked=True))
-    assert realtime.configure(50, [1], True) == ["realtime_priority"]
+    monkeypatch.setattr(service, "_lock_memory", lambda _: asked.update(locked=True))
+    assert service.claim_resources(50, [1], True) == ["realtime_priority"]
     assert asked == {"cpus": [1], "locked": True}
-    assert realtime.configure(0, [1, 7], False) == ["cpus"]
-    assert realtime.configure(0, [], False) == []
+    assert service.claim_resources(0, [1, 7], False) == ["cpus"]
+    assert service.claim_resources(0, [], False) == []
 
 
 def test_lines_as_text_and_the_fields_of_json(capfd):
@@ -92,12 +93,16 @@ def test_a_reader_of_the_log_that_stands_still_holds_nobody(monkeypatch):
 class Systemd:
     """The other end of NOTIFY_SOCKET."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.socket.bind(address)
-        self.socket.settimeout(10.0)
+        self.socket.bind(name.replace("@", "\0"))
 
-    def next(self) -> str:
+    def notifier(self) -> Notifier:
+        return Notifier({"NOTIFY_SOCKET": self.name, "WATCHDOG_USEC": "100000"})
+
+    def next(self, wait_s: float = 10.0) -> str:
+        self.socket.settimeout(wait_s)
         return self.socket.recv(4096).decode()
 
     def until(self, start: str) -> List[str]:
@@ -107,32 +112,20 @@ class Systemd:
             found.append(self.next())
         return found
 
-    def count(self, wait_s: float) -> int:
-        """How many messages come within this time."""
-        while self._take(0.0):
-            pass
-        count = 0
-        while self._take(wait_s):
-            count += 1
-        return count
-
-    def _take(self, wait_s: float) -> bool:
-        self.socket.settimeout(wait_s or 0.001)
-        try:
-            self.socket.recv(4096)
-        except socket.timeout:
-            return False
-        finally:
-            self.socket.settimeout(10.0)
+    def is_told_nothing(self, wait_s: float) -> bool:
+        """Whether nothing more comes within this time."""
+        with contextlib.suppress(socket.timeout):
+            while True:
+                self.next(0.001)
+        with contextlib.suppress(socket.timeout):
+            return not self.next(wait_s)
         return True
 
 
 @pytest.fixture
 def systemd():
     """Listens at an abstract address, which Linux frees by itself."""
-    name = f"phil-test-{os.getpid()}"
-    end = Systemd(f"\0{name}")
-    end.name = f"@{name}"  # type: ignore[attr-defined]
+    end = Systemd(f"@phil-test-{os.getpid()}")
     yield end
     end.socket.close()
 
@@ -147,7 +140,7 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
         assert systemd.next() == "READY=1\nSTATUS=standby"
         assert [systemd.next() for _ in range(3)] == ["WATCHDOG=1"] * 3
         edge.process.send_signal(signal.SIGSTOP)
-        assert systemd.count(0.6) == 0
+        assert systemd.is_told_nothing(0.6)
         edge.process.send_signal(signal.SIGCONT)
         assert systemd.next() == "WATCHDOG=1"
         edge.process.terminate()
@@ -204,7 +197,7 @@ def running():
     def start(notifier: Any, vehicle: Any = None) -> Any:
         policy: Any = FakePolicy()
         link: Any = FakeLink()
-        controller = Controller(limit_rows([PEDAL], {}), needs_rearm=False)
+        controller = Controller(shared_limits([PEDAL], {}), needs_rearm=False)
         control = ControlLoop(policy, controller, link, vehicle, notifier)
         control.start()
         main = threading.Thread(target=control.run)
@@ -222,28 +215,26 @@ def running():
 
 def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch):
     monkeypatch.setattr(loop, "_HUNG_S", 0.2)
-    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
-    _, link, policy = running(notifier)
+    _, link, policy = running(systemd.notifier())
     assert systemd.next() == "WATCHDOG=1"
     policy.free.clear()
     link.state_comes(encode(make_state(0)))
     assert systemd.until("STATUS")[-1] == "STATUS=safe_stop inference_too_long"
     before = link.sent["command"]
-    wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message for a while")
+    wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message for a while")
     assert link.sent["command"] > before  # the safe stops go on
     policy.free.set()
     assert systemd.next() == "WATCHDOG=1"
 
 
 def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running, systemd):
-    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
-    control, link, policy = running(notifier)
+    control, link, policy = running(systemd.notifier())
     link.state_comes(encode(make_state(0)))
     assert systemd.until("STATUS")[-1] == "STATUS=drive"
     policy.act = lambda frames: sys.exit("no exception that inference catches")
     link.state_comes(encode(make_state(1)))
     assert systemd.until("STATUS")[-1] == "STATUS=safe_stop policy_thread_dead"
-    wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message any more")
+    wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message any more")
     before = link.sent["command"]
     for step in range(2, 8):  # a simulator that lives on changes nothing
         link.state_comes(encode(make_state(step)))
@@ -260,13 +251,12 @@ def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     monkeypatch.setattr(loop, "_HUNG_S", 0.2)
     vehicle = BrokenVehicle()
     runner = VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
-    notifier = Notifier({"NOTIFY_SOCKET": systemd.name, "WATCHDOG_USEC": "100000"})
-    running(notifier, runner)
+    running(systemd.notifier(), runner)
     runner.start()
     try:
         assert systemd.next() == "WATCHDOG=1"
         vehicle.broken = "hang"
-        wait_until(lambda: systemd.count(0.3) == 0, "no watchdog message for a while")
+        wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message for a while")
         vehicle.broken = ""
         vehicle.released.set()
         assert systemd.until("WATCHDOG")[-1] == "WATCHDOG=1"
@@ -311,17 +301,9 @@ def test_a_hundred_thousand_states_leave_the_memory_as_it_is(running):
     assert health.superseded > 0
 
 
-def test_without_systemd_nothing_is_said():
-    for environment in ({}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2"}):
-        notifier = Notifier(environment)
-        notifier.tell("READY=1")
-        assert notifier.watchdog_period_s is None
-
-
 def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
-    path = tmp_path / "notify"
-    end = Systemd(str(path))
-    notifier = Notifier({"NOTIFY_SOCKET": str(path)})
+    end = Systemd(str(tmp_path / "notify"))
+    notifier = end.notifier()
     for _ in range(2000):  # more than the socket takes
         notifier.tell("WATCHDOG=1")
     end.socket.close()
@@ -337,7 +319,14 @@ def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
         ({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"}, None),
         ({"WATCHDOG_USEC": "0"}, None),
         ({"WATCHDOG_USEC": "soon"}, None),
+        ({}, None),
+        ({"NOTIFY_SOCKET": ""}, None),
+        ({"NOTIFY_SOCKET": "vsock:2"}, None),
     ],
 )
-def test_the_watchdog_period_is_half_of_systemds(environment, period_s):
-    assert Notifier(environment).watchdog_period_s == period_s
+def test_the_watchdog_period_is_half_of_systemds_and_without_it_nothing_is_said(
+    environment, period_s
+):
+    notifier = Notifier(environment)
+    notifier.tell("READY=1")
+    assert notifier.watchdog_period_s == period_s

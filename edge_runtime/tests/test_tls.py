@@ -3,27 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from cryptography.hazmat.primitives import serialization as form
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import (
-    BestAvailableEncryption,
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-)
 
-from edge_runtime.tls import (
-    EDGE,
-    ROLES,
-    ROUTER,
-    SIMULATOR,
-    check_name,
-    common_name,
-    read_private_key,
-    read_signing_key,
-    rules_for_edge,
-    rules_for_listener,
-)
+from edge_runtime import tls
 from edge_runtime.util import UserError
 from edge_runtime.wire import TOPICS
 
@@ -42,12 +26,9 @@ def allowed(config, name, message, flow):
 
 
 def test_each_party_may_send_only_what_is_its_own():
-    config = rules_for_listener(["a", "b"])
-    assert allowed(config, "edge-a", "put", "ingress") == {
-        "phil/a/command",
-        "phil/a/feedback",
-        "phil/a/health",
-    }
+    config = tls.rules_for_listener(["a", "b"])
+    sent = {f"phil/a/{topic}" for topic in ("command", "feedback", "health")}
+    assert allowed(config, "edge-a", "put", "ingress") == sent
     assert allowed(config, "simulator-a", "put", "ingress") == {"phil/a/state", "phil/a/scene"}
     for name in ("viewer", "operator-a", "router", "stranger"):
         for message in SENDS:
@@ -59,7 +40,7 @@ def test_each_party_may_send_only_what_is_its_own():
 
 
 def test_nobody_may_delete_and_the_rest_is_denied():
-    config = rules_for_listener(["a"])
+    config = tls.rules_for_listener(["a"])
     assert (config["enabled"], config["default_permission"]) == (True, "deny")
     for rule in config["rules"]:
         assert rule["permission"] == "allow"
@@ -67,19 +48,18 @@ def test_nobody_may_delete_and_the_rest_is_denied():
 
 
 def test_every_key_of_another_vehicle_is_out_of_reach():
-    config = rules_for_listener(["a", "b"])
+    config = tls.rules_for_listener(["a", "b"])
     for policy in config["policies"]:
         (name,) = policy["subjects"]
         if name.endswith("-a"):
-            keys = {
-                k for r in config["rules"] if r["id"] in policy["rules"] for k in r["key_exprs"]
-            }
+            rules = [rule for rule in config["rules"] if rule["id"] in policy["rules"]]
+            keys = {key for rule in rules for key in rule["key_exprs"]}
             assert keys
             assert all(key.startswith("phil/a/") for key in keys)
 
 
 def test_an_edge_takes_states_from_its_simulator_or_a_router_only():
-    config = rules_for_edge("a")
+    config = tls.rules_for_edge("a")
     assert [p["subjects"] for p in config["policies"]] == [["simulator-a"], ["router"]]
     assert allowed(config, "simulator-a", "put", "ingress") == {"phil/a/state"}
     assert allowed(config, "router", "query", "ingress") == {"phil/a/status", "phil/a/rearm"}
@@ -87,26 +67,26 @@ def test_an_edge_takes_states_from_its_simulator_or_a_router_only():
 
 
 def test_the_table_knows_every_topic_of_the_wire():
-    columns = [column for rights in ROLES.values() for column in rights[:6]]
+    columns = [column for rights in tls.ROLES.values() for column in rights[:6]]
     named = {suffix.split("/")[0] for column in columns for suffix in column}
     assert set(TOPICS) <= named
 
 
 def test_ids_are_unique_and_a_repeated_vehicle_counts_once():
-    config = rules_for_listener(["a", "a"])
-    assert config == rules_for_listener(["a"])
+    config = tls.rules_for_listener(["a", "a"])
+    assert config == tls.rules_for_listener(["a"])
     ids = [rule["id"] for rule in config["rules"]]
     assert len(ids) == len(set(ids))
 
 
 def test_a_wrong_name_says_which_would_be_right():
-    check_name("edge-a", common_name(EDGE, "a"))
+    tls.check_name("edge-a", tls.common_name(tls.EDGE, "a"))
     with pytest.raises(UserError, match=r"certificate of viewer.*simulator-a or router"):
-        check_name("viewer", common_name(SIMULATOR, "a"), common_name(ROUTER))
+        tls.check_name("viewer", tls.common_name(tls.SIMULATOR, "a"), tls.common_name(tls.ROUTER))
     with pytest.raises(UserError, match=r"of viewer, .* that of router; choose another directory$"):
-        check_name("viewer", common_name(ROUTER))
+        tls.check_name("viewer", tls.common_name(tls.ROUTER))
     with pytest.raises(UserError, match="vehicle id"):
-        common_name(EDGE, "a/b")
+        tls.common_name(tls.EDGE, "a/b")
 
 
 SM2 = """-----BEGIN PRIVATE KEY-----
@@ -119,14 +99,19 @@ Vr/LhzTsFDjPQKyiO3ZuVQ2q4nEoMMYUN0FiBWkZ5VWDR6fIxYHvmw3f
 
 
 def pem(key, encryption=None):
-    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption or NoEncryption())
+    return key.private_bytes(
+        form.Encoding.PEM,
+        form.PrivateFormat.PKCS8,
+        encryption or form.NoEncryption(),
+    )
 
 
-def test_a_signing_key_is_read(tmp_path):
-    key = Ed25519PrivateKey.generate()
-    path = tmp_path / "policy.key"
+def test_a_signing_key_is_read_and_one_of_another_kind_is_a_private_key(tmp_path):
+    path, key = tmp_path / "policy.key", Ed25519PrivateKey.generate()
     path.write_bytes(pem(key))
-    assert read_signing_key(path).public_key() == key.public_key()
+    assert tls.read_signing_key(path).public_key() == key.public_key()
+    path.write_bytes(pem(ec.generate_private_key(ec.SECP256R1())))
+    assert isinstance(tls.read_private_key(path), ec.EllipticCurvePrivateKey)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +119,10 @@ def test_a_signing_key_is_read(tmp_path):
     [
         (b"no key", "is not a private key"),
         (SM2.encode(), "is not a private key"),
-        (pem(Ed25519PrivateKey.generate(), BestAvailableEncryption(b"secret")), "password"),
+        (
+            pem(Ed25519PrivateKey.generate(), form.BestAvailableEncryption(b"secret")),
+            "password",
+        ),
         (pem(ec.generate_private_key(ec.SECP256R1())), "is not an Ed25519 key"),
     ],
 )
@@ -142,10 +130,4 @@ def test_what_cannot_sign_is_said(tmp_path, data, part):
     path = tmp_path / "some.key"
     path.write_bytes(data)
     with pytest.raises(UserError, match=part):
-        read_signing_key(path)
-
-
-def test_a_key_of_another_kind_is_a_private_key(tmp_path):
-    path = tmp_path / "some.key"
-    path.write_bytes(pem(ec.generate_private_key(ec.SECP256R1())))
-    assert isinstance(read_private_key(path), ec.EllipticCurvePrivateKey)
+        tls.read_signing_key(path)

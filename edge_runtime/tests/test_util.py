@@ -11,49 +11,37 @@ from pathlib import Path
 
 import pytest
 
+from edge_runtime import util
 from edge_runtime.cli import run_cli, sigterm_as_interrupt
 from edge_runtime.config import load_config
 from edge_runtime.files import Hold, check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.service import WINDOW, LatencyWindow
 from edge_runtime.tests.harness import run_command
-from edge_runtime.util import (
-    MAX_FILE_MIB,
-    UserError,
-    counted,
-    ending_signals,
-    printable,
-    read_bytes,
-    read_json,
-    read_toml,
-)
+from edge_runtime.util import UserError, printable, read_bytes
 
 
-def test_write_atomic_replaces_and_leaves_nothing_else(tmp_path):
+def test_write_atomic_replaces_what_is_whole_and_leaves_nothing_else(tmp_path):
     path = tmp_path / "out.json"
     write_json_out(path, {"a": 1})
     write_json_out(path, {"a": 2})
+    with pytest.raises(ValueError, match="JSON"):
+        write_json_out(path, {"a": float("nan")})
     assert json.loads(path.read_text()) == {"a": 2}
     assert os.listdir(tmp_path) == ["out.json"]
     write_json_out(None, {"a": 3})
 
 
-def test_a_result_that_is_no_json_leaves_the_old_file(tmp_path):
-    path = tmp_path / "out.json"
-    path.write_text("old")
-    with pytest.raises(ValueError, match="JSON"):
-        write_json_out(path, {"a": float("nan")})
-    assert path.read_text() == "old"
-    assert os.listdir(tmp_path) == ["out.json"]
+def refused(path, match=None):
+    for write in (check_writable, lambda path: write_atomic(path, b"x")):
+        with pytest.raises(UserError, match=match):
+            write(path)
 
 
 def test_where_nothing_can_be_written(tmp_path):
     (tmp_path / "file").touch()
     for bad in (tmp_path / "file" / "out.json", tmp_path / "file" / "no" / "out.json", tmp_path):
-        with pytest.raises(UserError):
-            check_writable(bad)
-        with pytest.raises(UserError):
-            write_atomic(bad, b"x")
+        refused(bad)
     assert os.listdir(tmp_path) == ["file"]
 
 
@@ -79,10 +67,7 @@ def test_what_is_no_regular_file_is_refused_and_stays(tmp_path):
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(place))
         for path in (pipe, link, place):
-            with pytest.raises(UserError, match="no regular file"):
-                check_writable(path)
-            with pytest.raises(UserError, match="no regular file"):
-                write_atomic(path, b"x")
+            refused(path, "no regular file")
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     assert link.is_symlink()
     assert stat.S_ISSOCK(place.stat().st_mode)
@@ -109,10 +94,7 @@ def test_a_link_that_leads_nowhere_is_refused(tmp_path):
     lost.symlink_to(tmp_path / "no" / "out.json")
     circle.symlink_to(circle)
     for path in (lost, circle):
-        with pytest.raises(UserError, match="cannot write"):
-            check_writable(path)
-        with pytest.raises(UserError, match="cannot write"):
-            write_atomic(path, b"x")
+        refused(path, "cannot write")
         assert path.is_symlink()
 
 
@@ -157,8 +139,8 @@ def test_the_latency_window_forgets():
 
 READERS = {
     "bytes": lambda path: read_bytes(path, "thing"),
-    "json": lambda path: read_json(path, "thing"),
-    "toml": lambda path: read_toml(path, "thing"),
+    "json": lambda path: util.read_json(path, "thing"),
+    "toml": lambda path: util.read_toml(path, "thing"),
     "config": lambda path: load_config(path, {}),
     "policy": lambda path: load_policy(path, allow_unsigned=True),
     "hold": lambda path: Hold(str(path)),
@@ -180,8 +162,8 @@ def test_what_is_no_regular_file_is_refused_and_not_waited_for(tmp_path, reader)
 def test_what_is_too_large_is_refused_before_it_is_read(tmp_path, reader):
     path = tmp_path / "hole"
     path.touch()
-    os.truncate(path, (MAX_FILE_MIB << 20) + 1)
-    with pytest.raises(UserError, match=f"is larger than {MAX_FILE_MIB} MiB"):
+    os.truncate(path, (util.MAX_FILE_MIB << 20) + 1)
+    with pytest.raises(UserError, match=f"is larger than {util.MAX_FILE_MIB} MiB"):
         READERS[reader](path)
 
 
@@ -198,7 +180,7 @@ def test_nested_thousands_deep_it_is_one_line(tmp_path, place):
 
     path.write_text(nested("[", "]") if place == "list" else nested('{"a":', "}"))
     with pytest.raises(UserError, match=r"thing .* is not JSON: "):
-        read_json(path, "thing")
+        util.read_json(path, "thing")
     path.write_text("a = " + (nested("[", "]") if place == "list" else nested("{a=", "}")))
     with pytest.raises(UserError, match=r"config file .* is no TOML: "):
         load_config(path, {})
@@ -222,7 +204,7 @@ def test_run_ends_with_one_line(make_policy, tmp_path):
 
 
 def test_one_is_not_many():
-    words = [counted(count, "safe stop") for count in range(3)]
+    words = [util.counted(count, "safe stop") for count in range(3)]
     assert words == ["0 safe stops", "1 safe stop", "2 safe stops"]
 
 
@@ -253,7 +235,7 @@ def all_at_default():
 
 
 def test_all_that_end_a_process_are_interrupts(all_at_default):
-    ending = ending_signals()
+    ending = util.ending_signals()
     assert {signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM} <= ending
     assert {signal.SIGUSR1, signal.SIGALRM, signal.SIGABRT, signal.SIGPIPE} <= ending
     assert not {signal.SIGCHLD, signal.SIGCONT, signal.SIGTSTP, signal.SIGSEGV} & ending
@@ -261,8 +243,8 @@ def test_all_that_end_a_process_are_interrupts(all_at_default):
         for number in ending:
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(number)
-        assert ending_signals() == set()
-    assert ending_signals() == ending
+        assert util.ending_signals() == set()
+    assert util.ending_signals() == ending
 
 
 @pytest.mark.parametrize("handler", [signal.SIG_IGN, lambda number, frame: None])

@@ -159,7 +159,7 @@ class VehicleWatch:
         return False
 
 
-_PERIOD_S = 1.0 / TOPICS["feedback"].rate_hz
+_PERIOD_S = 1.0 / TOPICS["feedback"]
 _JOIN_S = 0.5
 
 

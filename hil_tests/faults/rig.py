@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from edge_runtime.commands import ask
-from edge_runtime.link_probe import free_endpoint
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import GROUP
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, FRAMES_SHAPE, SAFE_STOP, State, encode

@@ -15,8 +15,8 @@ from bridge.__main__ import main as bridge
 from bridge.network import parse_spec
 from bridge.tests.harness import simulate_undisturbed
 from edge_runtime.cli import run_cli
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess
+from edge_runtime.transport import free_endpoint
 from hil_tests.processes import POLICY, PUBLIC_KEY
 from hil_tests.recording import LEFT_TURN
 from trainer.drivers import OnnxDriver, make_environment

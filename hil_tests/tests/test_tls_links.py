@@ -15,11 +15,10 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from bridge.ports import SimulatorPort, open_listener
 from deploy.certs import CLOCK_SLACK, issue, read_authority
 from edge_runtime import wire
-from edge_runtime.link_probe import free_endpoint, why_no_link
 from edge_runtime.tests.harness import EdgeProcess, make_state, run_command, wait_until
 from edge_runtime.tests.policies import write_policy
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
-from edge_runtime.transport import open_session
+from edge_runtime.transport import free_endpoint, look, open_session
 from edge_runtime.util import UserError
 from hil_tests.processes import Process
 from hil_tests.tests.tls_parties import listener, make_certificates, session
@@ -98,11 +97,11 @@ def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, policy_fla
         assert edge.end() == 0
     place, files = free_endpoint("tls"), load_tls(parties / "edge-hunter01")
     simulator = open_session(listen=place.replace("tls/", "tcp/"), mode="router")
-    said = why_no_link(place, files)
+    _, said = look(place, files)
     simulator.close()
     assert re.match(f"{place} (does not speak TLS|answers, but not with TLS)", said)
-    assert "connection refused" in why_no_link(place, files)
-    assert why_no_link(endpoint, files) == ""
+    assert "connection refused" in look(place, files)[1]
+    assert look(endpoint, files) == (True, "")
 
 
 def test_a_viewers_certificate_is_no_servers(parties):

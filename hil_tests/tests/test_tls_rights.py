@@ -16,9 +16,9 @@ from bridge.__main__ import main as bridge
 from bridge.tests.harness import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
 from deploy.__main__ import main as deploy
 from edge_runtime.commands import ask
-from edge_runtime.link_probe import free_endpoint
 from edge_runtime.tests.harness import EdgeProcess, run_command
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests.processes import Process
 from hil_tests.tests.tls_parties import SETTLE_S, Intruder, listener, make_certificates, session

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from deploy.certs import write_key_pair
-from edge_runtime.policy import load_policy
-from edge_runtime.policy_file import read_onnx
+from edge_runtime.policy import load_policy, read_onnx
 from edge_runtime.tls import read_signing_key
 from edge_runtime.util import UserError
 from trainer import export as export_module
@@ -42,9 +41,9 @@ def test_the_file_is_what_the_contract_says(exported):
     model = onnx.load_from_string(exported.model)
     assert model.ir_version == 8
     assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", 17)]
-    file = read_onnx(exported.model)
+    _, _, metadata = read_onnx(exported.model)
     assert exported.policy_id == hashlib.sha256(exported.model).hexdigest()
-    assert "policy_id" not in file.metadata["phil.manifest"]
+    assert "policy_id" not in metadata["phil.manifest"]
     (frames,), (action,) = model.graph.input, model.graph.output
     assert (frames.name, action.name) == ("frames", "action")
     shape = [d.dim_param or d.dim_value for d in frames.type.tensor_type.shape.dim]
