@@ -28,7 +28,7 @@ from edge_runtime.cli import (
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from hil_tests.faults.run import choose_rows, run_faults
-from hil_tests.mock_hunter.body import make_parameters, read_changes
+from hil_tests.mock_hunter.hunter import make_parameters, read_changes
 from hil_tests.report import (
     check_report,
     comparison_verdict,

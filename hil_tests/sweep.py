@@ -23,7 +23,7 @@ from edge_runtime.files import make_directory, write_json
 from edge_runtime.link_probe import free_endpoint
 from edge_runtime.util import UserError, read_json
 from hil_tests.faults.rig import free_bus
-from hil_tests.mock_hunter.body import make_parameters
+from hil_tests.mock_hunter.hunter import make_parameters
 from hil_tests.processes import (
     CommandTimeoutError,
     Process,

@@ -20,8 +20,7 @@ from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE
 from edge_runtime.vehicles.mapping import SPECS, car_of, similarity_to
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, TOPICS, Command, Feedback
-from hil_tests.mock_hunter.body import Parameters
-from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.hunter import MockHunter, Parameters
 from trainer.drivers import OnnxDriver
 
 NAME, MODEL, SESSION = "hunter", "2.0", "virtual"

@@ -24,9 +24,9 @@ from edge_runtime.vehicles.hunter.core import STATUS_SILENCE_S
 from edge_runtime.wire import DRIVE
 from hil_tests.faults.observe import REACTION_LIMIT_S, CanMonitor, CommandSeen, Heard
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.row import Try, at_any_phase, fault
-from hil_tests.mock_hunter.body import MODELS
+from hil_tests.faults.rows import Try, at_any_phase, fault
 from hil_tests.mock_hunter.chassis import BITS, FAULTS
+from hil_tests.mock_hunter.hunter import MODELS
 
 MODEL = "hunter-2.0"
 QUIET_S = 0.5

@@ -21,7 +21,7 @@ from edge_runtime.wire import (
     encode,
 )
 from hil_tests.faults.rig import Rig, make_state
-from hil_tests.faults.row import GAP, Try, drives_on, drove_on, fault
+from hil_tests.faults.rows import GAP, Try, drives_on, drove_on, fault
 from hil_tests.processes import wait_until
 
 FLOOD_PER_S, FLOOD_S = 10_000, 2.0

@@ -17,10 +17,10 @@ from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import SLOW_LOOPS, write_policy
 from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE
-from hil_tests.faults import ends, hunter, messages  # noqa: F401 (they fill the table)
+from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.row import ROWS, Row, Try, at_any_phase
+from hil_tests.faults.rows import ROWS, Row, Try, at_any_phase
 from hil_tests.processes import POLICY, PUBLIC_KEY, in_parallel, trusting
 
 SLOW_S = 2.5 * CONTROL_PERIOD_S

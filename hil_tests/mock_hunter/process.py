@@ -22,9 +22,8 @@ from edge_runtime.cli import examples, seconds
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter.bus import MULTICAST_BUS, BusName, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE, PROFILES
-from hil_tests.mock_hunter.body import MODELS, SOURCES, make_parameters, read_changes
 from hil_tests.mock_hunter.chassis import FAULTS, check_fault
-from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.hunter import MODELS, SOURCES, MockHunter, make_parameters, read_changes
 
 Switch = tuple[str, bool]
 """A fault's name, and whether it is switched on."""

@@ -11,7 +11,7 @@ from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
 from hil_tests import campaign, sweep
 from hil_tests.__main__ import main
-from hil_tests.mock_hunter.body import make_parameters
+from hil_tests.mock_hunter.hunter import make_parameters
 from hil_tests.processes import POLICY
 from hil_tests.report import (
     check_report,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.mapping import SPECS
-from hil_tests.mock_hunter.body import (
+from hil_tests.mock_hunter.hunter import (
     MODELS,
     SOURCES,
     Battery,

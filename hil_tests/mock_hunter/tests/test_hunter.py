@@ -16,9 +16,8 @@ from edge_runtime.vehicles.core import DEVIATES_S, FOLLOWS_S, State
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.mapping import CARS, SPECS, similarity_to
-from hil_tests.mock_hunter.body import MODELS, make_parameters
 from hil_tests.mock_hunter.chassis import BITS, FAULTS, LATE_S, obeys
-from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.hunter import MODELS, MockHunter, make_parameters
 
 P = MODELS["hunter-2.0"]
 CAN_MODE, STANDBY = (0x421, b"\x01"), (0x421, b"\x00")

@@ -12,8 +12,7 @@ from edge_runtime.cli import run_cli
 from edge_runtime.vehicles.hunter.bus import open_bus, parse_bus
 from hil_tests.__main__ import main
 from hil_tests.faults.rig import ChassisProcess, free_bus
-from hil_tests.mock_hunter.body import MODELS
-from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.hunter import MODELS, MockHunter
 from hil_tests.mock_hunter.process import Server, read_orders
 from hil_tests.processes import wait_until
 
