@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from bridge.messages import Scene
-from bridge.tests.harness import make_command
 from deploy.wheels import TARGETS
 from edge_runtime.cli import run_cli
-from edge_runtime.tests.harness import make_state
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.ros2.names import DEFAULT_ROS2_ENDPOINT
 from hil_tests import pictures, processes
@@ -21,11 +18,8 @@ from hil_tests.__main__ import main
 from hil_tests.pictures import (
     FILM_POLICY,
     FILM_SEED,
-    begins_s,
-    lost_s,
     policy_sees,
     success_against_latency,
-    trips_of,
 )
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import HumanGuide
@@ -116,7 +110,6 @@ def test_the_table_of_targets_is_that_of_the_bundles():
 
 
 DOCS = Path(__file__).parents[2] / "docs"
-MS = 10**6
 
 
 def test_the_table_of_pictures_is_that_of_the_command():
@@ -146,36 +139,6 @@ def test_the_guide_in_the_film_brakes_for_the_crash_and_hands_the_wheel_back():
     assert env.distance_m > 20.0
     with Image.open(DOCS / "take_over.gif") as film:
         assert len(list(ImageSequence.Iterator(film))) == len(moments)
-
-
-def test_a_round_trip_is_drawn_in_its_parts_and_a_lost_state_as_lost():
-    messages = []
-    for step in (0, 1, 3):
-        sent_ns = step * 100 * MS
-        answer = make_command(step, received_ns=sent_ns + 40 * MS, sent_ns=sent_ns + 43 * MS)
-        messages += [make_state(step, sent_ns=sent_ns), answer]
-    seen = Scene(episode=0, step=3, sim_time_s=0.3, round_trip_ms=90.0, answered_step=1)
-    trips = trips_of([*messages, seen])
-    for trip, downlink_ms in zip(trips.values(), (0.0, 47.0, 0.0), strict=True):
-        assert trip.parts_ms == pytest.approx((40.0, 3.0, downlink_ms))
-    assert lost_s(trips) == pytest.approx([0.2])
-
-
-def test_a_new_episode_begins_behind_the_last_one():
-    places = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 1))
-    trips = trips_of(make_state(step, episode=episode) for episode, step in places)
-    *times_s, last_s = (trip.time_s for trip in trips.values())
-    assert begins_s(trips) == [times_s[3], last_s]
-
-
-def test_only_the_first_answer_to_a_state_counts():
-    answers = [  # A safe stop is repeated.
-        make_command(0, mode="safe_stop", received_ns=45 * MS, sent_ns=sent_ns)
-        for sent_ns in (50 * MS, 250 * MS)
-    ]
-    (trip,) = trips_of([make_state(0, sent_ns=0), *answers]).values()
-    assert trip.parts_ms == pytest.approx((45.0, 5.0, 0.0))
-    assert trip.mode == "safe_stop"
 
 
 def test_pictures_of_what_is_kept_are_pictures(tmp_path):

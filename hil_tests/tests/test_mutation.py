@@ -3,7 +3,7 @@
 import tomllib
 from pathlib import Path
 
-from hil_tests.mutation.judge import ACCEPTED, Mutant, judge, read_accepted
+from hil_tests.mutation.mutants import ACCEPTED, Mutant, judge, read_accepted
 
 ROOT = Path(__file__).parents[2]
 KILLED = Mutant("safety.py", "T = 2", "T = 3", "killed")
