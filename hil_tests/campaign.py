@@ -23,7 +23,6 @@ from edge_runtime.cli import (
     not_negative,
     positive,
     share,
-    sigterm_as_interrupt,
 )
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
@@ -78,12 +77,8 @@ SHOWN_WRONG = 5
 def _add_shared(
     parser: argparse.ArgumentParser, parts: Sequence[str], runs: int, of_what: str, target: float
 ) -> None:
-    parser.add_argument(
-        "--out",
-        required=True,
-        metavar="R.json",
-        help="the report; R.md, pictures and R_rows/ (what is done already) go beside it",
-    )
+    out = "the report; R.md, pictures and R_rows/ (what is done already) go beside it"
+    parser.add_argument("--out", required=True, metavar="R.json", help=out)
     default = "policy file (default: results/policies/SCENARIO.onnx)"
     parser.add_argument("--policy", metavar="P.onnx", help=default)
     add_public_key(parser)
@@ -109,12 +104,9 @@ def _several(text: str) -> int:
 def _add_campaign_arguments(parser: argparse.ArgumentParser) -> None:
     runs_help = "episodes of each row, the same seeds"
     _add_shared(parser, ("latency", "faults"), 100, runs_help, 0.98)
-    parser.add_argument(
-        "--rows",
-        metavar="NAME,...",
-        help=f"only these latency axes ({', '.join(axis.name for axis in NETWORK_AXES)}) and "
-        "faults, by name or pattern (hunter_*)",
-    )
+    axes = ", ".join(axis.name for axis in NETWORK_AXES)
+    rows = f"only these latency axes ({axes}) and faults, by name or pattern (hunter_*)"
+    parser.add_argument("--rows", metavar="NAME,...", help=rows)
     parser.add_argument("--tries", type=positive, default=10, help="of each fault")
 
 
@@ -128,17 +120,17 @@ def _run_campaign(arguments: argparse.Namespace) -> int:
     name = Path(arguments.policy or f"{arguments.scenario}.onnx").name
     text = [f"# Campaign: {name}, {arguments.scenario}", "", f"`{_this_command()}`", ""]
     if axes:
-        report["latency"] = latency = run_latency(
-            _task(arguments), axes, arguments.target, jobs, out
-        )
+        latency = run_latency(_task(arguments), axes, arguments.target, jobs, out)
+        report["latency"] = latency
         text += ["## Latency", "", render_latency(latency)]
         print(latency["budget"]["sentence"])
     if faults is not None:
         with ProgressBar("faults", arguments.tries * len(choose_rows(faults or None))) as bar:
-            report["faults"] = found = run_faults(
+            found = run_faults(
                 arguments.tries, faults or None, arguments.policy and Path(arguments.policy),
                 lambda row: bar.advance({"row": row}), jobs, arguments.public_key,
             )  # fmt: skip
+        report["faults"] = found
         text += ["## Faults", "", render_faults(found)]
         for row in found["rows"]:
             for kind in ("wrong", "unsafe", "crashes"):
@@ -192,14 +184,13 @@ def run_latency(
 ) -> dict[str, Any]:
     """Drive every network of the axes; the report's part ``latency``."""
     specs = list(dict.fromkeys(spec for axis in axes for spec in axis.specs))
-    with sigterm_as_interrupt():  # Whoever ends a campaign ends its processes.
-        found = drive_all(task, specs, PART_EPISODES, drive_network, jobs, _rows_beside(out))
+    found = drive_all(task, specs, PART_EPISODES, drive_network, jobs, _rows_beside(out))
     rows = {spec: make_row(spec, parts) for spec, parts in found.items()}
     driven_s, wall_s = (sum(row[name] for row in rows.values()) for name in ("driven_s", "wall_s"))
     latency = {
         **task.facts(),
         "clock": "lockstep",
-        "axes": [axis.as_dict() for axis in axes],
+        "axes": _told(axes),
         "rows": rows,
         "budget": budget(axes, rows, target, task.policy.stem),
         "faster_than_real_time": driven_s / wall_s,
@@ -207,25 +198,20 @@ def run_latency(
     return {**latency, "figures": write_figures(out, latency)}
 
 
+def _told(axes: Sequence[Axis]) -> list[dict[str, Any]]:
+    names = ("name", "title", "unit", "values", "specs")
+    return [{name: getattr(axis, name) for name in names} for axis in axes]
+
+
 def _add_vehicle_arguments(parser: argparse.ArgumentParser) -> None:
     runs_help = "episodes of each loop and of each lag"
     _add_shared(parser, ("compare", "sweep"), 50, runs_help, 0.95)
     rigs = "simulators in real time side by side, each with a vehicle of its own"
     parser.add_argument("--rigs", type=positive, default=4, metavar="N", help=rigs)
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a parameter of the mock Hunter, as in python -m hil_tests mock_hunter",
-    )
-    parser.add_argument(
-        "--lags",
-        type=_lags,
-        default=LAGS,
-        metavar="DEAD+CONSTANT,...",
-        help="only these points of the sweep, in ms, as in 50+100,200+300 (default: a table)",
-    )
+    mock = "a parameter of the mock Hunter, as in python -m hil_tests mock_hunter"
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=mock)
+    only = "only these points of the sweep, in ms, as in 50+100,200+300 (default: a table)"
+    parser.add_argument("--lags", type=_lags, default=LAGS, metavar="DEAD+CONSTANT,...", help=only)
 
 
 def _lags(text: str) -> list[Lag]:
@@ -273,8 +259,7 @@ def drive_loop(task: Task, part: Part) -> list[dict[str, Any]]:
 
 def run_comparison(task: Task, target: float, rigs: int, out: Path) -> dict[str, Any]:
     """Drive both loops, ``rigs`` at a time; the report's part ``comparison``."""
-    with sigterm_as_interrupt():
-        found = drive_all(task, LOOPS, LOOP_EPISODES, drive_loop, rigs, _rows_beside(out))
+    found = drive_all(task, LOOPS, LOOP_EPISODES, drive_loop, rigs, _rows_beside(out))
     rows = {loop: make_row(loop, parts) for loop, parts in found.items()}
     return {
         **task.facts(),
@@ -290,14 +275,13 @@ def run_sweep(
     task: Task, lags: Sequence[Lag], target: float, jobs: int, out: Path
 ) -> dict[str, Any]:
     """Drive every lag, ``jobs`` at a time; the report's part ``sweep``."""
-    with sigterm_as_interrupt():
-        found = drive_all(task, lags, task.runs, drive_lag, jobs, _rows_beside(out), processes=True)
+    found = drive_all(task, lags, task.runs, drive_lag, jobs, _rows_beside(out), processes=True)
     rows = {lag.spec: row for lag, (row,) in found.items()}
     axes = [axis for axis in LAG_AXES if set(axis.specs) <= set(rows)]
     sweep = {
         **task.facts(),
         "mock": task.changes,
-        "axes": [axis.as_dict() for axis in axes],
+        "axes": _told(axes),
         "rows": rows,
         "budget": budget(axes, rows, target, task.policy.stem) if axes else None,
         "lag_budget": lag_budget(list(rows.values()), target),

@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,10 +13,8 @@ from matplotlib.figure import Figure
 from bridge.report import markdown_table
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
-from hil_tests.sweep import LOOPS, VEHICLE
+from hil_tests.sweep import LOOPS, VEHICLE, Found
 
-Found = Mapping[str, Any]
-"""A part of a report's JSON."""
 FIGURES = {
     "success": ("success", "success", "Wilson's 95 % interval"),
     "distance": ("surviving_distance_m", "surviving distance, m", "Student's 95 % interval"),
@@ -48,12 +45,13 @@ def render_faults(report: Found) -> str:
             "verdict")  # fmt: skip
     rows = []
     for row in report["rows"]:
-        tries = str(row["tries"]) + (f" (+{row['disturbed']} again)" if row["disturbed"] else "")
-        times = (
+        again = f" (+{row['disturbed']} again)" if row["disturbed"] else ""
+        rows.append((
+            row["done"], row["expected"], f"{row['tries']}{again}",
             _numbers(row["reaction_ms"], 0), _number(row["reaction_limit_ms"], 0),
             _numbers(row["recovery_ms"], 0), _number(row["recovery_limit_ms"], 0),
-        )  # fmt: skip
-        rows.append((row["done"], row["expected"], tries, *times, fault_verdict(row)))
+            fault_verdict(row),
+        ))  # fmt: skip
     end = (
         f"{report['crashes']} crashes and {report['unsafe_commands']} unsafe commands "
         "over the whole campaign."
@@ -63,11 +61,8 @@ def render_faults(report: Found) -> str:
 
 def fault_verdict(row: Found) -> str:
     """``met``, or what was not."""
-    faults = [
-        f"{row[f'{name}_late']} {name} late"
-        for name in ("reactions", "recoveries")
-        if row[f"{name}_late"]
-    ]
+    late = {name: row[f"{name}_late"] for name in ("reactions", "recoveries")}
+    faults = [f"{count} {name} late" for name, count in late.items() if count]
     faults += [f"{len(row[name])} {name}" for name in ("unsafe", "crashes", "wrong") if row[name]]
     counted = sum(row["rejected"].values())
     met = f"met, {counted:,} rejected and counted" if counted else "met"
@@ -87,17 +82,15 @@ _OF_A_ROW: Cells = {
     "ticks without a new command": lambda row: f"{row['ticks_without_new_command']:.0%}",
 }
 _OF_A_VEHICLE: Cells = {
-    "speed error rmse / max, m/s of the vehicle": lambda vehicle: _numbers(
-        vehicle["speed_error_mps"], 3
+    "speed error rmse / max, m/s of the vehicle": lambda row: _numbers(row["speed_error_mps"], 3),
+    "action error rmse / max": lambda row: ", ".join(
+        f"{name} {_numbers(error, 2)}" for name, error in row["action_error"].items()
     ),
-    "action error rmse / max": lambda vehicle: ", ".join(
-        f"{name} {_numbers(error, 2)}" for name, error in vehicle["action_error"].items()
+    "actuator lag, ms": lambda row: ", ".join(
+        f"{name} {_number(lag, 0)}" for name, lag in row["lag_ms"].items()
     ),
-    "actuator lag, ms": lambda vehicle: ", ".join(
-        f"{name} {_number(lag, 0)}" for name, lag in vehicle["lag_ms"].items()
-    ),
-    "feedback age p50 / p99, ms": lambda vehicle: _numbers(vehicle["feedback_age_ms"], 1),
-    "metres of the vehicle for one of the scenario": lambda vehicle: _number(vehicle["scale"], 3),
+    "feedback age p50 / p99, ms": lambda row: _numbers(row["feedback_age_ms"], 1),
+    "metres of the vehicle for one of the scenario": lambda row: _number(row["scale"], 3),
 }
 
 
@@ -115,11 +108,13 @@ def render_latency(latency: Found) -> str:
         *_pictures(latency),
     ]
     for axis in latency["axes"]:
-        points = zip(axis["values"], axis["specs"], strict=True)
-        rows = []
-        for value, spec in points:
-            cells = (tell(latency["rows"][spec]) for tell in _OF_A_ROW.values())
-            rows.append((f"{value:g} {axis['unit']}", *cells))
+        rows = [
+            (
+                f"{value:g} {axis['unit']}",
+                *(tell(latency["rows"][spec]) for tell in _OF_A_ROW.values()),
+            )
+            for value, spec in zip(axis["values"], axis["specs"], strict=True)
+        ]
         title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
         lines += [title, "", *markdown_table(("value", *_OF_A_ROW), rows)]
     return "\n".join(lines)
@@ -219,28 +214,22 @@ def _numbers(found: Mapping[str, float | None] | None, digits: int) -> str:
 
 
 def write_figures(out: Path, swept: Found) -> dict[str, str]:
-    """Write a PNG of success and one of surviving distance beside ``out``: a panel for each axis.
+    """Write a PNG of each of FIGURES beside ``out``, with a panel for each axis; their names.
 
-    Args:
-        out: the report's path; the pictures' names begin with its stem.
-        swept: a part of a report with axes.
-
-    Returns:
-        The files' names by figure.
+    ``swept`` is a part of a report with axes. The names begin with the stem of ``out``.
     """
     names = {}
     for name, (field, label, band) in FIGURES.items():
-        path = out.with_name(f"{out.stem}_{name}.png")
-        write_png(path, _draw_axes(swept, field, label, band))
-        names[name] = path.name
+        names[name] = f"{out.stem}_{name}.png"
+        write_png(out.with_name(names[name]), _draw_axes(swept, field, label, band))
     return names
 
 
 def write_lag_figures(out: Path, sweep: Found) -> dict[str, str]:
     """The table of lags as a picture, and the lines through it where they are whole."""
-    path = out.with_name(f"{out.stem}_table.png")
-    write_png(path, _draw_lags(sweep))
-    return {"table": path.name, **(write_figures(out, sweep) if sweep["axes"] else {})}
+    name = f"{out.stem}_table.png"
+    write_png(out.with_name(name), _draw_lags(sweep))
+    return {"table": name, **(write_figures(out, sweep) if sweep["axes"] else {})}
 
 
 def write_png(path: Path, figure: Figure) -> None:
@@ -270,11 +259,8 @@ def _draw_axes(swept: Found, field: str, label: str, band: str) -> Figure:
     for panel in panels[len(axes) :]:
         panel.set_visible(False)
     figure.supylabel(label)
-    title = (
-        f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point; "
-        f"bands: {band}"
-    )
-    handles = figure.axes[0].get_legend_handles_labels()
+    drives = f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point"
+    handles, title = figure.axes[0].get_legend_handles_labels(), f"{drives}; bands: {band}"
     figure.legend(*handles, loc="outside upper center", ncols=4, title=title, frameon=False)
     return figure
 
