@@ -63,7 +63,7 @@ _MAIN = (
 EXAMPLE = examples(
     "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
     "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
-    "    --config edge.toml --tls certs/edge-hunter01",
+    "    --config edge.toml --tls certs/edge-hunter01"
 )
 
 

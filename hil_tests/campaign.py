@@ -16,14 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.environments import CONDITIONS, NOMINAL
-from edge_runtime.cli import (
-    Command,
-    add_public_key,
-    examples,
-    not_negative,
-    positive,
-    share,
-)
+from edge_runtime.cli import Command, add_public_key, examples, not_negative, positive, share
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
 from hil_tests.faults.run import choose_rows, run_faults

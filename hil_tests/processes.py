@@ -237,10 +237,7 @@ def run_command(*arguments: str) -> None:
 
 
 def drive_shown(
-    vehicle_id: str,
-    trust: Sequence[str],
-    simulate: Sequence[str],
-    listener: Sequence[str] = (),
+    vehicle_id: str, trust: Sequence[str], simulate: Sequence[str], listener: Sequence[str] = ()
 ) -> None:
     """Drive the left turn with a mock vehicle and an operator, by commands as a person types them.
 

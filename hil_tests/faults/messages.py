@@ -11,15 +11,7 @@ import numpy as np
 
 from edge_runtime import wire
 from edge_runtime.cli import BAD_INPUT
-from edge_runtime.wire import (
-    CONTROL_PERIOD_S,
-    DRIVE,
-    Command,
-    Feedback,
-    Message,
-    Rejection,
-    encode,
-)
+from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command, Feedback, Message, Rejection, encode
 from hil_tests.faults.rig import Rig, make_state
 from hil_tests.faults.rows import GAP, Try, drives_on, drove_on, fault
 from hil_tests.processes import wait_until

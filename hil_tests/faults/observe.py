@@ -69,9 +69,7 @@ class Timeline:
 
 
 def unsafe_commands(
-    commands: Iterable[CommandSeen],
-    states: Mapping[Place, float],
-    by_arrival: bool = False,
+    commands: Iterable[CommandSeen], states: Mapping[Place, float], by_arrival: bool = False
 ) -> list[str]:
     """Why each unsafe command is one; empty where all is well.
 

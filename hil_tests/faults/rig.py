@@ -382,8 +382,7 @@ class ChassisProcess:
         count, word = len(self.switched), "on" if on else "off"
         self.process.tell(f"{name} {word}")
         done = wait_until(
-            lambda: [s for s in self.switched[count:] if s[1:] == (name, word)],
-            f"{name} {word}",
+            lambda: [s for s in self.switched[count:] if s[1:] == (name, word)], f"{name} {word}"
         )
         return float(done[0][0])
 

@@ -46,10 +46,7 @@ class Server:
     """Runs a mock on a bus until `stop`; every change is told as one line with its time."""
 
     def __init__(
-        self,
-        hunter: MockHunter,
-        bus: can.BusABC,
-        tell: Callable[[str], None] = lambda line: None,
+        self, hunter: MockHunter, bus: can.BusABC, tell: Callable[[str], None] = lambda line: None
     ) -> None:
         self.orders: queue.SimpleQueue[Switch] = queue.SimpleQueue()
         """Faults to switch next, from any thread."""

@@ -73,10 +73,7 @@ def test_the_limit_is_the_largest_value_up_to_which_all_hold(success, limit):
             "a policy holds at least 98% success up to 50 ms of delay and "
             "10 % of loss (the most that was tested), one at a time.",
         ),
-        (
-            {DELAY: (0.9, 1.0, 1.0, 1.0)},
-            "a policy is below 98% success even on a perfect network.",
-        ),
+        ({DELAY: (0.9, 1.0, 1.0, 1.0)}, "a policy is below 98% success even on a perfect network."),
         # An axis whose own base fails takes nothing from the others.
         (
             {LOSS: (1.0, 0.9), JITTER: (0.9, 1.0)},

@@ -15,12 +15,7 @@ from edge_runtime.util import UserError
 from edge_runtime.vehicles.ros2.names import DEFAULT_ROS2_ENDPOINT
 from hil_tests import pictures, processes
 from hil_tests.__main__ import main
-from hil_tests.pictures import (
-    FILM_POLICY,
-    FILM_SEED,
-    policy_sees,
-    success_against_latency,
-)
+from hil_tests.pictures import FILM_POLICY, FILM_SEED, policy_sees, success_against_latency
 from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.picture import drive_moments

@@ -116,8 +116,7 @@ def test_an_operator_re_arms_its_own_vehicle_only(parties):
 
 
 @pytest.mark.parametrize(
-    ("who", "is_believed"),
-    [("simulator-hunter01", True), ("simulator-hunter02", False)],
+    ("who", "is_believed"), [("simulator-hunter01", True), ("simulator-hunter02", False)]
 )
 def test_an_edge_takes_no_states_from_another_vehicles_simulator(parties, who, is_believed):
     """Its certificate is a server's of the same authority: TLS alone would let it pose."""

@@ -24,9 +24,7 @@ from hil_tests.mock_hunter.hunter import (
 P = MODELS["hunter-2.0"]
 setpoints = st.builds(Setpoint, st.floats(-3, 3), st.floats(-1, 1))
 bodies = st.builds(
-    Body,
-    st.floats(-P.max_speed_mps, P.max_speed_mps),
-    st.floats(-P.max_inner_rad, P.max_inner_rad),
+    Body, st.floats(-P.max_speed_mps, P.max_speed_mps), st.floats(-P.max_inner_rad, P.max_inner_rad)
 )
 steps_s = st.floats(0.001, 0.02)
 
