@@ -12,7 +12,6 @@ from edge_runtime.vehicles.mapping import SPECS
 from hil_tests.mock_hunter.hunter import (
     MODELS,
     SOURCES,
-    Battery,
     Body,
     Parameters,
     Setpoint,
@@ -123,22 +122,3 @@ def test_parameters_that_cannot_be_are_refused(changes, why):
     with pytest.raises(UserError, match=why):
         make_parameters("hunter-2.0", changes)
     assert make_parameters("hunter-se", {"dead_time_s": 0.0}).dead_time_s == 0.0
-
-
-def test_the_battery_sags_drains_and_runs_low():
-    battery = Battery(P)
-    rest_v = battery.volts
-    battery.advance(1.0, 1.0, 0.01)
-    assert battery.volts < rest_v  # under current
-    battery.advance(0.0, 0.0, 0.01)
-    assert rest_v - 0.01 < battery.volts < rest_v
-    battery.advance(0.0, 0.0, P.capacity_as / P.idle_a)  # all of it
-    assert battery.volts == pytest.approx(P.empty_v - P.resistance_ohm * P.idle_a)
-    assert battery.too_low
-    battery = Battery(P)
-    before_v = battery.volts
-    battery.empty(True)
-    battery.empty(True)
-    assert battery.too_low
-    battery.empty(False)
-    assert battery.volts == before_v
