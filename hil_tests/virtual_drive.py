@@ -110,12 +110,7 @@ class VirtualDrive:
 
 
 class VirtualHunter:
-    """The vehicle's side of the loop. Times are whole milliseconds from its switching on.
-
-    Args:
-        scenario: whose car it stands for.
-        parameters: of the chassis.
-    """
+    """The vehicle's side of the loop. Times are whole milliseconds from its switching on."""
 
     def __init__(self, scenario: str, parameters: Parameters) -> None:
         similarity = similarity_to(car_of(scenario, NAME), SPECS[MODEL])
@@ -124,11 +119,7 @@ class VirtualHunter:
         self.now_ms = 0
 
     def enable(self) -> None:
-        """Take control and wait until the chassis has confirmed it.
-
-        Raises:
-            RuntimeError: it does not, which is a fault of the driver or the mock.
-        """
+        """Take control; RuntimeError where the chassis does not confirm it (a fault of ours)."""
         self.core.enable(self.now_ms / 1e3)
         self.run(READY_MS)
         if self.core.state is not State.ENABLED:

@@ -209,34 +209,33 @@ def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
 def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
     """``count`` payloads; the n-th is the same for the same seed. Some may be valid still."""
     generator = np.random.default_rng(seed)
-    for _ in range(count):
-        yield _mutant(valid, generator)
+    names = sorted(msgspec.msgpack.decode(valid))
 
-
-def _mutant(valid: bytes, generator: np.random.Generator) -> bytes:
     def below(limit: int) -> int:
         return int(generator.integers(limit))
 
-    match below(7):
-        case 0:
-            return generator.bytes(below(_LONGEST_RANDOM))
-        case 1:
-            data = bytearray(valid)
-            for _ in range(1 + below(4)):
-                data[below(len(data))] ^= 1 << below(8)
-            return bytes(data)
-        case 2:
-            return valid[: below(len(valid))]
-        case 3:
-            return valid + generator.bytes(1 + below(_SPLICED))
-        case 4:  # a stretch of it replaced by a random one of another length
-            begin, end = sorted((below(len(valid)), below(len(valid))))
-            return valid[:begin] + generator.bytes(below(_SPLICED)) + valid[end:]
-    names = sorted(msgspec.msgpack.decode(valid))
-    name = names[below(len(names))]
-    if below(2):
-        return without(valid, name)
-    return with_fields(valid, **{name: _ABSURD[below(len(_ABSURD))]})
+    for _ in range(count):
+        match below(7):
+            case 0:
+                yield generator.bytes(below(_LONGEST_RANDOM))
+            case 1:
+                data = bytearray(valid)
+                for _ in range(1 + below(4)):
+                    data[below(len(data))] ^= 1 << below(8)
+                yield bytes(data)
+            case 2:
+                yield valid[: below(len(valid))]
+            case 3:
+                yield valid + generator.bytes(1 + below(_SPLICED))
+            case 4:  # a stretch of it replaced by a random one of another length
+                begin, end = sorted((below(len(valid)), below(len(valid))))
+                yield valid[:begin] + generator.bytes(below(_SPLICED)) + valid[end:]
+            case _:
+                name = names[below(len(names))]
+                if below(2):
+                    yield without(valid, name)
+                else:
+                    yield with_fields(valid, **{name: _ABSURD[below(len(_ABSURD))]})
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:

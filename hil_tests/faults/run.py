@@ -28,7 +28,7 @@ STALLED_S = 1.5 * CONTROL_PERIOD_S
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
 OnTry = Callable[[str], None]
-"""Told the row, after every try."""
+"""Called with the row's name, after every try."""
 
 
 def write_slow(path: Path) -> None:
@@ -75,16 +75,11 @@ def run_faults(
 ) -> dict[str, Any]:
     """Do every row ``tries`` times; a report for JSON.
 
-    Args:
-        tries: of each row.
-        rows: names of the table's rows, or patterns of them (``hunter_*``); None for all.
-        policy: an exported policy; None for the repository's own left turn.
-        on_try: called after every try.
-        jobs: rigs at once; rows that need the machine for themselves run after the others.
-        public_key: what the policy is verified with.
-
-    Raises:
-        UserError: a row that the table does not hold, or no policy.
+    ``rows`` are names of the table's rows, or patterns of them (``hunter_*``); None for all. An
+    exported ``policy`` (None for the repository's own left turn) is verified with ``public_key``.
+    ``on_try`` is called after every try. ``jobs`` rigs run at once; rows that need the machine for
+    themselves run after the others. Raises UserError for a row that the table does not hold, or no
+    policy.
     """
     chosen = choose_rows(rows)
     trust = trusting(policy, public_key)
@@ -118,8 +113,7 @@ def run_faults(
 def choose_rows(names: Sequence[str] | None) -> list[Row]:
     """The rows of these names or patterns, in the table's order; all for None.
 
-    Raises:
-        UserError: a name that the table does not hold, or a pattern that fits none.
+    Raises UserError for a name that the table does not hold, or a pattern that fits none.
     """
     known = [row.name for row in ROWS]
     chosen: set[str] = set()
