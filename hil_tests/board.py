@@ -41,6 +41,7 @@ Keep = Callable[[dict[str, Any]], None]
 BOARDS = ("aarch64", "python38")
 CACHE, WHEELS = ROOT / "build/board", ROOT / DEFAULT_FOLDER
 """Of the emulated board's disk, and of the bundles' wheels."""
+IMAGE = Path(__file__).with_name("board_image.sh")
 VEHICLE, _PORT = "hunter01", 7447
 ENDPOINT = f"tls/127.0.0.1:{_PORT}"
 _EPISODE_LIMIT_S, _BACK_LIMIT_S = 300.0, 120.0
@@ -68,34 +69,6 @@ _PROGRAMS = {
 }
 _BOOT_LIMIT_S = 300.0
 
-# The kernel's handler of aarch64 programs has a name of its own, and goes when this ends.
-_MAKE_IMAGE = """\
-cache=$1 key=$2 root=$1/root
-kernel=/proc/sys/fs/binfmt_misc
-[ -e $kernel/register ] || mount -t binfmt_misc binfmt_misc $kernel
-if [ ! -e $kernel/qemu-aarch64 ]; then
-    line=$(sed s/qemu-aarch64:/phil-aarch64:/ /usr/lib/binfmt.d/qemu-aarch64.conf)
-    printf %s "${line%F}F" > $kernel/register
-    trap 'echo -1 > $kernel/phil-aarch64' EXIT
-fi
-debootstrap --arch=arm64 --variant=minbase --include=python3,systemd-sysv,dbus,udev,iproute2,\
-openssh-server,openssh-client,linux-image-cloud-arm64 bullseye "$root" >&2
-cd "$root"
-mkdir -p root/.ssh
-cp "$key" root/.ssh/authorized_keys
-chmod 0700 root/.ssh
-printf '[Match]\\nName=e*\\n[Network]\\nAddress=10.0.2.15/24\\n' > etc/systemd/network/10.network
-ln -s /lib/systemd/system/systemd-networkd.service etc/systemd/system/multi-user.target.wants/
-echo board > etc/hostname
-echo '127.0.0.1 localhost board' > etc/hosts
-echo '/dev/vda / ext4 defaults 0 1' > etc/fstab
-rm -rf debootstrap var/cache/apt/archives/*.deb usr/share/doc usr/share/locale
-cp boot/vmlinuz-* "$cache/kernel"
-cp boot/initrd.img-* "$cache/initrd"
-truncate -s 3G "$cache/draft"
-mkfs.ext4 -q -F -d . "$cache/draft"
-mv "$cache/draft" "$cache/disk"
-"""
 # Its clock counts instructions, 1 ns each, and goes with ours only while it has nothing to do. So
 # it has as much time as a board, however slow the emulation is.
 _EMULATE = """\
@@ -326,7 +299,7 @@ def make_image() -> None:
     # In a mount namespace of its own: what it mounts is gone with it, whatever happens.
     apart = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-e", "-c"]
     done = subprocess.run(
-        [*apart, _MAKE_IMAGE, "sh", str(CACHE), str(CACHE / "key.pub")],
+        [*apart, IMAGE.read_text(), "sh", str(CACHE), str(CACHE / "key.pub")],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     shutil.rmtree(CACHE / "root", ignore_errors=True)

@@ -34,7 +34,6 @@ from hil_tests.report import (
     write_report,
 )
 from hil_tests.sweep import (
-    LAG_AXES,
     LAGS,
     LOOPS,
     MODEL,
@@ -180,20 +179,16 @@ def run_latency(
     found = drive_all(task, specs, PART_EPISODES, drive_network, jobs, _rows_beside(out))
     rows = {spec: make_row(spec, parts) for spec, parts in found.items()}
     driven_s, wall_s = (sum(row[name] for row in rows.values()) for name in ("driven_s", "wall_s"))
+    told = ("name", "title", "unit", "values", "specs")
     latency = {
         **task.facts(),
         "clock": "lockstep",
-        "axes": _told(axes),
+        "axes": [{name: getattr(axis, name) for name in told} for axis in axes],
         "rows": rows,
         "budget": budget(axes, rows, target, task.policy.stem),
         "faster_than_real_time": driven_s / wall_s,
     }
     return {**latency, "figures": write_figures(out, latency)}
-
-
-def _told(axes: Sequence[Axis]) -> list[dict[str, Any]]:
-    names = ("name", "title", "unit", "values", "specs")
-    return [{name: getattr(axis, name) for name in names} for axis in axes]
 
 
 def _add_vehicle_arguments(parser: argparse.ArgumentParser) -> None:
@@ -270,13 +265,10 @@ def run_sweep(
     """Drive every lag, ``jobs`` at a time; the report's part ``sweep``."""
     found = drive_all(task, lags, task.runs, drive_lag, jobs, _rows_beside(out), processes=True)
     rows = {lag.spec: row for lag, (row,) in found.items()}
-    axes = [axis for axis in LAG_AXES if set(axis.specs) <= set(rows)]
     sweep = {
         **task.facts(),
         "mock": task.changes,
-        "axes": _told(axes),
         "rows": rows,
-        "budget": budget(axes, rows, target, task.policy.stem) if axes else None,
         "lag_budget": lag_budget(list(rows.values()), target),
     }
     return {**sweep, "figures": write_lag_figures(out, sweep)}

@@ -15,11 +15,6 @@ from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
 from hil_tests.sweep import LOOPS, VEHICLE, Found
 
-FIGURES = {
-    "success": ("success", "success", "Wilson's 95 % interval"),
-    "distance": ("surviving_distance_m", "surviving distance, m", "Student's 95 % interval"),
-}
-"""Figure -> what of a row it shows, its label, and what the band is."""
 COLUMNS = 3
 
 
@@ -185,7 +180,6 @@ def render_sweep(sweep: Found) -> str:
     return "\n".join(
         [
             f"{lag_sentence(sweep)}\n",
-            *([f"{sweep['budget']['sentence']}\n"] if sweep["budget"] else []),
             *_pictures(sweep),
             f"Success of {sweep['runs']} episodes, and in brackets the lag of the speed that the "
             "drives showed, ms; a star where the driver stopped the vehicle, which did not follow:",
@@ -214,22 +208,17 @@ def _numbers(found: Mapping[str, float | None] | None, digits: int) -> str:
 
 
 def write_figures(out: Path, swept: Found) -> dict[str, str]:
-    """Write a PNG of each of FIGURES beside ``out``, with a panel for each axis; their names.
-
-    ``swept`` is a part of a report with axes. The names begin with the stem of ``out``.
-    """
-    names = {}
-    for name, (field, label, band) in FIGURES.items():
-        names[name] = f"{out.stem}_{name}.png"
-        write_png(out.with_name(names[name]), _draw_axes(swept, field, label, band))
-    return names
+    """Write a PNG beside ``out``, with a panel for each axis of a report's part; its name."""
+    name = f"{out.stem}_success.png"
+    write_png(out.with_name(name), _draw_axes(swept))
+    return {"success": name}
 
 
 def write_lag_figures(out: Path, sweep: Found) -> dict[str, str]:
-    """The table of lags as a picture, and the lines through it where they are whole."""
+    """The table of lags as a picture; its name."""
     name = f"{out.stem}_table.png"
     write_png(out.with_name(name), _draw_lags(sweep))
-    return {"table": name, **(write_figures(out, sweep) if sweep["axes"] else {})}
+    return {"table": name}
 
 
 def write_png(path: Path, figure: Figure) -> None:
@@ -239,28 +228,30 @@ def write_png(path: Path, figure: Figure) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-def _draw_axes(swept: Found, field: str, label: str, band: str) -> Figure:
+def _draw_axes(swept: Found) -> Figure:
     axes, name = swept["axes"], Path(swept["policy"]).stem
     rows, columns = math.ceil(len(axes) / COLUMNS), min(COLUMNS, len(axes))
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten().tolist()
     for panel, axis in zip(panels, axes, strict=False):
         values = axis["values"]
-        estimates = [swept["rows"][spec][field] for spec in axis["specs"]]
+        estimates = [swept["rows"][spec]["success"] for spec in axis["specs"]]
         panel.plot(values, [each["value"] for each in estimates], "o-", ms=3.5, label=name)
         low, high = ([each[end] for each in estimates] for end in ("low", "high"))
         panel.fill_between(values, low, high, alpha=0.2, linewidth=0)
         panel.set_xlabel(f"{axis['title']}, {axis['unit']}", fontsize=9)
         panel.grid(alpha=0.3)
-        if field == "success":
-            target = swept["budget"]["target_success"]
-            panel.axhline(target, color="0.4", lw=0.8, linestyle="--", label=f"{target:.0%}")
-            panel.set_ylim(-0.03, 1.03)
+        target = swept["budget"]["target_success"]
+        panel.axhline(target, color="0.4", lw=0.8, linestyle="--", label=f"{target:.0%}")
+        panel.set_ylim(-0.03, 1.03)
     for panel in panels[len(axes) :]:
         panel.set_visible(False)
-    figure.supylabel(label)
+    figure.supylabel("success")
     drives = f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point"
-    handles, title = figure.axes[0].get_legend_handles_labels(), f"{drives}; bands: {band}"
+    handles, title = (
+        figure.axes[0].get_legend_handles_labels(),
+        f"{drives}; bands: Wilson's 95 % interval",
+    )
     figure.legend(*handles, loc="outside upper center", ncols=4, title=title, frameon=False)
     return figure
 

@@ -107,20 +107,7 @@ class Lag(NamedTuple):
 
 DEAD_TIMES_MS = (0, 50, 100, 200, 300, 400, 500, 600, 800)
 TIME_CONSTANTS_MS = (20, 50, 100, 200, 300, 500, 750, 1000)
-LINE_DEAD_MS, LINE_CONSTANT_MS = 50, 100
-"""Where the lines lie: of the table, the values nearest to the mock's own (30 and 100 ms)."""
 LAGS = [Lag(dead, constant) for dead in DEAD_TIMES_MS for constant in TIME_CONSTANTS_MS]
-LAG_AXES = (
-    Axis("dead_time", f"dead time, with a time constant of {LINE_CONSTANT_MS} ms", "ms",
-         DEAD_TIMES_MS, f"dead={{}}ms,constant={LINE_CONSTANT_MS}ms",
-         Lag(DEAD_TIMES_MS[0], LINE_CONSTANT_MS).spec,
-         f"{{}} of dead time (time constant {LINE_CONSTANT_MS} ms)"),
-    Axis("time_constant", f"time constant, with a dead time of {LINE_DEAD_MS} ms", "ms",
-         TIME_CONSTANTS_MS, f"dead={LINE_DEAD_MS}ms,constant={{}}ms",
-         Lag(LINE_DEAD_MS, TIME_CONSTANTS_MS[0]).spec,
-         f"{{}} of time constant (dead time {LINE_DEAD_MS} ms)"),
-)  # fmt: skip
-"""Two lines through the table LAGS."""
 
 Found = Mapping[str, Any]
 """A part of a report's JSON."""

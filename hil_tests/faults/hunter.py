@@ -33,8 +33,6 @@ QUIET_S = 0.5
 """So long it must stand when the fault is over: the mock takes set-points up again within 20 ms."""
 STANDS_WITHIN_S = 2.0
 """After the fault: our reaction, the chassis's own 0.5 s where it hears nothing, the braking."""
-_SAID_BEFORE_S = 0.1
-"""Feedback that left before the driver took the re-arm comes so much after it at most."""
 _FAST_MPS = 0.9 * MODELS[MODEL].max_speed_mps
 _IMPOSSIBLE_MPS = 1.2 * MODELS[MODEL].max_speed_mps
 _DIFFERS_MPS = 0.15
@@ -108,11 +106,7 @@ def _when_over(
     rearmed_s = time.monotonic()
     rig.wait_until_driving(ready=lambda: rig.chassis.moves)
     recovered_s = rig.recovered_after_s(rearmed_s)
-    drove_s = rearmed_s + recovered_s
-    # Between a re-arm and the first drive feedback has nothing to say, or it was stopped again.
-    said = {w for s, w in list(rig.timeline.named) if rearmed_s + _SAID_BEFORE_S < s < drove_s}
-    notes = [f"after the re-arm: {', '.join(sorted(said))}"] if said else []
-    return Try(told_s - known_s, recovered_s, stop.reason, wrong=wrong, notes=notes)
+    return Try(told_s - known_s, recovered_s, stop.reason, wrong=wrong)
 
 
 def _drives(monitor: CanMonitor) -> bool:

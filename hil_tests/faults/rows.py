@@ -49,8 +49,6 @@ class Try:
     rejected: Mapping[str, int] = field(default_factory=dict)
     figures: Mapping[str, float] = field(default_factory=dict)
     """Further figures of the row, by name with unit."""
-    notes: list[str] = field(default_factory=list)
-    """What explains a time, and is no fault by itself."""
 
 
 DoFault = Callable[[Rig, int], Try]

@@ -186,7 +186,6 @@ def report_row(row: Row, outcome: Outcome) -> dict[str, Any]:
         "reasons": dict(Counter(t.reason for t in outcome.tries if t.reason)),
         "rejected": dict(sum((Counter(t.rejected) for t in outcome.tries), Counter())),
         "figures": figures,
-        "notes": [text for t in outcome.tries for text in t.notes],
         "wrong": wrong,
         "unsafe": outcome.unsafe,
         "crashes": outcome.crashes,
