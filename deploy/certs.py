@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import datetime
+import functools
 import ipaddress
 import os
 import re
@@ -73,12 +74,8 @@ _NO_USE = dict.fromkeys(
 
 
 def _add_keys_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        default=str(DEFAULT_PUBLIC_KEY.parent),
-        help="directory for policy.key and policy.pub",
-    )
+    out, text = str(DEFAULT_PUBLIC_KEY.parent), "directory for policy.key and policy.pub"
+    parser.add_argument("--out", metavar="DIR", default=out, help=text)
 
 
 def _run_keys(arguments: argparse.Namespace) -> int:
@@ -132,29 +129,15 @@ class Pair(NamedTuple):
 
 
 def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", default="certs", help="directory of all folders")
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        action="append",
-        help="a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
-        f" (default: {DEFAULT_VEHICLE_ID})",
-    )
-    parser.add_argument(
-        "--host",
-        metavar="NAME",
-        action="append",
-        default=[],
-        help="a name or address at which simulator or router are reached; may be repeated"
-        f" (always: {', '.join(LOOPBACK_HOSTS)})",
-    )
-    parser.add_argument(
-        "--days",
-        metavar="N",
-        type=whole_number(1, CA_DAYS),
-        default=365,
-        help="how long they are valid, days",
-    )
+    vehicle = "a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
+    vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
+    host = "a name or address at which simulator or router are reached; may be repeated"
+    host += f" (always: {', '.join(LOOPBACK_HOSTS)})"
+    add, days = parser.add_argument, whole_number(1, CA_DAYS)
+    add("--out", metavar="DIR", default="certs", help="directory of all folders")
+    add("--vehicle-id", metavar="ID", action="append", help=vehicle)
+    add("--host", metavar="NAME", action="append", default=[], help=host)
+    add("--days", metavar="N", type=days, default=365, help="how long they are valid, days")
 
 
 def _run_certs(arguments: argparse.Namespace) -> int:
@@ -328,28 +311,15 @@ CERTS = Command(
 
 
 def _add_router_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--listen",
-        metavar="tls/HOST:PORT",
-        action="append",
-        required=True,
-        help="where all others connect to, as tls/0.0.0.0:7447; may be repeated",
-    )
-    parser.add_argument(
-        "--tls",
-        metavar="DIR",
-        required=True,
-        help="the router's folder of `deploy certs`, as certs/router; zenohd opens its files",
-    )
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        action="append",
-        default=[],
-        help="a vehicle whose parties have rights at this router; may be repeated",
-    )
-    parser.add_argument("--vehicles", metavar="FILE", help="a file with one vehicle id a line")
-    parser.add_argument("--out", metavar="FILE.json5", required=True, help="the settings' file")
+    listen = "where all others connect to, as tls/0.0.0.0:7447; may be repeated"
+    tls = "the router's folder of `deploy certs`, as certs/router; zenohd opens its files"
+    vehicle = "a vehicle whose parties have rights at this router; may be repeated"
+    add, append = parser.add_argument, functools.partial(parser.add_argument, action="append")
+    append("--listen", metavar="tls/HOST:PORT", required=True, help=listen)
+    add("--tls", metavar="DIR", required=True, help=tls)
+    append("--vehicle-id", metavar="ID", default=[], help=vehicle)
+    add("--vehicles", metavar="FILE", help="a file with one vehicle id a line")
+    add("--out", metavar="FILE.json5", required=True, help="the settings' file")
 
 
 def _run_router(arguments: argparse.Namespace) -> int:
@@ -391,8 +361,7 @@ def _router_settings(
     rows["transport/link/rx/max_message_size"] = MAX_MESSAGE_BYTES
     nested: dict[str, Any] = {}
     for path, value in rows.items():
-        *folders, name = path.split("/")
-        place = nested
+        place, (*folders, name) = nested, path.split("/")
         for folder in folders:
             place = place.setdefault(folder, {})
         place[name] = value
