@@ -31,22 +31,10 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from edge_runtime import tls
 from edge_runtime.cli import Command, examples, whole_number
 from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
 from edge_runtime.policy_file import DEFAULT_PUBLIC_KEY
-from edge_runtime.tls import (
-    CA_FILE,
-    CERTIFICATE_FILE,
-    KEY_FILE,
-    ROLES,
-    ROUTER,
-    TlsFiles,
-    check_name,
-    common_name,
-    load_tls,
-    read_private_key,
-    rules_for_listener,
-)
 from edge_runtime.util import UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
@@ -160,7 +148,7 @@ def _run_certs(arguments: argparse.Namespace) -> int:
     for name, role in roles.items():
         issued = issue(authority, name, role, hosts, now, days)
         certificate = issued.certificate.public_bytes(Encoding.PEM)
-        files = {CERTIFICATE_FILE: certificate, KEY_FILE: _pem(issued.key)}
+        files = {tls.CERTIFICATE_FILE: certificate, tls.KEY_FILE: _pem(issued.key)}
         _write_folder(out / name, authority, files)
     print(f"authority (keep {ca_folder / CA_KEY_FILE} off every board): {ca_folder}")
     for name in roles:
@@ -174,9 +162,9 @@ def _missing(out: Path, vehicle_ids: Sequence[str]) -> dict[str, str]:
 
     Raises UserError where all have one, and for an id that no certificate can name.
     """
-    roles = {role: role for role, rights in ROLES.items() if rights.all_vehicles}
-    own = [role for role, rights in ROLES.items() if not rights.all_vehicles]
-    roles |= {common_name(role, vehicle): role for vehicle in vehicle_ids for role in own}
+    roles = {role: role for role, rights in tls.ROLES.items() if rights.all_vehicles}
+    own = [role for role, rights in tls.ROLES.items() if not rights.all_vehicles]
+    roles |= {tls.common_name(role, vehicle): role for vehicle in vehicle_ids for role in own}
     for name in roles:
         if len(name) > MAX_NAME_CHARS:
             raise UserError(
@@ -211,9 +199,9 @@ def _write_folder(folder: Path, authority: Pair, files: dict[str, bytes]) -> Non
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         draft.mkdir(mode=0o700)
-        write_atomic(draft / CA_FILE, authority.certificate.public_bytes(Encoding.PEM))
+        write_atomic(draft / tls.CA_FILE, authority.certificate.public_bytes(Encoding.PEM))
         for name, data in files.items():
-            write = write_private if name in (KEY_FILE, CA_KEY_FILE) else write_atomic
+            write = write_private if name in (tls.KEY_FILE, CA_KEY_FILE) else write_atomic
             write(draft / name, data)
         draft.rename(folder)  # Fails where somebody has filled it meanwhile.
     except OSError as error:
@@ -228,16 +216,16 @@ def _pem(key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey) -> bytes:
 
 def read_authority(folder: Path) -> Pair:
     """The authority that was made before. UserError where its files do not fit."""
-    pem = read_bytes(folder / CA_FILE, "authority")
+    pem = read_bytes(folder / tls.CA_FILE, "authority")
     try:
         certificate = x509.load_pem_x509_certificate(pem)
     except ValueError:
-        raise UserError(f"{folder / CA_FILE} is not a certificate in PEM") from None
-    key = read_private_key(folder / CA_KEY_FILE)
+        raise UserError(f"{folder / tls.CA_FILE} is not a certificate in PEM") from None
+    key = tls.read_private_key(folder / CA_KEY_FILE)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UserError(f"{folder / CA_KEY_FILE} is not a key of an elliptic curve")
     if key.public_key() != certificate.public_key():
-        raise UserError(f"{folder / CA_KEY_FILE} does not fit {CA_FILE} beside it")
+        raise UserError(f"{folder / CA_KEY_FILE} does not fit {tls.CA_FILE} beside it")
     return Pair(certificate, key)
 
 
@@ -261,7 +249,7 @@ def issue(
     """A certificate for a party; `hosts` are the names under which a listener is reached."""
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     names: list[tuple[x509.ExtensionType, bool]] = []
-    if ROLES[role].listens:
+    if tls.ROLES[role].listens:
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
         names.append((x509.SubjectAlternativeName(hosts), False))
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
@@ -326,7 +314,7 @@ def _run_router(arguments: argparse.Namespace) -> int:
     """Write the file. Raises UserError where anything in it would not hold."""
     check_writable(arguments.out)
     ids = arguments.vehicle_id + (_read_ids(arguments.vehicles) if arguments.vehicles else [])
-    settings = _router_settings(arguments.listen, ids, load_tls(arguments.tls))
+    settings = _router_settings(arguments.listen, ids, tls.load_tls(arguments.tls))
     write_json(arguments.out, settings)
     size = Path(arguments.out).stat().st_size
     names = len(settings["access_control"]["subjects"])
@@ -337,7 +325,7 @@ def _run_router(arguments: argparse.Namespace) -> int:
 
 
 def _router_settings(
-    listens: Sequence[str], vehicle_ids: Sequence[str], tls: TlsFiles
+    listens: Sequence[str], vehicle_ids: Sequence[str], files: tls.TlsFiles
 ) -> dict[str, Any]:
     """Zenoh's settings as one nested map: those of `bridge router --tls`, and a fleet's limits.
 
@@ -349,11 +337,11 @@ def _router_settings(
 
     for endpoint in listens:
         check_fits(check_endpoint(endpoint), with_tls=True)
-    check_name(tls.name, ROUTER)
+    tls.check_name(files.name, tls.ROUTER)
     if not vehicle_ids:
         raise UserError("no vehicle: name each with --vehicle-id, or all of them in --vehicles")
     ids = list(dict.fromkeys(map(check_vehicle_id, vehicle_ids)))
-    rows = session_rows(list(listens), None, "router", tls, rules_for_listener(ids))
+    rows = session_rows(list(listens), None, "router", files, tls.rules_for_listener(ids))
     sessions = SPARE_SESSIONS + SESSIONS_PER_VEHICLE * len(ids)
     rows["transport/unicast/max_sessions"] = sessions
     # After a router's restart all of its vehicles come at once.

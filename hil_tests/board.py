@@ -26,9 +26,17 @@ from pathlib import Path
 from typing import Any, Self
 
 from deploy.__main__ import main as deploy
-from deploy.bundle import NAME, Inputs, build_installer, make_bundle
+from deploy.bundle import (
+    DEFAULT_FOLDER,
+    NAME,
+    ROOT,
+    TARGETS,
+    Inputs,
+    build_edge_wheel,
+    build_installer,
+    make_bundle,
+)
 from deploy.installer.systemd import MAIN_UNIT
-from deploy.wheels import DEFAULT_FOLDER, ROOT, TARGETS, build_edge_wheel
 from edge_runtime.cli import examples, positive, sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.link_probe import free_endpoint

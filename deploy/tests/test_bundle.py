@@ -10,9 +10,18 @@ import pytest
 
 from deploy import bundle
 from deploy.__main__ import main
-from deploy.bundle import Inputs, build_installer, make_bundle
+from deploy.bundle import (
+    DEFAULT_FOLDER,
+    ROOT,
+    TARGETS,
+    Inputs,
+    build_edge_wheel,
+    build_installer,
+    gather,
+    lock_path,
+    make_bundle,
+)
 from deploy.tests.boards import HERE
-from deploy.wheels import DEFAULT_FOLDER, ROOT, TARGETS, build_edge_wheel, gather, lock_path
 from edge_runtime.config import load_config
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError

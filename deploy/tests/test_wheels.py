@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from deploy import wheels
+from deploy import bundle
+from deploy.bundle import TARGETS, Pin, gather, lock_path, read_lock
 from deploy.installer.layout import unpack_wheel
 from deploy.installer.verify import UserError as InstallerError
 from deploy.tests.boards import HERE
-from deploy.wheels import TARGETS, Pin, gather, lock_path, read_lock
 from edge_runtime.util import UserError
 
 
@@ -83,7 +83,7 @@ def test_a_lock_without_version_or_hash_is_refused(tmp_path, line):
 
 
 def test_a_full_folder_needs_no_network(tmp_path, monkeypatch):
-    monkeypatch.setattr(wheels, "pip", lambda *_: pytest.fail("pip was asked"))
+    monkeypatch.setattr(bundle, "pip", lambda *_: pytest.fail("pip was asked"))
     (tmp_path / "a-1-py3-none-any.whl").write_bytes(b"")
     (tmp_path / "other-1-py3-none-any.whl").write_bytes(b"other")
     lock = tmp_path / "lock.txt"

@@ -9,7 +9,7 @@ import pytest
 from edge_runtime.cli import run_cli
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
-from hil_tests import campaign, sweep
+from hil_tests import sweep
 from hil_tests.__main__ import main
 from hil_tests.mock_hunter.hunter import make_parameters
 from hil_tests.processes import POLICY
@@ -238,7 +238,7 @@ def test_a_mistake_is_one_line_before_anything_is_driven(command, options, said,
 
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):
     few = Axis("delay", "delay", "ms", (0, 100), "delay={}ms", "none", "{} of delay")
-    monkeypatch.setattr(campaign, "NETWORK_AXES", (few,))
+    monkeypatch.setattr(sweep, "NETWORK_AXES", (few,))
     out = tmp_path / "r.json"
     arguments = ["campaign", "--only", "latency", "--runs", "2", "--jobs", "2", "--out", str(out)]
     assert run_cli(main, arguments) == 0
@@ -255,7 +255,7 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
         driven.append(part)
         raise UserError("drives nothing")
 
-    monkeypatch.setattr(campaign, "drive_network", drive_network)
+    monkeypatch.setattr(sweep, "drive_network", drive_network)
     assert run_cli(main, arguments) == 0
     assert json.loads(out.read_text())["latency"]["rows"] == first["rows"]
     next((tmp_path / "r_rows").iterdir()).unlink()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from deploy.wheels import TARGETS
+from deploy.bundle import TARGETS
 from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError
 from edge_runtime.vehicles.ros2.names import DEFAULT_ROS2_ENDPOINT
