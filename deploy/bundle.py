@@ -106,12 +106,12 @@ class Made(NamedTuple):
 
 def _add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--target", choices=TARGETS, required=True, help="the board's kind")
-    add = functools.partial(parser.add_argument, metavar="FILE")
+    add = functools.partial(parser.add_argument, type=Path, metavar="FILE")
     add("--policy", required=True, help="signed policy file")
     add("--config", help="settings of `edge_runtime run`: connect, vehicle, ... (TOML)")
     add("--public-key", default=str(DEFAULT_PUBLIC_KEY), help="of whoever signed the policy")
     add("--key", default=DEFAULT_KEY, help="private key that signs the bundle")
-    add = functools.partial(parser.add_argument, metavar="DIR")
+    add = functools.partial(parser.add_argument, type=Path, metavar="DIR")
     add("--tls", help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01")
     add("--wheels", default=DEFAULT_FOLDER, help="wheels are kept here")
     add("--out", default=DEFAULT_OUT, help="where the archive goes")
@@ -119,18 +119,12 @@ def _add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_bundle(arguments: argparse.Namespace) -> int:
     """Make a bundle and print its size and contents."""
-    target, out = TARGETS[arguments.target], Path(arguments.out)
-    inputs = Inputs(
-        policy=Path(arguments.policy),
-        public_key=Path(arguments.public_key),
-        key=Path(arguments.key),
-        config=Path(arguments.config) if arguments.config else None,
-        tls=Path(arguments.tls) if arguments.tls else None,
-        wheels=[],
-    )
+    target, out = TARGETS[arguments.target], arguments.out
+    given = (getattr(arguments, name) for name in Inputs._fields[:-1])
+    inputs = Inputs(*given, wheels=[])
     check_inputs(inputs)  # Before minutes of downloads, and so is the next line.
     check_writable(out / "bundle.tar")
-    wheels = gather(target, lock_path(target), Path(arguments.wheels) / target.name)
+    wheels = gather(target, lock_path(target), arguments.wheels / target.name)
     with tempfile.TemporaryDirectory() as place:
         wheels.append(build_edge_wheel(Path(place)))
         made = make_bundle(inputs._replace(wheels=wheels), target, out)

@@ -1,4 +1,4 @@
-"""Key pairs and certificates as files; on the wire: hil_tests/tests/test_tls*.py."""
+"""Key pairs and certificates as files; on the wire: hil_tests/tests/test_tls.py."""
 
 import contextlib
 import datetime
