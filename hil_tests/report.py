@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from bridge.report import markdown_table
@@ -100,7 +99,7 @@ def render_latency(latency: Found) -> str:
         f"{latency['faster_than_real_time']:.1f} times real time in each worker, the start of "
         "each simulator included.",
         "",
-        *_pictures(latency),
+        *(f"![{name}]({path})\n" for name, path in latency["figures"].items()),
     ]
     for axis in latency["axes"]:
         rows = [
@@ -113,10 +112,6 @@ def render_latency(latency: Found) -> str:
         title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
         lines += [title, "", *markdown_table(("value", *_OF_A_ROW), rows)]
     return "\n".join(lines)
-
-
-def _pictures(part: Found) -> list[str]:
-    return [f"![{name}]({path})\n" for name, path in part["figures"].items()]
 
 
 def comparison_verdict(comparison: Found) -> str:
@@ -166,7 +161,7 @@ def lag_sentence(sweep: Found) -> str:
 
 
 def render_sweep(sweep: Found) -> str:
-    """The sentences, the pictures, and the table: success, measured lag, stops of the driver."""
+    """The sentence and the table: success, measured lag, stops of the driver."""
     points = {(row["constant_ms"], row["dead_ms"]): row for row in sweep["rows"].values()}
     constants, deads = (sorted({point[way] for point in points}) for way in (0, 1))
 
@@ -180,7 +175,6 @@ def render_sweep(sweep: Found) -> str:
     return "\n".join(
         [
             f"{lag_sentence(sweep)}\n",
-            *_pictures(sweep),
             f"Success of {sweep['runs']} episodes, and in brackets the lag of the speed that the "
             "drives showed, ms; a star where the driver stopped the vehicle, which did not follow:",
             "",
@@ -212,13 +206,6 @@ def write_figures(out: Path, swept: Found) -> dict[str, str]:
     name = f"{out.stem}_success.png"
     write_png(out.with_name(name), _draw_axes(swept))
     return {"success": name}
-
-
-def write_lag_figures(out: Path, sweep: Found) -> dict[str, str]:
-    """The table of lags as a picture; its name."""
-    name = f"{out.stem}_table.png"
-    write_png(out.with_name(name), _draw_lags(sweep))
-    return {"table": name}
 
 
 def write_png(path: Path, figure: Figure) -> None:
@@ -253,33 +240,4 @@ def _draw_axes(swept: Found) -> Figure:
         f"{drives}; bands: Wilson's 95 % interval",
     )
     figure.legend(*handles, loc="outside upper center", ncols=4, title=title, frameon=False)
-    return figure
-
-
-def _draw_lags(sweep: Found) -> Figure:
-    rows = sweep["rows"].values()
-    dead, constant = (sorted({row[name] for row in rows}) for name in ("dead_ms", "constant_ms"))
-    success = np.full((len(constant), len(dead)), np.nan)
-    for row in rows:
-        place = constant.index(row["constant_ms"]), dead.index(row["dead_ms"])
-        success[place] = row["success"]["value"]
-    target = sweep["lag_budget"]["target_success"]
-    size = (0.8 * len(dead) + 2.5, 0.55 * len(constant) + 2.0)
-    figure = Figure(figsize=size, layout="constrained")
-    panel = figure.subplots()
-    image = panel.imshow(success, origin="lower", aspect="auto", vmin=0.5, vmax=1, cmap="RdYlGn")
-    for (y, x), value in np.ndenumerate(success):
-        if not np.isnan(value):  # else it was not asked for
-            weight = "bold" if value >= target else "normal"
-            panel.text(x, y, f"{value:.0%}", ha="center", va="center", fontsize=8, weight=weight)
-    panel.set_xticks(range(len(dead)), map(str, dead))
-    panel.set_yticks(range(len(constant)), map(str, constant))
-    panel.set_xlabel("dead time of the actuator, ms")
-    panel.set_ylabel("its time constant, ms")
-    panel.set_title(
-        f"{sweep['scenario']}: success with a simulated Hunter in the loop, {sweep['runs']} "
-        f"episodes a point\n(bold: at least {target:.0%}; white: not tested)",
-        fontsize=10,
-    )
-    figure.colorbar(image, label="success")
     return figure

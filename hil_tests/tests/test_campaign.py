@@ -203,7 +203,7 @@ def test_the_lag_budget_is_the_sum_up_to_which_every_point_holds():
 def test_the_table_shows_lags_that_were_not_told_as_such():
     rows = {row["spec"]: row for row in (row_at(0, 100, 20, 90), row_at(50, 200, 10, None, 1))}
     found = {
-        "rows": rows, "runs": 20, "figures": {"table": "r_table.png"},
+        "rows": rows, "runs": 20,
         "lag_budget": lag_budget(list(rows.values()), 0.95),
     }  # fmt: skip
     text = render_sweep(found)
@@ -347,7 +347,6 @@ def test_the_sweep_as_a_command(tmp_path):
     assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 0
     found = json.loads(out.read_text())["sweep"]
     assert found["rows"]["dead=50ms,constant=100ms"]["outcomes"] == {"goal": 2}
-    assert (tmp_path / found["figures"]["table"]).stat().st_size > 5000
     (kept,) = (tmp_path / "r_rows").iterdir()
     (row,) = json.loads(kept.read_text())
     kept.write_text("{")
