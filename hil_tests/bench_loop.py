@@ -120,21 +120,17 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             "floor_memory_mb": floor_memory,
         },
         "modes": dict(ours.modes),
-        "state_bytes": len(ours.prepare()[1]),
         "lockstep": lockstep(policy, arguments.episodes),
     }
 
 
 class Contender:
-    """Sends states to a process. A block of them is an episode.
-
-    ``arrivals`` holds when the answer to each step came, ``modes`` how many answers had each mode.
-    """
+    """Sends states to a process. A block of them is an episode."""
 
     def __init__(self, session: zenoh.Session, vehicle_id: str) -> None:
         self.vehicle_id = vehicle_id
-        self.arrivals: dict[int, float] = {}
-        self.modes: Counter[str] = Counter()
+        self.arrivals: dict[int, float] = {}  # when the answer to each step came
+        self.modes: Counter[str] = Counter()  # how many answers had each
         draw = np.random.default_rng(0).integers
         shape = (PICTURES, *wire.FRAMES_SHAPE)
         self._pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]

@@ -208,9 +208,9 @@ class Board:
 
     def boot(self) -> float:
         """Switch it on; how long it took until all of its services were up, s."""
-        words = ["sh", "-c", _EMULATE, "sh", CACHE, self._disk, self._port]
+        words = ["sh", "-c", _EMULATE, "sh", str(CACHE), str(self._disk), str(self._port)]
         begun_s = time.monotonic()
-        self._machine = subprocess.Popen([str(word) for word in words], stdin=subprocess.DEVNULL)
+        self._machine = subprocess.Popen(words, stdin=subprocess.DEVNULL)
         wait_until(self._is_up, "the emulated computer is up", _BOOT_LIMIT_S)
         return round(time.monotonic() - begun_s, 1)
 
@@ -299,17 +299,10 @@ def make_image() -> None:
     Raises UserError where debootstrap failed, for instance without a network.
     """
     CACHE.mkdir(parents=True, exist_ok=True)
-    for name in ("key", "key.pub"):
-        (CACHE / name).unlink(missing_ok=True)
-    shutil.rmtree(CACHE / "root", ignore_errors=True)
-    key = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(CACHE / "key")]
-    subprocess.run(key, check=True)
     # In a mount namespace of its own: what it mounts is gone with it, whatever happens.
     apart = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-e", "-c"]
-    done = subprocess.run(
-        [*apart, IMAGE.read_text(), "sh", str(CACHE), str(CACHE / "key.pub")],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    words = [*apart, IMAGE.read_text(), "sh", str(CACHE)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     shutil.rmtree(CACHE / "root", ignore_errors=True)
     if done.returncode != 0:
         lines = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
@@ -340,7 +333,11 @@ def prove_aarch64(cuts: int, keep: Keep) -> None:
             board.copy(folder / NAME)
             for light in lights:
                 board.copy(light, Path(f"{light}.sig"))
-            report["rolled_back"] = _upgrade_and_back(board, lights[0])
+            before = board.current()
+            board.must(f"install {lights[0].name}")
+            upgraded = board.current()
+            board.must("rollback")
+            report["rolled_back"] = upgraded != before and board.current() == before
             report["changed_bytes"] = _change_bytes(board, lights[1])
             report["faulty"] = {
                 why: _install_faulty(board, parcels.light(line)) for why, line in FAULTS.items()
@@ -416,15 +413,6 @@ def _hang(board: Board) -> float:
     )
     board.wait_until_active()
     return round(time.monotonic() - begun_s, 1)
-
-
-def _upgrade_and_back(board: Board, light: Path) -> bool:
-    """Whether an upgrade became current, and a roll-back the release before."""
-    before = board.current()
-    board.must(f"install {light.name}")
-    upgraded = board.current()
-    board.must("rollback")
-    return upgraded != before and board.current() == before
 
 
 def _change_bytes(board: Board, bundle: Path) -> dict[str, Any]:

@@ -72,11 +72,7 @@ def _add_pictures_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_pictures(arguments: argparse.Namespace) -> int:
-    """Make them, each as far as it can be made here; returns the exit status.
-
-    Raises:
-        UserError: no such picture, or nowhere to put it.
-    """
+    """Make them, each as far as it can be made here. UserError for one that is not known."""
     names = arguments.names or list(PICTURES)
     for name in names:
         if name not in PICTURES:

@@ -78,6 +78,7 @@ class Process:
             errors="surrogateescape",  # what is no text goes through as it is
             env={**os.environ, **(environment or {})},
         )
+        self.pid = self._process.pid
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         if ready is not None:
@@ -88,11 +89,6 @@ class Process:
             if self.has_ended:
                 self._gone(None)
                 raise self._failure()
-
-    @property
-    def pid(self) -> int:
-        """The process's id."""
-        return self._process.pid
 
     @property
     def has_ended(self) -> bool:

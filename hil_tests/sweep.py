@@ -118,8 +118,7 @@ Rows = Mapping[str, Found]
 def limit_of(axis: Axis, rows: Rows, target: float) -> float | None:
     """The largest tested value up to which success is at the target at every tested value.
 
-    Success is the share of the row's episodes (the point estimate), and nothing is interpolated.
-    None where it is below the target even at 0.
+    Success is the point estimate; nothing is interpolated. None where even 0 is below the target.
     """
     limit: float | None = None
     for value in axis.values:
@@ -197,10 +196,7 @@ class Task(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Episodes of one point with the seeds ``seed``, ``seed + 1``, ...: the same for every point.
-
-    ``point`` is a network, one of LOOPS or a `Lag`.
-    """
+    """Episodes of one point (a network, one of LOOPS or a `Lag`), with the same seeds for each."""
 
     point: Any
     seed: int

@@ -68,7 +68,13 @@ class VirtualDrive:
         step, stops, stopped_ms, ended = 0, 0, math.inf, False
         while not ended:
             # The runtime's limiter would change nothing: the driver turns its set-points as fast.
-            self._command(hunter, step, self._driver.act(observation).tolist(), info["speed_mps"])
+            action, mps = self._driver.act(observation).tolist(), info["speed_mps"]
+            hunter.command(dict(zip(self.action_names, action, strict=True)), mps)
+            command = Command(
+                session=SESSION, episode=0, step=step, mode=DRIVE, action=action, policy_id="",
+                received_ns=0, inference_ns=0, sent_ns=hunter.now_ms * 10**6,
+            )  # fmt: skip
+            self.tracking.command(command)
             newest = None
             for now_ms, report in hunter.run(PERIOD_MS):
                 newest = self._feedback(step, report, now_ms)
@@ -82,21 +88,13 @@ class VirtualDrive:
             heard = VehicleDecision(
                 command=None, fresh=True, brake_reason="", undriven_s=0.0, feedback=newest
             )
-            action = self._apply(self._env, heard)
-            observation, _, terminated, truncated, info = self._env.step(action)
+            observation, _, terminated, truncated, info = self._env.step(
+                self._apply(self._env, heard)
+            )
             step, ended = step + 1, terminated or truncated
         self.tracking.end()
         time_s = step * CONTROL_PERIOD_S
         return Driven(seed, info["outcome"], float(info["distance_m"]), time_s, stops)
-
-    def _command(self, hunter: VirtualHunter, step: int, action: list[float], mps: float) -> None:
-        hunter.command(dict(zip(self.action_names, action, strict=True)), mps)
-        self.tracking.command(
-            Command(
-                session=SESSION, episode=0, step=step, mode=DRIVE, action=action, policy_id="",
-                received_ns=0, inference_ns=0, sent_ns=hunter.now_ms * 10**6,
-            )
-        )  # fmt: skip
 
     def _feedback(self, step: int, report: VehicleReport, now_ms: int) -> Feedback:
         """As `edge_runtime/vehicles/base.py` makes it."""

@@ -114,8 +114,7 @@ them with ``--set``."""
 def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> Parameters:
     """A model's row with some numbers replaced.
 
-    Raises:
-        UserError: an unknown name, or a number that is not positive (a dead time may be 0).
+    Raises UserError for an unknown name, or a number that is not positive (a dead time may be 0).
     """
     for name, value in (changes or {}).items():
         if name not in SOURCES:
