@@ -121,7 +121,7 @@ def _run_bundle(arguments: argparse.Namespace) -> int:
     """Make a bundle and print its size and contents."""
     target, out = TARGETS[arguments.target], arguments.out
     given = (getattr(arguments, name) for name in Inputs._fields[:-1])
-    inputs = Inputs(*given, wheels=[])
+    inputs = Inputs(*given, [])
     check_inputs(inputs)  # Before minutes of downloads, and so is the next line.
     check_writable(out / "bundle.tar")
     wheels = gather(target, lock_path(target), arguments.wheels / target.name)

@@ -7,7 +7,6 @@ from itertools import chain, repeat
 import pytest
 
 from edge_runtime.cli import run_cli
-from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
 from hil_tests import sweep
 from hil_tests.__main__ import main
@@ -209,31 +208,6 @@ def test_the_table_shows_lags_that_were_not_told_as_such():
     text = render_sweep(found)
     assert "| 100 | 100% (90) | - |" in text
     assert "| 200 | - | 50%* (-) |" in text
-
-
-@pytest.mark.parametrize(
-    ("command", "options", "said"),
-    [
-        ("campaign", ["--rows", "lag", "--only", "latency"], "no latency axis 'lag'"),
-        ("campaign", ["--rows", "delay,edge_kiled"], "no fault 'edge_kiled'"),
-        ("campaign", ["--rows", "delay", "--only", "faults"], "no fault"),
-        ("campaign", ["--runs", "1"], "2 or more have an interval"),
-        ("campaign", ["--policy", "nowhere.onnx", "--only", "latency"], "nowhere.onnx"),
-        ("campaign", ["--only", "latency", "--public-key", "no.pub"], "public key no.pub does not"),
-        ("vehicle", ["--lags", "50"], "'50' is no lag"),
-        ("vehicle", ["--lags", "50+0"], "'50+0' is no lag"),
-        ("vehicle", ["--set", "dead_time_s"], "use NAME=VALUE"),
-        ("vehicle", ["--set", "colour=1"], "no parameter 'colour'"),
-        ("vehicle", ["--policy", "nothing.onnx"], "nothing.onnx"),
-        ("vehicle", ["--public-key", "no.pub"], "public key no.pub does not exist"),
-    ],
-)
-def test_a_mistake_is_one_line_before_anything_is_driven(command, options, said, tmp_path, capsys):
-    assert exit_status(main, [command, "--out", str(tmp_path / "r.json"), *options]) == 2
-    errors = capsys.readouterr().err.strip()
-    assert said in errors
-    assert "\n" not in errors
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkeypatch, capsys):

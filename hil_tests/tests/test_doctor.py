@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from edge_runtime.cli import run_cli
 from hil_tests import doctor
 from hil_tests.__main__ import main
 from hil_tests.doctor import (
@@ -162,9 +161,3 @@ def test_what_goes_wrong_in_a_check_is_its_finding():
     assert summary([extra, basic]) == "The basics work. Missing besides: thing."
     assert summary([extra]) == "Missing: thing."
     assert summary([basic]) == "The basics work. Nothing is missing."
-
-
-def test_an_unknown_group_is_one_line(capsys):
-    assert run_cli(main, ["doctor", "--only", "wheels"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "choose from basics, training" in line

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
 from hil_tests import board as boards
 from hil_tests.__main__ import main
@@ -156,3 +157,53 @@ def test_every_file_and_line_that_is_named_is_there():
         assert entry["reason"]
         source = (ROOT / entry["file"]).read_text()
         assert " ".join(entry["was"].split()) in " ".join(source.split()), entry
+
+
+MISTAKES = {
+    "campaign --out {tmp}/r.json": {
+        "--rows lag --only latency": "no latency axis 'lag'",
+        "--rows delay,edge_kiled": "no fault 'edge_kiled'",
+        "--rows delay --only faults": "no fault",
+        "--runs 1": "2 or more have an interval",
+        "--policy nowhere.onnx --only latency": "nowhere.onnx",
+        "--only latency --public-key no.pub": "public key no.pub does not",
+    },
+    "vehicle --out {tmp}/r.json": {
+        "--lags 50": "'50' is no lag",
+        "--lags 50+0": "'50+0' is no lag",
+        "--set dead_time_s": "use NAME=VALUE",
+        "--set colour=1": "no parameter 'colour'",
+        "--policy nothing.onnx": "nothing.onnx",
+        "--public-key no.pub": "public key no.pub does not exist",
+    },
+    "demo": {
+        "--out {tmp}/file": "--out",
+        "--out {tmp}": "holds something else",
+        "--seed -3": "--seed",
+        "--minutes 0": "--minutes",
+        "--runs none": "--runs",
+    },
+    "pictures": {"x.png": "no picture 'x.png'", "--out /dev/null": "Not a directory"},
+    "doctor": {"--only wheels": "choose from basics, training"},
+    "mock_hunter": {
+        "--bus can0": "is no CAN bus",
+        "--bus udp_multicast:10.1.2.3": "is no IPv4 multicast group",
+        "--bus virtual:here": "a virtual bus ends with its process",
+        "--fault meteor": "no fault 'meteor'; choose from silent",
+        "--fault silent@-1": "not a finite number of seconds",
+        "--set wings=2": "no parameter 'wings'",
+        "--set track_m": "use NAME=VALUE",
+        "--model hunter-3": "invalid choice",
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "options"), [(name, each) for name, some in MISTAKES.items() for each in some]
+)
+def test_a_mistake_is_one_line_before_anything_is_done(command, options, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    assert exit_status(main, f"{command} {options}".format(tmp=tmp_path).split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert MISTAKES[command][options] in line
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
