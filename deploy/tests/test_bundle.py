@@ -152,24 +152,18 @@ def test_the_certificates_must_be_this_vehicles(workshop, party, tmp_path, name)
 
 
 def test_without_a_private_key_nothing_is_signed(workshop, tmp_path):
-    with pytest.raises(UserError, match="does not exist"):
-        workshop.make(key=tmp_path / "missing.key")
-    with pytest.raises(UserError, match="is not a private key"):
-        workshop.make(key=workshop.public_key)
+    for key, match in ((tmp_path / "missing.key", "not exist"), (workshop.public_key, "private")):
+        with pytest.raises(UserError, match=match):
+            workshop.make(key=key)
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        [],
-        ["--target", "toaster"],
-        ["--target", "jetpack5", "--policy", "missing.onnx"],
-        ["--target", "jetpack5", "--key", "missing.key"],
-        ["--target", "jetpack5", "--tls", "nowhere"],
-        ["--target", "jetpack5", "--wheels", "/dev/null/wheels"],
-        ["--target", "jetpack5", "--out", "/dev/null/bundles"],
-    ],
-)
+    ["", "--target toaster", *(f"--target jetpack5 {wrong}" for wrong in (
+        "--policy missing.onnx", "--key missing.key", "--tls nowhere",
+        "--wheels /dev/null/wheels", "--out /dev/null/bundles",
+    ))],
+)  # fmt: skip
 def test_a_mistake_is_one_line_before_anything_is_downloaded(
     workshop, tmp_path, capsys, monkeypatch, arguments
 ):
@@ -178,7 +172,7 @@ def test_a_mistake_is_one_line_before_anything_is_downloaded(
         monkeypatch.setattr(bundle, "gather", lambda *_: pytest.fail("downloads"))
     inputs = workshop.inputs()
     good = ["--policy", inputs.policy, "--public-key", inputs.public_key, "--key", inputs.key]
-    status = exit_status(main, ["bundle", *map(str, good), *arguments])
+    status = exit_status(main, ["bundle", *map(str, good), *arguments.split()])
     said = capsys.readouterr().err.strip().splitlines()
     assert (status, len(said)) == (2, 1)
     assert list(tmp_path.iterdir()) == []
@@ -223,12 +217,19 @@ def test_packages_come_out_and_scripts_stay_in(tmp_path):
     assert unpacked(tmp_path) == {"a/__init__.py", "a-1.dist-info/RECORD", "b.py", "c/d.so"}
 
 
+LEAVES = ("../x.py", "/x.py", "a/../../x.py", "a\\..\\x.py", "a-1.data/purelib/../../x.py")
+
+
 @pytest.mark.parametrize(
-    "name", ["../x.py", "/x.py", "a/../../x.py", "a\\..\\x.py", "a-1.data/purelib/../../x.py"]
+    ("data", "match"),
+    [
+        *((wheel(name), "outside") for name in LEAVES),
+        *((data, "is not a wheel") for data in (b"", b"no zip", wheel("a.py")[:-30])),
+    ],
 )
-def test_a_name_that_leaves_the_folder_is_refused(tmp_path, name):
-    with pytest.raises(InstallerError, match="outside"):
-        unpack_wheel(wheel(name), "a-1.whl", tmp_path / "site")
+def test_what_is_no_wheel_or_leaves_the_folder_is_refused(tmp_path, data, match):
+    with pytest.raises(InstallerError, match=match):
+        unpack_wheel(data, "a-1.whl", tmp_path / "site")
     assert not (tmp_path / "x.py").exists()
 
 
@@ -237,14 +238,6 @@ def test_two_wheels_may_not_hold_the_same_file(tmp_path):
     for clash in ("a.py", "a.py/b.py", "b-1.data/purelib/a.py"):
         with pytest.raises(InstallerError, match="another wheel"):
             unpack_wheel(wheel(clash), "b-1.whl", tmp_path)
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"no zip", wheel("a.py")[:-30]], ids=["empty", "no zip", "cut off"]
-)
-def test_what_is_no_wheel_is_said(tmp_path, data):
-    with pytest.raises(InstallerError, match="is not a wheel"):
-        unpack_wheel(data, "a-1.whl", tmp_path)
 
 
 @pytest.mark.parametrize("target", TARGETS.values(), ids=lambda target: target.name)
