@@ -12,15 +12,13 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import (
     Encoding,
-    NoEncryption,
-    PrivateFormat,
     load_pem_private_key,
     load_pem_public_key,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from deploy.__main__ import main
-from deploy.certs import issue, read_authority
+from deploy.certs import _pem, issue, read_authority
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.tls import load_tls, tls_for
 from edge_runtime.util import UserError
@@ -171,9 +169,7 @@ def test_a_certificate_outside_its_time_says_so(party, made, shift_days, match):
     then = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=shift_days)
     issued = issue(authority, "edge-hunter01", "edge", [], then, days=5)
     (party / "cert.pem").write_bytes(issued.certificate.public_bytes(Encoding.PEM))
-    (party / "key.pem").write_bytes(
-        issued.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    )
+    (party / "key.pem").write_bytes(_pem(issued.key))
     with pytest.raises(UserError, match=match):
         load_tls(party)
 

@@ -18,18 +18,17 @@ from typing import Any
 
 import pytest
 import zenoh
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from bridge.__main__ import main as bridge
 from bridge.ports import SimulatorPort, open_listener
 from bridge.tests.harness import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
 from deploy.__main__ import main as deploy
-from deploy.certs import CLOCK_SLACK, issue, read_authority
+from deploy.certs import CLOCK_SLACK, _pem, issue, read_authority
 from edge_runtime import wire
 from edge_runtime.commands import ask
 from edge_runtime.link_probe import free_endpoint, why_no_link
 from edge_runtime.tests.harness import EdgeProcess, make_state, run_command, wait_until
-from edge_runtime.tests.policies import write_policy
 from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
 from edge_runtime.transport import open_session
 from edge_runtime.util import UserError
@@ -119,6 +118,12 @@ class Intruder:
 LIFE_S = 2.0
 
 
+def edge_flags(endpoint, folder, files=None):
+    """Flags of `run` for a small unsigned policy."""
+    flags = ["--policy", str(make_policy(folder, "constant", 0.1)), "--allow-unsigned"]
+    return [*flags, "--connect", endpoint, *(["--tls", str(files)] if files else [])]
+
+
 @pytest.fixture(scope="module")
 def endpoint(parties):
     """Where a router with access control listens."""
@@ -176,9 +181,9 @@ def test_our_own_line_says_why(parties, endpoint, mode):
             open_session(connect=endpoint.replace("tls/", "tcp/"), mode=mode)
 
 
-def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, policy_flags):
+def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, tmp_path):
     plain = endpoint.replace("tls/", "tcp/")
-    with EdgeProcess(*policy_flags, "--connect", plain) as edge:
+    with EdgeProcess(*edge_flags(plain, tmp_path)) as edge:
         assert edge.process.stderr is not None
         line = next(line for line in edge.process.stderr if " waiting " in line)
         assert f"{plain} listens with TLS and wants --tls" in line
@@ -192,25 +197,22 @@ def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, policy_fla
     assert why_no_link(endpoint, files) == ""
 
 
-def test_a_viewers_certificate_is_no_servers(parties):
-    """Or anybody with a certificate could pose as the simulator."""
-    place = free_endpoint("tls")
+@pytest.mark.parametrize(
+    ("who", "host", "mode", "as_whom", "match"),
+    [  # or anybody with a certificate could pose as the simulator
+        ("viewer", "127.0.0.1", "peer", "edge-hunter01", "unsuitable certificate purpose"),
+        ("router", "127.0.0.2", "client", "viewer", "IP address mismatch"),
+    ],
+)
+def test_a_listener_needs_a_servers_certificate_of_its_address(
+    parties, who, host, mode, as_whom, match
+):
+    place = free_endpoint("tls").replace("127.0.0.1", host)
     with (
-        listener(place, parties / "viewer", rules_for_listener(["hunter01"])),
-        pytest.raises(UserError, match="unsuitable certificate purpose"),
+        listener(place, parties / who, rules_for_listener(["hunter01"])),
+        pytest.raises(UserError, match=match),
     ):
-        open_session(connect=place, mode="peer", tls=load_tls(parties / "edge-hunter01"))
-
-
-def test_an_address_that_the_certificate_does_not_name_is_refused(parties):
-    port = free_endpoint("tls").rsplit(":", 1)[1]
-    with (
-        listener(f"tls/127.0.0.2:{port}", parties / "router", rules_for_listener(["hunter01"])),
-        pytest.raises(UserError, match="IP address mismatch"),
-    ):
-        open_session(
-            connect=f"tls/127.0.0.2:{port}", mode="client", tls=load_tls(parties / "viewer")
-        )
+        open_session(connect=place, mode=mode, tls=load_tls(parties / as_whom))
 
 
 def test_who_listens_with_certificates_must_say_who_may_do_what(parties):
@@ -226,21 +228,12 @@ def test_a_link_ends_when_its_certificate_does(parties, endpoint, tmp_path):
     life = datetime.timedelta(seconds=LIFE_S)
     issued = issue(authority, folder.name, "edge", [], born + life, days=1)
     (folder / "cert.pem").write_bytes(issued.certificate.public_bytes(Encoding.PEM))
-    (folder / "key.pem").write_bytes(
-        issued.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    )
+    (folder / "key.pem").write_bytes(_pem(issued.key))
     with session(endpoint, folder, "peer", rules_for_edge("hunter01")) as edge:
         assert edge.info.routers_zid()
         wait_until(lambda: not edge.info.routers_zid(), "the end of the link", LIFE_S + 5)
     with pytest.raises(UserError, match="expired at"):
         load_tls(folder)
-
-
-@pytest.fixture
-def policy_flags(tmp_path):
-    """Flags of `run` for a small unsigned policy."""
-    write_policy(tmp_path / "p.onnx")
-    return ["--policy", str(tmp_path / "p.onnx"), "--allow-unsigned"]
 
 
 def drive(port, answered, first_step):
@@ -259,11 +252,10 @@ def start_router(endpoint, parties):
     return Process(*words, ready=f"ready listen={endpoint}")
 
 
-def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(parties, policy_flags):
+def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(parties, tmp_path):
     place = free_endpoint("tls")
     answered: list[bytes] = []
-    flags = ["--connect", place, "--tls", str(parties / "edge-hunter01"), *policy_flags]
-    with EdgeProcess(*flags) as edge:
+    with EdgeProcess(*edge_flags(place, tmp_path, parties / "edge-hunter01")) as edge:
         assert edge.ready_line.startswith("ready")
         router = start_router(place, parties)
         with session(place, parties / "simulator-hunter01") as simulator:
@@ -303,12 +295,11 @@ def drive_among(intruders, endpoint, flags, folder):
 
     Returns the report, the edge's log, and by name what each intruder heard and was answered.
     """
-    policy, out = make_policy(folder, "constant", 0.1), folder / "r.json"
-    edge_flags = ["--policy", str(policy), "--allow-unsigned", "--connect", endpoint]
+    out = folder / "r.json"
     simulate = ["simulate", "--env", SLOW_TOY, "--episodes", "3", "--listen", endpoint]
     with (
         BridgeProcess(*simulate, "--out", str(out), *flags("simulator-hunter01")) as run,
-        EdgeProcess(*edge_flags, *flags("edge-hunter01")) as edge,
+        EdgeProcess(*edge_flags(endpoint, folder), *flags("edge-hunter01")) as edge,
     ):
         wait_until_driving(edge)
         with contextlib.ExitStack() as opened:
@@ -399,19 +390,13 @@ def test_an_edge_takes_no_states_from_another_vehicles_simulator(parties, who, i
     assert len(states) == int(is_believed)
 
 
-def edge_flags(endpoint, parties, folder):
-    policy = make_policy(folder, "constant", 0.1)
-    flags = ["--policy", str(policy), "--allow-unsigned", "--connect", endpoint]
-    return [*flags, "--tls", str(parties / "edge-hunter01")]
-
-
 @pytest.mark.parametrize("is_there_first", [True, False])
 def test_another_vehicles_simulator_ends_no_edge_by_a_forged_token(
     parties, tmp_path, is_there_first
 ):
     """Posing as the server, it claims that an elder runtime has this vehicle's id."""
     endpoint, anything_goes = free_endpoint("tls"), {"enabled": False}
-    flags = edge_flags(endpoint, parties, tmp_path)
+    flags = edge_flags(endpoint, tmp_path, parties / "edge-hunter01")
     with contextlib.ExitStack() as opened:
         edge = None if is_there_first else opened.enter_context(EdgeProcess(*flags))
         posing = listener(endpoint, parties / "simulator-hunter02", anything_goes)
@@ -432,7 +417,7 @@ def test_another_vehicles_simulator_ends_no_edge_by_a_forged_token(
 def test_a_second_runtime_is_still_refused_over_tls(parties, tmp_path, who):
     """What the test above must not have broken."""
     endpoint = free_endpoint("tls")
-    flags = edge_flags(endpoint, parties, tmp_path)
+    flags = edge_flags(endpoint, tmp_path, parties / "edge-hunter01")
     with (
         listener(endpoint, parties / who, rules_for_listener(["hunter01"])),
         EdgeProcess(*flags) as edge,
