@@ -62,14 +62,11 @@ ROOT = Path(__file__).parents[1]
 LOCKS = ROOT / "requirements"
 DEFAULT_FOLDER = "build/wheels"
 TARGETS = {
-    target.name: target
-    for target in (
-        # Jetson Xavier NX with JetPack 5: Ubuntu 20.04.
-        Target(name="jetpack5", python="3.8", machine="aarch64", glibc="2.31"),
-        # Debian bullseye.
-        Target(name="linux-aarch64", python="3.9", machine="aarch64", glibc="2.31"),
-        # The twin of jetpack5 on a workstation: the same versions of everything.
-        Target(name="linux-x86_64", python="3.8", machine="x86_64", glibc="2.31"),
+    name: Target(name, python, machine, glibc="2.31")
+    for name, python, machine in (
+        ("jetpack5", "3.8", "aarch64"),  # Jetson Xavier NX: Ubuntu 20.04
+        ("linux-aarch64", "3.9", "aarch64"),  # Debian bullseye
+        ("linux-x86_64", "3.8", "x86_64"),  # jetpack5's versions on a workstation
     )
 }
 _MANYLINUX = (5, 12, 17, 24, 26, 27, 28, 31)
@@ -381,15 +378,15 @@ def _add_lock_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_lock(arguments: argparse.Namespace) -> int:
     """Download each `NAME==VERSION` of the lock and write the hash of what came beside it."""
     target = TARGETS[arguments.target]
-    path, lines = lock_path(target), []
-    for line in read_bytes(path, "lock").decode().splitlines():
+    path = lock_path(target)
+    lines = read_bytes(path, "lock").decode().splitlines()
+    for number, line in enumerate(lines):
         if line.strip() and not line.startswith("#"):
             pin = line.split()[0]
             with tempfile.TemporaryDirectory() as place:
                 download(target, [pin], Path(place))
                 (digest,) = _by_hash(Path(place))
-            line = f"{pin} --hash=sha256:{digest}"
-        lines.append(line)
+            lines[number] = f"{pin} --hash=sha256:{digest}"
     write_atomic(path, ("\n".join(lines) + "\n").encode())
     print(path)
     return 0

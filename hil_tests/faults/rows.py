@@ -7,11 +7,12 @@ puts it into ROWS. Faults of messages and of a Hunter have files of their own; `
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import resource
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -297,26 +298,17 @@ def slow_inference(rig: Rig, number: int) -> Try:
 @fault("drives on or safe_stop", GAP, alone=True)
 def cpu_starved(rig: Rig, number: int) -> Try:
     """Two spinning processes for each core, 2 s."""
-    spinners = [
-        multiprocessing.get_context("spawn").Process(target=_spin, daemon=True)
-        for _ in range(2 * (os.cpu_count() or 1))
-    ]
     begin_s = time.monotonic()
-    for spinner in spinners:
-        spinner.start()
+    words = [sys.executable, "-c", "while True: pass"]
+    spinners = [subprocess.Popen(words) for _ in range(2 * (os.cpu_count() or 1))]
     time.sleep(STARVED_S)
     ended_s = time.monotonic()
     for spinner in spinners:
         spinner.kill()
-        spinner.join()
+        spinner.wait()
     recovered_s = rig.recovered_after_s(ended_s)
     stops = sum(begin_s < m.seen_s < ended_s and m.mode == SAFE_STOP for m in rig.timeline.modes)
     return Try(rig.longest_gap(begin_s, ended_s), recovered_s, figures={"safe stops": stops})
-
-
-def _spin() -> None:
-    while True:
-        pass
 
 
 def _vehicle_is(word: str, rig: Rig, number: int) -> Try:
