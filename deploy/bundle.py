@@ -117,8 +117,8 @@ def _add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_bundle(arguments: argparse.Namespace) -> int:
     """Make a bundle and print its size and contents."""
     target, out = TARGETS[arguments.target], arguments.out
-    given = (getattr(arguments, name) for name in Inputs._fields[:-1])
-    inputs = Inputs(*given, [])
+    given = {name: getattr(arguments, name) for name in Inputs._fields if name != "wheels"}
+    inputs = Inputs(**given, wheels=[])
     check_inputs(inputs)  # Before minutes of downloads, and so is the next line.
     check_writable(out / "bundle.tar")
     wheels = gather(target, lock_path(target), arguments.wheels / target.name)

@@ -199,8 +199,12 @@ def _run_vehicle(arguments: argparse.Namespace) -> int:
         print(report.comparison_verdict(found))
         holds = found["holds"]
     if arguments.only != "compare":
-        jobs = arguments.jobs or cores()
-        result["sweep"] = found = run_sweep(task, arguments.lags, target, jobs, out)
+        jobs, keep, drive = arguments.jobs or cores(), _rows_beside(out), sweep.drive_lag
+        parts = sweep.drive_all(task, arguments.lags, task.runs, drive, jobs, keep, processes=True)
+        rows = {lag.spec: row for lag, (row,) in parts.items()}
+        lag_budget = sweep.lag_budget(list(rows.values()), target)
+        found = {**task.facts(), "mock": task.changes, "rows": rows, "lag_budget": lag_budget}
+        result["sweep"] = found
         text += ["", "## Lag, in virtual time", "", report.render_sweep(found)]
         print(report.lag_sentence(found))
     report.write_report(out, result, text)
@@ -227,17 +231,6 @@ def run_comparison(task: sweep.Task, target: float, rigs: int, out: Path) -> dic
         "target_success": target,
         "holds": rows[sweep.VEHICLE]["success"]["value"] >= target,
     }
-
-
-def run_sweep(
-    task: sweep.Task, lags: Sequence[sweep.Lag], target: float, jobs: int, out: Path
-) -> dict[str, Any]:
-    """Drive every lag, ``jobs`` at a time; the report's part ``sweep``."""
-    keep = _rows_beside(out)
-    found = sweep.drive_all(task, lags, task.runs, sweep.drive_lag, jobs, keep, processes=True)
-    rows = {lag.spec: row for lag, (row,) in found.items()}
-    lag_budget = sweep.lag_budget(list(rows.values()), target)
-    return {**task.facts(), "mock": task.changes, "rows": rows, "lag_budget": lag_budget}
 
 
 CAMPAIGN = Command(

@@ -210,15 +210,11 @@ class Part(NamedTuple):
         ]
 
 
-Drive = Callable[[Task, Part], list[dict[str, Any]]]
-"""Drives a part; its results, for JSON."""
-
-
 def drive_all(
     task: Task,
     points: Sequence[Any],
     size: int,
-    drive: Drive,
+    drive: Callable[[Task, Part], list[dict[str, Any]]],
     jobs: int,
     keep: Path,
     processes: bool = False,

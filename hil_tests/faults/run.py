@@ -27,8 +27,6 @@ SLOW_S = 2.5 * CONTROL_PERIOD_S
 STALLED_S = 1.5 * CONTROL_PERIOD_S
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
-OnTry = Callable[[str], None]
-"""Called with the row's name, after every try."""
 
 
 def write_slow(path: Path) -> None:
@@ -69,7 +67,7 @@ def run_faults(
     tries: int,
     rows: Sequence[str] | None = None,
     policy: Path | None = None,
-    on_try: OnTry = lambda row: None,
+    on_try: Callable[[str], None] = lambda row: None,
     jobs: int = 2,
     public_key: str | None = None,
 ) -> dict[str, Any]:
@@ -77,9 +75,9 @@ def run_faults(
 
     ``rows`` are names of the table's rows, or patterns of them (``hunter_*``); None for all. An
     exported ``policy`` (None for the repository's own left turn) is verified with ``public_key``.
-    ``on_try`` is called after every try. ``jobs`` rigs run at once; rows that need the machine for
-    themselves run after the others. Raises UserError for a row that the table does not hold, or no
-    policy.
+    ``on_try`` is called with the row's name after every try. ``jobs`` rigs run at once; rows that
+    need the machine for themselves run after the others. Raises UserError for a row that the table
+    does not hold, or no policy.
     """
     chosen = choose_rows(rows)
     trust = trusting(policy, public_key)
@@ -124,7 +122,9 @@ def choose_rows(names: Sequence[str] | None) -> list[Row]:
     return [row for row in ROWS if row.name in chosen]
 
 
-def run_row(row: Row, trust: Sequence[str], work: Path, tries: int, on_try: OnTry) -> Outcome:
+def run_row(
+    row: Row, trust: Sequence[str], work: Path, tries: int, on_try: Callable[[str], None]
+) -> Outcome:
     """All tries of a row; a rig in which a try came to no end is replaced.
 
     ``trust`` are the options of its edge runtimes; rigs have their directories in ``work``.
