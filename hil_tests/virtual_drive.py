@@ -77,7 +77,15 @@ class VirtualDrive:
             self.tracking.command(command)
             newest = None
             for now_ms, report in hunter.run(PERIOD_MS):
-                newest = self._feedback(step, report, now_ms)
+                # As `edge_runtime/vehicles/base.py` makes it.
+                newest = Feedback(
+                    vehicle=NAME, session=SESSION, episode=0, step=step, mode=DRIVE,
+                    action=[report.action.get(name, 0.0) for name in self.action_names],
+                    speed_mps=report.speed_mps, self_braking=report.self_braking,
+                    faults=report.faults, sent_ns=now_ms * 10**6,
+                    scenario_speed_mps=report.scenario_speed_mps,
+                    commanded_speed_mps=report.commanded_speed_mps,
+                )  # fmt: skip
                 self.tracking.feedback(newest)
             if hunter.core.state is not State.STOPPED:
                 stopped_ms = math.inf
@@ -95,16 +103,6 @@ class VirtualDrive:
         self.tracking.end()
         time_s = step * CONTROL_PERIOD_S
         return Driven(seed, info["outcome"], float(info["distance_m"]), time_s, stops)
-
-    def _feedback(self, step: int, report: VehicleReport, now_ms: int) -> Feedback:
-        """As `edge_runtime/vehicles/base.py` makes it."""
-        return Feedback(
-            vehicle=NAME, session=SESSION, episode=0, step=step, mode=DRIVE,
-            action=[report.action.get(name, 0.0) for name in self.action_names],
-            speed_mps=report.speed_mps, self_braking=report.self_braking, faults=report.faults,
-            sent_ns=now_ms * 10**6, scenario_speed_mps=report.scenario_speed_mps,
-            commanded_speed_mps=report.commanded_speed_mps,
-        )  # fmt: skip
 
 
 class VirtualHunter:

@@ -160,10 +160,6 @@ def _named(rig: Rig, expect: Expect, since_s: float) -> list[str]:
     return [f"feedback says {sorted(set(said))}, not {expect.says!r}"]
 
 
-def _reported_mps(frame: Heard) -> float:
-    return speed_mps(frame) if frame.can_id == 0x221 else 0.0
-
-
 def _status(test: Callable[[bytes], bool]) -> Callable[[Heard], bool]:
     return lambda frame: frame.can_id == 0x211 and test(frame.data)
 
@@ -173,7 +169,11 @@ _EXPECTS = (
     Expect("frozen", "stands still"),
     Expect("bus_off", "sends no 0x2"),
     Expect("late", "sends no 0x2"),
-    Expect("lying", "reports", lambda frame: _reported_mps(frame) > _IMPOSSIBLE_MPS),
+    Expect(
+        "lying",
+        "reports",
+        lambda frame: frame.can_id == 0x221 and speed_mps(frame) > _IMPOSSIBLE_MPS,
+    ),
     Expect("remote", "remote control", _status(lambda data: data[1] == 2)),
     Expect("estop", "emergency stop", _status(lambda data: data[0] == 1)),
     *(Expect(name, bit.words, _status(lambda data: any(data[4:6]))) for name, bit in BITS.items()),

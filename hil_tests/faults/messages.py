@@ -39,7 +39,13 @@ def bad_states(rig: Rig, number: int) -> Try:
             for reason, payload in _bad_of(rig.sender.step):
                 rig.probe.put("state", payload)
                 sent[reason] += 1
-            _send_reordered(rig, sent)
+            # Two states that have overtaken one another, and one that says it is from the future.
+            rig.sender.step += 3
+            step = rig.sender.step
+            rig.sender.send(make_state(step - 1))
+            rig.probe.put("state", encode(make_state(step - 2)))
+            sent["stale"] += 1
+            rig.sender.send(make_state(step, sent_ns=time.time_ns() + _HOUR_NS))
         time.sleep(CONTROL_PERIOD_S / 2)
     return Try(rejected=sent)
 
@@ -184,16 +190,6 @@ def _bad_of(step: int) -> Iterable[tuple[str, bytes]]:
     yield "duplicate", encode(make_state(step))
     yield "stale", encode(make_state(step - 1))
     # From another time of day is no reason: the next one is good whatever its clock says.
-
-
-def _send_reordered(rig: Rig, sent: Counter[str]) -> None:
-    """Two states that have overtaken one another, and one that says it comes from the future."""
-    rig.sender.step += 3
-    step = rig.sender.step
-    rig.sender.send(make_state(step - 1))
-    rig.probe.put("state", encode(make_state(step - 2)))
-    sent["stale"] += 1
-    rig.sender.send(make_state(step, sent_ns=time.time_ns() + _HOUR_NS))
 
 
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
