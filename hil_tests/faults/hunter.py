@@ -180,7 +180,7 @@ _EXPECTS = (
 )
 _hunter = partial(
     fault, expected="set-point 0 on the bus, vehicle_fault; stands until re-armed",
-    rig={"vehicle": "hunter", "model": MODEL}, flows=True,
+    rig={"vehicle": "hunter"}, flows=True,
 )  # fmt: skip
 
 for _expect in _EXPECTS:

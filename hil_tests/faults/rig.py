@@ -62,8 +62,8 @@ class Rig:
     ``policy`` are the edge runtime's options for its policy, ``vehicle`` its ``--vehicle``. The
     ``directory`` is an empty one, for switches and reports. Edge runtime and probe meet at a
     ``link`` or a ``router`` where ``between`` says so. ``sender`` sends states here, without a
-    simulator; ``model`` is that of a mock Hunter, on a CAN bus. Only what the options ask for is
-    there of the following.
+    simulator. With the vehicle ``hunter`` there is a mock of it on a CAN bus. Only what the options
+    ask for is there of the following.
     """
 
     simulator: Process
@@ -80,7 +80,6 @@ class Rig:
         between: str = "",
         vehicle: str = "none",
         sender: bool = False,
-        model: str = "",
     ) -> None:
         self.timeline = Timeline()
         self.directory = directory
@@ -104,9 +103,9 @@ class Rig:
         if between == "router":
             self.edge_endpoint = free_endpoint()
             self.router = self.start_router()
-        self._bus = free_bus() if model else ""
-        if model:
-            self.chassis = ChassisProcess(self._bus, "--model", model)
+        self._bus = free_bus() if vehicle == "hunter" else ""
+        if self._bus:
+            self.chassis = ChassisProcess(self._bus)
             self._processes.append(("chassis", self.chassis.process))
             self.monitor = CanMonitor(self._bus, HEARD)
             self._closing.callback(self.monitor.close)
