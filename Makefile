@@ -99,7 +99,7 @@ mutate: $(MUTATION_STAMP)  ## change the safety core in every small way: a test 
 		configuration=hil_tests/mutation/$$part.toml && cosmic-ray init $$configuration $$part.sqlite && \
 		cr-filter-operators $$part.sqlite $$configuration && cosmic-ray baseline $$configuration && \
 		cosmic-ray exec $$configuration $$part.sqlite || exit; \
-	done && python -m hil_tests.mutation.judge core.sqlite hunter.sqlite
+	done && python hil_tests/mutation/mutants.py core.sqlite hunter.sqlite
 
 lock: $(STAMP)  ## rewrite the lock from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | grep -v '^torch==' > requirements/workstation.txt.new

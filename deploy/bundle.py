@@ -1,16 +1,24 @@
 """``python -m deploy bundle``: all that a board needs to drive one policy, in one signed archive.
 
-The same inputs give the same bytes: the archive holds no time, place or user name.
+The same inputs give the same bytes: the archive holds no time, place or user name. A lock names
+every wheel of a kind of board by version and hash. A folder keeps the wheels between runs, so a
+bundle made from a full folder needs no network. After a change of versions in a lock,
+``python -m deploy lock TARGET`` writes the new hashes.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import hashlib
+import importlib.metadata
 import io
 import os
+import re
+import shutil
 import subprocess
+import sys
 import tarfile
 import tempfile
 import tomllib
@@ -26,21 +34,11 @@ import edge_runtime
 from deploy.certs import DEFAULT_KEY, write_private
 from deploy.installer.layout import CONFIG, POLICY, PUBLIC_KEY, TLS, WHEELS
 from deploy.installer.verify import MANIFEST, NAMESPACE, Manifest, Target, to_json
-from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel, gather, lock_path
-from edge_runtime.cli import examples
+from edge_runtime import tls
+from edge_runtime.cli import Command, examples
 from edge_runtime.config import NONE, Config, load_config
-from edge_runtime.files import check_writable, write_atomic
+from edge_runtime.files import check_writable, make_directory, write_atomic
 from edge_runtime.policy import DEFAULT_PUBLIC_KEY, Policy, load_policy
-from edge_runtime.tls import (
-    CA_FILE,
-    CERTIFICATE_FILE,
-    EDGE,
-    KEY_FILE,
-    check_name,
-    common_name,
-    load_tls,
-    read_signing_key,
-)
 from edge_runtime.util import UserError, read_bytes
 
 NAME = "install.pyz"
@@ -59,11 +57,25 @@ _MAIN = (
     'if __name__ == "__main__":\n    sys.exit(main(sys.argv[1:]))\n'
 )
 
-EXAMPLE = examples(
-    "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
-    "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
-    "    --config edge.toml --tls certs/edge-hunter01",
-)
+ROOT = Path(__file__).parents[1]
+LOCKS = ROOT / "requirements"
+DEFAULT_FOLDER = "build/wheels"
+TARGETS = {
+    name: Target(name, python, machine, glibc="2.31")
+    for name, python, machine in (
+        ("jetpack5", "3.8", "aarch64"),  # Jetson Xavier NX: Ubuntu 20.04
+        ("linux-aarch64", "3.9", "aarch64"),  # Debian bullseye
+        ("linux-x86_64", "3.8", "x86_64"),  # jetpack5's versions on a workstation
+    )
+}
+_MANYLINUX = (5, 12, 17, 24, 26, 27, 28, 31)
+"""The minor versions of glibc 2 that wheels are tagged with, up to the boards' own."""
+_PATCH = 2
+"""pip takes 3.9 for 3.9.0, which cryptography shuns; Debian bullseye has 3.9.2."""
+_LINE = re.compile(r"([A-Za-z0-9._-]+)==([A-Za-z0-9._+!-]+) --hash=sha256:([0-9a-f]{64})")
+_SETUPTOOLS = 75  # as edge_runtime/pyproject.toml asks
+_EPOCH_S = 315532800
+"""1980-01-01, the first day that a ZIP file knows: the built wheel's files bear it."""
 
 
 class Inputs(NamedTuple):
@@ -88,34 +100,27 @@ class Made(NamedTuple):
     sizes: dict[str, int]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def _add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--target", choices=TARGETS, required=True, help="the board's kind")
-    add = functools.partial(parser.add_argument, metavar="FILE")
+    add = functools.partial(parser.add_argument, type=Path, metavar="FILE")
     add("--policy", required=True, help="signed policy file")
     add("--config", help="settings of `edge_runtime run`: connect, vehicle, ... (TOML)")
     add("--public-key", default=str(DEFAULT_PUBLIC_KEY), help="of whoever signed the policy")
     add("--key", default=DEFAULT_KEY, help="private key that signs the bundle")
-    add = functools.partial(parser.add_argument, metavar="DIR")
+    add = functools.partial(parser.add_argument, type=Path, metavar="DIR")
     add("--tls", help="the vehicle's folder of `deploy certs`, as certs/edge-hunter01")
     add("--wheels", default=DEFAULT_FOLDER, help="wheels are kept here")
     add("--out", default=DEFAULT_OUT, help="where the archive goes")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _run_bundle(arguments: argparse.Namespace) -> int:
     """Make a bundle and print its size and contents."""
-    target, out = TARGETS[arguments.target], Path(arguments.out)
-    inputs = Inputs(
-        policy=Path(arguments.policy),
-        public_key=Path(arguments.public_key),
-        key=Path(arguments.key),
-        config=Path(arguments.config) if arguments.config else None,
-        tls=Path(arguments.tls) if arguments.tls else None,
-        wheels=[],
-    )
+    target, out = TARGETS[arguments.target], arguments.out
+    given = {name: getattr(arguments, name) for name in Inputs._fields if name != "wheels"}
+    inputs = Inputs(**given, wheels=[])
     check_inputs(inputs)  # Before minutes of downloads, and so is the next line.
     check_writable(out / "bundle.tar")
-    wheels = gather(target, lock_path(target), Path(arguments.wheels) / target.name)
+    wheels = gather(target, lock_path(target), arguments.wheels / target.name)
     with tempfile.TemporaryDirectory() as place:
         wheels.append(build_edge_wheel(Path(place)))
         made = make_bundle(inputs._replace(wheels=wheels), target, out)
@@ -153,7 +158,7 @@ def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
         name = "-".join(path.name.split("-")[:2])
         contents[f"{WHEELS}{name}.whl"] = path.read_bytes()
     if inputs.tls is not None:  # The party's three files, and none that may stand beside them.
-        for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE):
+        for name in (tls.CA_FILE, tls.CERTIFICATE_FILE, tls.KEY_FILE):
             contents[f"{TLS}{name}"] = read_bytes(inputs.tls / name, "TLS file")
     manifest = _manifest(contents, target, config.vehicle_id, policy.policy_id)
     path = out / f"phil-{target.name}-{config.vehicle_id}-{manifest.version}.tar"
@@ -169,7 +174,7 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
 
     Raises UserError for what `make_bundle` would refuse.
     """
-    key = read_signing_key(inputs.key)
+    key = tls.read_signing_key(inputs.key)
     if inputs.policy.is_file() and not Path(f"{inputs.policy}.sig").exists():
         # Here, because load_policy would name a flag that no bundle has.
         raise UserError(
@@ -179,7 +184,7 @@ def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str
     policy = load_policy(inputs.policy, inputs.public_key)
     config, text = _config(inputs)
     if inputs.tls is not None:
-        check_name(load_tls(inputs.tls).name, common_name(EDGE, config.vehicle_id))
+        tls.check_name(tls.load_tls(inputs.tls).name, tls.common_name(tls.EDGE, config.vehicle_id))
     return key, policy, config, text
 
 
@@ -277,3 +282,122 @@ def build_installer() -> bytes:
             info.external_attr = 0o100644 << 16
             archive.writestr(info, text)
     return packed.getvalue()
+
+
+class Pin(NamedTuple):
+    """One line of a lock; `sha256` in hex, of the one wheel that fits the target."""
+
+    name: str
+    version: str
+    sha256: str
+
+
+def lock_path(target: Target) -> Path:
+    """The file that names every wheel of a target by version and hash."""
+    return LOCKS / f"bundle-{target.name}.txt"
+
+
+def read_lock(path: Path) -> list[Pin]:
+    """The pins of a lock: `NAME==VERSION --hash=sha256:HEX`, one wheel a line."""
+    pins = []
+    for line in read_bytes(path, "lock").decode().splitlines():
+        if line.strip() and not line.startswith("#"):
+            found = _LINE.fullmatch(line.strip())
+            if found is None:
+                raise UserError(f"lock {path}: not NAME==VERSION --hash=sha256:HEX: {line}")
+            pins.append(Pin(*found.groups()))
+    return pins
+
+
+def gather(target: Target, lock: Path, folder: Path) -> list[Path]:
+    """The lock's wheels in `folder`, in the lock's order; pip fetches what is missing."""
+    pins = read_lock(lock)
+    found = _by_hash(folder)
+    if any(pin.sha256 not in found for pin in pins):
+        download(target, ["--require-hashes", "--requirement", str(lock)], folder)
+        found = _by_hash(folder)
+    missing = [pin.name for pin in pins if pin.sha256 not in found]
+    if missing:
+        raise UserError(f"no wheel with the lock's hash in {folder} for {', '.join(missing)}")
+    return [found[pin.sha256] for pin in pins]
+
+
+def download(target: Target, wanted: list[str], folder: Path) -> None:
+    """`pip download` of wheels for another computer. Raises UserError with pip's own line."""
+    make_directory(folder)
+    newest = int(target.glibc.split(".")[1])
+    tags = [*(f"_2_{minor}" for minor in _MANYLINUX if minor <= newest), "1", "2010", "2014"]
+    pip(
+        "download", "--only-binary=:all:", "--no-deps",
+        f"--python-version={target.python}.{_PATCH}",
+        *(f"--platform=manylinux{tag}_{target.machine}" for tag in tags),
+        "--dest", str(folder), *wanted,
+    )  # fmt: skip
+
+
+def build_edge_wheel(folder: Path) -> Path:
+    """The edge runtime's wheel, the same bytes from the same sources and the same setuptools."""
+    with tempfile.TemporaryDirectory() as place:
+        # Of a copy: building writes into its source folder.
+        source = Path(place) / "edge_runtime"
+        ignored = shutil.ignore_patterns("__pycache__", "build", "*.egg-info", "tests")
+        shutil.copytree(ROOT / "edge_runtime", source, ignore=ignored)
+        for path in source.rglob("*"):
+            path.chmod(0o755 if path.is_dir() else 0o644)  # the umask of whoever cloned it
+        made = Path(place) / "made"
+        # With the setuptools that is here, if it is new enough: no index is asked then.
+        options = []
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError, ValueError):
+            if int(importlib.metadata.version("setuptools").split(".")[0]) >= _SETUPTOOLS:
+                options = ["--no-build-isolation"]
+        pip("wheel", "--no-deps", *options, "--wheel-dir", str(made), str(source))
+        make_directory(folder)
+        return Path(shutil.move(next(made.glob("*.whl")), folder))
+
+
+def pip(*arguments: str) -> None:
+    """Run pip. Raises UserError with the last line that begins with ERROR."""
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments]
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": str(_EPOCH_S)}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.splitlines() if line.startswith("ERROR")]
+        raise UserError(f"pip {arguments[0]}: {(lines or ['failed'])[-1]}")
+
+
+def _by_hash(folder: Path) -> dict[str, Path]:
+    wheels = sorted(folder.glob("*.whl"))
+    return {hashlib.sha256(path.read_bytes()).hexdigest(): path for path in wheels}
+
+
+def _add_lock_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("target", choices=TARGETS, help="the board's kind")
+
+
+def _run_lock(arguments: argparse.Namespace) -> int:
+    """Download each `NAME==VERSION` of the lock and write the hash of what came beside it."""
+    target = TARGETS[arguments.target]
+    path = lock_path(target)
+    lines = read_bytes(path, "lock").decode().splitlines()
+    for number, line in enumerate(lines):
+        if line.strip() and not line.startswith("#"):
+            pin = line.split()[0]
+            with tempfile.TemporaryDirectory() as place:
+                download(target, [pin], Path(place))
+                (digest,) = _by_hash(Path(place))
+            lines[number] = f"{pin} --hash=sha256:{digest}"
+    write_atomic(path, ("\n".join(lines) + "\n").encode())
+    print(path)
+    return 0
+
+
+BUNDLE = Command(
+    examples(
+        "python -m deploy bundle --policy results/policies/left_turn.onnx \\\n"
+        "    --public-key results/policies/policy.pub --target jetpack5 --key keys/policy.key \\\n"
+        "    --config edge.toml --tls certs/edge-hunter01"
+    ),
+    _add_bundle_arguments,
+    _run_bundle,
+)
+LOCK = Command(examples("python -m deploy lock jetpack5"), _add_lock_arguments, _run_lock)

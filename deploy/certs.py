@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import datetime
+import functools
 import ipaddress
 import os
 import re
@@ -30,22 +31,10 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from edge_runtime import tls
 from edge_runtime.cli import Command, examples, whole_number
 from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
 from edge_runtime.policy import DEFAULT_PUBLIC_KEY
-from edge_runtime.tls import (
-    CA_FILE,
-    CERTIFICATE_FILE,
-    KEY_FILE,
-    ROLES,
-    ROUTER,
-    TlsFiles,
-    check_name,
-    common_name,
-    load_tls,
-    read_private_key,
-    rules_for_listener,
-)
 from edge_runtime.util import UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
@@ -73,12 +62,8 @@ _NO_USE = dict.fromkeys(
 
 
 def _add_keys_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        default=str(DEFAULT_PUBLIC_KEY.parent),
-        help="directory for policy.key and policy.pub",
-    )
+    out, text = str(DEFAULT_PUBLIC_KEY.parent), "directory for policy.key and policy.pub"
+    parser.add_argument("--out", metavar="DIR", default=out, help=text)
 
 
 def _run_keys(arguments: argparse.Namespace) -> int:
@@ -132,29 +117,15 @@ class Pair(NamedTuple):
 
 
 def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", default="certs", help="directory of all folders")
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        action="append",
-        help="a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
-        f" (default: {DEFAULT_VEHICLE_ID})",
-    )
-    parser.add_argument(
-        "--host",
-        metavar="NAME",
-        action="append",
-        default=[],
-        help="a name or address at which simulator or router are reached; may be repeated"
-        f" (always: {', '.join(LOOPBACK_HOSTS)})",
-    )
-    parser.add_argument(
-        "--days",
-        metavar="N",
-        type=whole_number(1, CA_DAYS),
-        default=365,
-        help="how long they are valid, days",
-    )
+    vehicle = "a vehicle to make edge-ID, simulator-ID and operator-ID for; may be repeated"
+    vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
+    host = "a name or address at which simulator or router are reached; may be repeated"
+    host += f" (always: {', '.join(LOOPBACK_HOSTS)})"
+    add, days = parser.add_argument, whole_number(1, CA_DAYS)
+    add("--out", metavar="DIR", default="certs", help="directory of all folders")
+    add("--vehicle-id", metavar="ID", action="append", help=vehicle)
+    add("--host", metavar="NAME", action="append", default=[], help=host)
+    add("--days", metavar="N", type=days, default=365, help="how long they are valid, days")
 
 
 def _run_certs(arguments: argparse.Namespace) -> int:
@@ -177,7 +148,7 @@ def _run_certs(arguments: argparse.Namespace) -> int:
     for name, role in roles.items():
         issued = issue(authority, name, role, hosts, now, days)
         certificate = issued.certificate.public_bytes(Encoding.PEM)
-        files = {CERTIFICATE_FILE: certificate, KEY_FILE: _pem(issued.key)}
+        files = {tls.CERTIFICATE_FILE: certificate, tls.KEY_FILE: _pem(issued.key)}
         _write_folder(out / name, authority, files)
     print(f"authority (keep {ca_folder / CA_KEY_FILE} off every board): {ca_folder}")
     for name in roles:
@@ -191,9 +162,9 @@ def _missing(out: Path, vehicle_ids: Sequence[str]) -> dict[str, str]:
 
     Raises UserError where all have one, and for an id that no certificate can name.
     """
-    roles = {role: role for role, rights in ROLES.items() if rights.all_vehicles}
-    own = [role for role, rights in ROLES.items() if not rights.all_vehicles]
-    roles |= {common_name(role, vehicle): role for vehicle in vehicle_ids for role in own}
+    roles = {role: role for role, rights in tls.ROLES.items() if rights.all_vehicles}
+    own = [role for role, rights in tls.ROLES.items() if not rights.all_vehicles]
+    roles |= {tls.common_name(role, vehicle): role for vehicle in vehicle_ids for role in own}
     for name in roles:
         if len(name) > MAX_NAME_CHARS:
             raise UserError(
@@ -228,9 +199,9 @@ def _write_folder(folder: Path, authority: Pair, files: dict[str, bytes]) -> Non
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         draft.mkdir(mode=0o700)
-        write_atomic(draft / CA_FILE, authority.certificate.public_bytes(Encoding.PEM))
+        write_atomic(draft / tls.CA_FILE, authority.certificate.public_bytes(Encoding.PEM))
         for name, data in files.items():
-            write = write_private if name in (KEY_FILE, CA_KEY_FILE) else write_atomic
+            write = write_private if name in (tls.KEY_FILE, CA_KEY_FILE) else write_atomic
             write(draft / name, data)
         draft.rename(folder)  # Fails where somebody has filled it meanwhile.
     except OSError as error:
@@ -245,16 +216,16 @@ def _pem(key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey) -> bytes:
 
 def read_authority(folder: Path) -> Pair:
     """The authority that was made before. UserError where its files do not fit."""
-    pem = read_bytes(folder / CA_FILE, "authority")
+    pem = read_bytes(folder / tls.CA_FILE, "authority")
     try:
         certificate = x509.load_pem_x509_certificate(pem)
     except ValueError:
-        raise UserError(f"{folder / CA_FILE} is not a certificate in PEM") from None
-    key = read_private_key(folder / CA_KEY_FILE)
+        raise UserError(f"{folder / tls.CA_FILE} is not a certificate in PEM") from None
+    key = tls.read_private_key(folder / CA_KEY_FILE)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UserError(f"{folder / CA_KEY_FILE} is not a key of an elliptic curve")
     if key.public_key() != certificate.public_key():
-        raise UserError(f"{folder / CA_KEY_FILE} does not fit {CA_FILE} beside it")
+        raise UserError(f"{folder / CA_KEY_FILE} does not fit {tls.CA_FILE} beside it")
     return Pair(certificate, key)
 
 
@@ -278,7 +249,7 @@ def issue(
     """A certificate for a party; `hosts` are the names under which a listener is reached."""
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     names: list[tuple[x509.ExtensionType, bool]] = []
-    if ROLES[role].listens:
+    if tls.ROLES[role].listens:
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
         names.append((x509.SubjectAlternativeName(hosts), False))
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
@@ -328,35 +299,22 @@ CERTS = Command(
 
 
 def _add_router_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--listen",
-        metavar="tls/HOST:PORT",
-        action="append",
-        required=True,
-        help="where all others connect to, as tls/0.0.0.0:7447; may be repeated",
-    )
-    parser.add_argument(
-        "--tls",
-        metavar="DIR",
-        required=True,
-        help="the router's folder of `deploy certs`, as certs/router; zenohd opens its files",
-    )
-    parser.add_argument(
-        "--vehicle-id",
-        metavar="ID",
-        action="append",
-        default=[],
-        help="a vehicle whose parties have rights at this router; may be repeated",
-    )
-    parser.add_argument("--vehicles", metavar="FILE", help="a file with one vehicle id a line")
-    parser.add_argument("--out", metavar="FILE.json5", required=True, help="the settings' file")
+    listen = "where all others connect to, as tls/0.0.0.0:7447; may be repeated"
+    tls = "the router's folder of `deploy certs`, as certs/router; zenohd opens its files"
+    vehicle = "a vehicle whose parties have rights at this router; may be repeated"
+    add, append = parser.add_argument, functools.partial(parser.add_argument, action="append")
+    append("--listen", metavar="tls/HOST:PORT", required=True, help=listen)
+    add("--tls", metavar="DIR", required=True, help=tls)
+    append("--vehicle-id", metavar="ID", default=[], help=vehicle)
+    add("--vehicles", metavar="FILE", help="a file with one vehicle id a line")
+    add("--out", metavar="FILE.json5", required=True, help="the settings' file")
 
 
 def _run_router(arguments: argparse.Namespace) -> int:
     """Write the file. Raises UserError where anything in it would not hold."""
     check_writable(arguments.out)
     ids = arguments.vehicle_id + (_read_ids(arguments.vehicles) if arguments.vehicles else [])
-    settings = _router_settings(arguments.listen, ids, load_tls(arguments.tls))
+    settings = _router_settings(arguments.listen, ids, tls.load_tls(arguments.tls))
     write_json(arguments.out, settings)
     size = Path(arguments.out).stat().st_size
     names = len(settings["access_control"]["subjects"])
@@ -367,7 +325,7 @@ def _run_router(arguments: argparse.Namespace) -> int:
 
 
 def _router_settings(
-    listens: Sequence[str], vehicle_ids: Sequence[str], tls: TlsFiles
+    listens: Sequence[str], vehicle_ids: Sequence[str], files: tls.TlsFiles
 ) -> dict[str, Any]:
     """Zenoh's settings as one nested map: those of `bridge router --tls`, and a fleet's limits.
 
@@ -379,11 +337,11 @@ def _router_settings(
 
     for endpoint in listens:
         check_fits(check_endpoint(endpoint), with_tls=True)
-    check_name(tls.name, ROUTER)
+    tls.check_name(files.name, tls.ROUTER)
     if not vehicle_ids:
         raise UserError("no vehicle: name each with --vehicle-id, or all of them in --vehicles")
     ids = list(dict.fromkeys(map(check_vehicle_id, vehicle_ids)))
-    rows = session_rows(list(listens), None, "router", tls, rules_for_listener(ids))
+    rows = session_rows(list(listens), None, "router", files, tls.rules_for_listener(ids))
     sessions = SPARE_SESSIONS + SESSIONS_PER_VEHICLE * len(ids)
     rows["transport/unicast/max_sessions"] = sessions
     # After a router's restart all of its vehicles come at once.
@@ -391,8 +349,7 @@ def _router_settings(
     rows["transport/link/rx/max_message_size"] = MAX_MESSAGE_BYTES
     nested: dict[str, Any] = {}
     for path, value in rows.items():
-        *folders, name = path.split("/")
-        place = nested
+        place, (*folders, name) = nested, path.split("/")
         for folder in folders:
             place = place.setdefault(folder, {})
         place[name] = value

@@ -48,18 +48,15 @@ EXAMPLE = examples(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("host", metavar="HOST", help="[user@]name, as ssh knows it")
-    parser.add_argument("bundle", metavar="BUNDLE.tar", help="of `python -m deploy bundle`")
-    parser.add_argument(
-        "--trust",
-        metavar="KEY.pub",
-        default=str(DEFAULT_PUBLIC_KEY),
-        help="public half of the key that signed the bundle; a new board will trust it",
-    )
-    parser.add_argument("--root", metavar="DIR", default=DEFAULT_ROOT, help="where on the board")
-    parser.add_argument("--service", metavar="WAY", choices=WAYS, help="who runs it there")
-    parser.add_argument("--no-sudo", action="store_true", help="the user there needs no sudo")
-    parser.add_argument("--dry-run", action="store_true", help="print each step and do nothing")
+    trust = "public half of the key that signed the bundle; a new board will trust it"
+    key, add = str(DEFAULT_PUBLIC_KEY), parser.add_argument
+    add("host", metavar="HOST", help="[user@]name, as ssh knows it")
+    add("bundle", metavar="BUNDLE.tar", help="of `python -m deploy bundle`")
+    add("--trust", metavar="KEY.pub", default=key, help=trust)
+    add("--root", metavar="DIR", default=DEFAULT_ROOT, help="where on the board")
+    add("--service", metavar="WAY", choices=WAYS, help="who runs it there")
+    add("--no-sudo", action="store_true", help="the user there needs no sudo")
+    add("--dry-run", action="store_true", help="print each step and do nothing")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,12 +7,9 @@ import sys
 from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "doctor": (
-        "hil_tests.doctor",
-        "what this machine can and cannot do, and how to get the rest",
-    ),
+    "doctor": ("hil_tests.doctor", "what this machine can and cannot do, and how to get the rest"),
     "demo": ("hil_tests.demo", "train, export and drive the left turn, end to end"),
-    "pictures": ("hil_tests.pictures", "every picture of the READMEs"),
+    "pictures": ("hil_tests.pictures:PICTURES_COMMAND", "every picture of the READMEs"),
     "campaign": ("hil_tests.campaign:CAMPAIGN", "every fault, every latency row, one report"),
     "mock_hunter": (
         "hil_tests.mock_hunter.process",
@@ -24,13 +21,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "bench": ("hil_tests.bench_loop", "the loop against the least that could answer"),
     "recording": (
-        "hil_tests.recording",
+        "hil_tests.pictures:RECORDING_COMMAND",
         "drive and record anew what the next release is replayed against",
     ),
-    "board": (
-        "hil_tests.board",
-        "a bundle installed and driven on boards that are not there; needs root",
-    ),
+    "board": ("hil_tests.board", "a bundle installed and driven on emulated boards; needs root"),
 }
 
 

@@ -119,21 +119,17 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
             "floor_memory_mb": floor_memory,
         },
         "modes": dict(ours.modes),
-        "state_bytes": len(ours.prepare()[1]),
         "lockstep": lockstep(policy, arguments.episodes),
     }
 
 
 class Contender:
-    """Sends states to a process. A block of them is an episode.
-
-    ``arrivals`` holds when the answer to each step came, ``modes`` how many answers had each mode.
-    """
+    """Sends states to a process. A block of them is an episode."""
 
     def __init__(self, session: zenoh.Session, vehicle_id: str) -> None:
         self.vehicle_id = vehicle_id
-        self.arrivals: dict[int, float] = {}
-        self.modes: Counter[str] = Counter()
+        self.arrivals: dict[int, float] = {}  # when the answer to each step came
+        self.modes: Counter[str] = Counter()  # how many answers had each
         draw = np.random.default_rng(0).integers
         shape = (PICTURES, *wire.FRAMES_SHAPE)
         self._pictures = [one.tobytes() for one in draw(0, 256, shape, dtype=np.uint8)]
@@ -247,21 +243,14 @@ def compare(
 ) -> dict[str, Any]:
     """For each quantile: ours, the floor's, their ratio over all blocks, and its 95 % interval.
 
-    Blocks are resampled in pairs (bootstrap): neighbours in time share the machine's noise.
-
-    Args:
-        ours: the latencies of each block, any unit.
-        floor: the floor's, block by block beside ours.
-        seed: of the resampling.
-
-    Raises:
-        ValueError: no blocks, or not as many of the one as of the other.
+    Both are the latencies of each block, in any unit, block by block side by side: blocks are
+    resampled in pairs (bootstrap, with the ``seed``), for neighbours in time share the machine's
+    noise. Raises ValueError for no blocks, or not as many of the one as of the other.
     """
     if not ours or len(ours) != len(floor):
         raise ValueError(f"{len(ours)} blocks of ours beside {len(floor)} of the floor")
 
-    def quantiles(draw: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Of ours and of the floor, [2, quantiles]."""
+    def quantiles(draw: Sequence[int] | np.ndarray) -> np.ndarray:  # [ours and floor, quantiles]
         both = (np.concatenate([blocks[index] for index in draw]) for blocks in (ours, floor))
         return np.array([np.percentile(times, QUANTILES) for times in both])
 
@@ -316,25 +305,21 @@ def lockstep(policy: list[str], episodes: int) -> dict[str, Any]:
             "--env", SCENARIO, "--clock", "lockstep", "--episodes", str(episodes),
         )  # fmt: skip
     simulated_s = sum(row["time_s"] for row in report["per_episode"])
-    return {
-        "scenario": SCENARIO,
-        "episodes": episodes,
-        "simulated_s": simulated_s,
-        "times_real_time": report["times_real_time"],
-    }
+    times = report["times_real_time"]
+    return {"scenario": SCENARIO, "episodes": episodes, "simulated_s": simulated_s,
+            "times_real_time": times}  # fmt: skip
 
 
 def rows(report: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str, str]]:
     """The rows of what was measured, with their bars."""
     for name, row in report["latency"]["latency_ms"].items():
         low, high = row["interval"]
+        ratio, bar = row["ratio"], f"≤ {RATIO_BAR:g} times"
         yield (
-            f"state sent to command received, {name}, ms",
-            f"{row['ours']:.3f}",
-            f"{row['floor']:.3f}",
-            f"{row['ratio']:.2f} [{low:.2f}, {high:.2f}]",
-            _bar(f"≤ {RATIO_BAR:g} times", row["ratio"] <= RATIO_BAR),
-        )
+            f"state sent to command received, {name}, ms", f"{row['ours']:.3f}",
+            f"{row['floor']:.3f}", f"{ratio:.2f} [{low:.2f}, {high:.2f}]",
+            _bar(bar, ratio <= RATIO_BAR),
+        )  # fmt: skip
     process, lock = report["process"], report["lockstep"]
     ours, floor = process["memory_mb"], process["floor_memory_mb"]
     grown, starts = "grown_after_first_tenth", process["first_command_s"]

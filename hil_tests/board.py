@@ -26,9 +26,17 @@ from pathlib import Path
 from typing import Any, Self
 
 from deploy.__main__ import main as deploy
-from deploy.bundle import NAME, Inputs, build_installer, make_bundle
+from deploy.bundle import (
+    DEFAULT_FOLDER,
+    NAME,
+    ROOT,
+    TARGETS,
+    Inputs,
+    build_edge_wheel,
+    build_installer,
+    make_bundle,
+)
 from deploy.installer.systemd import MAIN_UNIT
-from deploy.wheels import DEFAULT_FOLDER, TARGETS, build_edge_wheel
 from edge_runtime.cli import examples, positive, sigterm_as_interrupt
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.transport import free_endpoint
@@ -39,7 +47,9 @@ Keep = Callable[[dict[str, Any]], None]
 """Given a report, for JSON, each time when it has grown."""
 
 BOARDS = ("aarch64", "python38")
-DEFAULT_CACHE = "build/board"
+CACHE, WHEELS = ROOT / "build/board", ROOT / DEFAULT_FOLDER
+"""Of the emulated board's disk, and of the bundles' wheels."""
+IMAGE = Path(__file__).with_name("board_image.sh")
 VEHICLE, _PORT = "hunter01", 7447
 ENDPOINT = f"tls/127.0.0.1:{_PORT}"
 _EPISODE_LIMIT_S, _BACK_LIMIT_S = 300.0, 120.0
@@ -67,34 +77,6 @@ _PROGRAMS = {
 }
 _BOOT_LIMIT_S = 300.0
 
-# The kernel's handler of aarch64 programs has a name of its own, and goes when this ends.
-_MAKE_IMAGE = """\
-cache=$1 key=$2 root=$1/root
-kernel=/proc/sys/fs/binfmt_misc
-[ -e $kernel/register ] || mount -t binfmt_misc binfmt_misc $kernel
-if [ ! -e $kernel/qemu-aarch64 ]; then
-    line=$(sed s/qemu-aarch64:/phil-aarch64:/ /usr/lib/binfmt.d/qemu-aarch64.conf)
-    printf %s "${line%F}F" > $kernel/register
-    trap 'echo -1 > $kernel/phil-aarch64' EXIT
-fi
-debootstrap --arch=arm64 --variant=minbase --include=python3,systemd-sysv,dbus,udev,iproute2,\
-openssh-server,openssh-client,linux-image-cloud-arm64 bullseye "$root" >&2
-cd "$root"
-mkdir -p root/.ssh
-cp "$key" root/.ssh/authorized_keys
-chmod 0700 root/.ssh
-printf '[Match]\\nName=e*\\n[Network]\\nAddress=10.0.2.15/24\\n' > etc/systemd/network/10.network
-ln -s /lib/systemd/system/systemd-networkd.service etc/systemd/system/multi-user.target.wants/
-echo board > etc/hostname
-echo '127.0.0.1 localhost board' > etc/hosts
-echo '/dev/vda / ext4 defaults 0 1' > etc/fstab
-rm -rf debootstrap var/cache/apt/archives/*.deb usr/share/doc usr/share/locale
-cp boot/vmlinuz-* "$cache/kernel"
-cp boot/initrd.img-* "$cache/initrd"
-truncate -s 3G "$cache/draft"
-mkfs.ext4 -q -F -d . "$cache/draft"
-mv "$cache/draft" "$cache/disk"
-"""
 # Its clock counts instructions, 1 ns each, and goes with ours only while it has nothing to do. So
 # it has as much time as a board, however slow the emulation is.
 _EMULATE = """\
@@ -111,20 +93,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     boards = "an emulated aarch64 computer with systemd; Python 3.8 without systemd"
     parser.add_argument("--boards", nargs="+", choices=BOARDS, default=list(BOARDS), help=boards)
-    for name, metavar, kind, default, text in (
-        ("--cuts", "N", positive, 8, "power cuts of the emulated one"),
-        ("--cache", "DIR", Path, Path(DEFAULT_CACHE), "keeps the emulated one's disk"),
-        ("--wheels", "DIR", Path, Path(DEFAULT_FOLDER), "keeps the bundles' wheels"),
-        ("--out", "R.json", str, None, "write the reports to this file"),
-    ):
-        parser.add_argument(name, metavar=metavar, type=kind, default=default, help=text)
+    cuts = "power cuts of the emulated one"
+    parser.add_argument("--cuts", metavar="N", type=positive, default=8, help=cuts)
+    parser.add_argument("--out", metavar="R.json", help="write the reports to this file")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Prove each board, print its report, write the file.
 
-    Raises:
-        UserError: this machine cannot, or a step failed.
+    Raises UserError where this machine cannot, or a step failed.
     """
     if arguments.out is not None:
         check_writable(arguments.out)
@@ -139,17 +116,17 @@ def run(arguments: argparse.Namespace) -> int:
                 report[board] = found
                 write_json_out(arguments.out, report)
 
-            prove(board, arguments.cache, arguments.wheels, arguments.cuts, keep)
+            prove(board, arguments.cuts, keep)
             print(f"{board}: {json.dumps(report[board], indent=1)}", flush=True)
     return 0
 
 
-def prove(board: str, cache: Path, wheels: Path, cuts: int, keep: Keep) -> None:
+def prove(board: str, cuts: int, keep: Keep) -> None:
     """Prove one of BOARDS."""
     if board == "aarch64":
-        prove_aarch64(cache, wheels, cuts, keep)
+        prove_aarch64(cuts, keep)
     else:
-        keep(prove_python38(wheels))
+        keep(prove_python38())
 
 
 def why_not(board: str) -> str:
@@ -169,10 +146,8 @@ def find_python38() -> str | None:
     candidates = [shutil.which("python3.8")]
     candidates += [str(p) for p in sorted(Path.home().glob(".pyenv/versions/3.8*/bin/python"))]
     for candidate in filter(None, candidates):
-        asked = subprocess.run(
-            [candidate, "--version"], capture_output=True, text=True, check=False
-        )
-        if asked.stdout.startswith("Python 3.8."):
+        version = subprocess.run([candidate, "--version"], capture_output=True, check=False).stdout
+        if version.startswith(b"Python 3.8."):
             return candidate
     return None
 
@@ -180,8 +155,8 @@ def find_python38() -> str | None:
 class Parcels:
     """Makes bundles: whole ones as a person would, and light ones whose libraries lie there."""
 
-    def __init__(self, folder: Path, wheels: Path, endpoint: str) -> None:
-        self._folder, self._wheels = folder, wheels
+    def __init__(self, folder: Path, endpoint: str) -> None:
+        self._folder = folder
         self.trust, self.certificates = folder / "keys/policy.pub", folder / "certs"
         self._key, self._tls = folder / "keys/policy.key", self.certificates / f"edge-{VEHICLE}"
         self._config = folder / "edge.toml"
@@ -198,7 +173,7 @@ class Parcels:
             deploy(
                 ["bundle", "--policy", str(POLICY), "--public-key", str(PUBLIC_KEY),
                  "--target", target, "--config", str(self._config), "--key", str(self._key),
-                 "--tls", str(self._tls), "--wheels", str(self._wheels),
+                 "--tls", str(self._tls), "--wheels", str(WHEELS),
                  "--out", str(self._folder / target)]
             )  # fmt: skip
         return next((self._folder / target).glob("*.tar"))
@@ -219,25 +194,23 @@ class Parcels:
 class Board:
     """An emulated board with a disk of its own, on or without power, and the installer on it."""
 
-    def __init__(self, cache: Path, folder: Path) -> None:
-        self._cache, self._folder = cache.absolute(), folder
-        self._disk = folder / "disk.qcow2"
-        self._port = _free_port()
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._disk, self._port = folder, folder / "disk.qcow2", _free_port()
         self._config = folder / "ssh_config"
         self._config.write_text(
             f"Host board\n HostName 127.0.0.1\n Port {self._port}\n User root\n"
-            f" IdentityFile {self._cache}/key\n StrictHostKeyChecking no\n"
+            f" IdentityFile {CACHE}/key\n StrictHostKeyChecking no\n"
             " UserKnownHostsFile /dev/null\n LogLevel ERROR\n"
         )
-        base = ["-b", str(self._cache / "disk"), "-F", "raw"]
+        base = ["-b", str(CACHE / "disk"), "-F", "raw"]
         subprocess.run(["qemu-img", "create", "-q", "-f", "qcow2", *base, self._disk], check=True)
         self._machine: subprocess.Popen[bytes] | None = None
 
     def boot(self) -> float:
         """Switch it on; how long it took until all of its services were up, s."""
-        words = ["sh", "-c", _EMULATE, "sh", self._cache, self._disk, self._port]
+        words = ["sh", "-c", _EMULATE, "sh", str(CACHE), str(self._disk), str(self._port)]
         begun_s = time.monotonic()
-        self._machine = subprocess.Popen([str(word) for word in words], stdin=subprocess.DEVNULL)
+        self._machine = subprocess.Popen(words, stdin=subprocess.DEVNULL)
         wait_until(self._is_up, "the emulated computer is up", _BOOT_LIMIT_S)
         return round(time.monotonic() - begun_s, 1)
 
@@ -276,12 +249,9 @@ class Board:
         finally:
             os.environ["PATH"] = before
 
-    def send(self, bundle: Path) -> None:
-        """Copy a bundle and its signature there."""
-        self.copy(bundle, Path(f"{bundle}.sig"))
-
     def install(self, bundle: Path) -> subprocess.CompletedProcess[str]:
-        """Install a bundle that was sent there."""
+        """Copy a bundle and its signature there, and install it."""
+        self.copy(bundle, Path(f"{bundle}.sig"))
         return self.run(f"{INSTALL} install {bundle.name}")
 
     def must(self, command: str) -> None:
@@ -323,42 +293,33 @@ class Board:
         self.cut_power()
 
 
-def make_image(cache: Path) -> None:
+def make_image() -> None:
     """A disk with Debian on it, its kernel, and the key that opens it; minutes, once.
 
-    Raises:
-        UserError: debootstrap failed, for instance without a network.
+    Raises UserError where debootstrap failed, for instance without a network.
     """
-    cache.mkdir(parents=True, exist_ok=True)
-    for name in ("key", "key.pub"):
-        (cache / name).unlink(missing_ok=True)
-    shutil.rmtree(cache / "root", ignore_errors=True)
-    key = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(cache / "key")]
-    subprocess.run(key, check=True)
+    CACHE.mkdir(parents=True, exist_ok=True)
     # In a mount namespace of its own: what it mounts is gone with it, whatever happens.
     apart = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-e", "-c"]
-    done = subprocess.run(
-        [*apart, _MAKE_IMAGE, "sh", str(cache.absolute()), str((cache / "key.pub").absolute())],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    shutil.rmtree(cache / "root", ignore_errors=True)
+    words = [*apart, IMAGE.read_text(), "sh", str(CACHE)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    shutil.rmtree(CACHE / "root", ignore_errors=True)
     if done.returncode != 0:
         lines = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
         raise UserError(f"no image of the board: {(lines or ['failed'])[-1]}")
 
 
-def prove_aarch64(cache: Path, wheels: Path, cuts: int, keep: Keep) -> None:
+def prove_aarch64(cuts: int, keep: Keep) -> None:
     """Install, drive, upgrade, spoil, hang and cut off an emulated board.
 
-    Raises:
-        UserError: a step failed that must not.
+    Raises UserError where a step failed that must not.
     """
-    if not (cache / "disk").exists():
-        make_image(cache)
+    if not (CACHE / "disk").exists():
+        make_image()
     with tempfile.TemporaryDirectory(prefix="phil-board-") as place:
         folder = Path(place)
-        parcels = Parcels(folder, wheels, ENDPOINT)
-        with Board(cache, folder) as board:
+        parcels = Parcels(folder, ENDPOINT)
+        with Board(folder) as board:
             report: dict[str, Any] = {"boot_s": board.boot(), "is": board.run(_WHAT_IT_IS).stdout}
             report |= _push(board, parcels)
             report["status"] = board.status()
@@ -371,8 +332,12 @@ def prove_aarch64(cache: Path, wheels: Path, cuts: int, keep: Keep) -> None:
             board.run(f"rm -r {_LIBRARIES}/edge_runtime")
             board.copy(folder / NAME)
             for light in lights:
-                board.send(light)
-            report["rolled_back"] = _upgrade_and_back(board, lights[0])
+                board.copy(light, Path(f"{light}.sig"))
+            before = board.current()
+            board.must(f"install {lights[0].name}")
+            upgraded = board.current()
+            board.must("rollback")
+            report["rolled_back"] = upgraded != before and board.current() == before
             report["changed_bytes"] = _change_bytes(board, lights[1])
             report["faulty"] = {
                 why: _install_faulty(board, parcels.light(line)) for why, line in FAULTS.items()
@@ -450,15 +415,6 @@ def _hang(board: Board) -> float:
     return round(time.monotonic() - begun_s, 1)
 
 
-def _upgrade_and_back(board: Board, light: Path) -> bool:
-    """Whether an upgrade became current, and a roll-back the release before."""
-    before = board.current()
-    board.must(f"install {light.name}")
-    upgraded = board.current()
-    board.must("rollback")
-    return upgraded != before and board.current() == before
-
-
 def _change_bytes(board: Board, bundle: Path) -> dict[str, Any]:
     """Change one byte of a bundle, many times: each is refused, with nothing written."""
     choice, data = random.Random(1), bundle.read_bytes()
@@ -467,7 +423,6 @@ def _change_bytes(board: Board, bundle: Path) -> dict[str, Any]:
     before = board.run(_FINGERPRINT).stdout
     for place in choice.sample(range(len(data)), _CHANGED_BYTES):
         changed.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
-        board.send(changed)
         done = board.install(changed)
         untouched = board.run(_FINGERPRINT).stdout == before
         refused += done.returncode == 2 and "is refused" in done.stderr and untouched
@@ -477,7 +432,6 @@ def _change_bytes(board: Board, bundle: Path) -> dict[str, Any]:
 def _install_faulty(board: Board, bundle: Path) -> dict[str, Any]:
     """Install a release that must go back by itself; what the installer says of it."""
     before = board.current()
-    board.send(bundle)
     done = board.install(bundle)
     active = board.show(MAIN_UNIT, "ActiveState") == "active"
     went_back = board.current() == before and active
@@ -493,8 +447,7 @@ def _cut(board: Board, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]
     begun_s = time.monotonic()
     board.must(f"install {lights[0].name}")
     whole_s = time.monotonic() - begun_s
-    said_last: Counter[str] = Counter()
-    current: Counter[str] = Counter()
+    said_last, current = Counter[str](), Counter[str]()
     broken: list[str] = []
     boots_s: list[float] = []
     for number in range(cuts):
@@ -506,8 +459,8 @@ def _cut(board: Board, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]
         time.sleep(choice.uniform(0.0, 1.1 * whole_s))
         board.cut_power()
         said = (run.communicate()[0].strip().splitlines() or ["nothing"])[-1].split()[0]
-        boots_s.append(board.boot())
         said_last[said] += 1
+        boots_s.append(board.boot())
         try:
             then = board.current()
             current["the old one" if then == before else "the new one"] += 1
@@ -524,12 +477,12 @@ def _cut(board: Board, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]
         }  # fmt: skip
 
 
-def prove_python38(wheels: Path) -> dict[str, Any]:
+def prove_python38() -> dict[str, Any]:
     """Install offline under Python 3.8, run the release as a container would, drive; a report."""
     python, port = str(find_python38()), _free_port()
     with tempfile.TemporaryDirectory(prefix="phil-python38-") as place:
         folder = Path(place)
-        parcels = Parcels(folder, wheels, f"tls/127.0.0.1:{port}")
+        parcels = Parcels(folder, f"tls/127.0.0.1:{port}")
         bundle, opt = parcels.whole("linux-x86_64"), folder / "opt"
 
         def run(*words: str) -> str:

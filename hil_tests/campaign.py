@@ -16,53 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from bridge.environments import CONDITIONS, NOMINAL
-from edge_runtime.cli import (
-    Command,
-    add_public_key,
-    examples,
-    not_negative,
-    positive,
-    share,
-    sigterm_as_interrupt,
-)
+from edge_runtime.cli import Command, add_public_key, examples, not_negative, positive, share
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
+from hil_tests import report, sweep
 from hil_tests.faults.run import choose_rows, run_faults
-from hil_tests.mock_hunter.body import make_parameters, read_changes
-from hil_tests.report import (
-    check_report,
-    comparison_verdict,
-    lag_sentence,
-    render_comparison,
-    render_faults,
-    render_latency,
-    render_sweep,
-    write_figures,
-    write_lag_figures,
-    write_report,
-)
-from hil_tests.sweep import (
-    LAG_AXES,
-    LAGS,
-    LOOPS,
-    MODEL,
-    NETWORK_AXES,
-    POLICY,
-    VEHICLE,
-    Axis,
-    Lag,
-    Part,
-    Task,
-    budget,
-    cost,
-    drive_all,
-    drive_lag,
-    drive_network,
-    lag_budget,
-    make_row,
-    run_rig,
-    worth_keeping,
-)
+from hil_tests.mock_hunter.hunter import make_parameters, read_changes
 from trainer.evaluate import cores
 from trainer.options import add_scenario
 from trainer.util import ProgressBar
@@ -78,12 +37,8 @@ SHOWN_WRONG = 5
 def _add_shared(
     parser: argparse.ArgumentParser, parts: Sequence[str], runs: int, of_what: str, target: float
 ) -> None:
-    parser.add_argument(
-        "--out",
-        required=True,
-        metavar="R.json",
-        help="the report; R.md, pictures and R_rows/ (what is done already) go beside it",
-    )
+    out = "the report; R.md, pictures and R_rows/ (what is done already) go beside it"
+    parser.add_argument("--out", required=True, metavar="R.json", help=out)
     default = "policy file (default: results/policies/SCENARIO.onnx)"
     parser.add_argument("--policy", metavar="P.onnx", help=default)
     add_public_key(parser)
@@ -109,49 +64,46 @@ def _several(text: str) -> int:
 def _add_campaign_arguments(parser: argparse.ArgumentParser) -> None:
     runs_help = "episodes of each row, the same seeds"
     _add_shared(parser, ("latency", "faults"), 100, runs_help, 0.98)
-    parser.add_argument(
-        "--rows",
-        metavar="NAME,...",
-        help=f"only these latency axes ({', '.join(axis.name for axis in NETWORK_AXES)}) and "
-        "faults, by name or pattern (hunter_*)",
-    )
+    axes = ", ".join(axis.name for axis in sweep.NETWORK_AXES)
+    rows = f"only these latency axes ({axes}) and faults, by name or pattern (hunter_*)"
+    parser.add_argument("--rows", metavar="NAME,...", help=rows)
     parser.add_argument("--tries", type=positive, default=10, help="of each fault")
 
 
 def _run_campaign(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where a fault was not met as it should be."""
     out = Path(arguments.out)
-    check_report(out)
+    report.check_report(out)
     axes, faults = _choose(arguments)
     jobs = arguments.jobs or cores()
-    report: dict[str, Any] = {"command": _this_command()}
+    result: dict[str, Any] = {"command": _this_command()}
     name = Path(arguments.policy or f"{arguments.scenario}.onnx").name
     text = [f"# Campaign: {name}, {arguments.scenario}", "", f"`{_this_command()}`", ""]
     if axes:
-        report["latency"] = latency = run_latency(
-            _task(arguments), axes, arguments.target, jobs, out
-        )
-        text += ["## Latency", "", render_latency(latency)]
+        latency = run_latency(_task(arguments), axes, arguments.target, jobs, out)
+        result["latency"] = latency
+        text += ["## Latency", "", report.render_latency(latency)]
         print(latency["budget"]["sentence"])
     if faults is not None:
         with ProgressBar("faults", arguments.tries * len(choose_rows(faults or None))) as bar:
-            report["faults"] = found = run_faults(
+            found = run_faults(
                 arguments.tries, faults or None, arguments.policy and Path(arguments.policy),
                 lambda row: bar.advance({"row": row}), jobs, arguments.public_key,
             )  # fmt: skip
-        text += ["## Faults", "", render_faults(found)]
+        result["faults"] = found
+        text += ["## Faults", "", report.render_faults(found)]
         for row in found["rows"]:
             for kind in ("wrong", "unsafe", "crashes"):
                 for what in row[kind][:SHOWN_WRONG]:
                     print(f"{row['name']}: {kind}: {what}")
         print("Every fault was met." if found["passed"] else "Not every fault was met.")
-    write_report(out, report, text)
-    return 0 if faults is None or report["faults"]["passed"] else 1
+    report.write_report(out, result, text)
+    return 0 if faults is None or result["faults"]["passed"] else 1
 
 
-def _choose(arguments: argparse.Namespace) -> tuple[list[Axis], list[str] | None]:
+def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[str] | None]:
     """The latency axes, and the faults by name ([]: all of them; None: no faults)."""
-    known = {axis.name: axis for axis in NETWORK_AXES}
+    known = {axis.name: axis for axis in sweep.NETWORK_AXES}
     named = arguments.rows.split(",") if arguments.rows else []
     axes = [known[name] for name in named if name in known] if named else list(known.values())
     faults = [name for name in named if name not in known]
@@ -166,14 +118,14 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[Axis], list[str] | None
     return axes, None if without_faults else faults
 
 
-def _task(arguments: argparse.Namespace, changes: dict[str, float] | None = None) -> Task:
+def _task(arguments: argparse.Namespace, changes: dict[str, float] | None = None) -> sweep.Task:
     """UserError where the policy does not load.
 
     The edge runtime checks signatures where it matters; here the loop is measured.
     """
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
     loaded = load_policy(str(policy), arguments.public_key, allow_unsigned=True)
-    return Task(
+    return sweep.Task(
         policy, loaded.policy_id, arguments.scenario, arguments.condition, arguments.seed,
         arguments.runs, arguments.public_key, changes or {},
     )  # fmt: skip
@@ -188,23 +140,24 @@ def _rows_beside(out: Path) -> Path:
 
 
 def run_latency(
-    task: Task, axes: Sequence[Axis], target: float, jobs: int, out: Path
+    task: sweep.Task, axes: Sequence[sweep.Axis], target: float, jobs: int, out: Path
 ) -> dict[str, Any]:
     """Drive every network of the axes; the report's part ``latency``."""
     specs = list(dict.fromkeys(spec for axis in axes for spec in axis.specs))
-    with sigterm_as_interrupt():  # Whoever ends a campaign ends its processes.
-        found = drive_all(task, specs, PART_EPISODES, drive_network, jobs, _rows_beside(out))
-    rows = {spec: make_row(spec, parts) for spec, parts in found.items()}
+    drive, keep = sweep.drive_network, _rows_beside(out)
+    found = sweep.drive_all(task, specs, PART_EPISODES, drive, jobs, keep)
+    rows = {spec: sweep.make_row(spec, parts) for spec, parts in found.items()}
     driven_s, wall_s = (sum(row[name] for row in rows.values()) for name in ("driven_s", "wall_s"))
+    told = ("name", "title", "unit", "values", "specs")
     latency = {
         **task.facts(),
         "clock": "lockstep",
-        "axes": [axis.as_dict() for axis in axes],
+        "axes": [{name: getattr(axis, name) for name in told} for axis in axes],
         "rows": rows,
-        "budget": budget(axes, rows, target, task.policy.stem),
+        "budget": sweep.budget(axes, rows, target, task.policy.stem),
         "faster_than_real_time": driven_s / wall_s,
     }
-    return {**latency, "figures": write_figures(out, latency)}
+    return {**latency, "figures": report.write_figures(out, latency)}
 
 
 def _add_vehicle_arguments(parser: argparse.ArgumentParser) -> None:
@@ -212,23 +165,14 @@ def _add_vehicle_arguments(parser: argparse.ArgumentParser) -> None:
     _add_shared(parser, ("compare", "sweep"), 50, runs_help, 0.95)
     rigs = "simulators in real time side by side, each with a vehicle of its own"
     parser.add_argument("--rigs", type=positive, default=4, metavar="N", help=rigs)
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a parameter of the mock Hunter, as in python -m hil_tests mock_hunter",
-    )
-    parser.add_argument(
-        "--lags",
-        type=_lags,
-        default=LAGS,
-        metavar="DEAD+CONSTANT,...",
-        help="only these points of the sweep, in ms, as in 50+100,200+300 (default: a table)",
-    )
+    mock = "a parameter of the mock Hunter, as in python -m hil_tests mock_hunter"
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=mock)
+    only = "only these points of the sweep, in ms, as in 50+100,200+300 (default: a table)"
+    shape = "DEAD+CONSTANT,..."
+    parser.add_argument("--lags", type=_lags, default=sweep.LAGS, metavar=shape, help=only)
 
 
-def _lags(text: str) -> list[Lag]:
+def _lags(text: str) -> list[sweep.Lag]:
     lags = []
     for point in text.split(","):
         dead, _, constant = point.partition("+")
@@ -236,73 +180,57 @@ def _lags(text: str) -> list[Lag]:
             raise argparse.ArgumentTypeError(
                 f"{point!r} is no lag: write DEAD+CONSTANT in ms, as in 50+100"
             )
-        lags.append(Lag(int(dead), int(constant)))
+        lags.append(sweep.Lag(int(dead), int(constant)))
     return list(dict.fromkeys(lags))
 
 
 def _run_vehicle(arguments: argparse.Namespace) -> int:
     """Run the parts; 0, or 1 where the vehicle in the loop is below the target."""
     out, target, holds = Path(arguments.out), arguments.target, True
-    check_report(out)
+    report.check_report(out)
     task = _task(arguments, read_changes(arguments.set))
-    make_parameters(MODEL, task.changes)  # refuses what the mock does not know
-    report: dict[str, Any] = {"command": _this_command(), "policy_id": task.policy_id}
+    make_parameters(sweep.MODEL, task.changes)  # refuses what the mock does not know
+    result: dict[str, Any] = {"command": _this_command(), "policy_id": task.policy_id}
     title = f"# Vehicle in the loop: {task.policy.name}, {arguments.scenario}"
     text = [title, "", f"`{_this_command()}`"]
     if arguments.only != "sweep":
-        report["comparison"] = found = run_comparison(task, target, arguments.rigs, out)
-        text += ["", "## In real time", "", render_comparison(found)]
-        print(comparison_verdict(found))
+        result["comparison"] = found = run_comparison(task, target, arguments.rigs, out)
+        text += ["", "## In real time", "", report.render_comparison(found)]
+        print(report.comparison_verdict(found))
         holds = found["holds"]
     if arguments.only != "compare":
-        jobs = arguments.jobs or cores()
-        report["sweep"] = found = run_sweep(task, arguments.lags, target, jobs, out)
-        text += ["", "## Lag, in virtual time", "", render_sweep(found)]
-        print(lag_sentence(found))
-    write_report(out, report, text)
+        jobs, keep, drive = arguments.jobs or cores(), _rows_beside(out), sweep.drive_lag
+        parts = sweep.drive_all(task, arguments.lags, task.runs, drive, jobs, keep, processes=True)
+        rows = {lag.spec: row for lag, (row,) in parts.items()}
+        lag_budget = sweep.lag_budget(list(rows.values()), target)
+        found = {**task.facts(), "mock": task.changes, "rows": rows, "lag_budget": lag_budget}
+        result["sweep"] = found
+        text += ["", "## Lag, in virtual time", "", report.render_sweep(found)]
+        print(report.lag_sentence(found))
+    report.write_report(out, result, text)
     return 0 if holds else 1
 
 
-def drive_loop(task: Task, part: Part) -> list[dict[str, Any]]:
+def drive_loop(task: sweep.Task, part: sweep.Part) -> list[dict[str, Any]]:
     """Drive a part in real time from a stand, with or without a mock Hunter in the loop."""
     options = ("--clock", "realtime", "--loop", part.point, "--standing")
     limit_s = LONGEST_EPISODE_S * (1 + part.runs)
-    report = run_rig(task, part, limit_s, *options, hunter=part.point == VEHICLE)
-    return [worth_keeping(report)]
+    driven = sweep.run_rig(task, part, limit_s, *options, hunter=part.point == sweep.VEHICLE)
+    return [sweep.worth_keeping(driven)]
 
 
-def run_comparison(task: Task, target: float, rigs: int, out: Path) -> dict[str, Any]:
+def run_comparison(task: sweep.Task, target: float, rigs: int, out: Path) -> dict[str, Any]:
     """Drive both loops, ``rigs`` at a time; the report's part ``comparison``."""
-    with sigterm_as_interrupt():
-        found = drive_all(task, LOOPS, LOOP_EPISODES, drive_loop, rigs, _rows_beside(out))
-    rows = {loop: make_row(loop, parts) for loop, parts in found.items()}
+    found = sweep.drive_all(task, sweep.LOOPS, LOOP_EPISODES, drive_loop, rigs, _rows_beside(out))
+    rows = {loop: sweep.make_row(loop, parts) for loop, parts in found.items()}
     return {
         **task.facts(),
         "mock": task.changes,
         "rows": rows,
-        "cost": cost(rows[POLICY]["per_episode"], rows[VEHICLE]["per_episode"]),
+        "cost": sweep.cost(rows[sweep.POLICY]["per_episode"], rows[sweep.VEHICLE]["per_episode"]),
         "target_success": target,
-        "holds": rows[VEHICLE]["success"]["value"] >= target,
+        "holds": rows[sweep.VEHICLE]["success"]["value"] >= target,
     }
-
-
-def run_sweep(
-    task: Task, lags: Sequence[Lag], target: float, jobs: int, out: Path
-) -> dict[str, Any]:
-    """Drive every lag, ``jobs`` at a time; the report's part ``sweep``."""
-    with sigterm_as_interrupt():
-        found = drive_all(task, lags, task.runs, drive_lag, jobs, _rows_beside(out), processes=True)
-    rows = {lag.spec: row for lag, (row,) in found.items()}
-    axes = [axis for axis in LAG_AXES if set(axis.specs) <= set(rows)]
-    sweep = {
-        **task.facts(),
-        "mock": task.changes,
-        "axes": [axis.as_dict() for axis in axes],
-        "rows": rows,
-        "budget": budget(axes, rows, target, task.policy.stem) if axes else None,
-        "lag_budget": lag_budget(list(rows.values()), target),
-    }
-    return {**sweep, "figures": write_lag_figures(out, sweep)}
 
 
 CAMPAIGN = Command(

@@ -85,17 +85,12 @@ EXAMPLE = examples("python -m hil_tests doctor --only basics vehicle")
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "--only", metavar="GROUP", nargs="+", default=GROUPS, help=f"of {', '.join(GROUPS)}"
-    )
+    groups = f"of {', '.join(GROUPS)}"
+    parser.add_argument("--only", metavar="GROUP", nargs="+", default=GROUPS, help=groups)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make the checks and print them; 0 where the basics work.
-
-    Raises:
-        UserError: a group that is not there.
-    """
+    """Make the checks and print them; 0 where the basics work. UserError for an unknown group."""
     for group in arguments.only:
         if group not in GROUPS:
             raise UserError(f"no group {group!r}: choose from {', '.join(GROUPS)}")
@@ -191,8 +186,7 @@ def _packages() -> str:
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]]
-    absent = [name for name in wanted if _installed(name) is None]
-    if absent:
+    if absent := [name for name in wanted if _installed(name) is None]:
         raise MissingError(f"not installed: {', '.join(absent)}")
     return f"all {len(wanted)} that pyproject.toml asks for"
 
@@ -200,14 +194,11 @@ def _packages() -> str:
 def _versions() -> str:
     locked = dict(line.split("==") for line in LOCK.read_text().splitlines() if "==" in line)
     found = {name: version for name in locked if (version := _installed(name)) is not None}
-    other = [
-        f"{name} {version} (locked: {locked[name]})"
-        for name, version in found.items()
-        # torch says +cpu or +cu130 behind its version.
-        if version.split("+")[0] != locked[name]
-    ]
+    # torch says +cpu or +cu130 behind its version.
+    other = {n: version for n, version in found.items() if version.split("+")[0] != locked[n]}
     if other:
-        raise MissingError(f"other versions: {', '.join(other)}")
+        each = (f"{name} {version} (locked: {locked[name]})" for name, version in other.items())
+        raise MissingError(f"other versions: {', '.join(each)}")
     return f"{len(found)} packages as in {LOCK.name}"
 
 
@@ -329,9 +320,8 @@ def _board(name: str) -> str:
 def python_says(script: str) -> str:
     """What a script prints, in a process of its own.
 
-    Raises:
-        ModuleNotFoundError: it imports what is not installed.
-        MissingError: it fails in another way.
+    Raises ModuleNotFoundError where it imports what is not installed, MissingError where it fails
+    in another way.
     """
     try:
         return program_says(sys.executable, "-c", script)
@@ -345,8 +335,7 @@ def python_says(script: str) -> str:
 def program_says(*command: str) -> str:
     """The first line that a program prints, or where it is if it prints none.
 
-    Raises:
-        MissingError: it is not there, fails, or does not end.
+    Raises MissingError where it is not there, fails, or does not end.
     """
     name = Path(command[0]).name
     if (path := shutil.which(command[0])) is None:

@@ -48,16 +48,10 @@ class CommandTimeoutError(UserError, TimeoutError):
 class Process:
     """``python -m ARGUMENTS`` beside us; ``lines`` are its output with their monotonic times.
 
-    Args:
-        arguments: the module and its arguments.
-        ready: text of its output that says it has started; None: no wait.
-        shown: print the command.
-        environment: variables beside ours.
-        told: it reads its standard input, and `tell` writes there.
-        on_line: called with the time and text of each line, in a thread.
-
-    Raises:
-        UserError: it ended, or said nothing for too long, before it was ready.
+    ``ready`` is a text of its output that says it has started (None: no wait); ``shown`` prints the
+    command; ``environment`` are variables beside ours. With ``told`` it reads its standard input,
+    and `tell` writes there. ``on_line`` is called with the time and text of each line, in a thread.
+    Raises UserError where it ended, or said nothing for too long, before it was ready.
     """
 
     def __init__(
@@ -84,6 +78,7 @@ class Process:
             errors="surrogateescape",  # what is no text goes through as it is
             env={**os.environ, **(environment or {})},
         )
+        self.pid = self._process.pid
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         if ready is not None:
@@ -94,11 +89,6 @@ class Process:
             if self.has_ended:
                 self._gone(None)
                 raise self._failure()
-
-    @property
-    def pid(self) -> int:
-        """The process's id."""
-        return self._process.pid
 
     @property
     def has_ended(self) -> bool:
@@ -216,11 +206,7 @@ def operator(endpoint: str, vehicle_id: str) -> Iterator[None]:
 
 
 def run_command(*arguments: str) -> None:
-    """Print ``python -m ...`` and run it to its end, its output passed through.
-
-    Raises:
-        UserError: it failed; it has said why.
-    """
+    """Print ``python -m ...`` and run it to its end; UserError where it failed and has said why."""
     print(f"\n$ python -m {shlex.join(arguments)}", flush=True)
     process = subprocess.Popen([sys.executable, "-m", *arguments])
     try:
@@ -237,21 +223,13 @@ def run_command(*arguments: str) -> None:
 
 
 def drive_shown(
-    vehicle_id: str,
-    trust: Sequence[str],
-    simulate: Sequence[str],
-    listener: Sequence[str] = (),
+    vehicle_id: str, trust: Sequence[str], simulate: Sequence[str], listener: Sequence[str] = ()
 ) -> None:
     """Drive the left turn with a mock vehicle and an operator, by commands as a person types them.
 
-    Args:
-        vehicle_id: whose keys on the wire.
-        trust: the edge runtime's options for its policy.
-        simulate: further options of ``bridge simulate``.
-        listener: a further command of the bridge, which listens and ends after the drive.
-
-    Raises:
-        UserError: one of them failed.
+    ``trust`` are the edge runtime's options for its policy, ``simulate`` further ones of ``bridge
+    simulate``. ``listener`` is a further command of the bridge, which listens and ends after the
+    drive. Raises UserError where one of them failed.
     """
     endpoint = free_endpoint()
     common = ("--connect", endpoint, "--vehicle-id", vehicle_id)
@@ -267,14 +245,6 @@ def drive_shown(
             beside.succeed()
 
 
-def end_children() -> None:
-    """Ask every process that this one has started to end, whichever thread waits for it."""
-    for children in Path("/proc/self/task").glob("*/children"):
-        for child in children.read_text().split():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(int(child), signal.SIGTERM)
-
-
 def in_parallel(
     work: Callable[[Item], Result],
     items: Sequence[Item],
@@ -285,10 +255,8 @@ def in_parallel(
     """Do the work of each item, ``jobs`` at a time; ``on_done`` is called here, as they end.
 
     In threads, which suits work that waits for processes, or in processes. After a failure, and on
-    ^C, what has not begun is not begun any more, and every process under way is asked to end.
-
-    Raises:
-        UserError: a process of ours died.
+    ^C, what has not begun is not begun any more, and every process that this one has started is
+    asked to end. Raises UserError where a worker process died.
     """
     jobs = min(jobs, len(items)) or 1
     pool: Executor = ThreadPoolExecutor(jobs)
@@ -302,7 +270,10 @@ def in_parallel(
                 on_done(futures[future], future.result())
         except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
-            end_children()
+            for children in Path("/proc/self/task").glob("*/children"):  # whichever thread waits
+                for child in children.read_text().split():
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(int(child), signal.SIGTERM)
             if isinstance(error, BrokenProcessPool):
                 raise UserError("a worker process died; use fewer --jobs") from error
             raise
@@ -320,8 +291,7 @@ def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIE
     """Poll until the condition is true and return its value; TimeoutError otherwise."""
     end_s = time.monotonic() + timeout_s
     while time.monotonic() < end_s:
-        value = condition()
-        if value:
+        if value := condition():
             return value
         time.sleep(POLL_S)
     raise TimeoutError(f"not within {timeout_s:g} s: {what}")
@@ -332,9 +302,7 @@ def headless_viewer() -> Iterator[Any]:
     """Rerun's viewer without a screen, as a ``ViewerClient`` that asks it for pictures.
 
     Without a graphics card it draws in software, through Vulkan (Debian's mesa-vulkan-drivers).
-
-    Raises:
-        UserError: it does not start here, or ends as soon as it is to draw.
+    Raises UserError where it does not start here, or ends as soon as it is to draw.
     """
     host, _, port = free_endpoint().removeprefix("tcp/").rpartition(":")
     command = [sys.executable, "-m", "rerun", "--headless", "--hide-welcome-screen"]
@@ -364,9 +332,8 @@ def _connect_viewer(viewer: subprocess.Popen[bytes], url: str) -> Any:
             return client
         except Exception as error:
             if viewer.poll() is not None or time.monotonic() > give_up_s:
-                raise UserError(
-                    f"rerun's viewer does not start here ({error}): {VIEWER_NEEDS}"
-                ) from None
+                said = f"rerun's viewer does not start here ({error}): {VIEWER_NEEDS}"
+                raise UserError(said) from None
             time.sleep(VIEWER_LOOK_S)
 
 

@@ -6,23 +6,14 @@ import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from bridge.report import markdown_table
 from edge_runtime.files import check_writable, write_atomic, write_json_out
 from edge_runtime.util import UserError
-from hil_tests.sweep import LOOPS, VEHICLE
+from hil_tests.sweep import LOOPS, VEHICLE, Found
 
-Found = Mapping[str, Any]
-"""A part of a report's JSON."""
-FIGURES = {
-    "success": ("success", "success", "Wilson's 95 % interval"),
-    "distance": ("surviving_distance_m", "surviving distance, m", "Student's 95 % interval"),
-}
-"""Figure -> what of a row it shows, its label, and what the band is."""
 COLUMNS = 3
 
 
@@ -48,12 +39,13 @@ def render_faults(report: Found) -> str:
             "verdict")  # fmt: skip
     rows = []
     for row in report["rows"]:
-        tries = str(row["tries"]) + (f" (+{row['disturbed']} again)" if row["disturbed"] else "")
-        times = (
+        again = f" (+{row['disturbed']} again)" if row["disturbed"] else ""
+        rows.append((
+            row["done"], row["expected"], f"{row['tries']}{again}",
             _numbers(row["reaction_ms"], 0), _number(row["reaction_limit_ms"], 0),
             _numbers(row["recovery_ms"], 0), _number(row["recovery_limit_ms"], 0),
-        )  # fmt: skip
-        rows.append((row["done"], row["expected"], tries, *times, fault_verdict(row)))
+            fault_verdict(row),
+        ))  # fmt: skip
     end = (
         f"{report['crashes']} crashes and {report['unsafe_commands']} unsafe commands "
         "over the whole campaign."
@@ -63,11 +55,8 @@ def render_faults(report: Found) -> str:
 
 def fault_verdict(row: Found) -> str:
     """``met``, or what was not."""
-    faults = [
-        f"{row[f'{name}_late']} {name} late"
-        for name in ("reactions", "recoveries")
-        if row[f"{name}_late"]
-    ]
+    late = {name: row[f"{name}_late"] for name in ("reactions", "recoveries")}
+    faults = [f"{count} {name} late" for name, count in late.items() if count]
     faults += [f"{len(row[name])} {name}" for name in ("unsafe", "crashes", "wrong") if row[name]]
     counted = sum(row["rejected"].values())
     met = f"met, {counted:,} rejected and counted" if counted else "met"
@@ -87,17 +76,15 @@ _OF_A_ROW: Cells = {
     "ticks without a new command": lambda row: f"{row['ticks_without_new_command']:.0%}",
 }
 _OF_A_VEHICLE: Cells = {
-    "speed error rmse / max, m/s of the vehicle": lambda vehicle: _numbers(
-        vehicle["speed_error_mps"], 3
+    "speed error rmse / max, m/s of the vehicle": lambda row: _numbers(row["speed_error_mps"], 3),
+    "action error rmse / max": lambda row: ", ".join(
+        f"{name} {_numbers(error, 2)}" for name, error in row["action_error"].items()
     ),
-    "action error rmse / max": lambda vehicle: ", ".join(
-        f"{name} {_numbers(error, 2)}" for name, error in vehicle["action_error"].items()
+    "actuator lag, ms": lambda row: ", ".join(
+        f"{name} {_number(lag, 0)}" for name, lag in row["lag_ms"].items()
     ),
-    "actuator lag, ms": lambda vehicle: ", ".join(
-        f"{name} {_number(lag, 0)}" for name, lag in vehicle["lag_ms"].items()
-    ),
-    "feedback age p50 / p99, ms": lambda vehicle: _numbers(vehicle["feedback_age_ms"], 1),
-    "metres of the vehicle for one of the scenario": lambda vehicle: _number(vehicle["scale"], 3),
+    "feedback age p50 / p99, ms": lambda row: _numbers(row["feedback_age_ms"], 1),
+    "metres of the vehicle for one of the scenario": lambda row: _number(row["scale"], 3),
 }
 
 
@@ -112,21 +99,19 @@ def render_latency(latency: Found) -> str:
         f"{latency['faster_than_real_time']:.1f} times real time in each worker, the start of "
         "each simulator included.",
         "",
-        *_pictures(latency),
+        *(f"![{name}]({path})\n" for name, path in latency["figures"].items()),
     ]
     for axis in latency["axes"]:
-        points = zip(axis["values"], axis["specs"], strict=True)
-        rows = []
-        for value, spec in points:
-            cells = (tell(latency["rows"][spec]) for tell in _OF_A_ROW.values())
-            rows.append((f"{value:g} {axis['unit']}", *cells))
+        rows = [
+            (
+                f"{value:g} {axis['unit']}",
+                *(tell(latency["rows"][spec]) for tell in _OF_A_ROW.values()),
+            )
+            for value, spec in zip(axis["values"], axis["specs"], strict=True)
+        ]
         title = f"### {axis['title'][0].upper()}{axis['title'][1:]}"
         lines += [title, "", *markdown_table(("value", *_OF_A_ROW), rows)]
     return "\n".join(lines)
-
-
-def _pictures(part: Found) -> list[str]:
-    return [f"![{name}]({path})\n" for name, path in part["figures"].items()]
 
 
 def comparison_verdict(comparison: Found) -> str:
@@ -176,7 +161,7 @@ def lag_sentence(sweep: Found) -> str:
 
 
 def render_sweep(sweep: Found) -> str:
-    """The sentences, the pictures, and the table: success, measured lag, stops of the driver."""
+    """The sentence and the table: success, measured lag, stops of the driver."""
     points = {(row["constant_ms"], row["dead_ms"]): row for row in sweep["rows"].values()}
     constants, deads = (sorted({point[way] for point in points}) for way in (0, 1))
 
@@ -190,8 +175,6 @@ def render_sweep(sweep: Found) -> str:
     return "\n".join(
         [
             f"{lag_sentence(sweep)}\n",
-            *([f"{sweep['budget']['sentence']}\n"] if sweep["budget"] else []),
-            *_pictures(sweep),
             f"Success of {sweep['runs']} episodes, and in brackets the lag of the speed that the "
             "drives showed, ms; a star where the driver stopped the vehicle, which did not follow:",
             "",
@@ -219,28 +202,10 @@ def _numbers(found: Mapping[str, float | None] | None, digits: int) -> str:
 
 
 def write_figures(out: Path, swept: Found) -> dict[str, str]:
-    """Write a PNG of success and one of surviving distance beside ``out``: a panel for each axis.
-
-    Args:
-        out: the report's path; the pictures' names begin with its stem.
-        swept: a part of a report with axes.
-
-    Returns:
-        The files' names by figure.
-    """
-    names = {}
-    for name, (field, label, band) in FIGURES.items():
-        path = out.with_name(f"{out.stem}_{name}.png")
-        write_png(path, _draw_axes(swept, field, label, band))
-        names[name] = path.name
-    return names
-
-
-def write_lag_figures(out: Path, sweep: Found) -> dict[str, str]:
-    """The table of lags as a picture, and the lines through it where they are whole."""
-    path = out.with_name(f"{out.stem}_table.png")
-    write_png(path, _draw_lags(sweep))
-    return {"table": path.name, **(write_figures(out, sweep) if sweep["axes"] else {})}
+    """Write a PNG beside ``out``, with a panel for each axis of a report's part; its name."""
+    name = f"{out.stem}_success.png"
+    write_png(out.with_name(name), _draw_axes(swept))
+    return {"success": name}
 
 
 def write_png(path: Path, figure: Figure) -> None:
@@ -250,59 +215,29 @@ def write_png(path: Path, figure: Figure) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-def _draw_axes(swept: Found, field: str, label: str, band: str) -> Figure:
+def _draw_axes(swept: Found) -> Figure:
     axes, name = swept["axes"], Path(swept["policy"]).stem
     rows, columns = math.ceil(len(axes) / COLUMNS), min(COLUMNS, len(axes))
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flatten().tolist()
     for panel, axis in zip(panels, axes, strict=False):
         values = axis["values"]
-        estimates = [swept["rows"][spec][field] for spec in axis["specs"]]
+        estimates = [swept["rows"][spec]["success"] for spec in axis["specs"]]
         panel.plot(values, [each["value"] for each in estimates], "o-", ms=3.5, label=name)
         low, high = ([each[end] for each in estimates] for end in ("low", "high"))
         panel.fill_between(values, low, high, alpha=0.2, linewidth=0)
         panel.set_xlabel(f"{axis['title']}, {axis['unit']}", fontsize=9)
         panel.grid(alpha=0.3)
-        if field == "success":
-            target = swept["budget"]["target_success"]
-            panel.axhline(target, color="0.4", lw=0.8, linestyle="--", label=f"{target:.0%}")
-            panel.set_ylim(-0.03, 1.03)
+        target = swept["budget"]["target_success"]
+        panel.axhline(target, color="0.4", lw=0.8, linestyle="--", label=f"{target:.0%}")
+        panel.set_ylim(-0.03, 1.03)
     for panel in panels[len(axes) :]:
         panel.set_visible(False)
-    figure.supylabel(label)
-    title = (
-        f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point; "
-        f"bands: {band}"
+    figure.supylabel("success")
+    drives = f"{swept['scenario']}, {swept['condition']}, {swept['runs']} episodes a point"
+    handles, title = (
+        figure.axes[0].get_legend_handles_labels(),
+        f"{drives}; bands: Wilson's 95 % interval",
     )
-    handles = figure.axes[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside upper center", ncols=4, title=title, frameon=False)
-    return figure
-
-
-def _draw_lags(sweep: Found) -> Figure:
-    rows = sweep["rows"].values()
-    dead, constant = (sorted({row[name] for row in rows}) for name in ("dead_ms", "constant_ms"))
-    success = np.full((len(constant), len(dead)), np.nan)
-    for row in rows:
-        place = constant.index(row["constant_ms"]), dead.index(row["dead_ms"])
-        success[place] = row["success"]["value"]
-    target = sweep["lag_budget"]["target_success"]
-    size = (0.8 * len(dead) + 2.5, 0.55 * len(constant) + 2.0)
-    figure = Figure(figsize=size, layout="constrained")
-    panel = figure.subplots()
-    image = panel.imshow(success, origin="lower", aspect="auto", vmin=0.5, vmax=1, cmap="RdYlGn")
-    for (y, x), value in np.ndenumerate(success):
-        if not np.isnan(value):  # else it was not asked for
-            weight = "bold" if value >= target else "normal"
-            panel.text(x, y, f"{value:.0%}", ha="center", va="center", fontsize=8, weight=weight)
-    panel.set_xticks(range(len(dead)), map(str, dead))
-    panel.set_yticks(range(len(constant)), map(str, constant))
-    panel.set_xlabel("dead time of the actuator, ms")
-    panel.set_ylabel("its time constant, ms")
-    panel.set_title(
-        f"{sweep['scenario']}: success with a simulated Hunter in the loop, {sweep['runs']} "
-        f"episodes a point\n(bold: at least {target:.0%}; white: not tested)",
-        fontsize=10,
-    )
-    figure.colorbar(image, label="success")
     return figure

@@ -19,18 +19,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bridge.report import COLLISION, GOAL
+from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import make_directory, write_json
 from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError, read_json
 from hil_tests.faults.rig import free_bus
-from hil_tests.mock_hunter.body import make_parameters
-from hil_tests.processes import (
-    CommandTimeoutError,
-    Process,
-    in_parallel,
-    operator,
-    trusting,
-)
+from hil_tests.mock_hunter.hunter import make_parameters
+from hil_tests.processes import CommandTimeoutError, Process, in_parallel, operator, trusting
 from hil_tests.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.experiments.plan import digest
@@ -72,11 +67,6 @@ class Axis:
         """Of all its values."""
         return [self.spec(value) for value in self.values]
 
-    def as_dict(self) -> dict[str, Any]:
-        """As it stands in a report."""
-        names = ("name", "title", "unit", "values", "specs")
-        return {name: getattr(self, name) for name in names}
-
 
 NO_NETWORK = "none"
 _LATE = "delay=100ms"
@@ -117,30 +107,18 @@ class Lag(NamedTuple):
 
 DEAD_TIMES_MS = (0, 50, 100, 200, 300, 400, 500, 600, 800)
 TIME_CONSTANTS_MS = (20, 50, 100, 200, 300, 500, 750, 1000)
-LINE_DEAD_MS, LINE_CONSTANT_MS = 50, 100
-"""Where the lines lie: of the table, the values nearest to the mock's own (30 and 100 ms)."""
 LAGS = [Lag(dead, constant) for dead in DEAD_TIMES_MS for constant in TIME_CONSTANTS_MS]
-LAG_AXES = (
-    Axis("dead_time", f"dead time, with a time constant of {LINE_CONSTANT_MS} ms", "ms",
-         DEAD_TIMES_MS, f"dead={{}}ms,constant={LINE_CONSTANT_MS}ms",
-         Lag(DEAD_TIMES_MS[0], LINE_CONSTANT_MS).spec,
-         f"{{}} of dead time (time constant {LINE_CONSTANT_MS} ms)"),
-    Axis("time_constant", f"time constant, with a dead time of {LINE_DEAD_MS} ms", "ms",
-         TIME_CONSTANTS_MS, f"dead={LINE_DEAD_MS}ms,constant={{}}ms",
-         Lag(LINE_DEAD_MS, TIME_CONSTANTS_MS[0]).spec,
-         f"{{}} of time constant (dead time {LINE_DEAD_MS} ms)"),
-)  # fmt: skip
-"""Two lines through the table LAGS."""
 
-Rows = Mapping[str, Mapping[str, Any]]
+Found = Mapping[str, Any]
+"""A part of a report's JSON."""
+Rows = Mapping[str, Found]
 """The report's rows by their specification."""
 
 
 def limit_of(axis: Axis, rows: Rows, target: float) -> float | None:
     """The largest tested value up to which success is at the target at every tested value.
 
-    Success is the share of the row's episodes (the point estimate), and nothing is interpolated.
-    None where it is below the target even at 0.
+    Success is the point estimate; nothing is interpolated. None where even 0 is below the target.
     """
     limit: float | None = None
     for value in axis.values:
@@ -154,45 +132,39 @@ def budget(axes: Sequence[Axis], rows: Rows, target: float, name: str) -> dict[s
     """Each axis's limit, whether it is only the end of what was tested, and the sentence."""
     limits = {axis.name: limit_of(axis, rows, target) for axis in axes}
     open_ended = {axis.name: limits[axis.name] == axis.values[-1] for axis in axes}
+    goal, parts, missed = f"{target:.0%} success", [], []
+    for axis in axes:
+        limit = limits[axis.name]
+        if limit is None:
+            missed.append(f"on {axis.base} alone it is below that, so no {axis.name} has a budget")
+        else:
+            shown = axis.limit.format(f"{limit:g} {axis.unit}" if limit else "none")
+            most = " (the most that was tested)" if open_ended[axis.name] else ""
+            parts.append(f"{shown}{most}")
+    if any(limits[axis.name] is None and axis.base == NO_NETWORK for axis in axes):
+        sentence = f"{name} is below {goal} even on a perfect network."
+    elif parts:
+        listed = ", ".join(parts[:-1]) + (" and " if parts[:-1] else "") + parts[-1]
+        holds = f"{name} holds at least {goal} up to {listed}, one at a time"
+        sentence = "; ".join([holds, *missed]) + "."
+    else:
+        sentence = f"{name}: " + "; ".join(missed) + "."
     return {
         "target_success": target,
         "limits": limits,
         "up_to_the_largest_tested": open_ended,
-        "sentence": _sentence(axes, limits, open_ended, f"{target:.0%} success", name),
+        "sentence": sentence,
     }
 
 
-def _sentence(
-    axes: Sequence[Axis],
-    limits: Mapping[str, float | None],
-    open_ended: Mapping[str, bool],
-    goal: str,
-    name: str,
-) -> str:
-    parts, missed = [], []
-    for axis in axes:
-        limit = limits[axis.name]
-        if limit is None and axis.base == NO_NETWORK:
-            return f"{name} is below {goal} even on a perfect network."
-        if limit is None:
-            missed.append(f"on {axis.base} alone it is below that, so no {axis.name} has a budget")
-            continue
-        shown = axis.limit.format(f"{limit:g} {axis.unit}" if limit else "none")
-        parts.append(f"{shown} (the most that was tested)" if open_ended[axis.name] else shown)
-    if not parts:
-        return f"{name}: " + "; ".join(missed) + "."
-    listed = ", ".join(parts[:-1]) + (" and " if parts[:-1] else "") + parts[-1]
-    return "; ".join([f"{name} holds at least {goal} up to {listed}, one at a time", *missed]) + "."
-
-
-def lag_budget(rows: Sequence[Mapping[str, Any]], target: float) -> dict[str, Any]:
+def lag_budget(rows: Sequence[Found], target: float) -> dict[str, Any]:
     """Up to which sum of dead time and time constant every tested point holds the target.
 
     ``sum_ms`` is None where the least does not; ``measured_ms`` is the same by the lag that the
     drives showed (points where it could not be told are left out).
     """
 
-    def limit(points: Sequence[tuple[float, Mapping[str, Any]]]) -> float | None:
+    def limit(points: Sequence[tuple[float, Found]]) -> float | None:
         failing = [size for size, row in points if row["success"]["value"] < target]
         first = min(failing, default=float("inf"))
         return max((size for size, _ in points if size < first), default=None)
@@ -224,10 +196,7 @@ class Task(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Episodes of one point with the seeds ``seed``, ``seed + 1``, ...: the same for every point.
-
-    ``point`` is a network, one of LOOPS or a `Lag`.
-    """
+    """Episodes of one point (a network, one of LOOPS or a `Lag`), with the same seeds for each."""
 
     point: Any
     seed: int
@@ -241,29 +210,20 @@ class Part(NamedTuple):
         ]
 
 
-Drive = Callable[[Task, Part], list[dict[str, Any]]]
-"""Drives a part; its results, for JSON."""
-
-
 def drive_all(
     task: Task,
     points: Sequence[Any],
     size: int,
-    drive: Drive,
+    drive: Callable[[Task, Part], list[dict[str, Any]]],
     jobs: int,
     keep: Path,
     processes: bool = False,
 ) -> dict[Any, list[dict[str, Any]]]:
     """Drive the task's episodes at every point, ``jobs`` parts at a time; the results by point.
 
-    Args:
-        task: what all drives have in common.
-        points: in any order.
-        size: episodes of a part, at most.
-        drive: what is called with a part that is not kept.
-        jobs: parts side by side.
-        keep: directory of a file for each part, named by a hash of all that decides it.
-        processes: call ``drive`` in processes, not in threads.
+    A part has ``size`` episodes at most. What ``drive`` gives for it is kept in the directory
+    ``keep``, in a file named by a hash of all that decides it, and not driven again. ``drive`` is
+    called in threads, or in ``processes``.
 
     Raises:
         UserError: there can be no such directory, a kept result is no JSON, or a drive failed.
@@ -277,8 +237,13 @@ def drive_all(
     make_directory(keep)
     parts = [one for point in points for one in Part(point, task.seed, task.runs).split(size)]
     paths = {one: keep / f"{digest({**deciding, **one._asdict()})}.json" for one in parts}
-    found = {one: _read_kept(path) for one, path in paths.items() if path.is_file()}
-    with ProgressBar("parts", len(parts), len(found)) as bar:
+    found: dict[Part, list[dict[str, Any]]] = {
+        one: read_json(path, "kept result (remove it)")
+        for one, path in paths.items()
+        if path.is_file()
+    }
+    # Whoever ends a campaign ends its processes.
+    with sigterm_as_interrupt(), ProgressBar("parts", len(parts), len(found)) as bar:
 
         def on_done(one: Part, results: list[dict[str, Any]]) -> None:
             found[one] = results
@@ -293,29 +258,12 @@ def drive_all(
     }
 
 
-def _read_kept(path: Path) -> list[dict[str, Any]]:
-    try:
-        results: list[dict[str, Any]] = read_json(path, "kept result")
-    except UserError as error:
-        raise UserError(f"{error}; remove it") from None
-    return results
-
-
 def run_rig(task: Task, part: Part, limit_s: float, *options: str, hunter: bool = False) -> Any:
-    """Drive a part through processes of its own, which end with it.
+    """Drive a part through processes of its own; the simulator's report, with its command.
 
-    Args:
-        task: what is driven.
-        part: the seeds.
-        limit_s: the simulator's time.
-        options: further ones of ``bridge simulate``.
-        hunter: put a mock Hunter on a CAN bus into the loop, and an operator beside it.
-
-    Returns:
-        The simulator's report, with its command.
-
-    Raises:
-        UserError: a command failed, or did not end (CommandTimeoutError).
+    The simulator gets further ``options`` and ends within ``limit_s``. With ``hunter`` a mock
+    Hunter on a CAN bus is in the loop, and an operator beside it. Raises UserError where a command
+    failed, or did not end (CommandTimeoutError).
     """
     endpoint = free_endpoint()
     common = ("--vehicle-id", VEHICLE_ID)
@@ -343,19 +291,18 @@ def run_rig(task: Task, part: Part, limit_s: float, *options: str, hunter: bool 
 def simulate(endpoint: str, out: Path, limit_s: float, *options: str) -> dict[str, Any]:
     """Run ``bridge simulate`` beside an edge runtime; its report, with the command.
 
-    ``wall_s`` of the report includes the simulator's start.
-
-    Raises:
-        UserError: it failed, or did not end (CommandTimeoutError).
+    ``wall_s`` of the report includes the simulator's start. Raises UserError where it failed, or
+    did not end (CommandTimeoutError).
     """
-    words = ("bridge", "simulate", *options)
-    began_s = time.monotonic()
-    here = ("--listen", endpoint, "--out", str(out))
-    with Process(*words, *here) as simulator:
+    words, began_s = ("bridge", "simulate", *options), time.monotonic()
+    with Process(*words, "--listen", endpoint, "--out", str(out)) as simulator:
         simulator.succeed(limit_s)
     wall_s = round(time.monotonic() - began_s, 3)
-    command = f"python -m {shlex.join(words)}"
-    return {**read_json(out, "report"), "command": command, "wall_s": wall_s}
+    return {
+        **read_json(out, "report"),
+        "command": f"python -m {shlex.join(words)}",
+        "wall_s": wall_s,
+    }
 
 
 def drive_network(task: Task, part: Part, attempts: int = ATTEMPTS) -> list[dict[str, Any]]:
@@ -390,7 +337,7 @@ def drive_network(task: Task, part: Part, attempts: int = ATTEMPTS) -> list[dict
 def drive_lag(task: Task, part: Part) -> list[dict[str, Any]]:
     """Drive a part with a lag of the actuators in virtual time; its one row."""
     lag: Lag = part.point
-    env, driver = _cockpit(task.policy, task.scenario, task.condition, task.public_key)
+    env, driver = _loaded(task.policy, task.scenario, task.condition, task.public_key)
     times = {"dead_time_s": lag.dead_ms / 1e3, "speed_time_constant_s": lag.constant_ms / 1e3}
     virtual = VirtualDrive(env, driver, make_parameters(MODEL, {**task.changes, **times}))
     driven = [virtual.episode(part.seed + number) for number in range(part.runs)]
@@ -398,13 +345,13 @@ def drive_lag(task: Task, part: Part) -> list[dict[str, Any]]:
 
 
 @cache
-def _cockpit(
+def _loaded(
     policy: Path, scenario: str, condition: str, public_key: str | None
 ) -> tuple[Any, OnnxDriver]:
     return make_environment(scenario, condition), OnnxDriver(policy, public_key)
 
 
-def lag_row(lag: Lag, driven: Sequence[Driven], tracking: Mapping[str, Any]) -> dict[str, Any]:
+def lag_row(lag: Lag, driven: Sequence[Driven], tracking: Found) -> dict[str, Any]:
     """What a point amounts to."""
     return {
         "spec": lag.spec,
@@ -417,7 +364,7 @@ def lag_row(lag: Lag, driven: Sequence[Driven], tracking: Mapping[str, Any]) -> 
     }
 
 
-def worth_keeping(report: Mapping[str, Any]) -> dict[str, Any]:
+def worth_keeping(report: Found) -> dict[str, Any]:
     """What a campaign keeps of a simulator's report."""
     names = ("command", "wall_s", "latency_ms", "deadline_misses", "safe_stops", "rejected",
              "tick_overruns", "vehicle")  # fmt: skip
@@ -430,7 +377,7 @@ def worth_keeping(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def make_row(spec: str, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def make_row(spec: str, parts: Sequence[Found]) -> dict[str, Any]:
     """Join what was driven over the wire at one point, each part `worth_keeping`.
 
     Latencies are from state sent to command received: the median of the parts' p50 and the
@@ -460,19 +407,18 @@ def make_row(spec: str, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def join_vehicles(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def join_vehicles(parts: Sequence[Found]) -> dict[str, Any]:
     """One report of a vehicle for several: errors pooled, lags and ages the median of the parts.
 
     The largest stands for ``max`` and ``p99``.
     """
-    first = parts[0]
+    first, samples = parts[0], [part["samples"] for part in parts]
     return {
-        "name": first["name"],
-        "scale": first["scale"],
-        "samples": sum(part["samples"] for part in parts),
-        "speed_error_mps": _pool([(part["samples"], part["speed_error_mps"]) for part in parts]),
+        **{name: first[name] for name in ("name", "scale")},
+        "samples": sum(samples),
+        "speed_error_mps": _pool(samples, [part["speed_error_mps"] for part in parts]),
         "action_error": {
-            name: _pool([(part["samples"], part["action_error"][name]) for part in parts])
+            name: _pool(samples, [part["action_error"][name] for part in parts])
             for name in first["action_error"]
         },
         "lag_ms": {
@@ -485,12 +431,12 @@ def join_vehicles(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _pool(errors: Sequence[tuple[int, Mapping[str, float]]]) -> dict[str, float | None]:
-    told = [(samples, error) for samples, error in errors if error["rmse"] is not None]
+def _pool(samples: Sequence[int], errors: Sequence[Found]) -> dict[str, float | None]:
+    told = [each for each in zip(samples, errors, strict=True) if each[1]["rmse"] is not None]
     if not told:
         return {"rmse": None, "max": None}
-    squares = sum(samples * error["rmse"] ** 2 for samples, error in told)
-    rmse = (squares / sum(samples for samples, _ in told)) ** 0.5
+    squares = sum(count * error["rmse"] ** 2 for count, error in told)
+    rmse = (squares / sum(count for count, _ in told)) ** 0.5
     return {"rmse": rmse, "max": max(error["max"] for _, error in told)}
 
 
@@ -506,11 +452,11 @@ def _of_told(join: Callable[[list[float]], float], values: Sequence[float | None
     return join(told) if told else None
 
 
-def _counted(parts: Sequence[Mapping[str, Any]], name: str) -> dict[str, int]:
+def _counted(parts: Sequence[Found], name: str) -> dict[str, int]:
     return dict(sum((Counter(part[name]) for part in parts), Counter()))
 
 
-def summary(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def summary(episodes: Sequence[Found]) -> dict[str, Any]:
     """How episodes ended: success with Wilson's interval, distance with Student's, of 95 %."""
     outcomes = Counter(episode["outcome"] for episode in episodes)
     return {
@@ -521,9 +467,7 @@ def summary(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def cost(
-    policy: Sequence[Mapping[str, Any]], vehicle: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
+def cost(policy: Sequence[Found], vehicle: Sequence[Found]) -> dict[str, Any]:
     """What the actuators cost in time, by seed, where both loops reach the goal; 95 % interval."""
     times = {row["seed"]: row["time_s"] for row in policy if row["outcome"] == GOAL}
     longer = [
@@ -535,5 +479,5 @@ def cost(
 
 
 def interval(estimate: Estimate) -> dict[str, float]:
-    """As it stands in a report."""
+    """An estimate as a report has it."""
     return {"value": estimate.value, "low": estimate.low, "high": estimate.high}

@@ -20,8 +20,7 @@ from edge_runtime.vehicles.hunter.core import HunterCore
 from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE
 from edge_runtime.vehicles.mapping import SPECS, car_of, similarity_to
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, TOPICS, Command, Feedback
-from hil_tests.mock_hunter.body import Parameters
-from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.hunter import MockHunter, Parameters
 from trainer.drivers import OnnxDriver
 
 NAME, MODEL, SESSION = "hunter", "2.0", "virtual"
@@ -69,10 +68,24 @@ class VirtualDrive:
         step, stops, stopped_ms, ended = 0, 0, math.inf, False
         while not ended:
             # The runtime's limiter would change nothing: the driver turns its set-points as fast.
-            self._command(hunter, step, self._driver.act(observation).tolist(), info["speed_mps"])
+            action, mps = self._driver.act(observation).tolist(), info["speed_mps"]
+            hunter.command(dict(zip(self.action_names, action, strict=True)), mps)
+            command = Command(
+                session=SESSION, episode=0, step=step, mode=DRIVE, action=action, policy_id="",
+                received_ns=0, inference_ns=0, sent_ns=hunter.now_ms * 10**6,
+            )  # fmt: skip
+            self.tracking.command(command)
             newest = None
             for now_ms, report in hunter.run(PERIOD_MS):
-                newest = self._feedback(step, report, now_ms)
+                # As `edge_runtime/vehicles/base.py` makes it.
+                newest = Feedback(
+                    vehicle=NAME, session=SESSION, episode=0, step=step, mode=DRIVE,
+                    action=[report.action.get(name, 0.0) for name in self.action_names],
+                    speed_mps=report.speed_mps, self_braking=report.self_braking,
+                    faults=report.faults, sent_ns=now_ms * 10**6,
+                    scenario_speed_mps=report.scenario_speed_mps,
+                    commanded_speed_mps=report.commanded_speed_mps,
+                )  # fmt: skip
                 self.tracking.feedback(newest)
             if hunter.core.state is not State.STOPPED:
                 stopped_ms = math.inf
@@ -83,40 +96,17 @@ class VirtualDrive:
             heard = VehicleDecision(
                 command=None, fresh=True, brake_reason="", undriven_s=0.0, feedback=newest
             )
-            action = self._apply(self._env, heard)
-            observation, _, terminated, truncated, info = self._env.step(action)
+            observation, _, terminated, truncated, info = self._env.step(
+                self._apply(self._env, heard)
+            )
             step, ended = step + 1, terminated or truncated
         self.tracking.end()
         time_s = step * CONTROL_PERIOD_S
         return Driven(seed, info["outcome"], float(info["distance_m"]), time_s, stops)
 
-    def _command(self, hunter: VirtualHunter, step: int, action: list[float], mps: float) -> None:
-        hunter.command(dict(zip(self.action_names, action, strict=True)), mps)
-        self.tracking.command(
-            Command(
-                session=SESSION, episode=0, step=step, mode=DRIVE, action=action, policy_id="",
-                received_ns=0, inference_ns=0, sent_ns=hunter.now_ms * 10**6,
-            )
-        )  # fmt: skip
-
-    def _feedback(self, step: int, report: VehicleReport, now_ms: int) -> Feedback:
-        """As `edge_runtime/vehicles/base.py` makes it."""
-        return Feedback(
-            vehicle=NAME, session=SESSION, episode=0, step=step, mode=DRIVE,
-            action=[report.action.get(name, 0.0) for name in self.action_names],
-            speed_mps=report.speed_mps, self_braking=report.self_braking, faults=report.faults,
-            sent_ns=now_ms * 10**6, scenario_speed_mps=report.scenario_speed_mps,
-            commanded_speed_mps=report.commanded_speed_mps,
-        )  # fmt: skip
-
 
 class VirtualHunter:
-    """The vehicle's side of the loop. Times are whole milliseconds from its switching on.
-
-    Args:
-        scenario: whose car it stands for.
-        parameters: of the chassis.
-    """
+    """The vehicle's side of the loop. Times are whole milliseconds from its switching on."""
 
     def __init__(self, scenario: str, parameters: Parameters) -> None:
         similarity = similarity_to(car_of(scenario, NAME), SPECS[MODEL])
@@ -125,11 +115,7 @@ class VirtualHunter:
         self.now_ms = 0
 
     def enable(self) -> None:
-        """Take control and wait until the chassis has confirmed it.
-
-        Raises:
-            RuntimeError: it does not, which is a fault of the driver or the mock.
-        """
+        """Take control; RuntimeError where the chassis does not confirm it (a fault of ours)."""
         self.core.enable(self.now_ms / 1e3)
         self.run(READY_MS)
         if self.core.state is not State.ENABLED:

@@ -102,29 +102,23 @@ def _parser() -> argparse.ArgumentParser:
     commands.required = True
     for name, (text, words) in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text, epilog=example + words)
-        command.add_argument(
-            "--root", metavar="DIR", default=DEFAULT_ROOT, help=f"default: {DEFAULT_ROOT}"
-        )
-        command.add_argument(
-            "--service",
-            metavar="|".join(WAYS),
-            choices=WAYS,
-            help="who runs it (default: systemd where it runs this computer, else none)",
-        )
+        add, who = command.add_argument, "systemd where it runs this computer, else none"
+        add("--root", metavar="DIR", default=DEFAULT_ROOT, help=f"default: {DEFAULT_ROOT}")
+        ways = "|".join(WAYS)
+        add("--service", metavar=ways, choices=WAYS, help=f"who runs it (default: {who})")
         if name in ("install", "rollback"):
             for option, default, text in (
                 ("--health-limit", LIMITS.within_s, "healthy by then, or back"),
                 ("--settle", LIMITS.settle_s, "and for so long after that"),
             ):
                 text = f"{text}, s (default: {default:g})"
-                command.add_argument(option, metavar="S", type=_seconds, default=default, help=text)
+                add(option, metavar="S", type=_seconds, default=default, help=text)
         if name == "install":
-            command.add_argument("bundle", metavar="BUNDLE.tar")
-            command.add_argument(
-                "--trust", metavar="KEY.pub", help="first install: the public key to trust from now"
-            )
+            add("bundle", metavar="BUNDLE.tar")
+            trust = "first install: the public key to trust from now"
+            add("--trust", metavar="KEY.pub", help=trust)
         if name == "status":
-            command.add_argument("--json", action="store_true", help="print JSON")
+            add("--json", action="store_true", help="print JSON")
     return parser
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -16,6 +15,7 @@ import zipfile
 from pathlib import Path
 
 import numpy
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from deploy.bundle import NAME, Inputs, Made, build_installer, make_bundle
 from deploy.certs import write_key_pair
@@ -24,20 +24,8 @@ from edge_runtime.tests.policies import public_pem, write_policy
 from edge_runtime.transport import free_endpoint
 
 QUICK = ("--settle", "0.2")
-HERE = Target(
-    name="here",
-    python=f"{sys.version_info[0]}.{sys.version_info[1]}",
-    machine=platform.machine(),
-    glibc="2.17",
-)
-
-
-def host_wheel(folder: Path) -> Path:
-    """A wheel that holds a path file only."""
-    path = folder / "host-1.0-py3-none-any.whl"
-    with zipfile.ZipFile(path, "w") as wheel:
-        wheel.writestr("host.pth", f"{Path(numpy.__file__).parents[1]}\n")
-    return path
+PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"
+HERE = Target(name="here", python=PYTHON, machine=platform.machine(), glibc="2.17")
 
 
 def changed_wheel(wheel: Path, out: Path, member: str, old: str, new: str) -> Path:
@@ -63,7 +51,9 @@ class Workshop:
         self.folder = folder
         self.edge_wheel = edge_wheel
         self.key, self.public_key = write_key_pair(folder / "keys")
-        self.host = host_wheel(folder)
+        self.host = folder / "host-1.0-py3-none-any.whl"  # it holds a path file only
+        with zipfile.ZipFile(self.host, "w") as wheel:
+            wheel.writestr("host.pth", f"{Path(numpy.__file__).parents[1]}\n")
         self.endpoint = free_endpoint()
         (folder / NAME).write_bytes(build_installer())
 
@@ -71,8 +61,6 @@ class Workshop:
         """What a good bundle is made of; the policy always answers `value`."""
         policy, public = self.folder / f"{value}.onnx", self.folder / f"{value}.pub"
         if not policy.exists():
-            from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
             key = Ed25519PrivateKey.generate()
             public.write_bytes(public_pem(key))
             write_policy(policy, "constant", value=value, key=key)
@@ -126,10 +114,5 @@ class Board:
 
     def fingerprint(self) -> list[tuple]:
         """Every path with size and time: equal where nothing was written."""
-        found = []
-        for place, folders, names in os.walk(self.root):
-            for name in [*folders, *names]:
-                path = Path(place, name)
-                stat = path.lstat()
-                found.append((str(path), stat.st_size, stat.st_mtime_ns))
-        return sorted(found)
+        found = ((str(path), path.lstat()) for path in self.root.rglob("*"))
+        return sorted((path, stat.st_size, stat.st_mtime_ns) for path, stat in found)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from deploy.bundle import build_edge_wheel
 from deploy.tests.boards import Board, Workshop
-from deploy.wheels import build_edge_wheel
 
 
 @pytest.fixture(scope="session")

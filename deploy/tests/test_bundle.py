@@ -1,18 +1,34 @@
-"""What goes into a bundle, what may not, and that it is the same again."""
+"""What goes into a bundle and what may not, that it is the same again, and its wheels."""
 
 from __future__ import annotations
 
+import io
 import os
 import stat
 import tarfile
+import zipfile
+from pathlib import Path
 
 import pytest
 
 from deploy import bundle
 from deploy.__main__ import main
-from deploy.bundle import Inputs, build_installer, make_bundle
+from deploy.bundle import (
+    DEFAULT_FOLDER,
+    ROOT,
+    TARGETS,
+    Inputs,
+    Pin,
+    build_edge_wheel,
+    build_installer,
+    gather,
+    lock_path,
+    make_bundle,
+    read_lock,
+)
+from deploy.installer.layout import unpack_wheel
+from deploy.installer.verify import UserError as InstallerError
 from deploy.tests.boards import HERE
-from deploy.wheels import DEFAULT_FOLDER, ROOT, TARGETS, build_edge_wheel, gather, lock_path
 from edge_runtime.config import load_config
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.util import UserError
@@ -136,24 +152,18 @@ def test_the_certificates_must_be_this_vehicles(workshop, party, tmp_path, name)
 
 
 def test_without_a_private_key_nothing_is_signed(workshop, tmp_path):
-    with pytest.raises(UserError, match="does not exist"):
-        workshop.make(key=tmp_path / "missing.key")
-    with pytest.raises(UserError, match="is not a private key"):
-        workshop.make(key=workshop.public_key)
+    for key, match in ((tmp_path / "missing.key", "not exist"), (workshop.public_key, "private")):
+        with pytest.raises(UserError, match=match):
+            workshop.make(key=key)
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        [],
-        ["--target", "toaster"],
-        ["--target", "jetpack5", "--policy", "missing.onnx"],
-        ["--target", "jetpack5", "--key", "missing.key"],
-        ["--target", "jetpack5", "--tls", "nowhere"],
-        ["--target", "jetpack5", "--wheels", "/dev/null/wheels"],
-        ["--target", "jetpack5", "--out", "/dev/null/bundles"],
-    ],
-)
+    ["", "--target toaster", *(f"--target jetpack5 {wrong}" for wrong in (
+        "--policy missing.onnx", "--key missing.key", "--tls nowhere",
+        "--wheels /dev/null/wheels", "--out /dev/null/bundles",
+    ))],
+)  # fmt: skip
 def test_a_mistake_is_one_line_before_anything_is_downloaded(
     workshop, tmp_path, capsys, monkeypatch, arguments
 ):
@@ -162,7 +172,7 @@ def test_a_mistake_is_one_line_before_anything_is_downloaded(
         monkeypatch.setattr(bundle, "gather", lambda *_: pytest.fail("downloads"))
     inputs = workshop.inputs()
     good = ["--policy", inputs.policy, "--public-key", inputs.public_key, "--key", inputs.key]
-    status = exit_status(main, ["bundle", *map(str, good), *arguments])
+    status = exit_status(main, ["bundle", *map(str, good), *arguments.split()])
     said = capsys.readouterr().err.strip().splitlines()
     assert (status, len(said)) == (2, 1)
     assert list(tmp_path.iterdir()) == []
@@ -184,3 +194,89 @@ def test_a_bundle_that_is_interrupted_leaves_no_key_behind(workshop, tmp_path, m
     with pytest.raises(KeyboardInterrupt):
         make_bundle(workshop.inputs(), HERE, tmp_path / "out")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def wheel(*members: str) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name in members:
+            archive.writestr(name, name)
+    return packed.getvalue()
+
+
+def unpacked(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_packages_come_out_and_scripts_stay_in(tmp_path):
+    data = wheel(
+        "a/__init__.py", "a-1.dist-info/RECORD", "a-1.data/purelib/b.py", "a-1.data/platlib/c/d.so",
+        "a-1.data/scripts/tool", "a-1.data/headers/a.h", "a-1.data/data/share/x",
+    )  # fmt: skip
+    unpack_wheel(data, "a-1.whl", tmp_path)
+    assert unpacked(tmp_path) == {"a/__init__.py", "a-1.dist-info/RECORD", "b.py", "c/d.so"}
+
+
+LEAVES = ("../x.py", "/x.py", "a/../../x.py", "a\\..\\x.py", "a-1.data/purelib/../../x.py")
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        *((wheel(name), "outside") for name in LEAVES),
+        *((data, "is not a wheel") for data in (b"", b"no zip", wheel("a.py")[:-30])),
+    ],
+)
+def test_what_is_no_wheel_or_leaves_the_folder_is_refused(tmp_path, data, match):
+    with pytest.raises(InstallerError, match=match):
+        unpack_wheel(data, "a-1.whl", tmp_path / "site")
+    assert not (tmp_path / "x.py").exists()
+
+
+def test_two_wheels_may_not_hold_the_same_file(tmp_path):
+    unpack_wheel(wheel("a.py"), "a-1.whl", tmp_path)
+    for clash in ("a.py", "a.py/b.py", "b-1.data/purelib/a.py"):
+        with pytest.raises(InstallerError, match="another wheel"):
+            unpack_wheel(wheel(clash), "b-1.whl", tmp_path)
+
+
+@pytest.mark.parametrize("target", TARGETS.values(), ids=lambda target: target.name)
+def test_every_target_is_locked_by_hash(target):
+    pins = read_lock(lock_path(target))
+    names = {pin.name for pin in pins}
+    assert {"numpy", "onnxruntime", "eclipse-zenoh", "msgspec", "cryptography", "tomli"} <= names
+    assert len(names) == len(pins)
+
+
+def test_the_twin_has_the_boards_versions():
+    board, twin = (read_lock(lock_path(TARGETS[n])) for n in ("jetpack5", "linux-x86_64"))
+    assert [pin[:2] for pin in board] == [pin[:2] for pin in twin]
+
+
+@pytest.mark.parametrize("line", ["numpy", "numpy>=1", "numpy==1.0", "numpy==1 --hash=sha256:ab"])
+def test_a_lock_without_version_or_hash_is_refused(tmp_path, line):
+    path = tmp_path / "lock.txt"
+    path.write_text(f"# a lock\n\n{line}\n")
+    with pytest.raises(UserError, match=r"lock\.txt: not NAME==VERSION"):
+        read_lock(path)
+
+
+def test_a_full_folder_needs_no_network(tmp_path, monkeypatch):
+    monkeypatch.setattr(bundle, "pip", lambda *_: pytest.fail("pip was asked"))
+    (tmp_path / "a-1-py3-none-any.whl").write_bytes(b"")
+    (tmp_path / "other-1-py3-none-any.whl").write_bytes(b"other")
+    lock = tmp_path / "lock.txt"
+    empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    lock.write_text(f"a==1 --hash=sha256:{empty}\n")
+    assert read_lock(lock) == [Pin("a", "1", empty)]
+    assert gather(HERE, lock, tmp_path) == [tmp_path / "a-1-py3-none-any.whl"]
+
+
+def test_a_wheel_with_another_hash_is_not_taken(tmp_path, monkeypatch):
+    """The real pip: it finds no such version, or reaches no index; either is one line."""
+    (tmp_path / "a-1-py3-none-any.whl").write_bytes(b"changed")
+    lock = tmp_path / "lock.txt"
+    lock.write_text(f"phil-edge-runtime==0.0.1 --hash=sha256:{'0' * 64}\n")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    with pytest.raises(UserError, match="pip download: ERROR: No matching distribution"):
+        gather(HERE, lock, tmp_path)

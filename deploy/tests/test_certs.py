@@ -1,4 +1,4 @@
-"""Key pairs and certificates as files; on the wire: hil_tests/tests/test_tls*.py."""
+"""Key pairs and certificates as files; on the wire: hil_tests/tests/test_tls.py."""
 
 import contextlib
 import datetime
@@ -12,15 +12,13 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import (
     Encoding,
-    NoEncryption,
-    PrivateFormat,
     load_pem_private_key,
     load_pem_public_key,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from deploy.__main__ import main
-from deploy.certs import issue, read_authority
+from deploy.certs import _pem, issue, read_authority
 from edge_runtime.tests.harness import exit_status
 from edge_runtime.tls import load_tls, tls_for
 from edge_runtime.util import UserError
@@ -30,6 +28,11 @@ PARTIES = {"router", "viewer", "edge-hunter01", "simulator-hunter01", "operator-
 
 def make(folder, *options):
     return exit_status(main, ["certs", "--out", str(folder), *options])
+
+
+def extension(folder, kind):
+    certificate = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
+    return certificate.extensions.get_extension_for_class(kind).value
 
 
 def contents(folder):
@@ -62,8 +65,7 @@ def test_each_party_has_what_it_needs_and_no_more(made):
 
 def test_only_listeners_have_a_servers_certificate(made):
     for name in PARTIES:
-        certificate = x509.load_pem_x509_certificate((made / name / "cert.pem").read_bytes())
-        usage = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+        usage = extension(made / name, x509.ExtendedKeyUsage)
         assert ExtendedKeyUsageOID.CLIENT_AUTH in usage
         is_server = name in ("router", "simulator-hunter01")
         assert (ExtendedKeyUsageOID.SERVER_AUTH in usage) is is_server
@@ -78,9 +80,7 @@ def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
     assert {path: after[path] for path in before} == before
     new = {f"{role}-two" for role in ("edge", "simulator", "operator")}
     assert {p.parts[0] for p in set(after) - set(before)} == new
-    pem = (folder / "simulator-two" / "cert.pem").read_bytes()
-    certificate = x509.load_pem_x509_certificate(pem)
-    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    names = extension(folder / "simulator-two", x509.SubjectAlternativeName)
     assert set(names.get_values_for_type(x509.DNSName)) == {"localhost", "bench.local"}
     addresses = {str(a) for a in names.get_values_for_type(x509.IPAddress)}
     assert addresses == {"127.0.0.1", "::1", "10.0.0.7"}
@@ -89,20 +89,20 @@ def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        (["--vehicle-id", "hunter01"], "nothing is overwritten"),
-        (["--vehicle-id", "a/b"], "a/b"),
-        (["--vehicle-id", "new", "--host", "tcp/host:1"], "tcp/host:1"),
-        (["--vehicle-id", "new", "--days", "0"], "--days: '0'"),
-        (["--vehicle-id", "new", "--days", "soon"], "'soon' is not a whole number from 1 to 3650"),
-        (["--vehicle-id", "new", "--host", "a..b"], "a..b"),
-        (["--vehicle-id", "new", "--days", "3650"], "authority's own"),
-        (["--vehicle-id", "new", "--days", "99999999999"], "from 1 to 3650"),
-        (["--vehicle-id", "x" * 55], "shorter --vehicle-id"),
+        ("hunter01", "nothing is overwritten"),
+        ("a/b", "a/b"),
+        ("new --host tcp/host:1", "tcp/host:1"),
+        ("new --days 0", "--days: '0'"),
+        ("new --days soon", "'soon' is not a whole number from 1 to 3650"),
+        ("new --host a..b", "a..b"),
+        ("new --days 3650", "authority's own"),
+        ("new --days 99999999999", "from 1 to 3650"),
+        ("x" * 55, "shorter --vehicle-id"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(made, options, word, capsys):
     before = contents(made)
-    assert make(made, *options) == 2
+    assert make(made, "--vehicle-id", *options.split()) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert word in line
     assert contents(made) == before
@@ -171,9 +171,7 @@ def test_a_certificate_outside_its_time_says_so(party, made, shift_days, match):
     then = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=shift_days)
     issued = issue(authority, "edge-hunter01", "edge", [], then, days=5)
     (party / "cert.pem").write_bytes(issued.certificate.public_bytes(Encoding.PEM))
-    (party / "key.pem").write_bytes(
-        issued.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    )
+    (party / "key.pem").write_bytes(_pem(issued.key))
     with pytest.raises(UserError, match=match):
         load_tls(party)
 

@@ -1,14 +1,20 @@
-"""The installer as a process on a folder, with the real edge runtime and real Zenoh sessions."""
+"""The installer as a process on a folder, with the real edge runtime and real Zenoh sessions.
+
+Its switch is also cut off: by something else than the service's own fault, and by SIGKILL right
+before one of its own writes, which is a moment of a power cut.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import io
 import os
 import platform
 import queue
 import signal
 import subprocess
+import sys
 import threading
 from collections import Counter
 from pathlib import Path
@@ -20,9 +26,10 @@ from deploy.certs import write_key_pair
 from deploy.installer import __main__ as installer
 from deploy.installer import layout as layout_module
 from deploy.installer import systemd
-from deploy.installer.layout import Layout
-from deploy.installer.systemd import choose
-from deploy.installer.verify import UserError, read_bundle
+from deploy.installer.__main__ import Installer
+from deploy.installer.layout import Layout, why_not_whole
+from deploy.installer.systemd import NoService, choose
+from deploy.installer.verify import UnhealthyError, UserError, read_bundle
 from deploy.tests.boards import HERE, Board, changed_wheel
 from edge_runtime.tests.harness import Simulator, make_state, wait_until
 
@@ -374,3 +381,177 @@ def test_whoever_may_not_read_the_key_is_told_the_rest(board: Board, workshop, m
     monkeypatch.setattr(installer, "why_not_whole", may_not)
     assert installer.main(["status", "--root", str(board.root)]) == 0
     assert "not known: this user may not read" in capsys.readouterr().out
+
+
+OLD, NEW = "0.1.0-old", "0.1.0-new"
+
+
+class Service(NoService):
+    """Runs whatever `current` names; its watch of the new release ends with an error."""
+
+    name = "fake"
+
+    def __init__(self, layout: Layout, error: BaseException) -> None:
+        self.layout = layout
+        self.error = error
+        self.runs = ""
+        self.heard: list[str] = []
+        """What ran at a moment when commands could leave."""
+
+    def start(self, release) -> None:
+        self.runs = release.name
+
+    def watch(self, limits) -> None:
+        if self.runs == NEW:
+            raise self.error
+
+    def stop(self) -> None:
+        if self.runs and not self._is_held():
+            self.heard.append(self.runs)
+        self.runs = ""
+
+    def _is_held(self) -> bool:
+        with open(self.layout.hold) as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+        return False
+
+
+@pytest.fixture
+def layout(tmp_path, monkeypatch):
+    """A board on which the old release is current, and the new one lies beside it, proven."""
+    layout = Layout(str(tmp_path))
+    for version in (OLD, NEW):
+        layout.release(version).mkdir(parents=True)
+    layout.state.mkdir()
+    layout.link("current", OLD)
+    monkeypatch.setattr(Installer, "_prove", lambda self, version: None)
+    return layout
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        UnhealthyError("it ended"),
+        UserError("systemctl cannot be run: No such file or directory"),
+        OSError(28, "No space left on device", "/etc/systemd/system/phil-edge.service"),
+        KeyboardInterrupt(),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+@pytest.mark.parametrize("reader", ["there", "gone"])
+def test_whatever_cuts_the_watch_off_the_old_release_runs_again(layout, monkeypatch, error, reader):
+    """Also where nobody reads any more what the installer says: an ssh link that broke."""
+    service = Service(layout, error)
+    if reader == "gone":
+        closed = io.StringIO()
+        monkeypatch.setattr(closed, "write", _broken, raising=False)
+        monkeypatch.setattr(sys, "stdout", closed)
+    with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
+        Installer(layout, service).activate(NEW, is_new=True)
+    assert (layout.linked("current"), service.runs) == (OLD, OLD)
+    assert layout.versions() == [OLD]
+    assert service.heard == []
+
+
+def _broken(text: str) -> int:
+    raise BrokenPipeError(32, "Broken pipe")
+
+
+def test_a_roll_back_that_is_interrupted_can_be_tried_again(layout):
+    layout.link("previous", NEW)
+    service = Service(layout, KeyboardInterrupt())
+    with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
+        Installer(layout, service).activate(NEW, is_new=False)
+    assert (layout.linked("current"), layout.linked("previous"), service.runs) == (OLD, NEW, OLD)
+
+
+def test_a_stop_that_is_interrupted_starts_the_old_release_again(layout):
+    service = Service(layout, KeyboardInterrupt())
+    stops = [KeyboardInterrupt]
+
+    def stop() -> None:
+        service.runs = ""
+        if stops:
+            raise stops.pop()
+
+    service.stop = stop  # type: ignore[method-assign]
+    with pytest.raises(UnhealthyError, match=f"went back to {OLD}: interrupted"):
+        Installer(layout, service).activate(NEW, is_new=True)
+    assert (layout.linked("current"), layout.linked("previous"), service.runs) == (OLD, None, OLD)
+
+
+KILLER = """\
+import os, runpy, signal, sys
+_, where, number, *sys.argv = sys.argv
+left = int(number)
+STEPS = ("os.rename", "os.symlink", "os.remove", "os.rmdir", "os.mkdir")
+
+def watch(event, arguments):
+    global left
+    if event in STEPS and str(arguments[event in STEPS[:2]]).endswith(where):
+        left -= 1
+        if left == 0:
+            os.killpg(0, signal.SIGKILL)
+
+sys.addaudithook(watch)
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+"""Kills itself, and what it has started, before the step of that number among those whose path ends
+so."""
+
+
+def killed(board: Board, bundle, where: str, number: int) -> bool:
+    """Whether it came to that step."""
+    python, _, *line = board.command(
+        "install", bundle, "--trust", board.workshop.public_key, "--service", "none"
+    )
+    done = subprocess.run(
+        [python, "-c", KILLER, where, str(number), *line], start_new_session=True,
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode in (0, -signal.SIGKILL), done.stderr
+    return done.returncode != 0
+
+
+def whole(board: Board) -> str | None:
+    """The current version, when every release that bears a name is whole."""
+    layout = Layout(str(board.root))
+    for version in layout.versions():
+        assert why_not_whole(layout.release(version)) == "", version
+    return layout.linked("current")
+
+
+def complete(board: Board, made) -> None:
+    done = board.install(made.path)
+    assert done.returncode == 0, done.stderr
+    assert whole(board) == made.manifest.version
+    assert not [p for p in (board.root / "releases").iterdir() if p.name.startswith(".")]
+
+
+def test_killed_before_each_step_of_the_switch(board, workshop):
+    old, new = workshop.make(0.1), workshop.make(0.2)
+    complete(board, old)
+    for where in (f"releases/{new.manifest.version}", ".previous", "/previous", "/current"):
+        assert killed(board, new.path, where, 1), where
+        assert whole(board) == old.manifest.version
+    complete(board, new)
+
+
+@pytest.mark.board
+@pytest.mark.timeout(1800)
+def test_killed_before_every_step(board, workshop):
+    # Of three in turn the next one is neither current nor previous, so it is unpacked anew.
+    made = [workshop.make(value) for value in (0.1, 0.2, 0.3)]
+    complete(board, made[0])
+    for number in range(1, 1000):
+        old, new = made[(number - 1) % 3], made[number % 3]
+        was_killed = killed(board, new.path, "", number)
+        assert whole(board) in (old.manifest.version, new.manifest.version)
+        complete(board, new)
+        print(number, flush=True)
+        if not was_killed:
+            break
+    assert number > 20

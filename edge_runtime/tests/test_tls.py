@@ -1,4 +1,4 @@
-"""The table of rights as Zenoh will read it; that Zenoh obeys: hil_tests/tests/test_tls_*.py."""
+"""The table of rights as Zenoh will read it; that Zenoh obeys: hil_tests/tests/test_tls.py."""
 
 from __future__ import annotations
 

@@ -112,31 +112,18 @@ class FaultyMockVehicle(MockVehicle):
         return report
 
 
-class SteppedClock:
+def step_clock_on_signals() -> None:
     """The wall clock of this process: SIGUSR1 steps it one hour ahead, SIGUSR2 back again."""
-
-    def __init__(self) -> None:
-        self.step_s = 0
-        self._time, self._time_ns = time.time, time.time_ns
-
-    def time(self) -> float:
-        """As time.time."""
-        return self._time() + self.step_s
-
-    def time_ns(self) -> int:
-        """As time.time_ns."""
-        return self._time_ns() + self.step_s * 1_000_000_000
-
-    def install(self) -> None:
-        """Take the place of the process's clock, and listen to the signals."""
-        time.time, time.time_ns = self.time, self.time_ns
-        signal.signal(signal.SIGUSR1, lambda *_: setattr(self, "step_s", _STEP_S))
-        signal.signal(signal.SIGUSR2, lambda *_: setattr(self, "step_s", 0))
+    real, real_ns, step_s = time.time, time.time_ns, [0]
+    time.time = lambda: real() + step_s[0]
+    time.time_ns = lambda: real_ns() + step_s[0] * 10**9
+    for number, to_s in ((signal.SIGUSR1, _STEP_S), (signal.SIGUSR2, 0)):
+        signal.signal(number, lambda *_, to_s=to_s: step_s.__setitem__(0, to_s))
 
 
 def launch(package: str) -> None:
     """Put the faults in, then be the command."""
-    SteppedClock().install()
+    step_clock_on_signals()
     switch = Path(os.environ[DIRECTORY]) / VEHICLE
     vehicles._mock = lambda config, scenario: FaultyMockVehicle(switch)
     sys.argv = [package, *sys.argv[2:]]

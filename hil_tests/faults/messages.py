@@ -11,17 +11,9 @@ import numpy as np
 
 from edge_runtime import wire
 from edge_runtime.cli import BAD_INPUT
-from edge_runtime.wire import (
-    CONTROL_PERIOD_S,
-    DRIVE,
-    Command,
-    Feedback,
-    Message,
-    Rejection,
-    encode,
-)
+from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command, Feedback, Message, Rejection, encode
 from hil_tests.faults.rig import Rig, make_state
-from hil_tests.faults.row import GAP, Try, drives_on, drove_on, fault
+from hil_tests.faults.rows import GAP, Try, drives_on, drove_on, fault
 from hil_tests.processes import wait_until
 
 FLOOD_PER_S, FLOOD_S = 10_000, 2.0
@@ -47,7 +39,13 @@ def bad_states(rig: Rig, number: int) -> Try:
             for reason, payload in _bad_of(rig.sender.step):
                 rig.probe.put("state", payload)
                 sent[reason] += 1
-            _send_reordered(rig, sent)
+            # Two states that have overtaken one another, and one that says it is from the future.
+            rig.sender.step += 3
+            step = rig.sender.step
+            rig.sender.send(make_state(step - 1))
+            rig.probe.put("state", encode(make_state(step - 2)))
+            sent["stale"] += 1
+            rig.sender.send(make_state(step, sent_ns=time.time_ns() + _HOUR_NS))
         time.sleep(CONTROL_PERIOD_S / 2)
     return Try(rejected=sent)
 
@@ -194,16 +192,6 @@ def _bad_of(step: int) -> Iterable[tuple[str, bytes]]:
     # From another time of day is no reason: the next one is good whatever its clock says.
 
 
-def _send_reordered(rig: Rig, sent: Counter[str]) -> None:
-    """Two states that have overtaken one another, and one that says it comes from the future."""
-    rig.sender.step += 3
-    step = rig.sender.step
-    rig.sender.send(make_state(step - 1))
-    rig.probe.put("state", encode(make_state(step - 2)))
-    sent["stale"] += 1
-    rig.sender.send(make_state(step, sent_ns=time.time_ns() + _HOUR_NS))
-
-
 def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
     """A drive command to the newest state, or to one ``ahead`` of it."""
     session, episode, step = rig.timeline.commands[-1].place
@@ -217,34 +205,33 @@ def _command(rig: Rig, ahead: int = 0, **changes: object) -> Command:
 def mutated(valid: bytes, count: int, seed: int) -> Iterator[bytes]:
     """``count`` payloads; the n-th is the same for the same seed. Some may be valid still."""
     generator = np.random.default_rng(seed)
-    for _ in range(count):
-        yield _mutant(valid, generator)
+    names = sorted(msgspec.msgpack.decode(valid))
 
-
-def _mutant(valid: bytes, generator: np.random.Generator) -> bytes:
     def below(limit: int) -> int:
         return int(generator.integers(limit))
 
-    match below(7):
-        case 0:
-            return generator.bytes(below(_LONGEST_RANDOM))
-        case 1:
-            data = bytearray(valid)
-            for _ in range(1 + below(4)):
-                data[below(len(data))] ^= 1 << below(8)
-            return bytes(data)
-        case 2:
-            return valid[: below(len(valid))]
-        case 3:
-            return valid + generator.bytes(1 + below(_SPLICED))
-        case 4:  # a stretch of it replaced by a random one of another length
-            begin, end = sorted((below(len(valid)), below(len(valid))))
-            return valid[:begin] + generator.bytes(below(_SPLICED)) + valid[end:]
-    names = sorted(msgspec.msgpack.decode(valid))
-    name = names[below(len(names))]
-    if below(2):
-        return without(valid, name)
-    return with_fields(valid, **{name: _ABSURD[below(len(_ABSURD))]})
+    for _ in range(count):
+        match below(7):
+            case 0:
+                yield generator.bytes(below(_LONGEST_RANDOM))
+            case 1:
+                data = bytearray(valid)
+                for _ in range(1 + below(4)):
+                    data[below(len(data))] ^= 1 << below(8)
+                yield bytes(data)
+            case 2:
+                yield valid[: below(len(valid))]
+            case 3:
+                yield valid + generator.bytes(1 + below(_SPLICED))
+            case 4:  # a stretch of it replaced by a random one of another length
+                begin, end = sorted((below(len(valid)), below(len(valid))))
+                yield valid[:begin] + generator.bytes(below(_SPLICED)) + valid[end:]
+            case _:
+                name = names[below(len(names))]
+                if below(2):
+                    yield without(valid, name)
+                else:
+                    yield with_fields(valid, **{name: _ABSURD[below(len(_ABSURD))]})
 
 
 def with_fields(valid: bytes, **changes: object) -> bytes:

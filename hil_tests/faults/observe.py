@@ -69,9 +69,7 @@ class Timeline:
 
 
 def unsafe_commands(
-    commands: Iterable[CommandSeen],
-    states: Mapping[Place, float],
-    by_arrival: bool = False,
+    commands: Iterable[CommandSeen], states: Mapping[Place, float], by_arrival: bool = False
 ) -> list[str]:
     """Why each unsafe command is one; empty where all is well.
 
@@ -144,10 +142,10 @@ class Probe:
             )
             for topic in handlers
         }
-        self._declared: list[Any] = [
-            self._session.declare_subscriber(wire.key(vehicle_id, topic), handler)
-            for topic, handler in handlers.items()
-        ]
+        self._declared: list[Any] = list(self._publishers.values())
+        for topic, handler in handlers.items():
+            declared = self._session.declare_subscriber(wire.key(vehicle_id, topic), handler)
+            self._declared.append(declared)
 
     def put(self, topic: str, payload: bytes) -> None:
         """Send bytes as they are."""
@@ -155,7 +153,7 @@ class Probe:
 
     def close(self) -> None:
         """Undeclare all, then close."""
-        for declared in [*self._declared, *self._publishers.values()]:
+        for declared in self._declared:
             declared.undeclare()
         self._session.close()
 
@@ -173,16 +171,10 @@ class Probe:
         if isinstance(command, wire.Rejection):
             self.timeline.unreadable += 1
             return
-        self.timeline.commands.append(
-            CommandSeen(
-                seen_s,
-                (command.sent_ns - offset_ns) * 1e-9,
-                (command.session, command.episode, command.step),
-                command.mode,
-                command.action,
-                command.reason,
-            )
-        )
+        place = (command.session, command.episode, command.step)
+        sent_s = (command.sent_ns - offset_ns) * 1e-9
+        seen = CommandSeen(seen_s, sent_s, place, command.mode, command.action, command.reason)
+        self.timeline.commands.append(seen)
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
         seen_s = time.monotonic()

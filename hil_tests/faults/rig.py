@@ -59,16 +59,11 @@ _STATE_BYTES = 20
 class Rig:
     """Start it with ``with``; it ends every process that it started.
 
-    ``simulator`` or ``sender``, ``link``, ``router``, ``chassis`` and ``monitor`` are there where
-    the options ask for them.
-
-    Args:
-        policy: the edge runtime's options for its policy.
-        directory: an empty one, for switches and reports.
-        between: ``link`` or ``router``: what edge runtime and probe meet at.
-        vehicle: the edge runtime's ``--vehicle``.
-        sender: send states here, without a simulator.
-        model: of a mock Hunter, on a CAN bus.
+    ``policy`` are the edge runtime's options for its policy, ``vehicle`` its ``--vehicle``. The
+    ``directory`` is an empty one, for switches and reports. Edge runtime and probe meet at a
+    ``link`` or a ``router`` where ``between`` says so. ``sender`` sends states here, without a
+    simulator. With the vehicle ``hunter`` there is a mock of it on a CAN bus. Only what the options
+    ask for is there of the following.
     """
 
     simulator: Process
@@ -85,7 +80,6 @@ class Rig:
         between: str = "",
         vehicle: str = "none",
         sender: bool = False,
-        model: str = "",
     ) -> None:
         self.timeline = Timeline()
         self.directory = directory
@@ -109,9 +103,9 @@ class Rig:
         if between == "router":
             self.edge_endpoint = free_endpoint()
             self.router = self.start_router()
-        self._bus = free_bus() if model else ""
-        if model:
-            self.chassis = ChassisProcess(self._bus, "--model", model)
+        self._bus = free_bus() if vehicle == "hunter" else ""
+        if self._bus:
+            self.chassis = ChassisProcess(self._bus)
             self._processes.append(("chassis", self.chassis.process))
             self.monitor = CanMonitor(self._bus, HEARD)
             self._closing.callback(self.monitor.close)
@@ -216,10 +210,8 @@ class Rig:
 
     def own_brake_s(self, since_s: float) -> float:
         """When the simulated vehicle's brake went on after ``since_s``."""
-        pressed = _await_first(
-            self.brakes, lambda b: b[1] and b[0] > since_s, "the simulator's own brake"
-        )
-        return pressed[0]
+        what = "the simulator's own brake"
+        return _await_first(self.brakes, lambda b: b[1] and b[0] > since_s, what)[0]
 
     def stop_command(self, since_s: float) -> CommandSeen:
         """The first safe_stop command after ``since_s``."""
@@ -275,8 +267,7 @@ class Rig:
         self._closing.close()
 
     def _end_processes(self) -> None:
-        """Crashes are noted first."""
-        for name, process in self._processes:
+        for name, process in self._processes:  # crashes are noted first
             if process.crashed():
                 self.crashes.append(f"{name}: {process.lines[-1:]}")
         for _, process in reversed(self._processes):
@@ -379,12 +370,10 @@ class ChassisProcess:
 
     def switch(self, name: str, on: bool) -> float:
         """Switch a fault; when it took effect, monotonic s."""
-        count, word = len(self.switched), "on" if on else "off"
-        self.process.tell(f"{name} {word}")
-        done = wait_until(
-            lambda: [s for s in self.switched[count:] if s[1:] == (name, word)],
-            f"{name} {word}",
-        )
+        count, order = len(self.switched), (name, "on" if on else "off")
+        what = " ".join(order)
+        self.process.tell(what)
+        done = wait_until(lambda: [s for s in self.switched[count:] if s[1:] == order], what)
         return float(done[0][0])
 
     def stands_s(self, since_s: float, timeout_s: float) -> float:
@@ -437,8 +426,8 @@ class Link:
         """Break every connection and refuse new ones; what was under way is lost."""
         with self._lock:
             self._is_cut = True
-            _shut(*self._open)
-            self._open.clear()
+            while self._open:
+                _shut(self._open.pop())
 
     def stall(self) -> None:
         """Keep the connections and hold what comes, as a radio link that repeats does."""
@@ -453,9 +442,7 @@ class Link:
         """Break all and stop listening."""
         self._flowing.set()
         self.cut()
-        with contextlib.suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
+        _shut(self._listener)
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):  # closed
@@ -485,7 +472,8 @@ class Link:
                 sink.sendall(data)
                 if to_caller and len(data) > _STATE_BYTES:
                     self.last_state_s = time.monotonic()
-        _shut(source, sink)
+        _shut(source)
+        _shut(sink)
 
 
 def address(endpoint: str) -> tuple[str, int]:
@@ -494,8 +482,7 @@ def address(endpoint: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def _shut(*ends: socket.socket) -> None:
-    for end in ends:
-        with contextlib.suppress(OSError):
-            end.shutdown(socket.SHUT_RDWR)
-        end.close()
+def _shut(end: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        end.shutdown(socket.SHUT_RDWR)
+    end.close()

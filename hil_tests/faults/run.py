@@ -17,18 +17,16 @@ from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import SLOW_LOOPS, write_policy
 from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE
-from hil_tests.faults import ends, hunter, messages  # noqa: F401 (they fill the table)
+from hil_tests.faults import hunter, messages  # noqa: F401 (they fill the table)
 from hil_tests.faults.observe import longest_gap_s, spread_ms, unsafe_commands
 from hil_tests.faults.rig import Rig
-from hil_tests.faults.row import ROWS, Row, Try, at_any_phase
+from hil_tests.faults.rows import ROWS, Row, Try, at_any_phase
 from hil_tests.processes import POLICY, PUBLIC_KEY, in_parallel, trusting
 
 SLOW_S = 2.5 * CONTROL_PERIOD_S
 STALLED_S = 1.5 * CONTROL_PERIOD_S
 """States further apart than this are not the real-time drive that a row is about."""
 MOST_DISTURBED = 100
-OnTry = Callable[[str], None]
-"""Told the row, after every try."""
 
 
 def write_slow(path: Path) -> None:
@@ -69,22 +67,17 @@ def run_faults(
     tries: int,
     rows: Sequence[str] | None = None,
     policy: Path | None = None,
-    on_try: OnTry = lambda row: None,
+    on_try: Callable[[str], None] = lambda row: None,
     jobs: int = 2,
     public_key: str | None = None,
 ) -> dict[str, Any]:
     """Do every row ``tries`` times; a report for JSON.
 
-    Args:
-        tries: of each row.
-        rows: names of the table's rows, or patterns of them (``hunter_*``); None for all.
-        policy: an exported policy; None for the repository's own left turn.
-        on_try: called after every try.
-        jobs: rigs at once; rows that need the machine for themselves run after the others.
-        public_key: what the policy is verified with.
-
-    Raises:
-        UserError: a row that the table does not hold, or no policy.
+    ``rows`` are names of the table's rows, or patterns of them (``hunter_*``); None for all. An
+    exported ``policy`` (None for the repository's own left turn) is verified with ``public_key``.
+    ``on_try`` is called with the row's name after every try. ``jobs`` rigs run at once; rows that
+    need the machine for themselves run after the others. Raises UserError for a row that the table
+    does not hold, or no policy.
     """
     chosen = choose_rows(rows)
     trust = trusting(policy, public_key)
@@ -118,8 +111,7 @@ def run_faults(
 def choose_rows(names: Sequence[str] | None) -> list[Row]:
     """The rows of these names or patterns, in the table's order; all for None.
 
-    Raises:
-        UserError: a name that the table does not hold, or a pattern that fits none.
+    Raises UserError for a name that the table does not hold, or a pattern that fits none.
     """
     known = [row.name for row in ROWS]
     chosen: set[str] = set()
@@ -130,7 +122,9 @@ def choose_rows(names: Sequence[str] | None) -> list[Row]:
     return [row for row in ROWS if row.name in chosen]
 
 
-def run_row(row: Row, trust: Sequence[str], work: Path, tries: int, on_try: OnTry) -> Outcome:
+def run_row(
+    row: Row, trust: Sequence[str], work: Path, tries: int, on_try: Callable[[str], None]
+) -> Outcome:
     """All tries of a row; a rig in which a try came to no end is replaced.
 
     ``trust`` are the options of its edge runtimes; rigs have their directories in ``work``.
@@ -192,7 +186,6 @@ def report_row(row: Row, outcome: Outcome) -> dict[str, Any]:
         "reasons": dict(Counter(t.reason for t in outcome.tries if t.reason)),
         "rejected": dict(sum((Counter(t.rejected) for t in outcome.tries), Counter())),
         "figures": figures,
-        "notes": [text for t in outcome.tries for text in t.notes],
         "wrong": wrong,
         "unsafe": outcome.unsafe,
         "crashes": outcome.crashes,

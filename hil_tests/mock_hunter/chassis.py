@@ -54,7 +54,7 @@ BITS: dict[str, Bit] = {
     "remote_lost": Bit(words.REMOTE_LOST, stops=False),
 }
 
-BEHAVIOURS: dict[str, str] = {
+FAULTS: dict[str, str] = {
     "silent": "it sends nothing, and obeys",
     "frozen": "it repeats its last frames, and obeys",
     "stuck": "its motors stay as they are, whatever is asked; its brake works",
@@ -63,9 +63,8 @@ BEHAVIOURS: dict[str, str] = {
     "bus_off": "it neither sends nor hears",
     "remote": "the remote control takes over, its sticks at rest",
     "estop": "its emergency stop is pressed",
+    **{name: bit.words for name, bit in BITS.items()},
 }
-
-FAULTS: dict[str, str] = {**BEHAVIOURS, **{name: bit.words for name, bit in BITS.items()}}
 LATE_S = 0.4
 LIE_MPS = 3.0
 

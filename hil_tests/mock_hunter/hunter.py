@@ -1,17 +1,22 @@
 """The whole mock: frames and time in, frames out. No clock and no bus of its own.
 
-Drive it with `receive` for each frame of the bus and `due` at `next_s`; both take the time.
+Parameters and actuators with a lag and a rate come first, then the mock made of them and of the
+chassis's rules. Drive it with `receive` for each frame of the bus and `due` at `next_s`; both take
+the time. Angles are positive to the left. The inner front wheel is the one on the side of the turn.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
+from edge_runtime.util import UserError
 from edge_runtime.vehicles.hunter import protocol as codec
 from edge_runtime.vehicles.hunter.protocol import LINK_LOST, fault_bits
 from hil_tests.mock_hunter import chassis as rules
-from hil_tests.mock_hunter.body import Battery, Body, Parameters, Setpoint, advance, curvature, roll
 from hil_tests.mock_hunter.chassis import (
     BITS,
     LATE_S,
@@ -22,8 +27,12 @@ from hil_tests.mock_hunter.chassis import (
     Control,
     Event,
     check_fault,
-)  # fmt: skip
+)
 
+ASSUMED = "assumed"
+_MANUAL = "AgileX user manual (HARDWARE_FACTS.md)"
+STANDS_MPS = 0.005
+"""Slower than this it stands: half of what one count in 0x221 could show is 0.0005."""
 FAST_S = 0.02
 SLOW_EVERY = 5
 """Frames of 100 ms go with every fifth of those of 20 ms."""
@@ -43,10 +52,150 @@ _STATES = {
     Condition.EXCEPTION: codec.STATE_EXCEPTION,
     Condition.ESTOP_AND_EXCEPTION: codec.STATE_ESTOP,
 }
+_OF_A_PERSON = {
+    "remote": (Event.REMOTE_ON, Event.REMOTE_OFF),
+    "estop": (Event.ESTOP_ON, Event.ESTOP_OFF),
+}
 _SLOW = (codec.STEER_MOTOR_SLOW, codec.REAR_RIGHT_SLOW, codec.REAR_LEFT_SLOW)
 _ENABLED = 1 << 6
 _COOL_C, _HOT_C = 35, 105
+_BATTERY_V, _LOW_V, _IDLE_A = 27.9, 21.0, 1.0
 _INT32 = 2**32
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Geometry and actuators of one model; SOURCES says how far to trust each number."""
+
+    max_speed_mps: float
+    max_inner_rad: float
+    """Of the inner front wheel."""
+    wheelbase_m: float
+    track_m: float
+    command_timeout_s: float = 0.5
+    dead_time_s: float = 0.03
+    """From a command on the bus to the first movement of an actuator."""
+    speed_time_constant_s: float = 0.1
+    acceleration_mps2: float = 2.0
+    braking_mps2: float = 3.0
+    """Of the speed controller, and of the brake: the chassis stops a moving car with either."""
+    steering_rate_radps: float = 1.0
+    """Of the inner wheel."""
+    motor_revolutions_per_m: float = 20.0
+    """Of path of a rear wheel."""
+    steer_revolutions_per_rad: float = 20.0
+    """Of the steering motor, for each radian of the inner wheel."""
+    pulses_per_revolution: float = 100.0
+    """Of a motor's encoder."""
+
+
+MODELS: dict[str, Parameters] = {
+    "hunter-2.0": Parameters(
+        max_speed_mps=1.5, max_inner_rad=0.576, wheelbase_m=0.650, track_m=0.605
+    ),
+    # The SE's manual leaves its track between 0.46 and 0.52 m: the middle is assumed.
+    "hunter-se": Parameters(
+        max_speed_mps=4.8, max_inner_rad=0.400, wheelbase_m=0.55, track_m=0.49,
+        acceleration_mps2=3.0, braking_mps2=4.0,
+    ),
+}  # fmt: skip
+
+_FROM_THE_MANUAL = (
+    "max_speed_mps", "max_inner_rad", "wheelbase_m", "track_m", "command_timeout_s",
+)  # fmt: skip
+SOURCES: dict[str, str] = {
+    field.name: _MANUAL if field.name in _FROM_THE_MANUAL else ASSUMED
+    for field in fields(Parameters)
+}
+"""The manual says nothing of how fast the actuators are: measure them on the vehicle, and pass
+them with ``--set``."""
+
+
+def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> Parameters:
+    """A model's row with some numbers replaced.
+
+    Raises UserError for an unknown name, or a number that is not positive (a dead time may be 0).
+    """
+    for name, value in (changes or {}).items():
+        if name not in SOURCES:
+            raise UserError(f"no parameter {name!r}; choose from {', '.join(SOURCES)}")
+        if not (value > 0.0 or (name == "dead_time_s" and value == 0.0)) or value == float("inf"):
+            raise UserError(f"parameter {name} must be above 0, not {value}")
+    return replace(MODELS[model], **(changes or {}))
+
+
+def read_changes(texts: list[str]) -> dict[str, float]:
+    """Read the values of `--set NAME=VALUE`; UserError for one that is none."""
+    changes = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            changes[name] = float(value)
+        except ValueError:
+            raise UserError(f"--set {text!r} is not valid: use NAME=VALUE") from None
+    return changes
+
+
+class Setpoint(NamedTuple):
+    """What is asked of the body: speed, and the angle of the inner front wheel."""
+
+    speed_mps: float = 0.0
+    inner_rad: float = 0.0
+
+
+class Body(NamedTuple):
+    """Its speed, its inner wheel's angle and the rate of that, and the way of each rear wheel."""
+
+    speed_mps: float = 0.0
+    inner_rad: float = 0.0
+    steering_radps: float = 0.0
+    right_m: float = 0.0
+    left_m: float = 0.0
+
+    @property
+    def stands(self) -> bool:
+        """Whether it does not move."""
+        return abs(self.speed_mps) < STANDS_MPS
+
+
+def advance(body: Body, setpoint: Setpoint | None, step_s: float, parameters: Parameters) -> Body:
+    """One integration step towards the set-point; None: the brake, with the steering held."""
+    p, inner_rad = parameters, body.inner_rad
+    if setpoint is None:
+        change_mps, rate_mps2 = -body.speed_mps, p.braking_mps2
+    else:
+        gap_mps = _limit(setpoint.speed_mps, p.max_speed_mps) - body.speed_mps
+        change_mps = gap_mps * (1 - math.exp(-step_s / p.speed_time_constant_s))
+        rate_mps2 = p.braking_mps2 if body.speed_mps * change_mps < 0 else p.acceleration_mps2
+        turn_rad = _limit(setpoint.inner_rad, p.max_inner_rad) - body.inner_rad
+        inner_rad += _limit(turn_rad, p.steering_rate_radps * step_s)
+    speed_mps = body.speed_mps + _limit(change_mps, rate_mps2 * step_s)
+    steering_radps = (inner_rad - body.inner_rad) / step_s
+    after = body._replace(speed_mps=speed_mps, inner_rad=inner_rad, steering_radps=steering_radps)
+    return roll(after, step_s, parameters)
+
+
+def roll(body: Body, step_s: float, parameters: Parameters) -> Body:
+    """The way of the rear wheels at the present speed; in a turn the outer one covers more."""
+    half = curvature(body.inner_rad, parameters) * parameters.track_m / 2
+    way_m = body.speed_mps * step_s
+    return body._replace(
+        right_m=body.right_m + way_m * (1 + half), left_m=body.left_m + way_m * (1 - half)
+    )
+
+
+def curvature(inner_rad: float, parameters: Parameters) -> float:
+    """Of the rear axle's middle, 1/m: the inner wheel's radius is half a track shorter (Ackermann).
+
+    radius = wheelbase / tan(inner) + track / 2
+    """
+    slope = math.tan(abs(inner_rad))
+    amount = slope / (parameters.wheelbase_m + slope * parameters.track_m / 2)
+    return math.copysign(amount, inner_rad)
+
+
+def _limit(value: float, most: float) -> float:
+    return min(max(value, -most), most)
 
 
 class Wire(NamedTuple):
@@ -62,7 +211,6 @@ class MockHunter:
     def __init__(self, parameters: Parameters, now_s: float, profile: str = "v2") -> None:
         self.chassis = Chassis()
         self.body = Body()
-        self.battery = Battery(parameters)
         self.faults: set[str] = set()
         self.next_s = now_s
         """When `due` must be called next."""
@@ -90,21 +238,30 @@ class MockHunter:
         message = codec.decode(can_id, data)
         if message is None or "bus_off" in self.faults:
             return
-        self._obey(message, now_s)
+        if isinstance(message, codec.MotionCommand):
+            asked = Setpoint(message.speed_mps, message.inner_steering_rad)
+            self.chassis = rules.take_command(self.chassis, now_s)
+            self._under_way.append((now_s + self._parameters.dead_time_s, asked))
+        elif isinstance(message, codec.ModeCommand):
+            if message.mode == codec.CAN_CONTROL:
+                self.chassis = rules.take_can_mode(self.chassis, now_s)
+            elif message.mode == codec.STANDBY:
+                self.chassis = rules.advance(self.chassis, Event.STANDBY_MODE)
+        elif isinstance(message, codec.BrakeCommand) and message.locked in (0, 1):
+            self.chassis = self.chassis._replace(brake_locked=message.locked == 1)
+        elif isinstance(message, codec.ClearCommand):
+            self.chassis = rules.take_clear(self.chassis)
 
     def switch(self, name: str, on: bool, now_s: float) -> None:
         """Switch a fault on or off. Raises UserError for one that is not known."""
         check_fault(name)
         self.advance(now_s)
         (self.faults.add if on else self.faults.discard)(name)
-        if name == "undervoltage":
-            self.battery.empty(on)  # the battery's voltage makes the error
-        elif name in BITS:
+        if name in BITS:
             self.chassis = rules.take_cause(self.chassis, name, on)
-        elif name == "remote":
-            self._apply(Event.REMOTE_ON if on else Event.REMOTE_OFF)
-        elif name == "estop":
-            self._apply(Event.ESTOP_ON if on else Event.ESTOP_OFF)
+        elif name in _OF_A_PERSON:
+            event = _OF_A_PERSON[name][0 if on else 1]
+            self.chassis = rules.advance(self.chassis, event)
         self.advance(now_s)
 
     def due(self, now_s: float) -> list[Wire]:
@@ -115,54 +272,29 @@ class MockHunter:
             self._tick += 1
             missed = int((now_s - self.next_s) / FAST_S)
             self.next_s += (missed + 1) * FAST_S
-        return self._released(now_s)
+        found = []
+        while self._outgoing and self._outgoing[0][0] <= now_s:
+            found.append(self._outgoing.popleft()[1])
+        return found
 
     def advance(self, now_s: float) -> None:
         """Integrate up to this time."""
+        p = self._parameters
         self._now_s = max(self._now_s, now_s - _LONGEST_GAP_S)
         while now_s - self._now_s > 1e-9:
             step_s = min(STEP_S, now_s - self._now_s)
             self._now_s += step_s
-            self._step(step_s)
-
-    def _obey(self, message: object, now_s: float) -> None:
-        if isinstance(message, codec.MotionCommand):
-            asked = Setpoint(message.speed_mps, message.inner_steering_rad)
-            self.chassis = rules.take_command(self.chassis, now_s)
-            self._under_way.append((now_s + self._parameters.dead_time_s, asked))
-        elif isinstance(message, codec.ModeCommand):
-            if message.mode == codec.CAN_CONTROL:
-                self.chassis = rules.take_can_mode(self.chassis, now_s)
-            elif message.mode == codec.STANDBY:
-                self._apply(Event.STANDBY_MODE)
-        elif isinstance(message, codec.BrakeCommand) and message.locked in (0, 1):
-            self.chassis = self.chassis._replace(brake_locked=message.locked == 1)
-        elif isinstance(message, codec.ClearCommand):
-            self.chassis = rules.take_clear(self.chassis)
-
-    def _apply(self, event: Event) -> None:
-        self.chassis = rules.advance(self.chassis, event)
-
-    def _step(self, step_s: float) -> None:
-        timeout_s = self._parameters.command_timeout_s
-        self.chassis = rules.take_time(self.chassis, self._now_s, timeout_s)
-        if self.battery.too_low != ("undervoltage" in self.chassis.causes):
-            self.chassis = rules.take_cause(self.chassis, "undervoltage", self.battery.too_low)
-        while self._under_way and self._under_way[0][0] <= self._now_s:
-            self._setpoint = self._under_way.popleft()[1]
-        before_mps = self.body.speed_mps
-        self.body = self._move(step_s)
-        change = abs(self.body.speed_mps) - abs(before_mps)
-        self.battery.advance(self.body.speed_mps, change / step_s, step_s)
-
-    def _move(self, step_s: float) -> Body:
-        if not rules.obeys(self.chassis):
-            # Where control comes back, it does so from a stand, not with what was asked before.
-            self._setpoint = Setpoint(0.0, self.body.inner_rad)
-            return advance(self.body, None, step_s, self._parameters)
-        if "stuck" in self.faults:
-            return roll(self.body, step_s, self._parameters)
-        return advance(self.body, self._setpoint, step_s, self._parameters)
+            self.chassis = rules.take_time(self.chassis, self._now_s, p.command_timeout_s)
+            while self._under_way and self._under_way[0][0] <= self._now_s:
+                self._setpoint = self._under_way.popleft()[1]
+            if not rules.obeys(self.chassis):
+                # Where control comes back, it does so from a stand, not with what was asked before.
+                self._setpoint = Setpoint(0.0, self.body.inner_rad)
+                self.body = advance(self.body, None, step_s, p)
+            elif "stuck" in self.faults:
+                self.body = roll(self.body, step_s, p)
+            else:
+                self.body = advance(self.body, self._setpoint, step_s, p)
 
     def _report(self, now_s: float) -> None:
         with_slow = self._tick % SLOW_EVERY == 0
@@ -184,21 +316,32 @@ class MockHunter:
         found = [_frame(codec.MOTION_STATUS, codec.MotionStatus(speed_mps, body.inner_rad))]
         half = curvature(body.inner_rad, p) * p.track_m / 2
         drive, steer = p.motor_revolutions_per_m, p.steer_revolutions_per_rad
-        each_a = self.battery.amperes / 2
-        for row, turns, speed, way, amperes in (
-            (codec.REAR_RIGHT_FAST, drive, body.speed_mps * (1 + half), body.right_m, each_a),
-            (codec.REAR_LEFT_FAST, drive, body.speed_mps * (1 - half), body.left_m, each_a),
-            (codec.STEER_MOTOR_FAST, steer, body.steering_radps, body.inner_rad, 0.0),
+        for row, turns, speed, way in (
+            (codec.REAR_RIGHT_FAST, drive, body.speed_mps * (1 + half), body.right_m),
+            (codec.REAR_LEFT_FAST, drive, body.speed_mps * (1 - half), body.left_m),
+            (codec.STEER_MOTOR_FAST, steer, body.steering_radps, body.inner_rad),
         ):
-            pulses = way * turns * p.pulses_per_revolution
-            fast = codec.MotorFast(round(speed * turns * 60), amperes, _wrapped(pulses))
-            found.append(_frame(row, fast))
+            # As a 32-bit counter shows it after it has run over.
+            pulses = round(way * turns * p.pulses_per_revolution)
+            shown = (pulses + _INT32 // 2) % _INT32 - _INT32 // 2
+            found.append(_frame(row, codec.MotorFast(round(speed * turns * 60), _IDLE_A, shown)))
         return found
 
     def _slow_frames(self) -> list[Wire]:
         """0x211 and 0x261 to 0x263: every 100 ms."""
-        errors, volts = self.chassis.errors, self.battery.volts
-        found = [_frame(codec.SYSTEM_STATUS, self._status())]
+        chassis, errors = self.chassis, self.chassis.errors
+        words = [BITS[error].words for error in errors]
+        words += [LINK_LOST] if chassis.control is Control.LINK_LOST else []
+        volts = _LOW_V if "undervoltage" in errors else _BATTERY_V
+        status = codec.SystemStatus(
+            state=_STATES[chassis.condition],
+            mode=_MODES[chassis.control],
+            battery_v=volts,
+            faults=sum(fault_bits(each, self._profile) for each in words),
+            brake=int(chassis.brake_locked),
+            counter=self._tick // SLOW_EVERY % 256,
+        )
+        found = [_frame(codec.SYSTEM_STATUS, status)]
         for motor, row in enumerate(_SLOW):
             shown = (BITS[error].motor_bits for error in errors if motor in BITS[error].motors)
             hot = "overtemperature" in errors and motor != STEERING
@@ -207,31 +350,6 @@ class MockHunter:
             found.append(_frame(row, slow))
         return found
 
-    def _status(self) -> codec.SystemStatus:
-        """0x211: who drives, whether anybody may, the battery, the errors, the brake."""
-        chassis = self.chassis
-        words = [BITS[error].words for error in chassis.errors]
-        words += [LINK_LOST] if chassis.control is Control.LINK_LOST else []
-        return codec.SystemStatus(
-            state=_STATES[chassis.condition],
-            mode=_MODES[chassis.control],
-            battery_v=self.battery.volts,
-            faults=sum(fault_bits(each, self._profile) for each in words),
-            brake=int(chassis.brake_locked),
-            counter=self._tick // SLOW_EVERY % 256,
-        )
-
-    def _released(self, now_s: float) -> list[Wire]:
-        found = []
-        while self._outgoing and self._outgoing[0][0] <= now_s:
-            found.append(self._outgoing.popleft()[1])
-        return found
-
 
 def _frame(row: codec.Frame, message: object) -> Wire:
     return Wire(row.can_id, codec.encode(row, message))
-
-
-def _wrapped(pulses: float) -> int:
-    """As a 32-bit counter shows it after it has run over."""
-    return (round(pulses) + _INT32 // 2) % _INT32 - _INT32 // 2

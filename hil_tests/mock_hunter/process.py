@@ -20,11 +20,10 @@ import can
 
 from edge_runtime.cli import examples, seconds
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.hunter import MULTICAST_BUS, BusName, open_bus, parse_bus
+from edge_runtime.vehicles.hunter import MULTICAST_BUS, open_bus, parse_bus
 from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE, PROFILES
-from hil_tests.mock_hunter.body import MODELS, SOURCES, make_parameters, read_changes
 from hil_tests.mock_hunter.chassis import FAULTS, check_fault
-from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.hunter import MODELS, SOURCES, MockHunter, make_parameters, read_changes
 
 Switch = tuple[str, bool]
 """A fault's name, and whether it is switched on."""
@@ -47,10 +46,7 @@ class Server:
     """Runs a mock on a bus until `stop`; every change is told as one line with its time."""
 
     def __init__(
-        self,
-        hunter: MockHunter,
-        bus: can.BusABC,
-        tell: Callable[[str], None] = lambda line: None,
+        self, hunter: MockHunter, bus: can.BusABC, tell: Callable[[str], None] = lambda line: None
     ) -> None:
         self.orders: queue.SimpleQueue[Switch] = queue.SimpleQueue()
         """Faults to switch next, from any thread."""
@@ -67,16 +63,16 @@ class Server:
         """Obey and report."""
         while not self._ending.is_set():
             while not self.orders.empty():
-                self._switch(*self.orders.get())
+                (name, on), now_s = self.orders.get(), time.monotonic()
+                self._hunter.switch(name, on, now_s)
+                self._tell(f"fault t={now_s:.6f} {name}={'on' if on else 'off'}")
             for frame in self._hunter.due(time.monotonic()):
                 self._send(frame.can_id, frame.data)
-            self._say()
+            words = self._hunter.describe()
+            if words != self._said:
+                self._said = words
+                self._tell(f"chassis t={time.monotonic():.6f} {words}")
             self._listen()
-
-    def _switch(self, name: str, on: bool) -> None:
-        now_s = time.monotonic()
-        self._hunter.switch(name, on, now_s)
-        self._tell(f"fault t={now_s:.6f} {name}={'on' if on else 'off'}")
 
     def _listen(self) -> None:
         """Take what comes until the next report is due: one frame, or none."""
@@ -84,32 +80,23 @@ class Server:
         # What a socket cannot unpack is no frame.
         with contextlib.suppress(can.CanError):
             message = self._bus.recv(pause_s)
-            if message is not None and _is_plain(message):
+            if message is None:
+                return
+            # The chassis has data frames with an 11-bit identifier only.
+            odd = message.is_extended_id or message.is_remote_frame or message.is_error_frame
+            if not (odd or message.is_fd):
                 data = bytes(message.data)
                 self._hunter.receive(message.arbitration_id, data, time.monotonic())
 
     def _send(self, can_id: int, data: bytes) -> None:
-        frame = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        fails, frame = "", can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
         try:
             self._bus.send(frame)
         except can.CanError as error:
-            if not self._fails:
-                self._tell(f"bus t={time.monotonic():.6f} not sent: {error}")
-            self._fails = True
-        else:
-            self._fails = False
-
-    def _say(self) -> None:
-        words = self._hunter.describe()
-        if words != self._said:
-            self._said = words
-            self._tell(f"chassis t={time.monotonic():.6f} {words}")
-
-
-def _is_plain(message: can.Message) -> bool:
-    """Whether it is a data frame with an 11-bit identifier, the only kind that the chassis has."""
-    odd = (message.is_extended_id, message.is_remote_frame, message.is_error_frame, message.is_fd)
-    return not any(odd)
+            fails = str(error)
+        if fails and not self._fails:
+            self._tell(f"bus t={time.monotonic():.6f} not sent: {fails}")
+        self._fails = bool(fails)
 
 
 EXAMPLE = examples(
@@ -125,23 +112,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Faults are switched while it runs by lines on its standard input: NAME on, NAME off."
         f" Known are {', '.join(FAULTS)}. Parameters: {', '.join(SOURCES)}."
     )
-    parser.add_argument(
-        "--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is"
-    )
-    parser.add_argument("--model", default="hunter-2.0", choices=list(MODELS))
-    parser.add_argument(
-        "--profile", default=DEFAULT_PROFILE, choices=list(PROFILES), help="firmware's fault bits"
-    )
-    parser.add_argument("--set", action="append", metavar="NAME=VALUE", help="a parameter's value")
-    parser.add_argument(
-        "--fault", action="append", type=_fault, metavar="NAME[@S]", help="from the start, or later"
-    )
+    add, bits = parser.add_argument, "firmware's fault bits"
+    add("--bus", default=MULTICAST_BUS, metavar="INTERFACE:CHANNEL", help="where it is")
+    add("--model", default="hunter-2.0", choices=list(MODELS))
+    add("--profile", default=DEFAULT_PROFILE, choices=list(PROFILES), help=bits)
+    add("--set", action="append", metavar="NAME=VALUE", help="a parameter's value")
+    late = "from the start, or later"
+    add("--fault", action="append", type=_fault, metavar="NAME[@S]", help=late)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Be a Hunter until a signal comes."""
     parameters = make_parameters(arguments.model, read_changes(arguments.set or []))
-    bus, tell = open_bus(_check_reachable(arguments.bus)), partial(print, flush=True)
+    name, tell = parse_bus(arguments.bus), partial(print, flush=True)
+    if name.interface == "virtual":
+        raise UserError(
+            f"--bus {arguments.bus}: a virtual bus ends with its process, and nobody could reach"
+            f" the mock; use {MULTICAST_BUS} or socketcan:vcan0"
+        )
+    bus = open_bus(name)
     try:
         hunter = MockHunter(parameters, time.monotonic(), arguments.profile)
         server = Server(hunter, bus, tell)
@@ -166,16 +155,6 @@ def run(arguments: argparse.Namespace) -> int:
     finally:
         bus.shutdown()
     return 0
-
-
-def _check_reachable(text: str) -> BusName:
-    bus = parse_bus(text)
-    if bus.interface == "virtual":
-        raise UserError(
-            f"--bus {text}: a virtual bus ends with its process, and nobody could reach the mock;"
-            f" use {MULTICAST_BUS} or socketcan:vcan0"
-        )
-    return bus
 
 
 def _fault(text: str) -> tuple[float, str]:

@@ -23,7 +23,7 @@ from hil_tests.faults.observe import (
     unsafe_commands,
 )
 from hil_tests.faults.rig import ChassisProcess, Truth, make_state
-from hil_tests.faults.row import Row, Try
+from hil_tests.faults.rows import Row, Try
 from hil_tests.faults.run import ROWS, Outcome, choose_rows, report_row, run_faults
 from hil_tests.mock_hunter.chassis import FAULTS
 from hil_tests.report import render_faults

@@ -17,8 +17,8 @@ from bridge.tests.harness import simulate_undisturbed
 from edge_runtime.cli import run_cli
 from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.transport import free_endpoint
+from hil_tests.pictures import LEFT_TURN
 from hil_tests.processes import POLICY, PUBLIC_KEY
-from hil_tests.recording import LEFT_TURN
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.evaluate import drive_episodes
 from trainer.export import export_policy, write_policy

@@ -1,19 +1,15 @@
 """The mock on a bus: inside one process on `virtual`, and as a process of its own."""
 
 import contextlib
-import sys
 import threading
 import time
 
 import can
 import pytest
 
-from edge_runtime.cli import run_cli
 from edge_runtime.vehicles.hunter import open_bus, parse_bus
-from hil_tests.__main__ import main
 from hil_tests.faults.rig import ChassisProcess, free_bus
-from hil_tests.mock_hunter.body import MODELS
-from hil_tests.mock_hunter.hunter import MockHunter
+from hil_tests.mock_hunter.hunter import MODELS, MockHunter
 from hil_tests.mock_hunter.process import Server, read_orders
 from hil_tests.processes import wait_until
 
@@ -125,25 +121,3 @@ def test_orders_come_in_turn_and_those_that_are_none_are_told():
     read_orders(["remote on\n", *bad, "remote off\n"], found.append, told.append)
     assert found == [("remote", True), ("remote", False)]
     assert len(told) == len(bad)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (["--bus", "can0"], "is no CAN bus"),
-        (["--bus", "udp_multicast:10.1.2.3"], "is no IPv4 multicast group"),
-        (["--fault", "meteor"], "no fault 'meteor'; choose from silent"),
-        (["--fault", "silent@-1"], "not a finite number of seconds"),
-        (["--set", "wings=2"], "no parameter 'wings'"),
-        (["--set", "track_m"], "use NAME=VALUE"),
-        (["--model", "hunter-3"], "invalid choice"),
-    ],
-)
-def test_wrong_options_are_one_line_and_status_2(arguments, why, capsys):
-    # argparse ends the process itself, a UserError gives its status.
-    with pytest.raises(SystemExit) as ended:
-        sys.exit(run_cli(main, ["mock_hunter", *arguments]))
-    said = capsys.readouterr().err
-    assert ended.value.code == 2
-    assert why in said
-    assert said.count("\n") == 1

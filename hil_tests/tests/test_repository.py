@@ -1,0 +1,474 @@
+"""Held by reading every file: imports, READMEs, and the --help of every command.
+
+Who may import whom, that what is imported is asked for, and that nothing from outside, a message or
+a file, is ever run as code. What the READMEs point at is there, and what their pictures are drawn
+from. Every command has ``--help`` with examples, and its own parser takes each of them.
+"""
+
+import argparse
+import ast
+import importlib
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from deploy.bundle import TARGETS
+from deploy.installer import __main__ as installer
+from edge_runtime import __version__
+from edge_runtime.cli import ArgumentParser, examples
+from edge_runtime.util import UserError
+from edge_runtime.vehicles.ros2 import DEFAULT_ROS2_ENDPOINT
+from hil_tests import pictures, processes
+from hil_tests.__main__ import main
+from hil_tests.pictures import FILM_POLICY, FILM_SEED, policy_sees, success_against_latency
+from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
+from trainer.human.guide import HumanGuide
+from trainer.pictures import drive_moments
+
+ROOT = Path(__file__).parents[2]
+
+ARROWS = {
+    "edge_runtime": set(),
+    "bridge": {"edge_runtime"},
+    "trainer": {"edge_runtime", "bridge"},
+    "hil_tests": {"edge_runtime", "bridge", "trainer", "deploy"},
+    "deploy": {"edge_runtime"},
+}
+EDGE_LIBRARIES = {
+    "numpy", "onnxruntime", "zenoh", "msgspec", "cryptography", "tomli", "typing_extensions",
+}  # fmt: skip
+DOORS = {
+    "can": ROOT / "edge_runtime/vehicles/hunter/__init__.py",
+    "pycdr2": ROOT / "edge_runtime/vehicles/ros2/node.py",
+}
+"""Where alone the edge runtime may load a library that only one kind of vehicle needs."""
+UNSAFE = re.compile(
+    r"""^(import|from)\ .*\b(pickle|cPickle|_pickle|marshal|shelve|dill|cloudpickle|joblib)\b
+    | ^(eval|exec|compile|__import__)\(
+    | ^torch\.load\((?!.*weights_only=True)
+    | ^yaml\.(load|load_all|unsafe_load|full_load)\((?!.*Loader=(\w+\.)?C?SafeLoader)
+    | \ballow_pickle=(?!False)
+    | \.(read|to)_pickle\(
+    | \bshell=(?!False)""",
+    re.VERBOSE | re.DOTALL,
+)
+"""Imports and calls, as Python writes them, that run what they read."""
+ELSEWHERE = {"ray", "pycdr2", "stable_baselines3", "pytest", "hypothesis", "cosmic_ray", "parso"}
+"""Extras, and what the peers' and the mutation's environments have."""
+ONLY_IN = {"torch": {"trainer"}, "highway_env": {"trainer"}, "onnx": {"trainer"}}
+"""Heavy libraries and the only folders that may load them."""
+
+
+def sources(folder: str) -> list[Path]:
+    """The folder's files without its tests, which may use their neighbours' helpers."""
+    return [p for p in (ROOT / folder).rglob("*.py") if not {"tests", "build"} & set(p.parts)]
+
+
+@cache
+def tree_of(path: Path) -> ast.AST:
+    return ast.parse(path.read_text())
+
+
+@cache
+def imported(path: Path) -> frozenset[str]:
+    """Top-level names of everything that a file imports, wherever in it."""
+    names: set[str] = set()
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.split(".")[0])
+    return frozenset(names)
+
+
+@pytest.mark.parametrize("folder", ARROWS)
+def test_a_folder_imports_only_what_stands_below_it(folder):
+    files = sources(folder)
+    assert files
+    for path in files:
+        neighbours = imported(path) & set(ARROWS) - {folder}
+        assert neighbours <= ARROWS[folder], path
+
+
+def test_the_edge_runtime_uses_only_libraries_that_a_board_has():
+    for path in sources("edge_runtime"):
+        foreign = imported(path) - set(sys.stdlib_module_names) - {"edge_runtime"}
+        behind_it = {library for library, door in DOORS.items() if path == door}
+        assert foreign <= EDGE_LIBRARIES | behind_it, path
+
+
+@pytest.mark.parametrize("library", DOORS)
+def test_a_vehicles_library_is_loaded_only_with_the_vehicle(library):
+    code = f"import sys, edge_runtime.run; assert {library!r} not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize(("library", "folders"), ONLY_IN.items())
+def test_heavy_libraries_stay_where_they_belong(library, folders):
+    for folder in set(ARROWS) - folders:
+        for path in sources(folder):
+            assert library not in imported(path), path
+
+
+def test_the_check_can_fail(tmp_path):
+    bad = tmp_path / "bad.py"
+    bad.write_text("def f():\n    from trainer import x\n    import torch.nn\n")
+    assert imported(bad) == {"trainer", "torch"}
+
+
+def test_every_library_that_is_imported_is_a_dependency():
+    lines = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    asked_for = {re.split(r"[^\w.-]", line)[0].lower() for line in lines}
+    modules = {name for part in ARROWS for path in sources(part) for name in imported(path)}
+    foreign = modules - {*ARROWS, *ELSEWHERE} - sys.stdlib_module_names
+    installed = packages_distributions()
+    unasked = [
+        module
+        for module in foreign
+        if asked_for.isdisjoint(name.lower() for name in installed.get(module, ()))
+    ]
+    assert sorted(unasked) == []
+
+
+def faults(tree: ast.AST) -> list[str]:
+    kinds = (ast.Import, ast.ImportFrom, ast.Call)
+    lines = [ast.unparse(node) for node in ast.walk(tree) if isinstance(node, kinds)]
+    return [line for line in lines if UNSAFE.search(line)]
+
+
+@pytest.mark.parametrize("folder", ARROWS)
+def test_nothing_shipped_runs_what_it_reads(folder):
+    for path in sources(folder):
+        assert faults(tree_of(path)) == [], path
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import pickle", "from marshal import loads", "import cloudpickle as c", "eval(text)",
+        "exec(open(p).read())", "torch.load(p)", "torch.load(p, weights_only=False)",
+        "torch.load(p, weights_only=flag)", "np.load(p, allow_pickle=True)",
+        "numpy.load(p, allow_pickle=flag)", "yaml.load(text)",
+        "yaml.load(text, Loader=yaml.FullLoader)", "pandas.read_pickle(p)",
+        "subprocess.run(text, shell=True)",
+    ],
+)  # fmt: skip
+def test_the_check_sees_it(line):
+    assert faults(ast.parse(f"def f():\n    {line}\n"))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "model.eval()", "re.compile(text)", "torch.compile(model)",
+        "torch.load(p, weights_only=True)", "np.load(p)",
+        "yaml.load(text, Loader=yaml.SafeLoader)", "subprocess.run([name])",
+    ],
+)  # fmt: skip
+def test_the_check_lets_the_harmless_pass(line):
+    assert not faults(ast.parse(line))
+
+
+PACKAGES = ("edge_runtime", "bridge", "trainer", "deploy", "hil_tests")
+
+LEAST_WRITING = {"edge_runtime": 2, "bridge": 6, "trainer": 7, "deploy": 4, "hil_tests": 7}
+"""Commands with an --out of those packages."""
+
+
+def find_programs():
+    """Every module with a parser of its own, as ``python -m`` names it."""
+    sources = [path for folder in PACKAGES for path in (ROOT / folder).rglob("*.py")]
+    texts = [path.read_text() for path in sources if "tests" not in path.parts]
+    return sorted({name for text in texts for name in re.findall(r'prog="python -m (\S+)"', text)})
+
+
+PROGRAMS = find_programs()
+
+
+class ParsedError(Exception):
+    """The arguments are good; what they ask for is not done."""
+
+
+@pytest.fixture
+def only_parse(monkeypatch):
+    """Parsers end once they have read their arguments, and keep what help they print."""
+    helps = []
+
+    def parse(parser, arguments):
+        argparse.ArgumentParser.parse_args(parser, arguments)
+        raise ParsedError
+
+    monkeypatch.setattr(ArgumentParser, "parse_args", parse)
+    monkeypatch.setattr(ArgumentParser, "_print_message", lambda _, text, *__: helps.append(text))
+    return helps
+
+
+def main_of(program):
+    spec = importlib.util.find_spec(program)
+    assert spec is not None
+    is_package = spec.submodule_search_locations is not None
+    return importlib.import_module(f"{program}.__main__" if is_package else program).main
+
+
+def help_of(program, words, helps):
+    helps.clear()
+    with pytest.raises(SystemExit) as ended:
+        main_of(program)([*words, "--help"])
+    assert ended.value.code == 0
+    return helps[-1]
+
+
+def subcommands_in(text):
+    """The names below COMMAND in the help of a package."""
+    _, _, below = text.partition("\n  COMMAND\n")
+    return re.findall(r"^ {4}(\w+)", below.partition("\n\n")[0], re.M)
+
+
+def examples_in(text):
+    """The words of each example's command line, without ``python -m``."""
+    _, _, below = text.replace("\\\n", " ").partition("\nexample")
+    lines = re.findall(r"^(?:.*: | +)python -m (.+)$", below, re.M)
+    return [shlex.split(line, comments=True) for line in lines]
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_command_shows_examples_that_it_takes(program, only_parse):
+    shown = help_of(program, [], only_parse)
+    commands = [[name] for name in subcommands_in(shown)]
+    assert bool(commands) == (program in PACKAGES)
+    for words in [[], *commands]:
+        found = examples_in(help_of(program, words, only_parse))
+        assert found, f"python -m {program} {' '.join(words)} --help has no example"
+        for example in found:
+            assert example[: 1 + len(words)] == [program, *words]
+            # `train --set` alone lists the settings and ends; it drives nothing.
+            lists = example[-1] == "--set"
+            with pytest.raises(SystemExit if lists else ParsedError) as ended:
+                main_of(program)(example[1:])
+            assert not lists or ended.value.args == (0,)
+
+
+@pytest.mark.parametrize(("program", "least"), LEAST_WRITING.items())
+@pytest.mark.parametrize("empty", [("--out", ""), ("--out=",)], ids=" ".join)
+def test_an_empty_name_of_what_is_written_is_refused(program, least, empty, only_parse):
+    """It would be the directory where one stands, or, taken for no name, none at all."""
+    commands = subcommands_in(help_of(program, [], only_parse))
+    writing = [name for name in commands if "--out " in help_of(program, [name], only_parse)]
+    assert len(writing) >= least
+    for name in writing:
+        with pytest.raises(SystemExit) as ended:
+            main_of(program)([name, *empty])
+        assert ended.value.code == 2
+        assert f"{name}: an empty value after --out (see" in only_parse[-1]
+
+
+def test_a_wrong_example_is_found_out(only_parse):
+    parser = ArgumentParser(prog="x", epilog=examples("python -m x --runs \\\n    two # runs"))
+    parser.add_argument("--runs", type=int)
+    (example,) = examples_in(parser.format_help())
+    assert example == ["x", "--runs", "two"]
+    with pytest.raises(SystemExit) as ended:
+        parser.parse_args(example[1:])
+    assert ended.value.code == 2
+
+
+def test_phil_runs_every_folder():
+    """As installed: the script lies beside the Python that runs this test."""
+    phil = Path(sys.executable).with_name("phil")
+    for words, status, said in (
+        (["trainer", "--version"], 0, __version__),
+        (["edge_runtime", "chekc"], 2, "chekc"),
+        (["bridg"], 2, "did you mean bridge?"),
+        ([], 0, "hil_tests"),
+    ):
+        ended = subprocess.run([phil, *words], capture_output=True, text=True)
+        assert ended.returncode == status
+        assert said in ended.stdout + ended.stderr
+
+
+def test_the_installer_shows_examples_that_it_takes():
+    parser = installer._parser()
+    (commands,) = (
+        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+    )
+    for one in [parser, *commands.choices.values()]:
+        text = " ".join(one.format_help().split())
+        _, _, example = text.partition("example: sudo python3 install.pyz ")
+        parser.parse_args(shlex.split(example))
+
+
+@pytest.mark.parametrize("empty", [["--root", ""], ["--root="]], ids=" ".join)
+def test_the_installer_takes_no_empty_root(empty, capsys):
+    """It would be the directory where one stands."""
+    with pytest.raises(SystemExit) as ended:
+        installer.main(["uninstall", *empty])
+    assert ended.value.code == 2
+    assert "an empty value" in capsys.readouterr().err
+
+
+def test_the_installer_takes_a_root_that_ends_with_an_equals_sign():
+    assert installer._parser().parse_args(["uninstall", "--root=/a="]).root == "/a="
+
+
+def test_examples_and_paragraphs_keep_their_lines():
+    parser = ArgumentParser(
+        prog="x", description="One.\n\nTwo\nlines.", epilog=examples("a \\\n    b") + "\n\nAnd\nso."
+    )
+    text = parser.format_help()
+    assert "One.\n\nTwo lines." in text
+    assert text.endswith("examples:\n  a \\\n      b\n\nAnd so.\n")
+
+
+READMES = sorted(
+    {
+        path.relative_to(ROOT)
+        for path in [*ROOT.glob("*.md"), *ROOT.glob("*/README.md"), *ROOT.glob("docs/*.md")]
+        if ".venv" not in path.parts
+    }
+)
+
+
+def test_every_folder_has_one():
+    folders = ("edge_runtime", "bridge", "trainer", "hil_tests", "deploy")
+    assert {Path(folder) / "README.md" for folder in folders} <= set(READMES)
+
+
+def test_the_front_page_is_one_page():
+    assert len((ROOT / "README.md").read_bytes()) <= 8192
+
+
+def anchors(text: str) -> set[str]:
+    """The names that GitHub gives a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", each.lower()).strip().replace(" ", "-") for each in headings}
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))])
+def test_a_link_into_a_page_meets_a_heading(page):
+    for link, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", (ROOT / page).read_text()):
+        target = (ROOT / page).parent / link if link else ROOT / page
+        assert anchor in anchors(target.read_text()), (link, anchor)
+
+
+@pytest.mark.parametrize("readme", READMES, ids=str)
+def test_links_and_kept_files_exist_and_nothing_is_left_to_fill_in(readme):
+    text = (ROOT / readme).read_text()
+    links = re.findall(r"\]\(([^)#:]+)\)", text)
+    kept = re.findall(r"\bresults/[\w./-]+\.(?:onnx|pub|json|csv|md)\b", text)
+    for link in links:
+        assert (ROOT / readme.parent / link).exists(), link
+    for path in kept:
+        assert (ROOT / path).exists(), path
+    assert "<!--" not in text
+
+
+def test_security_names_every_port_that_speaks_plain_text_beside_tls():
+    text = (ROOT / "SECURITY.md").read_text()
+    assert f"`{DEFAULT_ROS2_ENDPOINT}`" in text
+    assert "--vehicle ros2" in text
+
+
+@pytest.mark.parametrize("readme", ["docs/first_day.md", "deploy/README.md"])
+def test_of_two_bundles_the_newest_one_is_pushed(readme, tmp_path):
+    """The command as it stands there, in a shell, with a program that tells its arguments."""
+    (command,) = re.findall(
+        r"^python -m deploy push (?:.*\\\n)*.*$", (ROOT / readme).read_text(), re.M
+    )
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\nfor each in "$@"; do echo "$each"; done\n')
+    python.chmod(0o755)
+    bundles = tmp_path / "build" / "bundles"
+    bundles.mkdir(parents=True)
+    for number, name in enumerate(("b", "a")):
+        path = bundles / f"phil-jetpack5-hunter01-{name}.tar"
+        path.touch()
+        os.utime(path, (number, number))
+    path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
+    told = subprocess.run(
+        ["sh", "-c", command], cwd=tmp_path, env={"PATH": path}, capture_output=True, text=True,
+        check=True,
+    ).stdout.split()  # fmt: skip
+    assert [word for word in told if word.endswith(".tar")] == [
+        "build/bundles/phil-jetpack5-hunter01-a.tar"
+    ]
+
+
+def test_the_table_of_targets_is_that_of_the_bundles():
+    text = (ROOT / "deploy" / "README.md").read_text()
+    for target in TARGETS.values():
+        assert f"| `{target.name}` | {target.python} | {target.machine}, {target.glibc} |" in text
+    assert f"this bundle needs Python {TARGETS['jetpack5'].python} there" in (
+        (ROOT / "docs" / "first_day.md").read_text()
+    )
+
+
+DOCS = ROOT / "docs"
+
+
+def test_the_table_of_pictures_is_that_of_the_command():
+    text = (DOCS / "README.md").read_text()
+    listed = re.findall(r"^\| \[(\S+)\]", text, re.M)
+    assert set(pictures.PICTURES) <= set(listed)
+    assert [name for name in listed if not (DOCS / name).is_file()] == []
+
+
+def test_every_picture_is_small():
+    heavy = [path.name for path in DOCS.glob("*.*") if path.stat().st_size > 2_000_000]
+    assert heavy == []
+
+
+def test_the_guide_in_the_film_brakes_for_the_crash_and_hands_the_wheel_back():
+    env = make_environment("left_turn")
+    driver, expert = (load_driver(name, env)[0] for name in (FILM_POLICY, "expert"))
+    guide = HumanGuide(expert, TRIGGERS["left_turn"](EXPERTS["left_turn"](env)))
+    moments = list(drive_moments(env, driver, guide, int(FILM_SEED), 15.0))
+    taken = [number for number, each in enumerate(moments) if each.intervention]
+    first = moments[taken[0]]
+    assert first.intervention is not None
+    assert (first.intervention.reason, first.action) == ("collision", -1.0)
+    assert all(moments[number].action < 0.0 < moments[number].policy_action for number in taken)
+    assert taken == list(range(taken[0], taken[-1] + 1))
+    assert taken[-1] < len(moments) - 10
+    assert env.distance_m > 20.0
+    with Image.open(DOCS / "take_over.gif") as film:
+        assert len(list(ImageSequence.Iterator(film))) == len(moments)
+
+
+def test_pictures_of_what_is_kept_are_pictures(tmp_path):
+    for make in (policy_sees, success_against_latency):
+        out = tmp_path / f"{make.__name__}.png"
+        make(out, tmp_path)
+        with Image.open(out) as picture:
+            assert min(picture.size) > 400
+            assert len(np.unique(np.asarray(picture.convert("L")))) > 8
+
+
+def test_one_that_cannot_be_made_does_not_keep_the_others_from_it(monkeypatch, tmp_path, capsys):
+    def fail(_out, _work):
+        raise UserError("no viewer here")
+
+    def write(out, _work):
+        out.write_bytes(b"picture")
+
+    monkeypatch.setattr(pictures, "PICTURES", {"a.png": fail, "b.png": write})
+    assert main(["pictures", "--out", str(tmp_path)]) == pictures.SOME_MISSING
+    assert (tmp_path / "b.png").read_bytes() == b"picture"
+    assert capsys.readouterr().err == "a.png: not made: no viewer here\n"
+    assert main(["pictures", "b.png", "--out", str(tmp_path)]) == 0
+
+
+def test_a_viewer_that_ends_as_it_draws_is_said(monkeypatch):
+    monkeypatch.setattr(processes, "_connect_viewer", lambda viewer, _url: viewer)
+    with pytest.raises(UserError, match="mesa-vulkan-drivers"), processes.headless_viewer():
+        raise ConnectionError("transport error")

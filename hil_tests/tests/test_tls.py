@@ -1,0 +1,523 @@
+"""Mutual TLS: who gets a link at all, and what those with a valid certificate may say and hear.
+
+One authority, a certificate in its time, TLS on both ends. What a party without the right says goes
+nowhere, and it hears nothing; a router holds to the same rights as its file says.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from bridge.__main__ import main as bridge
+from bridge.ports import SimulatorPort, open_listener
+from bridge.tests.harness import SLOW_TOY, BridgeProcess, make_policy, read, wait_until_driving
+from deploy.__main__ import main as deploy
+from deploy.certs import CLOCK_SLACK, _pem, issue, read_authority
+from edge_runtime import wire
+from edge_runtime.commands import ask
+from edge_runtime.tests.harness import EdgeProcess, make_state, run_command, wait_until
+from edge_runtime.tls import load_tls, rules_for_edge, rules_for_listener
+from edge_runtime.transport import free_endpoint, look, open_session
+from edge_runtime.util import UserError
+from hil_tests.processes import Process
+
+SETTLE_S = 0.4
+"""Until both ends know of a declaration, and until what must not come would have come."""
+
+
+@pytest.fixture(scope="module")
+def parties(tmp_path_factory):
+    """Certificates for hunter01 and hunter02, and in `foreign` those of another authority."""
+    folder = tmp_path_factory.mktemp("tls") / "certs"
+    vehicles = ["--vehicle-id", "hunter01", "--vehicle-id", "hunter02"]
+    assert deploy(["certs", "--out", str(folder), *vehicles]) == 0
+    assert deploy(["certs", "--out", str(folder / "foreign")]) == 0
+    return folder
+
+
+@contextlib.contextmanager
+def session(
+    endpoint: str, folder: Path | None, mode: str = "client", rules: Any = None
+) -> Iterator[zenoh.Session]:
+    """A session that connects with the files of a folder, plain without one."""
+    tls = None if folder is None else load_tls(folder)
+    opened = open_session(connect=endpoint, mode=mode, tls=tls, access=rules)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+@contextlib.contextmanager
+def listener(endpoint: str, folder: Path, rules: Any) -> Iterator[zenoh.Session]:
+    """A router inside this process."""
+    opened = open_session(listen=endpoint, mode="router", tls=load_tls(folder), access=rules)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+class Intruder:
+    """Says all that it should not about hunter01, and listens for all that it should not hear."""
+
+    def __init__(self, zenoh_session: zenoh.Session) -> None:
+        self._session = zenoh_session
+        self._own_zid = str(zenoh_session.info.zid())
+        self.heard: set[str] = set()
+        self._subscribers = [
+            zenoh_session.declare_subscriber(keys, self._hear, allowed_origin=zenoh.Locality.REMOTE)
+            for keys in ("**", "phil/**", "phil/hunter01/state", "phil/hunter01/command")
+        ]
+        self._tokens = zenoh_session.liveliness().declare_subscriber(
+            "phil/hunter01/*", self._hear, history=True
+        )
+
+    def speak(self) -> None:
+        """Publish a valid message, a broken one and a deletion on every key of hunter01."""
+        state = make_state(10**6, session="intruder")
+        for topic in ("state", "command", "feedback", "health", "scene"):
+            where = f"phil/hunter01/{topic}"
+            for payload in (wire.encode(state), b"broken"):
+                self._session.put(where, payload)
+            self._session.delete(where)
+
+    def ask(self) -> list[str]:
+        """The keys that answered a query for anything of hunter01, or for the router's insides."""
+        found = []
+        for selector in ("phil/hunter01/*", "phil/hunter01/status", "phil/hunter01/rearm"):
+            found += [str(r.ok.key_expr) for r in self._session.get(selector, timeout=1.0) if r.ok]
+        for reply in self._session.get("@/**", timeout=1.0):
+            # A session answers for itself, from its own memory; nobody else may.
+            if reply.ok and self._own_zid not in str(reply.ok.key_expr):
+                found.append(str(reply.ok.key_expr))
+        tokens = self._session.liveliness().get("phil/hunter01/alive", timeout=1.0)
+        return found + [str(reply.ok.key_expr) for reply in tokens if reply.ok]
+
+    def close(self) -> None:
+        for subscriber in (*self._subscribers, self._tokens):
+            subscriber.undeclare()
+
+    def _hear(self, sample: Any) -> None:
+        self.heard.add(str(sample.key_expr))
+
+
+LIFE_S = 2.0
+
+
+def edge_flags(endpoint, folder, files=None):
+    """Flags of `run` for a small unsigned policy."""
+    flags = ["--policy", str(make_policy(folder, "constant", 0.1)), "--allow-unsigned"]
+    return [*flags, "--connect", endpoint, *(["--tls", str(files)] if files else [])]
+
+
+@pytest.fixture(scope="module")
+def endpoint(parties):
+    """Where a router with access control listens."""
+    place = free_endpoint("tls")
+    with listener(place, parties / "router", rules_for_listener(["hunter01"])):
+        yield place
+
+
+def bare_session(endpoint, tls):
+    """Zenoh itself, past all checks of ours: its `transport/link/tls` as given."""
+    config = zenoh.Config()
+    rows = {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "scouting/multicast/enabled": False,
+        "transport/link/tls": tls,
+    }
+    for name, value in rows.items():
+        config.insert_json5(name, json.dumps(value))
+    return zenoh.open(config)
+
+
+def test_zenoh_lets_in_only_who_shows_a_certificate_of_the_authority(parties, endpoint):
+    ca = str(parties / "ca/ca.pem")
+    own, foreign = parties / "viewer", parties / "foreign/viewer"
+
+    def tls(folder):
+        return {
+            "root_ca_certificate": ca,
+            "enable_mtls": True,
+            "connect_certificate": str(folder / "cert.pem"),
+            "connect_private_key": str(folder / "key.pem"),
+        }
+
+    bare_session(endpoint, tls(own)).close()  # So that what follows is refused for its reason.
+    for refused in (tls(foreign), {"root_ca_certificate": ca}):
+        with pytest.raises(zenoh.ZError):
+            bare_session(endpoint, refused)
+    with pytest.raises(zenoh.ZError):
+        bare_session(endpoint.replace("tls/", "tcp/"), {})
+
+
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_our_own_line_says_why(parties, endpoint, mode):
+    mixed = load_tls(parties / "foreign/edge-hunter01")
+    with pytest.raises(UserError, match="not believed here"):
+        open_session(connect=endpoint, mode=mode, tls=mixed)
+    believing = type("Mixed", (type(mixed),), {"ca": str(parties / "ca/ca.pem")})(*mixed)
+    with pytest.raises(UserError, match="refuses the certificate of edge-hunter01"):
+        open_session(connect=endpoint, mode=mode, tls=believing)
+    with pytest.raises(UserError, match="needs certificates"):
+        open_session(connect=endpoint, mode=mode)
+    if mode == "client":
+        with pytest.raises(UserError, match="wants --tls"):
+            open_session(connect=endpoint.replace("tls/", "tcp/"), mode=mode)
+
+
+def test_an_edge_says_that_one_end_only_speaks_tls(parties, endpoint, tmp_path):
+    plain = endpoint.replace("tls/", "tcp/")
+    with EdgeProcess(*edge_flags(plain, tmp_path)) as edge:
+        assert edge.process.stderr is not None
+        line = next(line for line in edge.process.stderr if " waiting " in line)
+        assert f"{plain} listens with TLS and wants --tls" in line
+        assert edge.end() == 0
+    place, files = free_endpoint("tls"), load_tls(parties / "edge-hunter01")
+    simulator = open_session(listen=place.replace("tls/", "tcp/"), mode="router")
+    _, said = look(place, files)
+    simulator.close()
+    assert re.match(f"{place} (does not speak TLS|answers, but not with TLS)", said)
+    assert "connection refused" in look(place, files)[1]
+    assert look(endpoint, files) == (True, "")
+
+
+@pytest.mark.parametrize(
+    ("who", "host", "mode", "as_whom", "match"),
+    [  # or anybody with a certificate could pose as the simulator
+        ("viewer", "127.0.0.1", "peer", "edge-hunter01", "unsuitable certificate purpose"),
+        ("router", "127.0.0.2", "client", "viewer", "IP address mismatch"),
+    ],
+)
+def test_a_listener_needs_a_servers_certificate_of_its_address(
+    parties, who, host, mode, as_whom, match
+):
+    place = free_endpoint("tls").replace("127.0.0.1", host)
+    with (
+        listener(place, parties / who, rules_for_listener(["hunter01"])),
+        pytest.raises(UserError, match=match),
+    ):
+        open_session(connect=place, mode=mode, tls=load_tls(parties / as_whom))
+
+
+def test_who_listens_with_certificates_must_say_who_may_do_what(parties):
+    with pytest.raises(ValueError, match="access control"):
+        open_session(listen=free_endpoint("tls"), mode="router", tls=load_tls(parties / "router"))
+
+
+def test_a_link_ends_when_its_certificate_does(parties, endpoint, tmp_path):
+    folder = tmp_path / "edge-hunter01"
+    shutil.copytree(parties / "edge-hunter01", folder)
+    authority = read_authority(parties / "ca")
+    born = datetime.datetime.now(datetime.UTC) - CLOCK_SLACK
+    life = datetime.timedelta(seconds=LIFE_S)
+    issued = issue(authority, folder.name, "edge", [], born + life, days=1)
+    (folder / "cert.pem").write_bytes(issued.certificate.public_bytes(Encoding.PEM))
+    (folder / "key.pem").write_bytes(_pem(issued.key))
+    with session(endpoint, folder, "peer", rules_for_edge("hunter01")) as edge:
+        assert edge.info.routers_zid()
+        wait_until(lambda: not edge.info.routers_zid(), "the end of the link", LIFE_S + 5)
+    with pytest.raises(UserError, match="expired at"):
+        load_tls(folder)
+
+
+def drive(port, answered, first_step):
+    """Send states until commands have come back for some of them."""
+    answered.clear()
+    for step in range(first_step, first_step + 200):
+        port.publish_state(wire.encode(make_state(step, session=port.session)))
+        time.sleep(0.05)
+        if len(answered) >= 5:
+            return
+    raise AssertionError(f"{len(answered)} commands within 10 s")
+
+
+def start_router(endpoint, parties):
+    words = ("bridge", "router", "--listen", endpoint, "--tls", str(parties / "router"))
+    return Process(*words, ready=f"ready listen={endpoint}")
+
+
+def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(parties, tmp_path):
+    place = free_endpoint("tls")
+    answered: list[bytes] = []
+    with EdgeProcess(*edge_flags(place, tmp_path, parties / "edge-hunter01")) as edge:
+        assert edge.ready_line.startswith("ready")
+        router = start_router(place, parties)
+        with session(place, parties / "simulator-hunter01") as simulator:
+            port = SimulatorPort(simulator, "hunter01")
+            port.on_command(answered.append)
+            port.wait_for_edge(10.0, place)
+            with open_listener(place, "hunter01", 5.0, load_tls(parties / "viewer")) as feed:
+                drive(port, answered, 0)
+                heard = [feed.next(1.0) for _ in range(8)]
+                assert {"state", "command"} <= {each.topic for each in heard if each}
+                assert router.end() == 0
+                router = start_router(place, parties)
+                drive(port, answered, 10**6)
+            port.close()
+        status = ["status", "--connect", place, "--tls", str(parties / "operator-hunter01")]
+        assert run_command(*status).returncode == 0
+        assert edge.end() == 0
+    assert router.end() == 0
+
+
+@pytest.mark.parametrize("name", ["operator-hunter01", "simulator-hunter01"])
+def test_who_may_not_listen_is_told_so_and_not_that_nobody_is_there(parties, name):
+    with (
+        pytest.raises(UserError, match=f"of {name}, and this takes that of viewer"),
+        open_listener(free_endpoint("tls"), "hunter01", 0.0, load_tls(parties / name)),
+    ):
+        pass
+
+
+STRANGERS = ("edge-hunter02", "simulator-hunter02", "operator-hunter02", "viewer")
+FOREIGN = {"malformed", "foreign_session"}
+"""Why the edge runtime rejects what an intruder says, where it arrives."""
+
+
+def drive_among(intruders, endpoint, flags, folder):
+    """Drive while the intruders do their worst.
+
+    Returns the report, the edge's log, and by name what each intruder heard and was answered.
+    """
+    out = folder / "r.json"
+    simulate = ["simulate", "--env", SLOW_TOY, "--episodes", "3", "--listen", endpoint]
+    with (
+        BridgeProcess(*simulate, "--out", str(out), *flags("simulator-hunter01")) as run,
+        EdgeProcess(*edge_flags(endpoint, folder), *flags("edge-hunter01")) as edge,
+    ):
+        wait_until_driving(edge)
+        with contextlib.ExitStack() as opened:
+            present = {
+                name: Intruder(opened.enter_context(session(endpoint, files)))
+                for name, files in intruders.items()
+            }
+            time.sleep(SETTLE_S)
+            for intruder in present.values():
+                intruder.speak()
+            loot = {name: (each.heard, set(each.ask())) for name, each in present.items()}
+            for intruder in present.values():
+                intruder.close()
+        assert run.wait() == 0, run.errors
+        assert edge.end() == 0
+    return read(out), edge.log, loot
+
+
+def test_episodes_over_mutual_tls_among_intruders(parties, tmp_path):
+    endpoint = free_endpoint("tls")
+    report, log, loot = drive_among(
+        {name: parties / name for name in STRANGERS},
+        endpoint,
+        lambda name: ["--tls", str(parties / name)],
+        tmp_path,
+    )
+    assert [row["outcome"] for row in report["per_episode"]] == ["timeout"] * 3
+    # A pause of a busy machine may make a message stale; these are an intruder's only.
+    assert not FOREIGN & set(report["rejected"])
+    assert int(re.findall(r"accepted=(\d+)", log)[-1]) >= 100
+    for name in STRANGERS[:-1]:
+        assert loot[name] == (set(), set()), name
+    heard, answered = loot["viewer"]
+    assert {f"phil/hunter01/{suffix}" for suffix in ("state", "command", "alive")} <= heard
+    assert answered - {"phil/hunter01/alive"} == {"phil/hunter01/status"}
+
+
+def test_without_tls_the_same_intruder_gets_through(tmp_path):
+    """What makes the test above mean something."""
+    endpoint = free_endpoint()
+    report, _, loot = drive_among({"anybody": None}, endpoint, lambda _: [], tmp_path)
+    assert report["rejected_by_simulator"]["malformed"] > 0
+    assert set(report["rejected_by_edge"]) >= FOREIGN
+    heard, answered = loot["anybody"]
+    assert {"phil/hunter01/state", "phil/hunter01/command"} <= heard
+    assert {"phil/hunter01/status", "phil/hunter01/rearm"} <= answered
+
+
+def test_an_operator_re_arms_its_own_vehicle_only(parties):
+    endpoint, calls = free_endpoint("tls"), []
+
+    def rearmed(query):
+        calls.append(str(query.key_expr))
+        query.reply(query.key_expr, b'{"accepted": true}')
+
+    with (
+        listener(endpoint, parties / "router", rules_for_listener(["hunter01", "hunter02"])),
+        session(endpoint, parties / "edge-hunter01", "peer", rules_for_edge("hunter01")) as edge,
+    ):
+        queryable = edge.declare_queryable("phil/hunter01/rearm", rearmed)
+        time.sleep(SETTLE_S)
+        for name in STRANGERS:
+            with pytest.raises(UserError, match=f"{name} may not ask"):
+                ask(endpoint, "hunter01", "rearm", load_tls(parties / name))
+        assert calls == []
+        own = load_tls(parties / "operator-hunter01")
+        assert ask(endpoint, "hunter01", "rearm", own) == {"accepted": True}
+        assert calls == ["phil/hunter01/rearm"]
+        queryable.undeclare()
+
+
+@pytest.mark.parametrize(
+    ("who", "is_believed"), [("simulator-hunter01", True), ("simulator-hunter02", False)]
+)
+def test_an_edge_takes_no_states_from_another_vehicles_simulator(parties, who, is_believed):
+    """Its certificate is a server's of the same authority: TLS alone would let it pose."""
+    endpoint = free_endpoint("tls")
+    states: list[object] = []
+    with (
+        listener(endpoint, parties / who, rules_for_listener(["hunter01"])) as simulator,
+        session(endpoint, parties / "edge-hunter01", "peer", rules_for_edge("hunter01")) as edge,
+    ):
+        subscriber = edge.declare_subscriber("phil/hunter01/state", states.append)
+        time.sleep(SETTLE_S)
+        simulator.put("phil/hunter01/state", b"go")
+        time.sleep(SETTLE_S)
+        subscriber.undeclare()
+    assert len(states) == int(is_believed)
+
+
+@pytest.mark.parametrize("is_there_first", [True, False])
+def test_another_vehicles_simulator_ends_no_edge_by_a_forged_token(
+    parties, tmp_path, is_there_first
+):
+    """Posing as the server, it claims that an elder runtime has this vehicle's id."""
+    endpoint, anything_goes = free_endpoint("tls"), {"enabled": False}
+    flags = edge_flags(endpoint, tmp_path, parties / "edge-hunter01")
+    with contextlib.ExitStack() as opened:
+        edge = None if is_there_first else opened.enter_context(EdgeProcess(*flags))
+        posing = listener(endpoint, parties / "simulator-hunter02", anything_goes)
+        liveliness = opened.enter_context(posing).liveliness()
+        tokens = [
+            liveliness.declare_token(f"phil/hunter01/alive{claim}") for claim in ("", "/0-elder")
+        ]
+        edge = edge or opened.enter_context(EdgeProcess(*flags))
+        assert edge.ready_line.startswith("ready ")
+        time.sleep(4 * SETTLE_S)  # it looks twice within a second of the link
+        assert edge.end() == 0
+        for token in tokens:
+            token.undeclare()
+    assert "another" not in edge.log
+
+
+@pytest.mark.parametrize("who", ["simulator-hunter01", "router"])
+def test_a_second_runtime_is_still_refused_over_tls(parties, tmp_path, who):
+    """What the test above must not have broken."""
+    endpoint = free_endpoint("tls")
+    flags = edge_flags(endpoint, tmp_path, parties / "edge-hunter01")
+    with (
+        listener(endpoint, parties / who, rules_for_listener(["hunter01"])),
+        EdgeProcess(*flags) as edge,
+    ):
+        second = run_command("run", *flags)
+        assert second.returncode == 2
+        assert "another edge runtime is connected" in second.stderr
+        assert edge.end() == 0
+
+
+VEHICLES = ("hunter01", "hunter02")
+
+
+def router_file(endpoint, parties, out, rights=True):
+    words = ["router", "--listen", endpoint, "--tls", str(parties / "router"), "--out", str(out)]
+    assert deploy([*words, *(word for each in VEHICLES for word in ("--vehicle-id", each))]) == 0
+    settings = json.loads(out.read_text())
+    settings["access_control"]["enabled"] = rights
+    out.write_text(json.dumps(settings))
+    return str(out)
+
+
+@pytest.mark.parametrize(
+    ("rights", "heard"),
+    # Without rights, too: what makes the first row mean something.
+    [(True, {"phil/hunter01/state"}), (False, {f"phil/{each}/state" for each in VEHICLES})],
+)
+def test_a_vehicle_at_a_router_hears_only_its_own(parties, tmp_path, rights, heard):
+    endpoint, found = free_endpoint("tls"), []
+    path = router_file(endpoint, parties, tmp_path / "r.json5", rights)
+    with (
+        Process("bridge", "router", "--config", path, ready="ready"),
+        contextlib.ExitStack() as opened,
+    ):
+        edge, *simulators = (
+            opened.enter_context(session(endpoint, parties / name))
+            for name in ("edge-hunter01", *(f"simulator-{each}" for each in VEHICLES))
+        )
+        subscribers = [
+            edge.declare_subscriber(key, lambda sample: found.append(str(sample.key_expr)))
+            for key in ("phil/**", "phil/hunter01/state", "phil/hunter02/state")
+        ]
+        time.sleep(SETTLE_S)
+        for simulator, vehicle in zip(simulators, VEHICLES, strict=True):
+            simulator.put(f"phil/{vehicle}/state", b"go")
+        time.sleep(SETTLE_S)
+        for subscriber in subscribers:
+            subscriber.undeclare()
+    assert set(found) == heard
+
+
+def test_a_routers_file_names_the_vehicles_of_both_options(parties, tmp_path, capsys):
+    listed, out = tmp_path / "fleet.txt", tmp_path / "router.json5"
+    listed.write_text("# the yard\nhunter02\n\nhunter03  # at the gate\n")
+    words = ["router", "--listen", "tls/127.0.0.1:7447", "--tls", str(parties / "router")]
+    words += ["--vehicle-id", "hunter01", "--vehicles", str(listed), "--out", str(out)]
+    assert deploy(words) == 0
+    assert "3 vehicles" in capsys.readouterr().out
+    settings = json.loads(out.read_text())
+    rules = settings["access_control"]
+    names = {subject["id"] for subject in rules["subjects"]}
+    assert names >= {f"edge-hunter0{i}" for i in (1, 2, 3)}
+    assert (rules["enabled"], rules["default_permission"]) == (True, "deny")
+    assert settings["mode"] == "router"
+    assert settings["listen"]["endpoints"] == ["tls/127.0.0.1:7447"]
+    tls = settings["transport"]["link"]["tls"]
+    assert tls["enable_mtls"] is True
+    assert tls["listen_certificate"] == str(parties / "router" / "cert.pem")
+    assert settings["transport"]["link"]["protocols"] == ["tls", "quic"]
+    assert settings["scouting"]["multicast"]["enabled"] is False
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (["--listen", "tcp/127.0.0.1:7447"], "plain text"),
+        (["--tls", "viewer"], "certificate of viewer"),
+        (["--vehicle-id", "a/b"], "not valid"),
+        (["--vehicles", "nowhere.txt"], "does not exist"),
+        (["--out", "/dev/null/r.json5"], "Not a directory"),
+    ],
+)
+def test_a_routers_file_is_refused_where_it_would_not_hold(parties, tmp_path, change, says):
+    options = {
+        "--listen": "tls/127.0.0.1:7447",
+        "--tls": "router",
+        "--vehicle-id": "hunter01",
+        "--out": str(tmp_path / "r.json5"),
+    }
+    options |= dict([change])
+    options["--tls"] = str(parties / options["--tls"])
+    with pytest.raises(UserError, match=says):
+        deploy(["router", *(word for pair in options.items() for word in pair)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_router_says_what_is_wrong_with_its_file(tmp_path):
+    path = tmp_path / "r.json5"
+    path.write_text('{"mode": "router", "nonsense": 3}')
+
+    with pytest.raises(UserError, match="nonsense"):
+        bridge(["router", "--config", str(path)])
+    with pytest.raises(UserError, match="no other option"):
+        bridge(["router", "--config", str(path), "--listen", free_endpoint()])
