@@ -17,11 +17,13 @@ from bridge.environments import (
     CONDITIONS,
     NOMINAL,
     SCENARIOS,
+    EpisodeRunner,
     make_environment,
+    policy_action,
     scenario_of,
     task_of,
+    vehicle_action,
 )
-from bridge.episode import EpisodeRunner, policy_action, vehicle_action
 from bridge.inbound import CommandCheck, FeedbackCheck
 from bridge.ports import SimulatorPort, open_port
 from bridge.report import episode_line, make_report, rejections, summary_line

@@ -22,6 +22,7 @@ import rerun.blueprint as rrb
 
 from bridge.messages import SeenScene, read_scene
 from bridge.report import GOAL
+from bridge.rerun import flush
 from bridge.rerun.draw import (
     ALL_OF_IT,
     BLUE,
@@ -38,7 +39,6 @@ from bridge.rerun.draw import (
     style_lines,
     style_points,
 )
-from bridge.rerun.sinks import flush
 from edge_runtime.util import counted
 from trainer.human.guide import Reason
 from trainer.learner.networks import Critic

@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 
 from bridge.messages import Pace
-from bridge.rerun.draw import PICTURE_INTERVAL_S
-from bridge.rerun.sinks import (
+from bridge.rerun import (
     SERVE,
     Sink,
     ViewerGone,
@@ -36,6 +35,7 @@ from bridge.rerun.sinks import (
     open_sink,
     read_sink,
 )
+from bridge.rerun.draw import PICTURE_INTERVAL_S
 from edge_runtime.cli import examples, sigterm_as_interrupt
 from edge_runtime.util import counted
 from trainer.drawing import (

@@ -17,9 +17,19 @@ from bridge.commands import add_options, wait_to_be_told
 from bridge.messages import DECODERS, Heard, Pace, Scene
 from bridge.ports import open_listener
 from bridge.recording import Recording, read_heard
-from bridge.rerun import APPLIED, POLICY, draw
+from bridge.rerun import (
+    APPLIED,
+    POLICY,
+    SERVE,
+    Sink,
+    add_sink,
+    check_sink,
+    chosen_sink,
+    draw,
+    flush,
+    open_sink,
+)
 from bridge.rerun.draw import Plot
-from bridge.rerun.sinks import SERVE, Sink, add_sink, check_sink, chosen_sink, flush, open_sink
 from bridge.virtual_link import SILENCE_LIMIT_S
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt

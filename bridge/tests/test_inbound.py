@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode import vehicle_action
+from bridge.environments import vehicle_action
 from bridge.inbound import (
     NO_FEEDBACK,
     SELF_BRAKING,

@@ -17,10 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
+import bridge.rerun
 from bridge.messages import Pace, SeenCar, SeenScene, read_scene
-from bridge.rerun import sinks
+from bridge.rerun import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.draw import outline, view_bounds
-from bridge.rerun.sinks import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.wire_view import Timeline
 from bridge.tests.viewers import NO_GPU, in_place, listens
 from edge_runtime.util import UserError
@@ -169,8 +169,8 @@ def test_a_page_is_told_of_when_it_answers(kind, tmp_path, monkeypatch, capsys):
     ):
         (address,) = re.findall(r"http://([\d.]+):(\d+)/", capsys.readouterr().out)
         assert listens(*address)
-        assert listens("127.0.0.1", sinks.GRPC_PORT)
-        assert not listens("127.0.0.2", sinks.GRPC_PORT), "loopback's first address only"
+        assert listens("127.0.0.1", bridge.rerun.GRPC_PORT)
+        assert not listens("127.0.0.2", bridge.rerun.GRPC_PORT), "loopback's first address only"
         recording.log("speed", rr.Scalars(3.0))
     end_s = time.monotonic() + 5.0
     while listens(*address):
@@ -184,7 +184,7 @@ def test_a_window_listens_on_loopback_only_and_stays_open(tmp_path, monkeypatch)
         ports.append(free_port())
         return ports[-1]
 
-    monkeypatch.setattr(sinks, "free_port", remembered)
+    monkeypatch.setattr(bridge.rerun, "free_port", remembered)
     with in_place("works", tmp_path, monkeypatch):
         show("spawn")
         show("spawn")
@@ -213,7 +213,7 @@ def test_a_viewer_that_is_gone_is_one_plain_error(where, kind, why, tmp_path, mo
 
 def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
     """A scenario needs a colour of the view, and not the view; an evaluation needs no network."""
-    taken = ("messages", "network", "recording", "report", "virtual_link", "rerun.sinks")
+    taken = ("messages", "network", "recording", "report", "virtual_link", "rerun")
     code = "import sys\n" + "".join(f"import bridge.{name}\n" for name in taken)
     code += "assert not {'zenoh', 'rerun', 'gymnasium'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
