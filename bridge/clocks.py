@@ -68,6 +68,9 @@ class Clock:
         self._publish = publish
         self._check = check
         self._spec = spec
+        self._hold = CommandHold(now_s=0.0)
+        # Real time's delay line and ticks share what this guards; lock-step has one thread.
+        self._arrived = threading.Condition()
         self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
@@ -84,7 +87,9 @@ class Clock:
 
     def newest_answer(self) -> tuple[int, float] | None:
         """The newest state of this episode that was answered, and its latency in ms."""
-        raise NotImplementedError
+        with self._arrived:
+            step = self._hold.newest_step
+            return None if step < 0 else (step, self.latencies_ms[-1])
 
     def finish(self, state: State) -> None:
         """Send the final state at once, and forget whatever is still under way.
@@ -92,7 +97,9 @@ class Clock:
         It says that the simulation has ended, which no radio link carries: no delay or loss is
         injected, and no answer is awaited.
         """
-        raise NotImplementedError
+        with self._arrived:
+            self._check.end(state.step, self._hold.newest_step)
+        self._publish(encode(_stamp(state)))
 
     def close(self) -> None:
         """Stop any thread."""
@@ -114,6 +121,7 @@ class LockStepClock(Clock):
             on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
             on_stale=lambda: self._check.reject(Reason.STALE.value),
         )
+        self._hold = self._link.hold
         self._answered_at_s: float | None = None
         self._edge_silent = False
 
@@ -128,16 +136,6 @@ class LockStepClock(Clock):
         while arrival := self._link.next_at_edge():
             self._arrive_at_edge(arrival)
         return self._link.decide(self._wall_silence_s())
-
-    def newest_answer(self) -> tuple[int, float] | None:
-        """The newest state of this episode that was answered, and its latency in ms."""
-        step = self._link.hold.newest_step
-        return None if step < 0 else (step, self.latencies_ms[-1])
-
-    def finish(self, state: State) -> None:
-        """Publish the final state at once; no answer to it is awaited."""
-        self._check.end(state.step, self._link.hold.newest_step)
-        self._publish(encode(_stamp(state)))
 
     def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
@@ -188,22 +186,20 @@ class LockStepClock(Clock):
 
     def _wall_silence_s(self) -> float | None:
         """Wall time without an answer (s), if the last state really published got none."""
-        if not self._edge_silent:
-            return None
-        answered_at_s = self._answered_at_s
-        return SILENCE_LIMIT_S if answered_at_s is None else time.monotonic() - answered_at_s
+        if self._edge_silent and self._answered_at_s is not None:
+            return time.monotonic() - self._answered_at_s
+        return SILENCE_LIMIT_S if self._edge_silent else None
 
 
 class RealTimeClock(Clock):
     """The clock of ``--clock realtime``.
 
     The caller's thread runs the ticks, Zenoh's hands in commands, the delay line's delivers both
-    directions. The condition guards everything that the delay line and the ticks share.
+    directions.
     """
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self._line = DelayLine()
-        self._arrived = threading.Condition()
         super().__init__(publish, check, spec)
 
     def begin(self, episode: int, seed: int) -> None:
@@ -230,18 +226,10 @@ class RealTimeClock(Clock):
             )
             return self._hold.decide(time.monotonic())
 
-    def newest_answer(self) -> tuple[int, float] | None:
-        """The newest state of this episode that was answered, and its latency in ms."""
-        with self._arrived:
-            step = self._hold.newest_step
-            return None if step < 0 else (step, self.latencies_ms[-1])
-
     def finish(self, state: State) -> None:
         """Forget what is under way and publish the final state at once."""
         self._line.clear()
-        with self._arrived:
-            self._check.end(state.step, self._hold.newest_step)
-        self._publish(encode(_stamp(state)))
+        super().finish(state)
 
     def close(self) -> None:
         """Stop the delay line."""
@@ -409,8 +397,6 @@ class VehicleClock(RealTimeClock):
         return False
 
 
-REALTIME = "realtime"
-CLOCKS: dict[str, type[Clock]] = {"lockstep": LockStepClock, REALTIME: RealTimeClock}
 Action = Callable[[], None]
 
 
@@ -470,3 +456,7 @@ class DelayLine:
                 next_s = self._heap.next_arrival_s()
                 self._changed.wait(None if next_s is None else next_s - time.monotonic())
         return None
+
+
+REALTIME = "realtime"
+CLOCKS: dict[str, type[Clock]] = {"lockstep": LockStepClock, REALTIME: RealTimeClock}

@@ -61,17 +61,13 @@ class SimulatorPort:
         self._scenes = zenoh_session.declare_publisher(scenes, congestion_control=drop)
         token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
         self._declared: list[Any] = [self._states, self._scenes, token]
-        self._subscribe("health", self.edge_counts.observe_message)
+        self.hear("health", self.edge_counts.observe_message)
 
-    def on_command(self, handler: PayloadHandler) -> None:
-        """Call ``handler(payload)`` for every command, on Zenoh's thread: it must be quick."""
-        self._subscribe("command", handler)
+    def hear(self, topic: str, handler: PayloadHandler) -> None:
+        """Call ``handler(payload)`` for every message of the vehicle's topic.
 
-    def on_feedback(self, handler: PayloadHandler) -> None:
-        """Call ``handler(payload)`` for every feedback of the vehicle, as ``on_command`` does."""
-        self._subscribe("feedback", handler)
-
-    def _subscribe(self, topic: str, handler: PayloadHandler) -> None:
+        It is called on Zenoh's thread: it must be quick.
+        """
         own = key(self.vehicle_id, topic)
         hear = only_own(own, lambda sample: handler(sample.payload.to_bytes()))
         self._declared.append(self._zenoh.declare_subscriber(own, hear))
@@ -83,10 +79,7 @@ class SimulatorPort:
     def publish_scene(self, environment: Any, stamps: Stamps) -> None:
         """Send the scene, if the environment has one and anybody is listening."""
         somebody: Any = self._scenes.matching_status
-        if not somebody.matching:
-            return
-        scene = scene_of(environment)
-        if scene is not None:
+        if somebody.matching and (scene := scene_of(environment)) is not None:
             self._scenes.put(encode_scene(scene, stamps))
 
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
@@ -194,10 +187,6 @@ class WireListener:
             elif self.simulator_gone.is_set():
                 return
 
-    def now_ns(self) -> int:
-        """Return the clock of ``Heard.arrived_ns``."""
-        return self._zero_ns + time.monotonic_ns()
-
     def hearer(self, topic: str) -> Callable[[zenoh.Sample], None]:
         """Return the subscriber callback of one topic."""
 
@@ -207,7 +196,7 @@ class WireListener:
             size = len(sample.payload)
             # A flood of huge messages must not fill the memory.
             payload = sample.payload.to_bytes() if size <= MAX_PAYLOAD_BYTES else b""
-            self._put(Heard(str(sample.key_expr), topic, payload, self.now_ns(), size))
+            self._put(str(sample.key_expr), topic, payload, size)
 
         return hear
 
@@ -218,7 +207,7 @@ class WireListener:
             key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
             if topic == "simulator":
                 self._note_simulator(key, here)
-            self._put(Heard(key, topic, bytes([here]), self.now_ns(), 1))
+            self._put(key, topic, bytes([here]), size=1)
 
         return change
 
@@ -227,14 +216,15 @@ class WireListener:
             self._simulators.add(key)
             self.simulator_gone.clear()
             self.simulator_seen.set()
-            return
-        self._simulators.discard(key)
-        if not self._simulators:
-            self.simulator_gone.set()
+        else:
+            self._simulators.discard(key)
+            if not self._simulators:
+                self.simulator_gone.set()
 
-    def _put(self, heard: Heard) -> None:
+    def _put(self, key: str, topic: str, payload: bytes, size: int) -> None:
+        arrived_ns = self._zero_ns + time.monotonic_ns()
         try:
-            self._queue.put_nowait(heard)
+            self._queue.put_nowait(Heard(key, topic, payload, arrived_ns, size))
         except queue.Full:
             self.dropped += 1
 
@@ -265,10 +255,10 @@ def open_listener(
         try:
             # A listener to a vehicle that is not there would never see it go, nor end.
             if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
-                hint = "start one: python -m bridge simulate"
-                if vehicle_id != ANY_VEHICLE:
-                    hint = "name it with --vehicle-id"
-                which = "" if vehicle_id == ANY_VEHICLE else f" with vehicle id {vehicle_id}"
+                if vehicle_id == ANY_VEHICLE:
+                    which, hint = "", "start one: python -m bridge simulate"
+                else:
+                    which, hint = f" with vehicle id {vehicle_id}", "name it with --vehicle-id"
                 raise UserError(f"no simulator{which} at {connect}; {hint}")
             yield listener
         finally:

@@ -26,7 +26,7 @@ import sys
 import time
 import typing
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -206,12 +206,12 @@ class RecordingWriter:
         if isinstance(message, wire.State):
             # The frames lie one after the other: in memory that is one picture, twice as high.
             count, height, width = wire.FRAMES_SHAPE
-            size, at = (width, count * height), heard.arrived_ns
+            size, at = (width, count * height), _stamp(heard.arrived_ns)
             picture = RawImage(at, *size, "mono8", width, message.frames, _vehicle_id(heard))
             self._copy(heard, "frames", picture)
 
     def _event(self, heard: Heard, level: Level, text: str) -> None:
-        self._copy(heard, "events", Log(heard.arrived_ns, level, text, _vehicle_id(heard)))
+        self._copy(heard, "events", Log(_stamp(heard.arrived_ns), level, text, _vehicle_id(heard)))
 
     def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
         """Add what viewers can draw, to the vehicle's topic of that name."""
@@ -221,7 +221,10 @@ class RecordingWriter:
             schema_id = self._mcap.register_schema(schema.name, "protobuf", schema.descriptors)
             self._schemas[kind] = schema, schema_id
         schema, schema_id = self._schemas[kind]
-        data = fill(schema.make(), values).SerializeToString()
+        known = schema.make.DESCRIPTOR.fields_by_name
+        fields = msgspec.to_builtins(values, builtin_types=(bytes,)).items()
+        drawn = {name: value for name, value in fields if name in known}
+        data = schema.make(**drawn).SerializeToString()
         topic = f"view/{_vehicle_id(heard)}/{name}"
         self._add(topic, "protobuf", heard.arrived_ns, data, schema_id)
 
@@ -301,8 +304,8 @@ class FlushedFile:
 
 Field: Any = descriptor_pb2.FieldDescriptorProto
 TIMESTAMP = "google.protobuf.Timestamp"
-Time = Annotated[int, TIMESTAMP]
-"""Nanoseconds since 1970."""
+Time = Annotated[dict[str, int], TIMESTAMP]
+"""As `_stamp` makes it."""
 Fixed32 = Annotated[int, Field.TYPE_FIXED32]
 Data = Annotated[bytes, Field.TYPE_BYTES]
 _SCALARS = {
@@ -342,6 +345,11 @@ class Log(msgspec.Struct):
     name: str
 
 
+def _stamp(time_ns: int) -> dict[str, int]:
+    """Nanoseconds since 1970 as protobuf's timestamp has them."""
+    return dict(zip(("seconds", "nanos"), divmod(time_ns, 10**9), strict=True))
+
+
 class Schema(NamedTuple):
     """A protobuf message type: its full name, its class, and its serialised FileDescriptorSet."""
 
@@ -374,55 +382,34 @@ def describe(kind: type[msgspec.Struct]) -> Schema:
     return Schema(name, make, files.SerializeToString())
 
 
-def fill(target: Any, values: msgspec.Struct) -> Any:
-    """Copy the fields that both have into the protobuf message, and return it."""
-    for descriptor in target.DESCRIPTOR.fields:
-        value, own = getattr(values, descriptor.name), getattr(target, descriptor.name)
-        if isinstance(value, Mapping):
-            own.update(value)
-        elif isinstance(value, list | tuple):
-            for one in value:
-                fill(own.add(), one) if isinstance(one, msgspec.Struct) else own.append(one)
-        elif descriptor.message_type is not None:
-            own.FromNanoseconds(value)
-        elif value is not None:
-            setattr(target, descriptor.name, value)
-    return target
-
-
-def _add_struct(message: Any, kind: type[msgspec.Struct], path: str) -> None:
-    message.name = kind.__name__
+def _add_struct(message: Any, kind: type[msgspec.Struct], package: str) -> None:
+    message.name, path = kind.__name__, f"{package}.{kind.__name__}"
     hints = typing.get_type_hints(kind, include_extras=True)
     for number, (name, hint) in enumerate(hints.items(), start=1):
-        field = Field(name=name, number=number, label=Field.LABEL_OPTIONAL)
-        if _type_field(field, _without_none(hint), message, f"{path}.{kind.__name__}"):
-            message.field.append(field)
-
-
-def _type_field(field: Any, hint: Any, message: Any, path: str) -> bool:
-    """Fill in the type; False where the viewers' copy goes without this field."""
-    origin, inner = typing.get_origin(hint), typing.get_args(hint)
-    if hint in _SCALARS:
-        field.type = _SCALARS[hint]
-    elif hint == Time:
-        field.type, field.type_name = Field.TYPE_MESSAGE, f".{TIMESTAMP}"
-    elif origin is dict:
-        field.label, field.type = Field.LABEL_REPEATED, Field.TYPE_MESSAGE
-        field.type_name = f".{path}.{_add_map_entry(message, field.name, inner)}"
-    elif origin in (list, Sequence):
-        field.label = Field.LABEL_REPEATED
-        return typing.get_origin(inner[0]) is None and _type_field(field, inner[0], message, path)
-    elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
-        _add_struct(message.nested_type.add(), hint, path)
-        field.type, field.type_name = Field.TYPE_MESSAGE, f".{path}.{hint.__name__}"
-    elif isinstance(hint, type) and issubclass(hint, enum.IntEnum):
-        levels = message.enum_type.add(name=hint.__name__)
-        for one in hint:
-            levels.value.add(name=one.name, number=one.value)
-        field.type, field.type_name = Field.TYPE_ENUM, f".{path}.{hint.__name__}"
-    else:
-        return False
-    return True
+        inner = typing.get_args(hint)
+        if type(None) in inner:
+            hint = inner[0]
+        field = message.field.add(name=name, number=number, label=Field.LABEL_OPTIONAL)
+        origin, inner = typing.get_origin(hint), typing.get_args(hint)
+        if origin in (dict, list, Sequence):
+            field.label, hint = Field.LABEL_REPEATED, inner[0]
+        if origin is dict:
+            field.type = Field.TYPE_MESSAGE
+            field.type_name = f".{path}.{_add_map_entry(message, name, inner)}"
+        elif hint in _SCALARS:
+            field.type = _SCALARS[hint]
+        elif hint == Time:
+            field.type, field.type_name = Field.TYPE_MESSAGE, f".{TIMESTAMP}"
+        elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+            _add_struct(message.nested_type.add(), hint, path)
+            field.type, field.type_name = Field.TYPE_MESSAGE, f".{path}.{hint.__name__}"
+        elif hint is Level:
+            levels = message.enum_type.add(name=hint.__name__)
+            for one in hint:
+                levels.value.add(name=one.name, number=one.value)
+            field.type, field.type_name = Field.TYPE_ENUM, f".{path}.{hint.__name__}"
+        else:
+            del message.field[-1]
 
 
 def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
@@ -433,12 +420,6 @@ def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
     for number, (label, kind) in enumerate(zip(("key", "value"), inner, strict=True), start=1):
         entry.field.add(name=label, number=number, label=Field.LABEL_OPTIONAL, type=_SCALARS[kind])
     return entry_name
-
-
-def _without_none(hint: Any) -> Any:
-    inner = [part for part in typing.get_args(hint) if part is not type(None)]
-    is_optional = type(None) in typing.get_args(hint) and len(inner) == 1
-    return inner[0] if is_optional else hint
 
 
 KEPT = ".damaged"

@@ -391,7 +391,7 @@ class _Live:
         self._answers: Answers = {}
 
     def replay(self, states: Iterable[tuple[State, Exchange]]) -> Answers:
-        self._port.on_command(self._inbox.put)
+        self._port.hear("command", self._inbox.put)
         zero_s: float | None = None
         last_s = 0.0
         for state, exchange in states:

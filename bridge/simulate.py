@@ -119,11 +119,11 @@ def _serve(asked: Namespace, environment: gymnasium.Env[Any, Any]) -> dict[str, 
             clock = CLOCKS[asked.clock](port.publish_state, check, asked.latency)
         with contextlib.closing(clock), progress_bar("episodes") as progress:
             bar = EpisodeBar(progress, asked.episodes)
-            port.on_command(clock.receive)
+            port.hear("command", clock.receive)
             port.wait_for_edge(wait_s, endpoint)
             manifest = port.edge_manifest()
             if isinstance(clock, VehicleClock):
-                port.on_feedback(clock.receive_feedback)
+                port.hear("feedback", clock.receive_feedback)
                 clock.wait_for_vehicle(wait_s, asked.vehicle_id)
             return _drive(asked, environment, port, clock, check, bar, manifest)
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bridge.rerun import APPLIED, HUMAN, POLICY
+from bridge.rerun import APPLIED, HUMAN, POLICY, flush
 
 # isort: split
 import rerun as rr
@@ -22,7 +22,6 @@ import rerun.blueprint as rrb
 
 from bridge.messages import SeenScene, read_scene
 from bridge.report import GOAL
-from bridge.rerun import flush
 from bridge.rerun.draw import (
     ALL_OF_IT,
     BLUE,

@@ -38,8 +38,8 @@ def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
     _, router, client = sessions
     port = SimulatorPort(router, "v1")
     heard: list[bytes] = []
-    port.on_command(heard.append)
-    port.on_feedback(heard.append)
+    port.hear("command", heard.append)
+    port.hear("feedback", heard.append)
     time.sleep(HEARS_S)
     for topic in ("command", "feedback", "health"):
         put_wildly(client, topic)
