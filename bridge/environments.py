@@ -12,6 +12,7 @@ import importlib.metadata
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -109,13 +110,11 @@ def load_plugin(environment_id: str) -> None:
     if ":" in environment_id or environment_id in gymnasium.registry:
         return
     wanted = environment_id.rpartition("/")[0]
-    for plugin in importlib.metadata.entry_points(group=PLUGIN_GROUP):
-        space = "" if plugin.name == ROOT else plugin.name
-        if space == wanted:
-            register = plugin.load()
-            with namespace(space) if space else contextlib.nullcontext():
-                if callable(register):  # A module has registered them by being imported.
-                    register()
+    for plugin in importlib.metadata.entry_points(group=PLUGIN_GROUP, name=wanted or ROOT):
+        register = plugin.load()
+        with namespace(wanted) if wanted else contextlib.nullcontext():
+            if callable(register):  # A module has registered them by being imported.
+                register()
 
 
 def _check_spaces(environment: gymnasium.Env[Any, Any], name: str) -> None:
@@ -204,41 +203,33 @@ OnTick = Callable[[int, int, Decision], None]
 """Called with episode, step, decision after every tick."""
 
 
+@dataclass
 class EpisodeRunner:
     """Drives one environment through a clock and keeps what the report needs."""
 
-    def __init__(
-        self,
-        environment: gymnasium.Env[Any, Any],
-        clock: Clock,
-        session: str,
-        publish_scene: PublishScene,
-        on_tick: OnTick,
-        apply: Apply = policy_action,
-        standing: bool = False,
-        rejected: Callable[[], Mapping[str, int]] = dict,
-        task: str = "",
-    ) -> None:
+    environment: Environment
+    clock: Clock
+    session: str
+    publish_scene: PublishScene
+    on_tick: OnTick
+    apply: Apply = policy_action
+    standing: bool = False
+    rejected: Callable[[], Mapping[str, int]] = dict
+    task: str = ""
+
+    def __post_init__(self) -> None:
         self.safe_stops = SafeStopLog(CONTROL_PERIOD_S)
         self.deadline_misses = 0
         self.command_ages_ms: list[float] = []
         """Of the command that the vehicle obeyed, for each tick in which it obeyed one."""
         self._under_way: State | None = None
-        self._environment = environment
-        self._clock = clock
-        self._session = session
-        self._publish_scene = publish_scene
-        self._on_tick = on_tick
-        self._apply = apply
-        self._rejected = rejected
-        self._task = task or msgspec.UNSET
-        self._options = {"standing": True} if standing else None
+        self._options = {"standing": True} if self.standing else None
 
     def show_task(self, seed: int) -> None:
         """Send one state, the final one already, so that the edge runtime compares it as well."""
-        observation, info = self._environment.reset(seed=seed, options=self._options)
-        self._clock.begin(0, seed)
-        self._clock.finish(self._state(0, 0, observation, info, final=True))
+        observation, info = self.environment.reset(seed=seed, options=self._options)
+        self.clock.begin(0, seed)
+        self.clock.finish(self._state(0, 0, observation, info, final=True))
 
     def run(self, episode: int, seed: int) -> EpisodeResult:
         """Drive one episode to its end; the seed decides the environment and the link.
@@ -250,15 +241,13 @@ class EpisodeRunner:
         try:
             return self._drive(episode, seed)
         except BaseException:
-            if self._under_way is not None:
-                cut = self._under_way
-                final = msgspec.structs.replace(cut, step=cut.step + 1, final=True)
-                self._clock.finish(final)
+            if (cut := self._under_way) is not None:
+                self.clock.finish(msgspec.structs.replace(cut, step=cut.step + 1, final=True))
             raise
 
     def _drive(self, episode: int, seed: int) -> EpisodeResult:
-        observation, info = self._environment.reset(seed=seed, options=self._options)
-        self._clock.begin(episode, seed)
+        observation, info = self.environment.reset(seed=seed, options=self._options)
+        self.clock.begin(episode, seed)
         result = EpisodeResult(seed, "", 0.0, 0.0, 0.0, 0.0, 0.0, 0)
         lateral_mps2: list[float] = []
         longitudinal_mps2: list[float] = []
@@ -267,14 +256,14 @@ class EpisodeRunner:
             state = self._state(episode, result.steps, observation, info)
             self._show(state)
             self._under_way = state
-            decision = self._clock.exchange(state)
+            decision = self.clock.exchange(state)
             if decision.brake_reason == Event.OTHER_TASK.value:
                 raise UserError(
                     "the edge runtime's policy is for another task than this environment"
-                    f" ({self._task}); start it with a policy of this one"
+                    f" ({self.task}); start it with a policy of this one"
                 )
-            action = self._apply(self._environment, decision)
-            observation, reward, terminated, truncated, info = self._environment.step(action)
+            action = self.apply(self.environment, decision)
+            observation, reward, terminated, truncated, info = self.environment.step(action)
             result.steps += 1
             result.actions.append([float(value) for value in action])
             result.reward += _finite("reward", reward)
@@ -285,7 +274,7 @@ class EpisodeRunner:
             ended = bool(terminated or truncated)
         final = self._state(episode, result.steps, observation, info, final=True)
         self._show(final)
-        self._clock.finish(final)
+        self.clock.finish(final)
         self._under_way = None
         result.outcome = str(info.get("outcome") or "ended")
         result.distance_m = _number(info, "distance_m")
@@ -303,7 +292,7 @@ class EpisodeRunner:
         final: bool = False,
     ) -> State:
         return State(
-            session=self._session,
+            session=self.session,
             episode=episode,
             step=step,
             sim_time_s=round(step * CONTROL_PERIOD_S, 6),
@@ -311,31 +300,28 @@ class EpisodeRunner:
             frames=np.ascontiguousarray(observation, dtype=np.uint8).tobytes(),
             speed_mps=_speed_mps(info),
             final=final,
-            task=self._task,
+            task=self.task or msgspec.UNSET,
         )
 
     def _show(self, state: State) -> None:
-        step, round_trip_ms = self._clock.newest_answer() or (None, None)
+        step, round_trip_ms = self.clock.newest_answer() or (None, None)
         stamps = Stamps(
-            state.episode, state.step, state.sim_time_s, round_trip_ms, step, self._rejected()
+            state.episode, state.step, state.sim_time_s, round_trip_ms, step, self.rejected()
         )
-        self._publish_scene(self._environment, stamps)
+        self.publish_scene(self.environment, stamps)
 
     def _note(self, state: State, decision: Decision, speed_mps: float) -> None:
         self.deadline_misses += not decision.fresh
         if decision.command_age_s is not None:
             self.command_ages_ms.append(decision.command_age_s * 1e3)
         self.safe_stops.observe(state.episode, state.step, decision, speed_mps)
-        self._on_tick(state.episode, state.step, decision)
+        self.on_tick(state.episode, state.step, decision)
 
 
 def _speed_mps(info: dict[str, Any]) -> float:
-    try:
-        return _finite("speed_mps", info["speed_mps"])
-    except KeyError:
-        raise UserError(
-            "the environment's info holds no speed_mps, which every state needs"
-        ) from None
+    if "speed_mps" not in info:
+        raise UserError("the environment's info holds no speed_mps, which every state needs")
+    return _number(info, "speed_mps")
 
 
 def _number(info: dict[str, Any], name: str) -> float:

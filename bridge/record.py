@@ -34,9 +34,15 @@ import msgspec
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import CompressionType, Writer
 
-from bridge.commands import add_options
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard
-from bridge.ports import ANY_VEHICLE, POLL_S, QUEUE_MESSAGES, WireListener, open_listener
+from bridge.ports import (
+    ANY_VEHICLE,
+    POLL_S,
+    QUEUE_MESSAGES,
+    WireListener,
+    add_options,
+    open_listener,
+)
 from bridge.recording import METADATA, WIRE_ENCODING, Recording
 from edge_runtime import __version__, wire
 from edge_runtime.cli import Command, examples, seconds, sigterm_as_interrupt

@@ -20,9 +20,8 @@ from typing import Any
 import zenoh
 
 from bridge.clocks import DelayLine, Publish
-from bridge.commands import add_options, wait_to_be_told
 from bridge.network import LatencySpec, make_link
-from bridge.ports import simulator_key
+from bridge.ports import add_options, simulator_key, wait_to_be_told
 from bridge.report import quantiles
 from edge_runtime import tls as access
 from edge_runtime.cli import Command, examples, sigterm_as_interrupt

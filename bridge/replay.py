@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from bridge.commands import add_options, progress_bar
 from bridge.messages import DECODERS, Heard
-from bridge.ports import SimulatorPort, open_port
+from bridge.ports import SimulatorPort, add_options, open_port, progress_bar
 from bridge.recording import Recording, choose_vehicle, heard_of
 from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
 from edge_runtime.config import NONE, Config, load_config

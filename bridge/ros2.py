@@ -18,9 +18,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from bridge.commands import add_options
 from bridge.messages import DECODERS, Heard, Pace
-from bridge.ports import open_listener
+from bridge.ports import add_options, open_listener
 from edge_runtime.cli import ArgumentParser, examples, number, sigterm_as_interrupt
 from edge_runtime.commands import ask
 from edge_runtime.files import write_json_out

@@ -12,7 +12,6 @@ import gymnasium
 from rich.progress import Progress
 
 from bridge.clocks import CLOCKS, REALTIME, Clock, VehicleClock
-from bridge.commands import add_options, progress_bar
 from bridge.environments import (
     CONDITIONS,
     NOMINAL,
@@ -25,7 +24,7 @@ from bridge.environments import (
     vehicle_action,
 )
 from bridge.inbound import CommandCheck, FeedbackCheck
-from bridge.ports import SimulatorPort, open_port
+from bridge.ports import SimulatorPort, add_options, open_port, progress_bar
 from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.virtual_link import Decision
 from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt

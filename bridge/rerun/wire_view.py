@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.commands import add_options, wait_to_be_told
 from bridge.messages import DECODERS, Heard, Pace, Scene
-from bridge.ports import open_listener
+from bridge.ports import add_options, open_listener, wait_to_be_told
 from bridge.recording import Recording, read_heard
 from bridge.rerun import (
     APPLIED,

@@ -66,7 +66,7 @@ def test_a_listener_hears_what_was_put_to_one_vehicle(sessions, vehicle_id):
 
 _ANOTHER_THREAD_TAKES_IT = """
 import signal, threading, time
-from bridge.commands import wait_to_be_told
+from bridge.ports import wait_to_be_told
 from edge_runtime.cli import sigterm_as_interrupt
 with sigterm_as_interrupt():
     threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
