@@ -30,7 +30,6 @@ from bridge.rerun import (
     ViewerGone,
     add_sink,
     check_sink,
-    chosen_sink,
     flush,
     open_sink,
     read_sink,
@@ -85,8 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Draw all of it; a page is served until somebody interrupts. Returns the exit status."""
     paths = find_recordings([Path(place) for place in arguments.recordings])
-    sink = chosen_sink(arguments)
-    check_sink(sink)
+    sink = check_sink(arguments.sink)
     for path in paths:  # Before a window opens, or a file takes another's place.
         next(read_steps(path), None)
     with open_sink(sink, SITTING_APPLICATION, make_blueprint(None, SITTINGS)) as recording:
@@ -110,9 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def check_word(word: str) -> Sink:
     """The sink that ``--rerun`` names; UserError where nothing could be shown there."""
-    sink = read_sink(word)
-    check_sink(sink)
-    return sink
+    return check_sink(read_sink(word))
 
 
 @contextmanager

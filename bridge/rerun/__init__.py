@@ -87,30 +87,25 @@ def flush(recording: rr.RecordingStream) -> None:
 
 
 def add_sink(parser: argparse.ArgumentParser) -> None:
-    """``--spawn``, ``--serve`` or ``--save F.rrd``."""
+    """``--spawn``, ``--serve`` or ``--save F.rrd``, kept as ``sink``; without any it is None."""
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--spawn", action="store_true", help="open a rerun window (the default)")
-    where.add_argument(
-        "--serve", action="store_true", help="serve a web page on this machine's loopback only"
-    )
-    where.add_argument("--save", metavar="F.rrd", help="write a recording instead of showing it")
+    page, window = "serve a web page on this machine's loopback only", "open a rerun window"
+    for kind, text in ((SPAWN, f"{window} (the default)"), (SERVE, page)):
+        where.add_argument(
+            f"--{kind}", dest="sink", action="store_const", const=Sink(kind), help=text
+        )
+    text = "write a recording instead of showing it"
+    where.add_argument("--save", dest="sink", metavar="F.rrd", type=_file, help=text)
 
 
-def chosen_sink(arguments: argparse.Namespace) -> Sink:
-    """The one of `add_sink` that was chosen. UserError: a file that rerun would not open."""
-    if arguments.save is None:
-        return Sink(SERVE if arguments.serve else SPAWN)
-    if not arguments.save.endswith(SUFFIX):
-        raise UserError(f"--save {arguments.save}: rerun opens only what is called F{SUFFIX}")
-    return Sink("save", arguments.save)
+def _file(path: str) -> Sink:
+    if not path.endswith(SUFFIX):
+        raise UserError(f"{path}: rerun opens only what is called F{SUFFIX}")
+    return Sink("save", path)
 
 
 def read_sink(word: str) -> Sink:
-    """The sink that a word names: ``spawn``, ``serve``, or a path that ends in .rrd.
-
-    Raises:
-        UserError: it names none.
-    """
+    """``spawn``, ``serve``, or a path that ends in .rrd; UserError for any other word."""
     if word in (SPAWN, SERVE):
         return Sink(word)
     if not word.endswith(SUFFIX):
@@ -118,8 +113,9 @@ def read_sink(word: str) -> Sink:
     return Sink("save", word)
 
 
-def check_sink(sink: Sink) -> None:
-    """Say at once, not after long work, that nothing could be shown: UserError."""
+def check_sink(sink: Sink | None) -> Sink:
+    """The sink (None: a window); UserError at once where nothing could be shown there."""
+    sink = sink or Sink(SPAWN)
     if sink.path:
         check_writable(sink.path)
     elif sink.kind == SERVE:
@@ -134,6 +130,7 @@ def check_sink(sink: Sink) -> None:
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
         raise UserError("no display for a window here: serve a page, or save a file")
+    return sink
 
 
 @contextlib.contextmanager
@@ -144,10 +141,7 @@ def open_sink(
 
     A window stays open afterwards; a page is served until then. SIGTERM raises KeyboardInterrupt
     meanwhile, unless the command has another use for it: a file is to be finished, and a server
-    not to be left behind.
-
-    Raises:
-        ViewerGone: there is none any more, or none has come.
+    not to be left behind. ViewerGone: there is no viewer any more, or none has come.
     """
     import rerun as rr
 
@@ -206,14 +200,9 @@ def _shown(recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint) -
 
 
 class Viewer:
-    """A viewer that listens.
+    """A viewer that listens at ``ports``, started with these options of rerun's command.
 
-    Args:
-        options: of rerun's command.
-        ports: at which it is to listen.
-
-    Raises:
-        ViewerGone: it ends at once, or does not listen in time.
+    ViewerGone: it ends at once, or does not listen in time.
     """
 
     def __init__(self, options: Sequence[str], ports: Sequence[int]) -> None:
@@ -227,8 +216,13 @@ class Viewer:
             env={**os.environ, "RERUN_APP_ONLY": "true"},  # As rerun's own spawn: no questions.
             start_new_session=True,
         )
+        end_s = time.monotonic() + START_S
         try:
-            self._await(ports)
+            while not all(map(_answers, ports)):
+                words = self.last_words()
+                if words or time.monotonic() > end_s:
+                    raise ViewerGone(words or f"it does not listen after {START_S:.0f} s")
+                time.sleep(LOOK_S)
         except BaseException:
             self.end()
             raise
@@ -258,14 +252,6 @@ class Viewer:
         lines = self._said.read().decode(errors="replace").split("\n")
         words = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
         return words[-1] if words else "it was closed"
-
-    def _await(self, ports: Sequence[int]) -> None:
-        end_s = time.monotonic() + START_S
-        while not all(map(_answers, ports)):
-            words = self.last_words()
-            if words or time.monotonic() > end_s:
-                raise ViewerGone(words or f"it does not listen after {START_S:.0f} s")
-            time.sleep(LOOK_S)
 
 
 def free_port() -> int:

@@ -16,18 +16,7 @@ import rerun.blueprint as rrb
 from bridge.messages import DECODERS, Heard, Pace, Scene
 from bridge.ports import add_options, open_listener, wait_to_be_told
 from bridge.recording import Recording, read_heard
-from bridge.rerun import (
-    APPLIED,
-    POLICY,
-    SERVE,
-    Sink,
-    add_sink,
-    check_sink,
-    chosen_sink,
-    draw,
-    flush,
-    open_sink,
-)
+from bridge.rerun import APPLIED, POLICY, SERVE, Sink, add_sink, check_sink, draw, flush, open_sink
 from bridge.rerun.draw import Plot
 from bridge.virtual_link import SILENCE_LIMIT_S
 from edge_runtime import wire
@@ -61,8 +50,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    sink = chosen_sink(arguments)
-    check_sink(sink)
+    sink = check_sink(arguments.sink)
     if arguments.recording is not None:
         _show_recording(arguments, sink)
     else:
@@ -78,7 +66,6 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
     heard = read_heard(file, arguments.vehicle_id)
     first = next(heard, None)  # Says what is wrong with the file before anything is opened.
     with (
-        sigterm_as_interrupt(),
         open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
         contextlib.suppress(KeyboardInterrupt),
     ):
