@@ -22,7 +22,6 @@ from bridge.ros2 import (
     Policies,
     Policy,
     drive_of,
-    feedback_curvature,
     image_of,
     odometry_of,
     twist_of,
@@ -124,13 +123,11 @@ def test_the_odometry_says_what_it_does_not_know():
     pose = DeadReckoning()
     pose.advance(1.0, 0.0, 0)
     pose.advance(1.0, 0.0, S // 2)
-    unsteered = odometry_of(
-        make_feedback(1.0, 0.5), pose, feedback_curvature(make_feedback(1.0, 0.5), PEDAL, 1.0)
-    )
+    unsteered = odometry_of(make_feedback(1.0, 0.5), pose, PEDAL.curvature([0.5]))
     assert unsteered.pose.covariance[7] == unsteered.pose.covariance[35] == UNKNOWN
     assert unsteered.pose.covariance[0] == pytest.approx(0.05**2)
     steered = make_feedback(1.0, -1.0)
-    curvature = feedback_curvature(steered, STEERING, 0.25)
+    curvature = STEERING.curvature(steered.action, 0.25)
     assert curvature is not None
     assert curvature > 0  # to the left
     message = odometry_of(steered, pose, curvature)
@@ -209,7 +206,7 @@ def test_the_vehicles_scale_is_its_speed_over_the_scenarios(scenario_mps, scale)
             scenario_speed_mps=None if scenario_mps is None else scenario_mps * speed_mps,
         )
         outlet.take(heard("feedback", encode(feedback), at_s=len(node.published["odom"])))
-    car_curvature = feedback_curvature(make_feedback(1.0, -1.0), STEERING, 1.0)
+    car_curvature = STEERING.curvature([-1.0])
     yaw_rates = [message.twist.twist.angular.z for message in node.published["odom"]]
     assert yaw_rates == pytest.approx([car_curvature / scale, 0.0, car_curvature / scale])
 
