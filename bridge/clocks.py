@@ -36,15 +36,7 @@ from bridge.virtual_link import (
 )
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
-from edge_runtime.wire import (
-    CONTROL_PERIOD_S,
-    SAFE_STOP,
-    Command,
-    Feedback,
-    Reason,
-    State,
-    encode,
-)
+from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Feedback, Reason, State, encode
 
 Publish = Callable[[bytes], None]
 """Sends an encoded state over the wire; must not block."""
@@ -52,7 +44,7 @@ WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 """Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
 
 
-class Clock:
+class _Clock:
     """Drives the exchange of one episode at a time; ``begin``, ``exchange`` ..., ``finish``."""
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
@@ -71,19 +63,6 @@ class Clock:
         self._hold = CommandHold(now_s=0.0)
         # Real time's delay line and ticks share what this guards; lock-step has one thread.
         self._arrived = threading.Condition()
-        self.begin(episode=0, seed=0)
-
-    def begin(self, episode: int, seed: int) -> None:
-        """Start an episode; ``seed`` decides the delays and losses of the link."""
-        raise NotImplementedError
-
-    def receive(self, payload: bytes) -> None:
-        """Take one command from the wire, on Zenoh's thread."""
-        raise NotImplementedError
-
-    def exchange(self, state: State) -> Decision:
-        """Send the state of one tick and decide what the vehicle does in it."""
-        raise NotImplementedError
 
     def newest_answer(self) -> tuple[int, float] | None:
         """The newest state of this episode that was answered, and its latency in ms."""
@@ -105,15 +84,16 @@ class Clock:
         """Stop any thread."""
 
 
-class LockStepClock(Clock):
+class LockStepClock(_Clock):
     """The clock of ``--clock lockstep``. One thread runs it; Zenoh's only fills the inbox."""
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()
         super().__init__(publish, check, spec)
+        self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode at virtual time 0."""
+        """Start an episode at virtual time 0; ``seed`` decides the link's delays and losses."""
         self._check.begin(episode)
         self._link: VirtualLink[State] = VirtualLink(
             self._spec,
@@ -147,8 +127,7 @@ class LockStepClock(Clock):
         self._publish(payload)
         if arrival.overtaken:
             return  # The edge runtime rejects it as stale, as it should, and does not answer.
-        answer = self._await_answer(arrival.step, published_s)
-        if answer is not None:
+        if (answer := self._await_answer(arrival.step, published_s)) is not None:
             command, received_s = answer
             self._link.answer(arrival, command, computing_s=received_s - published_s)
 
@@ -160,8 +139,7 @@ class LockStepClock(Clock):
                 payload, received_s = self._inbox.get(timeout=wait_s)
             except queue.Empty:
                 break
-            command = self._check.read(payload)
-            if command is None:
+            if (command := self._check.read(payload)) is None:
                 continue
             if command.step == step:
                 self._answered_at_s, self._edge_silent = received_s, False
@@ -178,11 +156,10 @@ class LockStepClock(Clock):
 
         Once the edge runtime is silent, T for each state is also the pace of the braking steps.
         """
+        answered_at_s = published_s if self._answered_at_s is None else self._answered_at_s
         if self._edge_silent:
             return published_s + CONTROL_PERIOD_S
-        if self._answered_at_s is None:
-            return published_s + SILENCE_LIMIT_S
-        return max(self._answered_at_s + SILENCE_LIMIT_S, published_s + CONTROL_PERIOD_S)
+        return max(answered_at_s + SILENCE_LIMIT_S, published_s + CONTROL_PERIOD_S)
 
     def _wall_silence_s(self) -> float | None:
         """Wall time without an answer (s), if the last state really published got none."""
@@ -191,7 +168,7 @@ class LockStepClock(Clock):
         return SILENCE_LIMIT_S if self._edge_silent else None
 
 
-class RealTimeClock(Clock):
+class RealTimeClock(_Clock):
     """The clock of ``--clock realtime``.
 
     The caller's thread runs the ticks, Zenoh's hands in commands, the delay line's delivers both
@@ -201,9 +178,10 @@ class RealTimeClock(Clock):
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self._line = DelayLine()
         super().__init__(publish, check, spec)
+        self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode now."""
+        """Start an episode now; ``seed`` decides the link's delays and losses."""
         with self._arrived:
             self._check.begin(episode)
             self._link = make_link(self._spec, seed)
@@ -269,15 +247,14 @@ class RealTimeClock(Clock):
     def _arrive_at_vehicle(self, payload: bytes) -> None:
         now_s = time.monotonic()
         with self._arrived:
-            command = self._check.read(payload)
-            if command is None:
+            if (command := self._check.read(payload)) is None:
                 return
-            answered_step = self._hold.newest_step
-            if not self._hold.admit(command, now_s, self._sent_s[command.step]):
+            answered_step, sent_s = self._hold.newest_step, self._sent_s[command.step]
+            if not self._hold.admit(command, now_s, sent_s):
                 self._check.reject(Reason.STALE.value)
                 return
             if command.step > answered_step:
-                self.latencies_ms.append((now_s - self._sent_s[command.step]) * 1e3)
+                self.latencies_ms.append((now_s - sent_s) * 1e3)
             self._admitted(command)
             self._arrived.notify()
 
@@ -379,11 +356,9 @@ class VehicleClock(RealTimeClock):
     def _feedback_arrives(self, payload: bytes, received_s: float) -> None:
         now_s = time.monotonic()
         with self._arrived:
-            feedback = self.feedback_check.read(payload, now_s)
-            if feedback is None:
-                return
-            self._feedback.admit(feedback, received_s, now_s)
-            self.tracking.feedback(feedback)
+            if (feedback := self.feedback_check.read(payload, now_s)) is not None:
+                self._feedback.admit(feedback, received_s, now_s)
+                self.tracking.feedback(feedback)
 
     def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:
         """Whether it holds for what the vehicle says, of whichever drive, before ``limit_s``."""
@@ -458,5 +433,6 @@ class DelayLine:
         return None
 
 
-REALTIME = "realtime"
-CLOCKS: dict[str, type[Clock]] = {"lockstep": LockStepClock, REALTIME: RealTimeClock}
+Clock = LockStepClock | RealTimeClock
+LOCKSTEP, REALTIME = "lockstep", "realtime"
+CLOCKS: dict[str, type[Clock]] = {LOCKSTEP: LockStepClock, REALTIME: RealTimeClock}

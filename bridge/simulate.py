@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 from rich.progress import Progress
 
-from bridge.clocks import CLOCKS, REALTIME, Clock, VehicleClock
+from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, VehicleClock
 from bridge.environments import (
     CONDITIONS,
     NOMINAL,
@@ -63,7 +63,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--clock",
         choices=sorted(CLOCKS),
-        default="lockstep",
+        default=LOCKSTEP,
         help="lockstep waits for each command; realtime waits for nobody",
     )
     parser.add_argument(
@@ -142,7 +142,8 @@ def _drive(
     edge = port.edge_counts
 
     def on_tick(episode: int, step: int, decision: Decision) -> None:
-        bar.tick(episode, step, decision, rearm if edge.waits_for_rearm else "")
+        waits = edge.newest is not None and edge.newest.needs_rearm
+        bar.tick(episode, step, decision, rearm if waits else "")
 
     runner = EpisodeRunner(
         environment,
