@@ -353,6 +353,18 @@ def without_chunk(number: int) -> list[tuple[str, int, bytes]]:
     return whole[:first] + whole[first + sizes[number] :]
 
 
+@pytest.fixture
+def repair(capsys):
+    """Run ``bridge repair`` to a good end; return what it prints."""
+
+    def repaired(*arguments):
+        capsys.readouterr()
+        assert bridge_status(["repair", *map(str, arguments)]) == 0
+        return capsys.readouterr().out
+
+    return repaired
+
+
 def damage_contents(path, number):
     flip_chunk(path, number)
 
@@ -385,13 +397,12 @@ def test_only_the_broken_chunk_is_lost(copy, damage, number):
     assert recording.metadata == whole.metadata
 
 
-def test_repair_says_what_it_leaves_out_and_keeps_the_file_as_it_was(copy, capsys):
+def test_repair_says_what_it_leaves_out_and_keeps_the_file_as_it_was(copy, repair):
     flip_chunk(copy, 3)
     damaged, kept = copy.read_bytes(), copy.with_name("drive.mcap.damaged")
     left = without_chunk(3)
     assert 2000 < len(left) < len(told_in(LEFT_TURN))
-    assert bridge_status(["repair", str(copy)]) == 0
-    assert capsys.readouterr().out == (
+    assert repair(copy) == (
         f"wrote {copy}: {len(left)} messages; left out: 1 damaged place of"
         f" {chunks(LEFT_TURN)[3].chunk_length} bytes; the file as it was: {kept}\n"
     )
@@ -399,8 +410,7 @@ def test_repair_says_what_it_leaves_out_and_keeps_the_file_as_it_was(copy, capsy
     assert told_in(copy) == left
     with copy.open("rb") as stream:
         assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == len(left)
-    assert bridge_status(["repair", str(copy)]) == 0
-    assert "is whole" in capsys.readouterr().out
+    assert "is whole" in repair(copy)
 
 
 def test_a_replay_says_damaged_and_replays_the_rest(tmp_path, capsys):
@@ -419,14 +429,12 @@ def test_a_replay_says_damaged_and_replays_the_rest(tmp_path, capsys):
     assert line.startswith("the recording is damaged (1 damaged place of")
 
 
-def test_a_broken_index_is_written_anew_and_no_message_is_lost(copy, capsys):
+def test_a_broken_index_is_written_anew_and_no_message_is_lost(copy, repair):
     flip(copy, copy.stat().st_size - 100)
-    assert bridge_status(["repair", str(copy)]) == 0
-    assert (
-        f"{len(told_in(LEFT_TURN))} messages; left out: 1 damaged place" in capsys.readouterr().out
-    )
+    count = len(told_in(LEFT_TURN))
+    assert f"{count} messages; left out: 1 damaged place" in repair(copy)
     with copy.open("rb") as stream:
-        assert len(list(make_reader(stream).iter_messages())) == len(told_in(LEFT_TURN))
+        assert len(list(make_reader(stream).iter_messages())) == count
 
 
 def test_bytes_that_are_gone_take_no_more_with_them(copy):
@@ -436,12 +444,11 @@ def test_bytes_that_are_gone_take_no_more_with_them(copy):
     assert told_in(copy) == without_chunk(0)
 
 
-def test_of_a_cut_file_with_a_broken_first_chunk_the_nameless_messages_are_counted(copy, capsys):
+def test_of_a_cut_file_with_a_broken_first_chunk_the_nameless_messages_are_counted(copy, repair):
     data = copy.read_bytes()
     copy.write_bytes(data[: chunks(copy)[20].chunk_start_offset])
     flip(copy, 300)
-    assert bridge_status(["repair", str(copy)]) == 0
-    out = capsys.readouterr().out
+    out = repair(copy)
     assert "messages whose topic was in a damaged place" in out
     assert "the file as it was" in out
 
@@ -454,61 +461,55 @@ def test_a_damaged_file_is_not_kept_over_an_earlier_one(copy, refusal):
     assert (kept.read_text(), copy.read_bytes()) == ("mine", damaged)
 
 
-def test_a_file_without_a_checksum_over_all_of_it_is_not_called_whole(copy, tmp_path, capsys):
+def test_a_file_without_a_checksum_over_all_of_it_is_not_called_whole(copy, tmp_path, repair):
     """As other programs write them. --out writes it with one."""
     data, out = bytearray(copy.read_bytes()), tmp_path / "out.mcap"
     end = data.index(b"\x0f" + (4).to_bytes(8, "little"), chunks(copy)[-1].chunk_start_offset)
     data[end + 9 : end + 13] = bytes(4)
     copy.write_bytes(data)
-    assert bridge_status(["repair", str(copy)]) == 0
-    assert (
-        f"can be read to its end: {len(told_in(LEFT_TURN))} messages; nothing done"
-        in capsys.readouterr().out
-    )
+    said = repair(copy)
+    assert f"can be read to its end: {len(told_in(LEFT_TURN))} messages; nothing done" in said
     assert copy.read_bytes() == data
-    assert bridge_status(["repair", str(copy), "--out", str(out)]) == 0
-    assert bridge_status(["repair", str(out)]) == 0
-    assert "is whole" in capsys.readouterr().out
+    repair(copy, "--out", out)
+    assert "is whole" in repair(out)
 
 
-def test_a_change_outside_of_the_chunks_is_said_and_mended(copy, tmp_path, capsys):
+def test_a_change_outside_of_the_chunks_is_said_and_mended(copy, tmp_path, repair):
     whole = tmp_path / "whole.mcap"
-    assert bridge_status(["repair", str(copy), "--out", str(whole)]) == 0
+    repair(copy, "--out", whole)
     flip(whole, chunks(whole)[3].chunk_start_offset + 9)  # when its first message came
-    assert bridge_status(["repair", str(whole)]) == 0
-    said = capsys.readouterr().out
+    said = repair(whole)
     assert (
         f"{len(told_in(LEFT_TURN))} messages; left out: bytes that changed outside of its chunks"
         in said
     )
     assert whole.with_name("whole.mcap.damaged").exists()
-    assert bridge_status(["repair", str(whole)]) == 0
-    assert "is whole" in capsys.readouterr().out
+    assert "is whole" in repair(whole)
 
 
-def test_a_repair_that_was_killed_can_be_done_again(copy):
+def test_a_repair_that_was_killed_can_be_done_again(copy, repair):
     flip_chunk(copy, 3)
     copy.with_name("drive.mcap.damaged").hardlink_to(copy)
-    assert bridge_status(["repair", str(copy)]) == 0
+    repair(copy)
     assert told_in(copy) == without_chunk(3)
 
 
-def test_through_a_link_the_file_is_repaired_and_kept_where_it_is(copy, tmp_path):
+def test_through_a_link_the_file_is_repaired_and_kept_where_it_is(copy, tmp_path, repair):
     flip_chunk(copy, 3)
     link = tmp_path / "elsewhere" / "link.mcap"
     link.parent.mkdir()
     link.symlink_to(copy)
-    assert bridge_status(["repair", str(link)]) == 0
+    repair(link)
     assert link.is_symlink()
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "drive.mcap", "drive.mcap.damaged", "elsewhere",
     ]  # fmt: skip
 
 
-def test_out_writes_a_new_file_only(copy, tmp_path, refusal):
+def test_out_writes_a_new_file_only(copy, tmp_path, refusal, repair):
     flip_chunk(copy, 3)
     damaged, out = copy.read_bytes(), tmp_path / "ok.mcap"
-    assert bridge_status(["repair", str(copy), "--out", str(out)]) == 0
+    repair(copy, "--out", out)
     assert copy.read_bytes() == damaged
     whole = out.read_bytes()
     line = refusal("repair", copy, "--out", out)
@@ -517,7 +518,7 @@ def test_out_writes_a_new_file_only(copy, tmp_path, refusal):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["drive.mcap", "ok.mcap"]
 
 
-def test_what_is_being_written_is_not_repaired_and_a_kill_frees_it(tmp_path, capsys, refusal):
+def test_what_is_being_written_is_not_repaired_and_a_kill_frees_it(tmp_path, refusal, repair):
     path, data = tmp_path / "growing.mcap", LEFT_TURN.read_bytes()[:100_000]
     command = [sys.executable, "-c", HELD_OPEN, str(path), str(len(data))]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
@@ -531,8 +532,7 @@ def test_what_is_being_written_is_not_repaired_and_a_kill_frees_it(tmp_path, cap
         assert path.read_bytes() == data
         writer.kill()
         writer.wait()
-    assert bridge_status(["repair", str(path)]) == 0
-    assert "a torn end of" in capsys.readouterr().out
+    assert "a torn end of" in repair(path)
     assert [place.name for place in tmp_path.iterdir()] == ["growing.mcap"]
 
 
