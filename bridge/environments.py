@@ -177,9 +177,7 @@ def vehicle_action(action_names: Sequence[str]) -> Apply:
     leads to it (``pedal_for_speed``), that pedal takes the place of the reported one: it makes up
     for what the last step missed, while errors of pedals would add up. Without feedback the car
     brakes fully; an environment that is only steered does so whenever the vehicle brakes.
-
-    Args:
-        action_names: of the policy's actions, in order.
+    ``action_names`` are those of the policy's actions, in order.
     """
 
     def apply(environment: Environment, decision: Decision) -> np.ndarray:

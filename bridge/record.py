@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import functools
 import io
 import os
 import sys
@@ -123,16 +124,6 @@ def _run_record(arguments: Any) -> int:
     return 0
 
 
-RECORD = Command(
-    examples(
-        "python -m bridge record --out drive.mcap",
-        "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
-    ),
-    _add_record_arguments,
-    _run_record,
-)
-
-
 def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> None:
     now_s = time.monotonic()
     end_s = None if arguments.duration_s is None else now_s + arguments.duration_s
@@ -163,7 +154,7 @@ class RecordingWriter:
         self._mcap = start_mcap(self._file)
         self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
         self._channels: dict[str, int] = {}
-        self._schemas: dict[str, tuple[Schema, int]] = {}
+        self._schema_ids: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
 
     def write(self, heard: Heard, with_view: bool = True) -> None:
@@ -221,17 +212,15 @@ class RecordingWriter:
 
     def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
         """Add what viewers can draw, to the vehicle's topic of that name."""
-        kind = type(values).__name__
-        if kind not in self._schemas:
-            schema = describe(type(values))
+        schema = describe(type(values))
+        if schema.name not in self._schema_ids:
             schema_id = self._mcap.register_schema(schema.name, "protobuf", schema.descriptors)
-            self._schemas[kind] = schema, schema_id
-        schema, schema_id = self._schemas[kind]
+            self._schema_ids[schema.name] = schema_id
         known = schema.make.DESCRIPTOR.fields_by_name
         fields = msgspec.to_builtins(values, builtin_types=(bytes,)).items()
         drawn = {name: value for name, value in fields if name in known}
         data = schema.make(**drawn).SerializeToString()
-        topic = f"view/{_vehicle_id(heard)}/{name}"
+        topic, schema_id = f"view/{_vehicle_id(heard)}/{name}", self._schema_ids[schema.name]
         self._add(topic, "protobuf", heard.arrived_ns, data, schema_id)
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
@@ -364,6 +353,7 @@ class Schema(NamedTuple):
     descriptors: bytes
 
 
+@functools.cache
 def describe(kind: type[msgspec.Struct]) -> Schema:
     """Mirror a struct: one of the two above by Foxglove's name, one of the wire as ``phil.<name>``.
 
@@ -465,18 +455,17 @@ def _run_repair(arguments: Any) -> int:
         found = counted(messages, "message")
         if not messages:
             raise UserError(f"{source} holds no whole message; there is nothing to repair")
-        if recording.trouble() or arguments.out is not None:
-            kept = _write(data, recording, arguments.out)
-        elif recording.has_checksums:
-            print(f"{source} is whole: {found}; nothing done")
+        if arguments.out is None and not recording.trouble():
+            whole, more = "is whole", ""
+            if not recording.has_checksums:
+                whole = "can be read to its end"
+                more = (
+                    ". It has no checksum over all of it, so a change in its index would not show;"
+                    " --out G.mcap writes it with one"
+                )
+            print(f"{source} {whole}: {found}; nothing done{more}")
             return 0
-        else:
-            print(
-                f"{source} can be read to its end: {found}; nothing done. It has no checksum over"
-                " all of it, so a change in its index would not show; --out G.mcap writes it with"
-                " one"
-            )
-            return 0
+        kept = _write(data, recording, arguments.out)
     left_out = recording.missing() and f"; left out: {recording.missing()}"
     print(f"wrote {arguments.out or source}: {found}{left_out}{kept}")
     return 0
@@ -491,16 +480,11 @@ def _write(data: bytes, recording: Recording, out: str | None) -> str:
     kept = file.with_name(file.name + KEPT)
     try:
         os.link(file, kept)
-    except FileExistsError:
+    except OSError as error:
         # A repair that was killed leaves its link.
         if not (kept.exists() and kept.samefile(file)):
-            raise UserError(
-                f"{kept} exists; move it away, or name another file with --out"
-            ) from None
-    except OSError as error:
-        raise UserError(
-            f"cannot keep {file} as {kept}: {error.strerror}; name another file with --out"
-        ) from None
+            why = f"{kept} exists" if kept.exists() else f"cannot make {kept}: {error.strerror}"
+            raise UserError(f"{why}; name another file with --out") from None
     try:
         write_atomic(file, data)
     except UserError:  # Nothing was replaced. (After an interrupt nobody knows: it stays.)
@@ -523,12 +507,9 @@ def _rewrite(recording: Recording) -> tuple[bytes, int]:
             channels[channel.id] = writer.register_channel(
                 channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0)
             )
+        times = {"log_time": message.log_time, "publish_time": message.publish_time}
         writer.add_message(
-            channels[channel.id],
-            message.log_time,
-            message.data,
-            message.publish_time,
-            message.sequence,
+            channels[channel.id], data=message.data, sequence=message.sequence, **times
         )
         messages += 1
     if recording.metadata:
@@ -537,11 +518,12 @@ def _rewrite(recording: Recording) -> tuple[bytes, int]:
     return stream.getvalue(), messages
 
 
-REPAIR = Command(
-    examples(
-        "python -m bridge repair drive.mcap",
-        "python -m bridge repair drive.mcap --out whole.mcap",
-    ),
-    _add_repair_arguments,
-    _run_repair,
+RECORD_EXAMPLE = examples(
+    "python -m bridge record --out drive.mcap",
+    "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
 )
+REPAIR_EXAMPLE = examples(
+    "python -m bridge repair drive.mcap", "python -m bridge repair drive.mcap --out whole.mcap"
+)
+RECORD = Command(RECORD_EXAMPLE, _add_record_arguments, _run_record)
+REPAIR = Command(REPAIR_EXAMPLE, _add_repair_arguments, _run_repair)

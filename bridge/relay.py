@@ -88,16 +88,6 @@ def _run_relay(arguments: Any) -> int:
     return 0
 
 
-RELAY = Command(
-    examples(
-        "python -m bridge relay --listen tcp/127.0.0.1:7448 --connect tcp/127.0.0.1:7447 \\\n"
-        "    --latency 50ms+-10ms,loss=1% --out relay.json",
-    ),
-    _add_relay_arguments,
-    _run_relay,
-)
-
-
 @contextlib.contextmanager
 def open_relay(
     listen: str, connect: str, vehicle_id: str, latency: LatencySpec, seed: int
@@ -315,12 +305,14 @@ def _run_router(arguments: Any) -> int:
     return 0
 
 
-ROUTER = Command(
-    examples(
-        "python -m bridge router --listen tcp/127.0.0.1:7447",
-        "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
-        "    --vehicle-id hunter01 --vehicle-id hunter02",
-    ),
-    _add_router_arguments,
-    _run_router,
+RELAY_EXAMPLE = examples(
+    "python -m bridge relay --listen tcp/127.0.0.1:7448 --connect tcp/127.0.0.1:7447 \\\n"
+    "    --latency 50ms+-10ms,loss=1% --out relay.json",
 )
+ROUTER_EXAMPLE = examples(
+    "python -m bridge router --listen tcp/127.0.0.1:7447",
+    "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+    "    --vehicle-id hunter01 --vehicle-id hunter02",
+)
+RELAY = Command(RELAY_EXAMPLE, _add_relay_arguments, _run_relay)
+ROUTER = Command(ROUTER_EXAMPLE, _add_router_arguments, _run_router)

@@ -43,10 +43,6 @@ class EpisodeResult:
     steps: int
     actions: list[list[float]] = field(default_factory=list)
 
-    def as_dict(self) -> dict[str, Any]:
-        """The row of `per_episode` in a report."""
-        return asdict(self)
-
 
 def summarise(
     results: Sequence[EpisodeResult], scenario: str, condition: str, policy_id: str, seed: int
