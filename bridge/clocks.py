@@ -36,15 +36,7 @@ from bridge.virtual_link import (
 )
 from edge_runtime.safety import Event
 from edge_runtime.util import UserError
-from edge_runtime.wire import (
-    CONTROL_PERIOD_S,
-    SAFE_STOP,
-    Command,
-    Feedback,
-    Reason,
-    State,
-    encode,
-)
+from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Feedback, Reason, State, encode
 
 Publish = Callable[[bytes], None]
 """Sends an encoded state over the wire; must not block."""
@@ -52,7 +44,7 @@ WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 """Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
 
 
-class Clock:
+class _Clock:
     """Drives the exchange of one episode at a time; ``begin``, ``exchange`` ..., ``finish``."""
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
@@ -68,23 +60,15 @@ class Clock:
         self._publish = publish
         self._check = check
         self._spec = spec
-        self.begin(episode=0, seed=0)
-
-    def begin(self, episode: int, seed: int) -> None:
-        """Start an episode; ``seed`` decides the delays and losses of the link."""
-        raise NotImplementedError
-
-    def receive(self, payload: bytes) -> None:
-        """Take one command from the wire, on Zenoh's thread."""
-        raise NotImplementedError
-
-    def exchange(self, state: State) -> Decision:
-        """Send the state of one tick and decide what the vehicle does in it."""
-        raise NotImplementedError
+        self._hold = CommandHold(now_s=0.0)
+        # Real time's delay line and ticks share what this guards; lock-step has one thread.
+        self._arrived = threading.Condition()
 
     def newest_answer(self) -> tuple[int, float] | None:
         """The newest state of this episode that was answered, and its latency in ms."""
-        raise NotImplementedError
+        with self._arrived:
+            step = self._hold.newest_step
+            return None if step < 0 else (step, self.latencies_ms[-1])
 
     def finish(self, state: State) -> None:
         """Send the final state at once, and forget whatever is still under way.
@@ -92,21 +76,24 @@ class Clock:
         It says that the simulation has ended, which no radio link carries: no delay or loss is
         injected, and no answer is awaited.
         """
-        raise NotImplementedError
+        with self._arrived:
+            self._check.end(state.step, self._hold.newest_step)
+        self._publish(encode(_stamp(state)))
 
     def close(self) -> None:
         """Stop any thread."""
 
 
-class LockStepClock(Clock):
+class LockStepClock(_Clock):
     """The clock of ``--clock lockstep``. One thread runs it; Zenoh's only fills the inbox."""
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self._inbox: queue.SimpleQueue[tuple[bytes, float]] = queue.SimpleQueue()
         super().__init__(publish, check, spec)
+        self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode at virtual time 0."""
+        """Start an episode at virtual time 0; ``seed`` decides the link's delays and losses."""
         self._check.begin(episode)
         self._link: VirtualLink[State] = VirtualLink(
             self._spec,
@@ -114,6 +101,7 @@ class LockStepClock(Clock):
             on_heard=lambda latency_s: self.latencies_ms.append(latency_s * 1e3),
             on_stale=lambda: self._check.reject(Reason.STALE.value),
         )
+        self._hold = self._link.hold
         self._answered_at_s: float | None = None
         self._edge_silent = False
 
@@ -129,16 +117,6 @@ class LockStepClock(Clock):
             self._arrive_at_edge(arrival)
         return self._link.decide(self._wall_silence_s())
 
-    def newest_answer(self) -> tuple[int, float] | None:
-        """The newest state of this episode that was answered, and its latency in ms."""
-        step = self._link.hold.newest_step
-        return None if step < 0 else (step, self.latencies_ms[-1])
-
-    def finish(self, state: State) -> None:
-        """Publish the final state at once; no answer to it is awaited."""
-        self._check.end(state.step, self._link.hold.newest_step)
-        self._publish(encode(_stamp(state)))
-
     def _arrive_at_edge(self, arrival: Arrival[State]) -> None:
         # The stamp is the wall clock at the real publication: virtual delays are not in it.
         payload = encode(_stamp(arrival.message))
@@ -149,8 +127,7 @@ class LockStepClock(Clock):
         self._publish(payload)
         if arrival.overtaken:
             return  # The edge runtime rejects it as stale, as it should, and does not answer.
-        answer = self._await_answer(arrival.step, published_s)
-        if answer is not None:
+        if (answer := self._await_answer(arrival.step, published_s)) is not None:
             command, received_s = answer
             self._link.answer(arrival, command, computing_s=received_s - published_s)
 
@@ -162,8 +139,7 @@ class LockStepClock(Clock):
                 payload, received_s = self._inbox.get(timeout=wait_s)
             except queue.Empty:
                 break
-            command = self._check.read(payload)
-            if command is None:
+            if (command := self._check.read(payload)) is None:
                 continue
             if command.step == step:
                 self._answered_at_s, self._edge_silent = received_s, False
@@ -180,34 +156,32 @@ class LockStepClock(Clock):
 
         Once the edge runtime is silent, T for each state is also the pace of the braking steps.
         """
+        answered_at_s = published_s if self._answered_at_s is None else self._answered_at_s
         if self._edge_silent:
             return published_s + CONTROL_PERIOD_S
-        if self._answered_at_s is None:
-            return published_s + SILENCE_LIMIT_S
-        return max(self._answered_at_s + SILENCE_LIMIT_S, published_s + CONTROL_PERIOD_S)
+        return max(answered_at_s + SILENCE_LIMIT_S, published_s + CONTROL_PERIOD_S)
 
     def _wall_silence_s(self) -> float | None:
         """Wall time without an answer (s), if the last state really published got none."""
-        if not self._edge_silent:
-            return None
-        answered_at_s = self._answered_at_s
-        return SILENCE_LIMIT_S if answered_at_s is None else time.monotonic() - answered_at_s
+        if self._edge_silent and self._answered_at_s is not None:
+            return time.monotonic() - self._answered_at_s
+        return SILENCE_LIMIT_S if self._edge_silent else None
 
 
-class RealTimeClock(Clock):
+class RealTimeClock(_Clock):
     """The clock of ``--clock realtime``.
 
     The caller's thread runs the ticks, Zenoh's hands in commands, the delay line's delivers both
-    directions. The condition guards everything that the delay line and the ticks share.
+    directions.
     """
 
     def __init__(self, publish: Publish, check: CommandCheck, spec: LatencySpec) -> None:
         self._line = DelayLine()
-        self._arrived = threading.Condition()
         super().__init__(publish, check, spec)
+        self.begin(episode=0, seed=0)
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start an episode now."""
+        """Start an episode now; ``seed`` decides the link's delays and losses."""
         with self._arrived:
             self._check.begin(episode)
             self._link = make_link(self._spec, seed)
@@ -230,18 +204,10 @@ class RealTimeClock(Clock):
             )
             return self._hold.decide(time.monotonic())
 
-    def newest_answer(self) -> tuple[int, float] | None:
-        """The newest state of this episode that was answered, and its latency in ms."""
-        with self._arrived:
-            step = self._hold.newest_step
-            return None if step < 0 else (step, self.latencies_ms[-1])
-
     def finish(self, state: State) -> None:
         """Forget what is under way and publish the final state at once."""
         self._line.clear()
-        with self._arrived:
-            self._check.end(state.step, self._hold.newest_step)
-        self._publish(encode(_stamp(state)))
+        super().finish(state)
 
     def close(self) -> None:
         """Stop the delay line."""
@@ -281,15 +247,14 @@ class RealTimeClock(Clock):
     def _arrive_at_vehicle(self, payload: bytes) -> None:
         now_s = time.monotonic()
         with self._arrived:
-            command = self._check.read(payload)
-            if command is None:
+            if (command := self._check.read(payload)) is None:
                 return
-            answered_step = self._hold.newest_step
-            if not self._hold.admit(command, now_s, self._sent_s[command.step]):
+            answered_step, sent_s = self._hold.newest_step, self._sent_s[command.step]
+            if not self._hold.admit(command, now_s, sent_s):
                 self._check.reject(Reason.STALE.value)
                 return
             if command.step > answered_step:
-                self.latencies_ms.append((now_s - self._sent_s[command.step]) * 1e3)
+                self.latencies_ms.append((now_s - sent_s) * 1e3)
             self._admitted(command)
             self._arrived.notify()
 
@@ -391,11 +356,9 @@ class VehicleClock(RealTimeClock):
     def _feedback_arrives(self, payload: bytes, received_s: float) -> None:
         now_s = time.monotonic()
         with self._arrived:
-            feedback = self.feedback_check.read(payload, now_s)
-            if feedback is None:
-                return
-            self._feedback.admit(feedback, received_s, now_s)
-            self.tracking.feedback(feedback)
+            if (feedback := self.feedback_check.read(payload, now_s)) is not None:
+                self._feedback.admit(feedback, received_s, now_s)
+                self.tracking.feedback(feedback)
 
     def _wait_until(self, holds: Callable[[Feedback], bool], limit_s: float) -> bool:
         """Whether it holds for what the vehicle says, of whichever drive, before ``limit_s``."""
@@ -409,8 +372,6 @@ class VehicleClock(RealTimeClock):
         return False
 
 
-REALTIME = "realtime"
-CLOCKS: dict[str, type[Clock]] = {"lockstep": LockStepClock, REALTIME: RealTimeClock}
 Action = Callable[[], None]
 
 
@@ -470,3 +431,8 @@ class DelayLine:
                 next_s = self._heap.next_arrival_s()
                 self._changed.wait(None if next_s is None else next_s - time.monotonic())
         return None
+
+
+Clock = LockStepClock | RealTimeClock
+LOCKSTEP, REALTIME = "lockstep", "realtime"
+CLOCKS: dict[str, type[Clock]] = {LOCKSTEP: LockStepClock, REALTIME: RealTimeClock}

@@ -209,8 +209,17 @@ class FeedbackHold:
         ``heard`` is what its commands would have it do: the simulator hears those, too. They give
         a stop its reason, and decide nothing.
         """
-        feedback = self.newest(now_s)
-        reason = NO_FEEDBACK if feedback is None else _brake_reason(feedback, heard, episode)
+        feedback, reason = self.newest(now_s), ""
+        if feedback is None:
+            reason = NO_FEEDBACK
+        elif feedback.episode != episode:
+            # Until it has taken a command of this episode it stands because the last one has
+            # ended: no fault, unless there are no commands.
+            reason = heard.brake_reason
+        elif feedback.mode == SAFE_STOP:
+            reason = heard.brake_reason or UNKNOWN_SAFE_STOP
+        elif feedback.self_braking:
+            reason = SELF_BRAKING
         return VehicleDecision(
             command=heard.command,
             fresh=heard.fresh,
@@ -220,19 +229,6 @@ class FeedbackHold:
             feedback=feedback,
             feedback_age_s=None if feedback is None else now_s - self._received_s,
         )
-
-
-def _brake_reason(feedback: Feedback, heard: Decision, episode: int) -> str:
-    """Why the vehicle brakes; empty while it obeys the policy.
-
-    Until it has taken a command of this episode it stands because the last one has ended: no
-    fault, unless there are no commands.
-    """
-    if feedback.episode != episode:
-        return heard.brake_reason
-    if feedback.mode == SAFE_STOP:
-        return heard.brake_reason or UNKNOWN_SAFE_STOP
-    return SELF_BRAKING if feedback.self_braking else ""
 
 
 class EdgeCounts:
@@ -251,11 +247,6 @@ class EdgeCounts:
         """How often another edge runtime took over, or the same was started again."""
         self.newest: Health | None = None
         self._lock = threading.Lock()
-
-    @property
-    def waits_for_rearm(self) -> bool:
-        """Return whether, by the newest health, only an operator can let the vehicle drive."""
-        return self.newest is not None and self.newest.needs_rearm
 
     def observe_message(self, payload: bytes) -> None:
         """Take a health message; one that cannot be read is counted."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import heapq
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -26,55 +26,44 @@ DIRECTIONS = ("up", "down")
 """State to edge runtime, and command to simulator."""
 TAILS = ("normal", "lognormal", "pareto")
 ORDERS = ("free", "kept")
-MAX_TIME_S = 1e6
 
 
-class Measure(NamedTuple):
-    """How a number with a unit is read and written. What does not fit is read as None."""
+class Kind(NamedTuple):
+    """How the value of a setting is read (as None where it does not fit) and written."""
 
-    units: Mapping[str, float]
-    """Unit to its factor; values are written in the first, whose factor is 1."""
-    least: float = 0.0
-    most: float = math.inf
-
-    def read(self, text: str) -> float | None:
-        """The value in the first unit."""
-        match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)([A-Za-z/%]*)", text)
-        if match is None or match[2] not in self.units:
-            return None
-        value = float(match[1]) * self.units[match[2]]
-        return value if self.least <= value <= self.most else None
-
-    def write(self, value: float) -> str:
-        """The shortest text that reads back as the same value."""
-        return repr(float(value)).removesuffix(".0") + next(iter(self.units))
-
-    @property
-    def limit(self) -> str:
-        """What a message about a wrong value says besides the example."""
-        return f", at most {self.write(self.most)}"
-
-
-class Choice(NamedTuple):
-    """How one of a few words is read and written."""
-
-    words: tuple[str, ...]
+    read: Callable[[str], Any]
+    write: Callable[[Any], str]
     limit: str = ""
-
-    def read(self, text: str) -> str | None:
-        """The word itself; None for any other."""
-        return text if text in self.words else None
-
-    def write(self, value: str) -> str:
-        """The word itself."""
-        return value
+    """What a message about a wrong value says besides the example."""
 
 
-MS = Measure({"ms": 1.0, "us": 1e-3, "s": 1e3}, most=60_000.0)
-SECONDS = Measure({"s": 1.0, "ms": 1e-3, "us": 1e-6}, most=MAX_TIME_S)
-PERCENT = Measure({"%": 1.0}, most=100.0)
-COUNT = Measure({"": 1.0}, least=1.0, most=1e6)
-RATE = Measure({"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}, math.ulp(0.0), 1e9)
+def _measure(units: Mapping[str, float], most: float, least: float = 0.0) -> Kind:
+    """A number with a unit; values are kept and written in the first, whose factor is 1."""
+
+    def read(text: str) -> float | None:
+        match = re.fullmatch(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)([A-Za-z/%]*)", text)
+        if match is None or match[2] not in units:
+            return None
+        value = float(match[1]) * units[match[2]]
+        return value if least <= value <= most else None
+
+    def write(value: float) -> str:
+        # The shortest text that reads back as the same value.
+        return repr(float(value)).removesuffix(".0") + next(iter(units))
+
+    return Kind(read, write, f", at most {write(most)}")
+
+
+def _choice(words: Sequence[str]) -> Kind:
+    return Kind(lambda text: text if text in words else None, str)
+
+
+MS = _measure({"ms": 1.0, "us": 1e-3, "s": 1e3}, most=60_000.0)
+SECONDS = _measure({"s": 1.0, "ms": 1e-3, "us": 1e-6}, most=1e6)
+PERCENT = _measure({"%": 1.0}, most=100.0)
+COUNT = _measure({"": 1.0}, most=1e6, least=1.0)
+_RATES = {"kbit/s": 1.0, "bit/s": 1e-3, "Mbit/s": 1e3, "Gbit/s": 1e6}
+RATE = _measure(_RATES, most=1e9, least=math.ulp(0.0))
 
 
 @dataclass(frozen=True)
@@ -98,40 +87,40 @@ class Outage:
         return (since_s % self.period_s if self.period_s else since_s) < self.length_s
 
 
-class Outages(NamedTuple):
-    """How windows are read and written: LENGTH@START, LENGTH/PERIOD or LENGTH/PERIOD@START."""
-
-    limit: str = ""
-
-    def read(self, text: str) -> tuple[Outage, ...] | None:
-        """The windows, which a plus separates; None where one is not understood."""
-        # A plus also stands inside an exponent, where it is followed by a bare number.
-        windows = [self._window(part) for part in re.split(r"(?<!e)\+", text)]
-        return None if None in windows else tuple(window for window in windows if window)
-
-    def _window(self, text: str) -> Outage | None:
-        match = re.fullmatch(r"([^/@]+)(?:/([^/@]+))?(?:@([^/@]+))?", text)
-        if match is None or not (match[2] or match[3]):
-            return None
-        times_s = [SECONDS.read(part) for part in match.groups() if part]
-        length_s, other_s, start_s = times_s[0], times_s[1], times_s[-1]
-        if length_s is None or other_s is None or start_s is None:
-            return None
-        if match[2] and length_s >= other_s:
-            raise UserError(f"outage {text!r} never ends: the length comes first, then the period")
-        return Outage(length_s, start_s, other_s if match[2] else None)
-
-    def write(self, outages: tuple[Outage, ...]) -> str:
-        """The windows; a start that is the period is left out."""
-        return "+".join(
-            SECONDS.write(one.length_s)
-            + ("" if one.period_s is None else "/" + SECONDS.write(one.period_s))
-            + ("" if one.start_s == one.period_s else "@" + SECONDS.write(one.start_s))
-            for one in outages
-        )
+def _read_outages(text: str) -> tuple[Outage, ...] | None:
+    """Windows with a plus between: LENGTH@START, LENGTH/PERIOD or LENGTH/PERIOD@START."""
+    # A plus also stands inside an exponent, where it is followed by a bare number.
+    windows = [_read_outage(part) for part in re.split(r"(?<!e)\+", text)]
+    return None if None in windows else tuple(window for window in windows if window)
 
 
-def _setting(default: Any, name: str, kind: Measure | Choice | Outages, example: str) -> Any:
+def _read_outage(text: str) -> Outage | None:
+    match = re.fullmatch(r"([^/@]+)(?:/([^/@]+))?(?:@([^/@]+))?", text)
+    if match is None or not (match[2] or match[3]):
+        return None
+    times_s = [SECONDS.read(part) for part in match.groups() if part]
+    if None in times_s:
+        return None
+    length_s, other_s, start_s = times_s[0], times_s[1], times_s[-1]
+    if match[2] and length_s >= other_s:
+        raise UserError(f"outage {text!r} never ends: the length comes first, then the period")
+    return Outage(length_s, start_s, other_s if match[2] else None)
+
+
+def _write_outages(outages: tuple[Outage, ...]) -> str:
+    """The windows; a start that is the period is left out."""
+    return "+".join(
+        SECONDS.write(one.length_s)
+        + ("" if one.period_s is None else "/" + SECONDS.write(one.period_s))
+        + ("" if one.start_s == one.period_s else "@" + SECONDS.write(one.start_s))
+        for one in outages
+    )
+
+
+OUTAGES = Kind(_read_outages, _write_outages)
+
+
+def _setting(default: Any, name: str, kind: Kind, example: str) -> Any:
     return field(default=default, metadata={"name": name, "kind": kind, "example": example})
 
 
@@ -148,7 +137,7 @@ class DirectionSpec:
     """Standard deviation of the time under way; what falls below zero becomes zero."""
     loss_percent: float = _setting(0.0, "loss", PERCENT, "1%")
     """Share of the messages that never arrive, in percent, over all states of the burst model."""
-    tail: str = _setting("normal", "tail", Choice(TAILS), "|".join(TAILS))
+    tail: str = _setting("normal", "tail", _choice(TAILS), "|".join(TAILS))
     """Distribution of the time under way (`SHAPES`); mean and standard deviation stay."""
     burst_messages: float = _setting(0.0, "burst", COUNT, "5")
     """Mean length of a bad stretch in messages (`BurstLoss`); 0: losses are independent."""
@@ -160,7 +149,7 @@ class DirectionSpec:
     """Share of the messages that are held back, so that later ones can overtake them."""
     reorder_by_ms: float = _setting(150.0, "reorder_by", MS, "300ms")
     """How long they are held back; the default lets one state of the control loop pass."""
-    order: str = _setting("free", "order", Choice(ORDERS), "|".join(ORDERS))
+    order: str = _setting("free", "order", _choice(ORDERS), "|".join(ORDERS))
     """``kept``: no message overtakes, so a late message holds up all behind it, as TCP does."""
     duplicate_percent: float = _setting(0.0, "duplicate", PERCENT, "1%")
     """Share of the messages that arrive twice; the copy's time under way is drawn anew."""
@@ -168,7 +157,7 @@ class DirectionSpec:
     """Bandwidth in 1000 bit/s; 0: no limit."""
     queue_ms: float = _setting(200.0, "queue", MS, "100ms")
     """Longest wait for the line; a message that would wait longer is dropped."""
-    outages: tuple[Outage, ...] = _setting((), "outage", Outages(), "0.5s@2s+0.2s/10s")
+    outages: tuple[Outage, ...] = _setting((), "outage", OUTAGES, "0.5s@2s+0.2s/10s")
     """Windows in which whatever leaves the sender is lost."""
 
     def __post_init__(self) -> None:
@@ -222,9 +211,9 @@ class LatencySpec:
 
     def __str__(self) -> str:
         """Canonical form: defaults are left out, prefixes only where needed."""
-        both = self.up.written() if self.up == self.down else None
-        parts = self.up.written("up.") + self.down.written("down.") if both is None else both
-        return ",".join(parts) or "none"
+        if self.up == self.down:
+            return ",".join(self.up.written()) or "none"
+        return ",".join(self.up.written("up.") + self.down.written("down."))
 
 
 def parse_spec(text: str) -> LatencySpec:
@@ -291,10 +280,6 @@ _PARETO_MEAN = PARETO_ALPHA / (PARETO_ALPHA - 1)
 _PARETO_STD = _PARETO_MEAN / math.sqrt(PARETO_ALPHA * (PARETO_ALPHA - 2))
 
 
-def _lognormal(draw: float) -> float:
-    return (math.exp(LOGNORMAL_SIGMA * draw) - _LOGNORMAL_MEAN) / _LOGNORMAL_STD
-
-
 def _pareto(draw: float) -> float:
     upper_tail = 0.5 * math.erfc(draw / math.sqrt(2.0))
     return (upper_tail ** (-1.0 / PARETO_ALPHA) - _PARETO_MEAN) / _PARETO_STD
@@ -302,7 +287,7 @@ def _pareto(draw: float) -> float:
 
 SHAPES: dict[str, Callable[[float], float]] = {
     "normal": lambda draw: draw,
-    "lognormal": _lognormal,
+    "lognormal": lambda draw: (math.exp(LOGNORMAL_SIGMA * draw) - _LOGNORMAL_MEAN) / _LOGNORMAL_STD,
     "pareto": _pareto,
 }
 """How long a message is under way: shapes with mean 0 and standard deviation 1.
@@ -362,9 +347,8 @@ class LatencyModel:
         self._rng = np.random.default_rng(seed)
         self._reorder_rng = np.random.default_rng(reorder)
         self._duplicate_rng = np.random.default_rng(duplicate)
-        self._bursts = (
-            BurstLoss(spec, np.random.default_rng(bursts)) if spec.burst_messages else None
-        )
+        burst_rng = np.random.default_rng(bursts)
+        self._bursts = BurstLoss(spec, burst_rng) if spec.burst_messages else None
         self._shape = SHAPES[spec.tail]
         self._line_free_s = self._newest_arrival_s = float("-inf")
 
@@ -375,18 +359,20 @@ class LatencyModel:
         """
         loss_percent = self._bursts.percent() if self._bursts else self.spec.loss_percent
         lost = self._rng.random() * 100.0 < loss_percent
-        draws = [self._rng.standard_normal()]
+        draw = self._rng.standard_normal()
         held_back = self._reorder_rng.random() * 100.0 < self.spec.reorder_percent
         duplicated = self._duplicate_rng.random() * 100.0 < self.spec.duplicate_percent
-        second_draw = self._duplicate_rng.standard_normal()
-        if duplicated:
-            draws.append(second_draw)
+        draws = (draw, self._duplicate_rng.standard_normal())[: 1 + duplicated]
         left_s = self._leave_s(now_s, size_bytes)
         if left_s is None or lost or any(outage.covers(left_s) for outage in self.spec.outages):
             return ()
         extra_s = self.spec.reorder_by_ms * 1e-3 if held_back else 0.0
         times = sorted(left_s + self._under_way_s(draw) + extra_s for draw in draws)
-        return self._in_order(times) if self.spec.order == "kept" else tuple(times)
+        if self.spec.order == "kept":
+            # What would arrive before an earlier message arrives with it.
+            times = [max(arrival_s, self._newest_arrival_s) for arrival_s in times]
+            self._newest_arrival_s = times[-1]
+        return tuple(times)
 
     def _leave_s(self, now_s: float, size_bytes: int) -> float | None:
         """When the message's last byte has left; None if the queue is full. No rate: at once."""
@@ -401,12 +387,6 @@ class LatencyModel:
     def _under_way_s(self, draw: float) -> float:
         under_way_ms = self.spec.delay_ms + self.spec.jitter_ms * self._shape(draw)
         return max(0.0, under_way_ms) * 1e-3
-
-    def _in_order(self, times: list[float]) -> tuple[float, ...]:
-        """No message overtakes: what would arrive before an earlier message arrives with it."""
-        kept = tuple(max(arrival_s, self._newest_arrival_s) for arrival_s in times)
-        self._newest_arrival_s = kept[-1]
-        return kept
 
 
 class Link(NamedTuple):

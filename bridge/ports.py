@@ -3,6 +3,9 @@
 The port publishes states and hands on what comes back. A listener (viewer, recorder, ROS 2) hears
 every topic through a bounded queue. Zenoh's threads only put into it, so a listener that falls
 behind loses messages and never holds up the vehicle.
+
+After them stands what the commands share: their options, which say where an end is, the progress
+bar, and how they wait.
 """
 
 from __future__ import annotations
@@ -10,23 +13,29 @@ from __future__ import annotations
 import contextlib
 import queue
 import secrets
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 import zenoh
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from bridge.environments import scene_of
 from bridge.inbound import EdgeCounts
 from bridge.messages import TOKEN_TOPICS, WIRE_TOPICS, Heard, Stamps, encode_scene, scene_key
+from bridge.network import GRAMMAR, parse_spec
 from edge_runtime import tls as access
+from edge_runtime.cli import not_negative, seconds
+from edge_runtime.files import check_writable
 from edge_runtime.policy import Manifest
 from edge_runtime.tls import TlsFiles
-from edge_runtime.transport import only_own, open_session
+from edge_runtime.transport import DEFAULT_ENDPOINT, check_endpoint, only_own, open_session
 from edge_runtime.util import UserError
-from edge_runtime.wire import MAX_PAYLOAD_BYTES, check_vehicle_id, key
+from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_PAYLOAD_BYTES, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
 POLL_S = 0.1
@@ -61,17 +70,13 @@ class SimulatorPort:
         self._scenes = zenoh_session.declare_publisher(scenes, congestion_control=drop)
         token = zenoh_session.liveliness().declare_token(simulator_key(vehicle_id))
         self._declared: list[Any] = [self._states, self._scenes, token]
-        self._subscribe("health", self.edge_counts.observe_message)
+        self.hear("health", self.edge_counts.observe_message)
 
-    def on_command(self, handler: PayloadHandler) -> None:
-        """Call ``handler(payload)`` for every command, on Zenoh's thread: it must be quick."""
-        self._subscribe("command", handler)
+    def hear(self, topic: str, handler: PayloadHandler) -> None:
+        """Call ``handler(payload)`` for every message of the vehicle's topic.
 
-    def on_feedback(self, handler: PayloadHandler) -> None:
-        """Call ``handler(payload)`` for every feedback of the vehicle, as ``on_command`` does."""
-        self._subscribe("feedback", handler)
-
-    def _subscribe(self, topic: str, handler: PayloadHandler) -> None:
+        It is called on Zenoh's thread: it must be quick.
+        """
         own = key(self.vehicle_id, topic)
         hear = only_own(own, lambda sample: handler(sample.payload.to_bytes()))
         self._declared.append(self._zenoh.declare_subscriber(own, hear))
@@ -83,10 +88,7 @@ class SimulatorPort:
     def publish_scene(self, environment: Any, stamps: Stamps) -> None:
         """Send the scene, if the environment has one and anybody is listening."""
         somebody: Any = self._scenes.matching_status
-        if not somebody.matching:
-            return
-        scene = scene_of(environment)
-        if scene is not None:
+        if somebody.matching and (scene := scene_of(environment)) is not None:
             self._scenes.put(encode_scene(scene, stamps))
 
     def wait_for_edge(self, limit_s: float, endpoint: str) -> None:
@@ -194,10 +196,6 @@ class WireListener:
             elif self.simulator_gone.is_set():
                 return
 
-    def now_ns(self) -> int:
-        """Return the clock of ``Heard.arrived_ns``."""
-        return self._zero_ns + time.monotonic_ns()
-
     def hearer(self, topic: str) -> Callable[[zenoh.Sample], None]:
         """Return the subscriber callback of one topic."""
 
@@ -207,7 +205,7 @@ class WireListener:
             size = len(sample.payload)
             # A flood of huge messages must not fill the memory.
             payload = sample.payload.to_bytes() if size <= MAX_PAYLOAD_BYTES else b""
-            self._put(Heard(str(sample.key_expr), topic, payload, self.now_ns(), size))
+            self._put(str(sample.key_expr), topic, payload, size)
 
         return hear
 
@@ -218,7 +216,7 @@ class WireListener:
             key, here = str(sample.key_expr), sample.kind != zenoh.SampleKind.DELETE
             if topic == "simulator":
                 self._note_simulator(key, here)
-            self._put(Heard(key, topic, bytes([here]), self.now_ns(), 1))
+            self._put(key, topic, bytes([here]), size=1)
 
         return change
 
@@ -227,14 +225,15 @@ class WireListener:
             self._simulators.add(key)
             self.simulator_gone.clear()
             self.simulator_seen.set()
-            return
-        self._simulators.discard(key)
-        if not self._simulators:
-            self.simulator_gone.set()
+        else:
+            self._simulators.discard(key)
+            if not self._simulators:
+                self.simulator_gone.set()
 
-    def _put(self, heard: Heard) -> None:
+    def _put(self, key: str, topic: str, payload: bytes, size: int) -> None:
+        arrived_ns = self._zero_ns + time.monotonic_ns()
         try:
-            self._queue.put_nowait(heard)
+            self._queue.put_nowait(Heard(key, topic, payload, arrived_ns, size))
         except queue.Full:
             self.dropped += 1
 
@@ -265,10 +264,10 @@ def open_listener(
         try:
             # A listener to a vehicle that is not there would never see it go, nor end.
             if not listener.simulator_seen.wait(max(TOKEN_S, give_up_s - time.monotonic())):
-                hint = "start one: python -m bridge simulate"
-                if vehicle_id != ANY_VEHICLE:
-                    hint = "name it with --vehicle-id"
-                which = "" if vehicle_id == ANY_VEHICLE else f" with vehicle id {vehicle_id}"
+                if vehicle_id == ANY_VEHICLE:
+                    which, hint = "", "start one: python -m bridge simulate"
+                else:
+                    which, hint = f" with vehicle id {vehicle_id}", "name it with --vehicle-id"
                 raise UserError(f"no simulator{which} at {connect}; {hint}")
             yield listener
         finally:
@@ -286,3 +285,88 @@ def connect_client(endpoint: str, wait_s: float, tls: TlsFiles | None = None) ->
             if time.monotonic() >= give_up_s:
                 raise
             time.sleep(RETRY_S)
+
+
+def writable(path: str) -> str:
+    """The path itself; UserError where no report could be written there later."""
+    check_writable(path)
+    return path
+
+
+ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
+_SECONDS = {"metavar": "SECONDS", "type": seconds}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--listen": {**ENDPOINT, "help": "where the edge runtime and viewers connect to"},
+    "--connect": {
+        **ENDPOINT,
+        "default": DEFAULT_ENDPOINT,
+        "help": "where the simulator or the router listens",
+    },
+    "--tls": {
+        "metavar": "DIR",
+        "help": "ca.pem, cert.pem, key.pem of this party (python -m deploy certs);"
+        " endpoint tls/...",
+    },
+    "--vehicle-id": {
+        "metavar": "ID",
+        "type": check_vehicle_id,
+        "default": DEFAULT_VEHICLE_ID,
+        "help": "the vehicle",
+    },
+    "--wait-s": {
+        **_SECONDS,
+        "default": 10.0,
+        "help": "how long to wait for a simulator, in seconds",
+    },
+    "--duration-s": {
+        **_SECONDS,
+        "help": "stop after this many seconds (otherwise when no simulator is left)",
+    },
+    "--wait-edge-s": {
+        **_SECONDS,
+        "default": 30.0,
+        "help": "how long to wait for an edge runtime, in seconds",
+    },
+    "--latency": {
+        "metavar": "SPEC",
+        "type": parse_spec,
+        "default": "none",
+        "help": "injected network: " + GRAMMAR.replace("%", "%%"),
+    },
+    "--seed": {
+        "metavar": "N",
+        "type": not_negative,
+        "default": 0,
+        "help": "of delays and losses",
+    },
+    "--out": {"metavar": "R.json", "type": writable, "help": "write the report to this file"},
+}
+"""The options that several commands have; their types raise UserError for a bad value."""
+
+
+def add_options(parser: Any, *names: str, **changes: Any) -> None:
+    """Declare options of the table; ``changes`` are this command's own help, default and so on."""
+    for name in names:
+        parser.add_argument(name, **{**OPTIONS[name], **changes})
+
+
+def wait_to_be_told() -> NoReturn:
+    """Sleep until KeyboardInterrupt (main thread only).
+
+    The kernel may hand a signal to any thread, one of Zenoh's too. That does not wake this thread
+    from a lock, so it looks again now and then.
+    """
+    while True:
+        time.sleep(RETRY_S)
+
+
+def progress_bar(unit: str) -> Progress:
+    """Make a bar on stderr that counts ``unit``; it shows nothing where stderr is no terminal."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
+        TimeElapsedColumn(),
+    )
+    return Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty())

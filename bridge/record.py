@@ -20,13 +20,14 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import functools
 import io
 import os
 import sys
 import time
 import typing
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -34,9 +35,15 @@ import msgspec
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import CompressionType, Writer
 
-from bridge.commands import add_options
 from bridge.messages import DECODERS, TOKEN_TOPICS, Heard
-from bridge.ports import ANY_VEHICLE, POLL_S, QUEUE_MESSAGES, WireListener, open_listener
+from bridge.ports import (
+    ANY_VEHICLE,
+    POLL_S,
+    QUEUE_MESSAGES,
+    WireListener,
+    add_options,
+    open_listener,
+)
 from bridge.recording import METADATA, WIRE_ENCODING, Recording
 from edge_runtime import __version__, wire
 from edge_runtime.cli import Command, examples, seconds, sigterm_as_interrupt
@@ -117,16 +124,6 @@ def _run_record(arguments: Any) -> int:
     return 0
 
 
-RECORD = Command(
-    examples(
-        "python -m bridge record --out drive.mcap",
-        "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
-    ),
-    _add_record_arguments,
-    _run_record,
-)
-
-
 def _listen(listener: WireListener, writer: RecordingWriter, arguments: Any) -> None:
     now_s = time.monotonic()
     end_s = None if arguments.duration_s is None else now_s + arguments.duration_s
@@ -157,7 +154,7 @@ class RecordingWriter:
         self._mcap = start_mcap(self._file)
         self._mcap.flush()  # Before anybody is told of the file, it is an MCAP file.
         self._channels: dict[str, int] = {}
-        self._schemas: dict[str, tuple[Schema, int]] = {}
+        self._schema_ids: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
 
     def write(self, heard: Heard, with_view: bool = True) -> None:
@@ -206,23 +203,24 @@ class RecordingWriter:
         if isinstance(message, wire.State):
             # The frames lie one after the other: in memory that is one picture, twice as high.
             count, height, width = wire.FRAMES_SHAPE
-            size, at = (width, count * height), heard.arrived_ns
+            size, at = (width, count * height), _stamp(heard.arrived_ns)
             picture = RawImage(at, *size, "mono8", width, message.frames, _vehicle_id(heard))
             self._copy(heard, "frames", picture)
 
     def _event(self, heard: Heard, level: Level, text: str) -> None:
-        self._copy(heard, "events", Log(heard.arrived_ns, level, text, _vehicle_id(heard)))
+        self._copy(heard, "events", Log(_stamp(heard.arrived_ns), level, text, _vehicle_id(heard)))
 
     def _copy(self, heard: Heard, name: str, values: msgspec.Struct) -> None:
         """Add what viewers can draw, to the vehicle's topic of that name."""
-        kind = type(values).__name__
-        if kind not in self._schemas:
-            schema = describe(type(values))
+        schema = describe(type(values))
+        if schema.name not in self._schema_ids:
             schema_id = self._mcap.register_schema(schema.name, "protobuf", schema.descriptors)
-            self._schemas[kind] = schema, schema_id
-        schema, schema_id = self._schemas[kind]
-        data = fill(schema.make(), values).SerializeToString()
-        topic = f"view/{_vehicle_id(heard)}/{name}"
+            self._schema_ids[schema.name] = schema_id
+        known = schema.make.DESCRIPTOR.fields_by_name
+        fields = msgspec.to_builtins(values, builtin_types=(bytes,)).items()
+        drawn = {name: value for name, value in fields if name in known}
+        data = schema.make(**drawn).SerializeToString()
+        topic, schema_id = f"view/{_vehicle_id(heard)}/{name}", self._schema_ids[schema.name]
         self._add(topic, "protobuf", heard.arrived_ns, data, schema_id)
 
     def _add(self, topic: str, encoding: str, now_ns: int, data: bytes, schema_id: int = 0) -> None:
@@ -301,8 +299,8 @@ class FlushedFile:
 
 Field: Any = descriptor_pb2.FieldDescriptorProto
 TIMESTAMP = "google.protobuf.Timestamp"
-Time = Annotated[int, TIMESTAMP]
-"""Nanoseconds since 1970."""
+Time = Annotated[dict[str, int], TIMESTAMP]
+"""As `_stamp` makes it."""
 Fixed32 = Annotated[int, Field.TYPE_FIXED32]
 Data = Annotated[bytes, Field.TYPE_BYTES]
 _SCALARS = {
@@ -342,6 +340,11 @@ class Log(msgspec.Struct):
     name: str
 
 
+def _stamp(time_ns: int) -> dict[str, int]:
+    """Nanoseconds since 1970 as protobuf's timestamp has them."""
+    return dict(zip(("seconds", "nanos"), divmod(time_ns, 10**9), strict=True))
+
+
 class Schema(NamedTuple):
     """A protobuf message type: its full name, its class, and its serialised FileDescriptorSet."""
 
@@ -350,6 +353,7 @@ class Schema(NamedTuple):
     descriptors: bytes
 
 
+@functools.cache
 def describe(kind: type[msgspec.Struct]) -> Schema:
     """Mirror a struct: one of the two above by Foxglove's name, one of the wire as ``phil.<name>``.
 
@@ -374,55 +378,34 @@ def describe(kind: type[msgspec.Struct]) -> Schema:
     return Schema(name, make, files.SerializeToString())
 
 
-def fill(target: Any, values: msgspec.Struct) -> Any:
-    """Copy the fields that both have into the protobuf message, and return it."""
-    for descriptor in target.DESCRIPTOR.fields:
-        value, own = getattr(values, descriptor.name), getattr(target, descriptor.name)
-        if isinstance(value, Mapping):
-            own.update(value)
-        elif isinstance(value, list | tuple):
-            for one in value:
-                fill(own.add(), one) if isinstance(one, msgspec.Struct) else own.append(one)
-        elif descriptor.message_type is not None:
-            own.FromNanoseconds(value)
-        elif value is not None:
-            setattr(target, descriptor.name, value)
-    return target
-
-
-def _add_struct(message: Any, kind: type[msgspec.Struct], path: str) -> None:
-    message.name = kind.__name__
+def _add_struct(message: Any, kind: type[msgspec.Struct], package: str) -> None:
+    message.name, path = kind.__name__, f"{package}.{kind.__name__}"
     hints = typing.get_type_hints(kind, include_extras=True)
     for number, (name, hint) in enumerate(hints.items(), start=1):
-        field = Field(name=name, number=number, label=Field.LABEL_OPTIONAL)
-        if _type_field(field, _without_none(hint), message, f"{path}.{kind.__name__}"):
-            message.field.append(field)
-
-
-def _type_field(field: Any, hint: Any, message: Any, path: str) -> bool:
-    """Fill in the type; False where the viewers' copy goes without this field."""
-    origin, inner = typing.get_origin(hint), typing.get_args(hint)
-    if hint in _SCALARS:
-        field.type = _SCALARS[hint]
-    elif hint == Time:
-        field.type, field.type_name = Field.TYPE_MESSAGE, f".{TIMESTAMP}"
-    elif origin is dict:
-        field.label, field.type = Field.LABEL_REPEATED, Field.TYPE_MESSAGE
-        field.type_name = f".{path}.{_add_map_entry(message, field.name, inner)}"
-    elif origin in (list, Sequence):
-        field.label = Field.LABEL_REPEATED
-        return typing.get_origin(inner[0]) is None and _type_field(field, inner[0], message, path)
-    elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
-        _add_struct(message.nested_type.add(), hint, path)
-        field.type, field.type_name = Field.TYPE_MESSAGE, f".{path}.{hint.__name__}"
-    elif isinstance(hint, type) and issubclass(hint, enum.IntEnum):
-        levels = message.enum_type.add(name=hint.__name__)
-        for one in hint:
-            levels.value.add(name=one.name, number=one.value)
-        field.type, field.type_name = Field.TYPE_ENUM, f".{path}.{hint.__name__}"
-    else:
-        return False
-    return True
+        inner = typing.get_args(hint)
+        if type(None) in inner:
+            hint = inner[0]
+        field = message.field.add(name=name, number=number, label=Field.LABEL_OPTIONAL)
+        origin, inner = typing.get_origin(hint), typing.get_args(hint)
+        if origin in (dict, list, Sequence):
+            field.label, hint = Field.LABEL_REPEATED, inner[0]
+        if origin is dict:
+            field.type = Field.TYPE_MESSAGE
+            field.type_name = f".{path}.{_add_map_entry(message, name, inner)}"
+        elif hint in _SCALARS:
+            field.type = _SCALARS[hint]
+        elif hint == Time:
+            field.type, field.type_name = Field.TYPE_MESSAGE, f".{TIMESTAMP}"
+        elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+            _add_struct(message.nested_type.add(), hint, path)
+            field.type, field.type_name = Field.TYPE_MESSAGE, f".{path}.{hint.__name__}"
+        elif hint is Level:
+            levels = message.enum_type.add(name=hint.__name__)
+            for one in hint:
+                levels.value.add(name=one.name, number=one.value)
+            field.type, field.type_name = Field.TYPE_ENUM, f".{path}.{hint.__name__}"
+        else:
+            del message.field[-1]
 
 
 def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
@@ -433,12 +416,6 @@ def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
     for number, (label, kind) in enumerate(zip(("key", "value"), inner, strict=True), start=1):
         entry.field.add(name=label, number=number, label=Field.LABEL_OPTIONAL, type=_SCALARS[kind])
     return entry_name
-
-
-def _without_none(hint: Any) -> Any:
-    inner = [part for part in typing.get_args(hint) if part is not type(None)]
-    is_optional = type(None) in typing.get_args(hint) and len(inner) == 1
-    return inner[0] if is_optional else hint
 
 
 KEPT = ".damaged"
@@ -478,18 +455,17 @@ def _run_repair(arguments: Any) -> int:
         found = counted(messages, "message")
         if not messages:
             raise UserError(f"{source} holds no whole message; there is nothing to repair")
-        if recording.trouble() or arguments.out is not None:
-            kept = _write(data, recording, arguments.out)
-        elif recording.has_checksums:
-            print(f"{source} is whole: {found}; nothing done")
+        if arguments.out is None and not recording.trouble():
+            whole, more = "is whole", ""
+            if not recording.has_checksums:
+                whole = "can be read to its end"
+                more = (
+                    ". It has no checksum over all of it, so a change in its index would not show;"
+                    " --out G.mcap writes it with one"
+                )
+            print(f"{source} {whole}: {found}; nothing done{more}")
             return 0
-        else:
-            print(
-                f"{source} can be read to its end: {found}; nothing done. It has no checksum over"
-                " all of it, so a change in its index would not show; --out G.mcap writes it with"
-                " one"
-            )
-            return 0
+        kept = _write(data, recording, arguments.out)
     left_out = recording.missing() and f"; left out: {recording.missing()}"
     print(f"wrote {arguments.out or source}: {found}{left_out}{kept}")
     return 0
@@ -504,16 +480,11 @@ def _write(data: bytes, recording: Recording, out: str | None) -> str:
     kept = file.with_name(file.name + KEPT)
     try:
         os.link(file, kept)
-    except FileExistsError:
+    except OSError as error:
         # A repair that was killed leaves its link.
         if not (kept.exists() and kept.samefile(file)):
-            raise UserError(
-                f"{kept} exists; move it away, or name another file with --out"
-            ) from None
-    except OSError as error:
-        raise UserError(
-            f"cannot keep {file} as {kept}: {error.strerror}; name another file with --out"
-        ) from None
+            why = f"{kept} exists" if kept.exists() else f"cannot make {kept}: {error.strerror}"
+            raise UserError(f"{why}; name another file with --out") from None
     try:
         write_atomic(file, data)
     except UserError:  # Nothing was replaced. (After an interrupt nobody knows: it stays.)
@@ -536,12 +507,9 @@ def _rewrite(recording: Recording) -> tuple[bytes, int]:
             channels[channel.id] = writer.register_channel(
                 channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0)
             )
+        times = {"log_time": message.log_time, "publish_time": message.publish_time}
         writer.add_message(
-            channels[channel.id],
-            message.log_time,
-            message.data,
-            message.publish_time,
-            message.sequence,
+            channels[channel.id], data=message.data, sequence=message.sequence, **times
         )
         messages += 1
     if recording.metadata:
@@ -550,11 +518,12 @@ def _rewrite(recording: Recording) -> tuple[bytes, int]:
     return stream.getvalue(), messages
 
 
-REPAIR = Command(
-    examples(
-        "python -m bridge repair drive.mcap",
-        "python -m bridge repair drive.mcap --out whole.mcap",
-    ),
-    _add_repair_arguments,
-    _run_repair,
+RECORD_EXAMPLE = examples(
+    "python -m bridge record --out drive.mcap",
+    "python -m bridge record --out car-a.mcap --vehicle-id car-a --wait-s 60 --duration-s 300",
 )
+REPAIR_EXAMPLE = examples(
+    "python -m bridge repair drive.mcap", "python -m bridge repair drive.mcap --out whole.mcap"
+)
+RECORD = Command(RECORD_EXAMPLE, _add_record_arguments, _run_record)
+REPAIR = Command(REPAIR_EXAMPLE, _add_repair_arguments, _run_repair)

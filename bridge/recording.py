@@ -97,18 +97,15 @@ class Condition:
 
     def missing(self) -> str:
         """Say what could not be read; empty where all of the file could."""
-        parts = []
-        if self.damaged_places:
-            places = counted(self.damaged_places, "damaged place")
-            parts.append(f"{places} of {counted(self.damaged_bytes, 'byte')}")
-        if self.is_altered:
-            parts.append("bytes that changed outside of its chunks")
-        if self.nameless_messages:
-            messages = counted(self.nameless_messages, "message")
-            parts.append(f"{messages} whose topic was in a damaged place")
-        if self.torn_bytes:
-            parts.append(f"a torn end of {counted(self.torn_bytes, 'byte')}")
-        return ", ".join(parts)
+        places = counted(self.damaged_places, "damaged place")
+        messages = counted(self.nameless_messages, "message")
+        parts = {
+            f"{places} of {counted(self.damaged_bytes, 'byte')}": self.damaged_places,
+            "bytes that changed outside of its chunks": self.is_altered,
+            f"{messages} whose topic was in a damaged place": self.nameless_messages,
+            f"a torn end of {counted(self.torn_bytes, 'byte')}": self.torn_bytes,
+        }
+        return ", ".join(part for part, is_so in parts.items() if is_so)
 
     def trouble(self) -> str:
         """Say what is wrong with the file, as a verb with its object; empty: nothing."""
@@ -343,12 +340,8 @@ def choose_vehicle(recording: Recording, vehicle_id: str | None) -> str:
 def read_heard(recording: Recording, vehicle_id: str | None) -> Iterator[Heard]:
     """The wire's messages of one vehicle as a listener would have heard them, in their order.
 
-    Args:
-        recording: it may be cut off or damaged, and says so afterwards.
-        vehicle_id: which one; None: the only one in it.
-
-    Raises:
-        UserError: no recording, no such vehicle in it, or several and none is named.
+    The recording may be cut off or damaged, and says so afterwards. ``vehicle_id`` None: the only
+    one in it. UserError: no recording, no such vehicle in it, or several and none is named.
     """
     return heard_of(recording, choose_vehicle(recording, vehicle_id))
 

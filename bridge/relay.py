@@ -20,9 +20,8 @@ from typing import Any
 import zenoh
 
 from bridge.clocks import DelayLine, Publish
-from bridge.commands import add_options, wait_to_be_told
 from bridge.network import LatencySpec, make_link
-from bridge.ports import simulator_key
+from bridge.ports import add_options, simulator_key, wait_to_be_told
 from bridge.report import quantiles
 from edge_runtime import tls as access
 from edge_runtime.cli import Command, examples, sigterm_as_interrupt
@@ -60,30 +59,23 @@ def _run_relay(arguments: Any) -> int:
             )
     if arguments.listen == arguments.connect:
         raise UserError(f"--listen and --connect are both {arguments.listen}: that is a circle")
-    known = {name: getattr(arguments, name) for name in ("vehicle_id", "listen", "connect")}
-    known["latency_spec"] = str(arguments.latency)
+    names = ("vehicle_id", "listen", "connect", "latency", "seed")
+    asked = {name: getattr(arguments, name) for name in names}
     began_s = time.monotonic()
     relay: Relay | None = None
     with (
         contextlib.suppress(KeyboardInterrupt),  # the ordinary end
         sigterm_as_interrupt(),
-        open_relay(
-            arguments.listen,
-            arguments.connect,
-            arguments.vehicle_id,
-            arguments.latency,
-            arguments.seed,
-        ) as running,
+        open_relay(**asked) as running,
     ):
         relay = running
-        shown = " ".join(f"{name}={value}" for name, value in known.items())
-        print(f"ready {shown}".replace("latency_spec", "latency"), flush=True)
+        print("ready", *(f"{name}={asked[name]}" for name in names[:4]), flush=True)
         wait_to_be_told()
     if relay is None:
         return 0  # told to end before it had begun
     report = {
-        **known,
-        "seed": arguments.seed,
+        "latency_spec": str(asked.pop("latency")),
+        **asked,
         "duration_s": round(time.monotonic() - began_s, 3),
         **relay.traffic.report(),
         "queries": relay.queries,
@@ -96,25 +88,15 @@ def _run_relay(arguments: Any) -> int:
     return 0
 
 
-RELAY = Command(
-    examples(
-        "python -m bridge relay --listen tcp/127.0.0.1:7448 --connect tcp/127.0.0.1:7447 \\\n"
-        "    --latency 50ms+-10ms,loss=1% --out relay.json",
-    ),
-    _add_relay_arguments,
-    _run_relay,
-)
-
-
 @contextlib.contextmanager
 def open_relay(
-    listen: str, connect: str, vehicle_id: str, spec: LatencySpec, seed: int
+    listen: str, connect: str, vehicle_id: str, latency: LatencySpec, seed: int
 ) -> Iterator[Relay]:
     """Listen for the edge runtime and connect to the simulator; UserError for a busy port."""
     with (
         contextlib.closing(open_session(listen=listen, mode="router")) as to_edge,
         contextlib.closing(open_session(connect=connect, mode="peer")) as to_simulator,
-        contextlib.closing(Relay(to_edge, to_simulator, vehicle_id, spec, seed)) as relay,
+        contextlib.closing(Relay(to_edge, to_simulator, vehicle_id, latency, seed)) as relay,
     ):
         yield relay
 
@@ -137,13 +119,11 @@ class Relay:
         self._edge, self._simulator, self._vehicle_id = to_edge, to_simulator, vehicle_id
         self._lock = threading.Lock()
         self._mirrored: dict[str, Any] = {}
-        publishers = {"state": self._publisher(to_edge, "state", express=False)}
-        for topic in DOWN:
-            publishers[topic] = self._publisher(to_simulator, topic, express=True)
+        ways = {"state": (to_simulator, to_edge)} | dict.fromkeys(DOWN, (to_edge, to_simulator))
+        publishers = {topic: self._publisher(to, topic) for topic, (_, to) in ways.items()}
         self.traffic = RelayTraffic(spec, seed, {name: one.put for name, one in publishers.items()})
         self._declared = list(publishers.values())
-        self._declared += [self._hear(to_simulator, "state")]
-        self._declared += [self._hear(to_edge, topic) for topic in DOWN]
+        self._declared += [self._hear(source, topic) for topic, (source, _) in ways.items()]
         self._declared += [self._answer(topic) for topic in QUERIES]
         self._mirror(to_edge, to_simulator, key(vehicle_id, "alive"))
         self._mirror(to_simulator, to_edge, simulator_key(vehicle_id))
@@ -157,8 +137,9 @@ class Relay:
             token.undeclare()
         self.traffic.close()
 
-    def _publisher(self, session: zenoh.Session, topic: str, express: bool) -> Any:
+    def _publisher(self, session: zenoh.Session, topic: str) -> Any:
         # As the ends themselves publish: a slow listener holds nothing up.
+        express = topic in DOWN
         return session.declare_publisher(
             key(self._vehicle_id, topic),
             congestion_control=zenoh.CongestionControl.DROP,
@@ -313,28 +294,25 @@ def _run_router(arguments: Any) -> int:
         if arguments.config is None:
             session = open_session(listen=listens, mode="router", tls=tls, access=rules)
         else:
-            session = _open(arguments.config)
+            read_bytes(arguments.config, "router's config file")
+            try:  # as zenohd would
+                session = zenoh.open(zenoh.Config.from_file(arguments.config))
+            except zenoh.ZError as error:
+                raise UserError(f"Zenoh opens no router with {arguments.config}: {error}") from None
         with contextlib.closing(session):
             print(f"ready {ready}", flush=True)
             wait_to_be_told()
     return 0
 
 
-def _open(path: str) -> zenoh.Session:
-    """A router with the settings of a file, as zenohd would open it."""
-    read_bytes(path, "router's config file")
-    try:
-        return zenoh.open(zenoh.Config.from_file(path))
-    except zenoh.ZError as error:
-        raise UserError(f"Zenoh opens no router with {path}: {error}") from None
-
-
-ROUTER = Command(
-    examples(
-        "python -m bridge router --listen tcp/127.0.0.1:7447",
-        "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
-        "    --vehicle-id hunter01 --vehicle-id hunter02",
-    ),
-    _add_router_arguments,
-    _run_router,
+RELAY_EXAMPLE = examples(
+    "python -m bridge relay --listen tcp/127.0.0.1:7448 --connect tcp/127.0.0.1:7447 \\\n"
+    "    --latency 50ms+-10ms,loss=1% --out relay.json",
 )
+ROUTER_EXAMPLE = examples(
+    "python -m bridge router --listen tcp/127.0.0.1:7447",
+    "python -m bridge router --listen tls/0.0.0.0:7447 --tls certs/router \\\n"
+    "    --vehicle-id hunter01 --vehicle-id hunter02",
+)
+RELAY = Command(RELAY_EXAMPLE, _add_relay_arguments, _run_relay)
+ROUTER = Command(ROUTER_EXAMPLE, _add_router_arguments, _run_router)

@@ -11,6 +11,7 @@ import queue
 import secrets
 import sys
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,9 +19,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from bridge.commands import add_options, progress_bar
 from bridge.messages import DECODERS, Heard
-from bridge.ports import SimulatorPort, open_port
+from bridge.ports import SimulatorPort, add_options, open_port, progress_bar
 from bridge.recording import Recording, choose_vehicle, heard_of
 from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
 from edge_runtime.config import NONE, Config, load_config
@@ -31,15 +31,7 @@ from edge_runtime.safety import MAX_INFERENCE_S, SILENCE_S, Event
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, printable
 from edge_runtime.vehicles import vehicle_limits
-from edge_runtime.wire import (
-    SAFE_STOP,
-    Command,
-    Health,
-    State,
-    decode_command,
-    decode_state,
-    encode,
-)
+from edge_runtime.wire import SAFE_STOP, Command, Health, State, decode_command, encode
 
 RUNTIME_ENDED = "runtime_ended"
 """Reason of the farewell of a runtime that is ended; no decision about a state."""
@@ -128,17 +120,17 @@ def run(arguments: Any) -> int:
     )
     for row in report["first_differences"][:3]:
         recorded, ours = _text(row["recorded"]), _text(row["replayed"])
-        place = f"episode {row['episode']} step {row['step']}"
-        print(f"  {place}: recorded {recorded}; replayed {ours}")
+        print(
+            f"  episode {row['episode']} step {row['step']}: recorded {recorded}; replayed {ours}"
+        )
     return DIFFERENT if report["different"] else 0
 
 
 def _text(answers: Sequence[Mapping[str, Any]]) -> str:
-    parts = [
-        f"{answer['mode']} {[round(value, 4) for value in answer['action']]}"
-        + (f" ({printable(answer['reason'])})" if answer["reason"] else "")
-        for answer in answers
-    ]
+    parts = []
+    for answer in answers:
+        reason = f" ({printable(answer['reason'])})" if answer["reason"] else ""
+        parts.append(f"{answer['mode']} {[round(x, 4) for x in answer['action']]}{reason}")
     return ", then ".join(parts) or "nothing"
 
 
@@ -198,7 +190,7 @@ class RecordedDrive:
         self.recording = Recording(path)
         self.exchanges: dict[Key, Exchange] = {}
         self.policy_ids: list[str] = []
-        self.vehicle = "none"
+        self.vehicle = NONE
         self.runtime_starts_s: list[float] = []
         self.vehicle_id = choose_vehicle(self.recording, vehicle_id)
         self._zero_ns: int | None = None
@@ -206,33 +198,29 @@ class RecordedDrive:
         for heard in heard_of(self.recording, self.vehicle_id):
             self._take(heard)
         if not self.exchanges:
-            raise UserError(
-                f"{path} holds no answered state of vehicle {self.vehicle_id} to replay"
-            )
+            raise UserError(f"{path} holds no answered state of vehicle {self.vehicle_id}")
 
     def states(self) -> Iterator[State]:
         """Yield every state that can be read, answered or not, in order of arrival."""
         for heard in heard_of(self.recording, self.vehicle_id):
             if heard.topic == "state":
-                state = decode_state(heard.payload)
+                state = DECODERS["state"](heard.payload)
                 if isinstance(state, State):
                     yield state
 
     def answered(self) -> Iterator[tuple[State, Exchange]]:
         """Yield the states that reached the policy, each once."""
-        done: set[Key] = set()
+        left = dict(self.exchanges)
         for state in self.states():
-            key = key_of(state)
-            if key in self.exchanges and key not in done:
-                done.add(key)
-                yield state, self.exchanges[key]
+            if (exchange := left.pop(key_of(state), None)) is not None:
+                yield state, exchange
 
     def _take(self, heard: Heard) -> None:
         if self._zero_ns is None:
             self._zero_ns = heard.arrived_ns
-        heard_s = (heard.arrived_ns - self._zero_ns) * 1e-9
         if heard.topic not in ("command", "health"):
             return
+        heard_s = (heard.arrived_ns - self._zero_ns) * 1e-9
         message = DECODERS[heard.topic](heard.payload)
         if isinstance(message, Command) and message.reason != RUNTIME_ENDED:
             self._take_command(message, heard_s)
@@ -247,10 +235,9 @@ class RecordedDrive:
             self.policy_ids.append(command.policy_id)
         sent_s = self._sent_s(command, heard_s)
         key = (command.session, command.episode, command.step)
-        if key not in self.exchanges:
-            self.exchanges[key] = _first_exchange(command, sent_s)
-        self.exchanges[key].last_s = sent_s
-        note(self.exchanges[key].answers, command)
+        exchange = self.exchanges.setdefault(key, _first_exchange(command, sent_s))
+        exchange.last_s = sent_s
+        note(exchange.answers, command)
 
     def _sent_s(self, command: Command, heard_s: float) -> float:
         """When the command was sent, in the recorder's time.
@@ -280,8 +267,7 @@ def key_of(state: State) -> Key:
 
 def _first_exchange(command: Command, sent_s: float) -> Exchange:
     """The state arrived as long before its answer as the runtime had it."""
-    thought_s = max(0.0, (command.sent_ns - command.received_ns) * 1e-9)
-    arrived_s = sent_s - thought_s
+    arrived_s = sent_s - max(0.0, (command.sent_ns - command.received_ns) * 1e-9)
     begun_s = max(arrived_s, sent_s - command.inference_ns * 1e-9)
     finished_s = sent_s
     if command.inference_ns == 0 and command.reason == Event.TOO_LONG.value:
@@ -300,39 +286,30 @@ def replay_in_process(drive: RecordedDrive, policy: Policy, config: Config) -> A
     policy or cannot follow its scenario.
     """
     limits = vehicle_limits(drive.vehicle, config, policy.manifest.scenario)
-    shared = shared_limits(policy.manifest.action, limits)
-    return _Replay(drive, policy, shared, needs_rearm=drive.vehicle != NONE).run()
+    return _Replay(drive, policy, shared_limits(policy.manifest.action, limits)).run()
 
 
 class _Replay:
-    def __init__(
-        self, drive: RecordedDrive, policy: Policy, limits: Limits, needs_rearm: bool
-    ) -> None:
-        self._drive = drive
-        self._policy = policy
-        self._limits = limits
-        self._needs_rearm = needs_rearm
-        self._restarts_s: Iterator[float] = iter(drive.runtime_starts_s[1:])
-        self._next_restart_s = next(self._restarts_s, float("inf"))
+    def __init__(self, drive: RecordedDrive, policy: Policy, limits: Limits) -> None:
+        self._drive, self._policy, self._limits = drive, policy, limits
+        self._restarts_s = deque(drive.runtime_starts_s[1:])
         self._controller = self._make_controller()
         self._last_heard_s = 0.0
         self._answers: Answers = {}
 
     def run(self) -> Answers:
         for state, exchange in self._drive.answered():
-            self._restart(exchange.arrived_s)
+            while self._restarts_s and exchange.arrived_s >= self._restarts_s[0]:
+                self._restarts_s.popleft()
+                self._pass_time(self._last_heard_s)
+                self._controller = self._make_controller()
             self._answer(state, exchange)
         self._pass_time(self._last_heard_s)
         return self._answers
 
-    def _restart(self, now_s: float) -> None:
-        while now_s >= self._next_restart_s:
-            self._pass_time(self._last_heard_s)
-            self._controller = self._make_controller()
-            self._next_restart_s = next(self._restarts_s, float("inf"))
-
     def _make_controller(self) -> Controller:
-        return Controller(self._limits, self._needs_rearm, task=self._policy.manifest.task)
+        needs_rearm = self._drive.vehicle != NONE
+        return Controller(self._limits, needs_rearm, task=self._policy.manifest.task)
 
     def _answer(self, state: State, exchange: Exchange) -> None:
         self._pass_time(exchange.begun_s)
@@ -391,25 +368,21 @@ class _Live:
         self._answers: Answers = {}
 
     def replay(self, states: Iterable[tuple[State, Exchange]]) -> Answers:
-        self._port.on_command(self._inbox.put)
-        zero_s: float | None = None
-        last_s = 0.0
+        self._port.hear("command", self._inbox.put)
+        zero_s, last_s = float("-inf"), 0.0
         for state, exchange in states:
-            if zero_s is None:
+            if zero_s == float("-inf"):
                 zero_s = time.monotonic() - exchange.arrived_s
             self._listen_until(zero_s + exchange.arrived_s)
-            self._publish(state)
+            fresh = self._fresh.setdefault(state.session, secrets.token_hex(8))
+            self._recorded[fresh] = state.session
+            sent = msgspec.structs.replace(state, session=fresh, sent_ns=time.time_ns())
+            self._port.publish_state(encode(sent))
             self._listen_until(time.monotonic() + SILENCE_S, key_of(state))
             zero_s = max(zero_s, time.monotonic() - exchange.finished_s)
             last_s = exchange.last_s
-        self._listen_until((zero_s or 0.0) + last_s)
+        self._listen_until(zero_s + last_s)
         return self._answers
-
-    def _publish(self, state: State) -> None:
-        fresh = self._fresh.setdefault(state.session, secrets.token_hex(8))
-        self._recorded[fresh] = state.session
-        sent = msgspec.structs.replace(state, session=fresh, sent_ns=time.time_ns())
-        self._port.publish_state(encode(sent))
 
     def _listen_until(self, end_s: float, wanted: Key | None = None) -> None:
         """Take what comes before ``end_s`` (monotonic), or until the wanted answer is there."""
@@ -440,8 +413,8 @@ def compare(
     kinds: dict[str, dict[str, int]] = {}
     differences: list[dict[str, Any]] = []
     largest = 0.0
-    each_ours = _without_repetitions([recorded[key].answers for key in answered])
-    each_theirs = _without_repetitions([replayed.get(key, []) for key in answered])
+    each_ours = _without_repetitions(recorded[key].answers for key in answered)
+    each_theirs = _without_repetitions(replayed.get(key, []) for key in answered)
     for key, ours, theirs in zip(answered, each_ours, each_theirs, strict=True):
         same_shape, distance = _distance(ours, theirs)
         largest = max(largest, distance)
@@ -450,13 +423,10 @@ def compare(
         row["compared"] += 1
         if not same_shape or distance > tolerance:
             row["different"] += 1
-            differences.append(
-                {
-                    **dict(zip(("session", "episode", "step"), key, strict=True)),
-                    "recorded": [answer._asdict() for answer in ours],
-                    "replayed": [answer._asdict() for answer in theirs],
-                }
-            )
+            place = dict(zip(("session", "episode", "step"), key, strict=True))
+            each = {"recorded": ours, "replayed": theirs}
+            told = {name: [one._asdict() for one in found] for name, found in each.items()}
+            differences.append({**place, **told})
     return {
         "states": len(states),
         "compared": len(answered),
@@ -470,15 +440,13 @@ def compare(
     }
 
 
-def _without_repetitions(each: Sequence[Sequence[Answer]]) -> list[Sequence[Answer]]:
+def _without_repetitions(each: Iterable[Sequence[Answer]]) -> Iterator[Sequence[Answer]]:
     """The answers to each state, without a first one that only repeats the stop before it."""
-    kept: list[Sequence[Answer]] = []
     standing: Answer | None = None
     for answers in each:
         repeats = len(answers) > 1 and answers[0] == standing and standing.mode == SAFE_STOP
-        kept.append(answers[1:] if repeats else answers)
+        yield answers[1:] if repeats else answers
         standing = answers[-1] if answers else None
-    return kept
 
 
 def _distance(ours: Sequence[Answer], theirs: Sequence[Answer]) -> tuple[bool, float]:

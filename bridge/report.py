@@ -43,10 +43,6 @@ class EpisodeResult:
     steps: int
     actions: list[list[float]] = field(default_factory=list)
 
-    def as_dict(self) -> dict[str, Any]:
-        """The row of `per_episode` in a report."""
-        return asdict(self)
-
 
 def summarise(
     results: Sequence[EpisodeResult], scenario: str, condition: str, policy_id: str, seed: int
@@ -58,13 +54,14 @@ def summarise(
     if not results:
         raise ValueError("no episode to summarise")
     outcomes = Counter(result.outcome for result in results)
-    spreads = {
+    fields = {
         "surviving_distance_m": "distance_m",
         "episode_reward": "reward",
         "episode_time_s": "time_s",
         "lateral_acceleration_mps2": "lateral_acceleration_mps2",
         "longitudinal_acceleration_mps2": "longitudinal_acceleration_mps2",
     }
+    columns = {key: [getattr(result, name) for result in results] for key, name in fields.items()}
     return {
         "scenario": scenario,
         "condition": condition,
@@ -72,16 +69,12 @@ def summarise(
         "success_rate": outcomes[GOAL] / len(results),
         "collision_rate": outcomes[COLLISION] / len(results),
         **{
-            key: _spread([getattr(result, name) for result in results])
-            for key, name in spreads.items()
+            key: {"mean": float(np.mean(values)), "std": float(np.std(values))}
+            for key, values in columns.items()
         },
         "policy_id": policy_id,
         "seed": seed,
     }
-
-
-def _spread(values: Sequence[float]) -> dict[str, float]:
-    return {"mean": float(np.mean(values)), "std": float(np.std(values))}
 
 
 STANDSTILL_MPS = 0.05
@@ -203,16 +196,16 @@ def summary_line(report: Mapping[str, Any]) -> str:
         times = f"latency p50 {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
     outcomes = Counter({GOAL: 0})
     outcomes.update(row["outcome"] for row in report["per_episode"])
-    ends = (
-        f"{count} {name} ({count / report['episodes']:.0%})" for name, count in outcomes.items()
-    )
+    episodes = report["episodes"]
+    ends = ", ".join(f"{count} {name} ({count / episodes:.0%})" for name, count in outcomes.items())
     stops = Counter(event["reason"] for event in report["safe_stop_events"])
-    vehicle = "" if report["vehicle"] is None else f"; {_vehicle_words(report['vehicle'])}"
-    return printable(
-        f"{counted(report['episodes'], 'episode')}: {', '.join(ends)}; {times}; "
-        f"{_reasons('safe stop', stops)}; "
-        f"{_reasons('rejected message', report['rejected'])}{vehicle}"
-    )
+    parts = [f"{counted(episodes, 'episode')}: {ends}", times, _reasons("safe stop", stops)]
+    parts.append(_reasons("rejected message", report["rejected"]))
+    if vehicle := report["vehicle"]:
+        told = {name: lag for name, lag in vehicle["lag_ms"].items() if lag is not None}
+        lags = ", ".join(f"{name} {lag:.0f} ms" for name, lag in told.items())
+        parts.append(f"{vehicle['name']}: lag {lags or 'not measured'}")
+    return printable("; ".join(parts))
 
 
 def episode_line(
@@ -230,13 +223,6 @@ def _reasons(noun: str, counts: Mapping[str, int]) -> str:
     """As in "3 safe stops (2 no_command, 1 vehicle_fault)"."""
     each = ", ".join(f"{count} {reason}" for reason, count in counts.items() if count)
     return counted(sum(counts.values()), noun) + (f" ({each})" if each else "")
-
-
-def _vehicle_words(vehicle: Mapping[str, Any]) -> str:
-    """As in "hunter: lag speed 135 ms, pedal 160 ms"."""
-    told = {name: lag for name, lag in vehicle["lag_ms"].items() if lag is not None}
-    lags = ", ".join(f"{name} {lag:.0f} ms" for name, lag in told.items())
-    return f"{vehicle['name']}: lag {lags or 'not measured'}"
 
 
 MAX_LAG_S = 2.0
@@ -349,53 +335,47 @@ class TrackingLog:
 
         None stands wherever nothing was measured: a vehicle that takes no speed has no set-point.
         """
-        speed = [one for episode in self._episodes if (one := _speed(episode)) is not None]
-        actions = {name: self._action(index) for index, name in enumerate(action_names)}
+        speed = []
+        actions: dict[str, list[Series]] = {name: [] for name in action_names}
+        for episode in self._episodes:
+            commands, feedback = episode.commands, episode.feedback
+            if told := [f for f in feedback if f.commanded_speed_mps is not None]:
+                asked = [(f.sent_ns, f.commanded_speed_mps or 0.0) for f in told]
+                reached = [(f.sent_ns, f.speed_mps) for f in told]
+                speed.append(_series(asked, reached, held=False))
+            for index, name in enumerate(action_names if commands and feedback else ()):
+                asked = [(c.sent_ns, c.action[index]) for c in commands]
+                reached = [(f.sent_ns, f.action[index]) for f in feedback]
+                actions[name].append(_series(asked, reached, held=True))
+        lags_ms = {name: lag_ms(series) for name, series in actions.items()}
         return {
             "name": self.vehicle,
             "scale": self._scale(),
             "samples": sum(len(episode.feedback) for episode in self._episodes),
             "speed_error_mps": errors(speed),
             "action_error": {name: errors(series) for name, series in actions.items()},
-            "lag_ms": {
-                "speed": lag_ms(speed),
-                **{name: lag_ms(series) for name, series in actions.items()},
-            },
+            "lag_ms": {"speed": lag_ms(speed), **lags_ms},
             "faults": dict(self.faults),
         }
 
-    def _action(self, index: int) -> list[Series]:
-        found = []
-        for episode in self._episodes:
-            commands, feedback = episode.commands, episode.feedback
-            if commands and feedback:
-                zero_ns = feedback[0].sent_ns
-                asked = _columns(((c.sent_ns, c.action[index]) for c in commands), zero_ns)
-                reached = _columns(((f.sent_ns, f.action[index]) for f in feedback), zero_ns)
-                found.append(Series(*asked, *reached, held=True))
-        return found
-
     def _scale(self) -> float | None:
         """Metres of the vehicle for one of the scenario, from where that is told best: at speed."""
-        told = [f for e in self._episodes for f in e.feedback if f.scenario_speed_mps]
-        if not told:
-            return None
-        fastest = max(told, key=lambda f: abs(f.scenario_speed_mps or 0.0))
-        return fastest.speed_mps / (fastest.scenario_speed_mps or 1.0)
+        told = [
+            (abs(f.scenario_speed_mps), f.speed_mps / f.scenario_speed_mps)
+            for episode in self._episodes
+            for f in episode.feedback
+            if f.scenario_speed_mps
+        ]
+        return max(told, key=lambda row: row[0])[1] if told else None
 
 
-def _speed(episode: _Episode) -> Series | None:
-    told = [f for f in episode.feedback if f.commanded_speed_mps is not None]
-    if not told:
-        return None
-    zero_ns = told[0].sent_ns
-    asked = _columns(((f.sent_ns, f.commanded_speed_mps or 0.0) for f in told), zero_ns)
-    reached = _columns(((f.sent_ns, f.speed_mps) for f in told), zero_ns)
-    return Series(*asked, *reached, held=False)
-
-
-def _columns(rows: Iterable[tuple[int, float]], zero_ns: int) -> tuple[Numbers, Numbers]:
-    """Times in s since ``zero_ns``, ascending even where a clock was stepped, and the values."""
-    times_ns, values = zip(*sorted(rows, key=lambda row: row[0]), strict=True)
-    seconds = [(time_ns - zero_ns) / 1e9 for time_ns in times_ns]
-    return np.array(seconds), np.array(values, dtype=np.float64)
+def _series(
+    asked: Sequence[tuple[int, float]], reached: Sequence[tuple[int, float]], held: bool
+) -> Series:
+    """Rows of stamp (ns) and value as columns, ascending even where a clock was stepped."""
+    columns: list[Numbers] = []
+    for rows in (asked, reached):
+        times_ns, values = zip(*sorted(rows, key=lambda row: row[0]), strict=True)
+        columns.append(np.array([(time_ns - reached[0][0]) / 1e9 for time_ns in times_ns]))
+        columns.append(np.array(values, dtype=np.float64))
+    return Series(columns[0], columns[1], columns[2], columns[3], held)

@@ -18,9 +18,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from bridge.commands import add_options
 from bridge.messages import DECODERS, Heard, Pace
-from bridge.ports import open_listener
+from bridge.ports import add_options, open_listener
 from edge_runtime.cli import ArgumentParser, examples, number, sigterm_as_interrupt
 from edge_runtime.commands import ask
 from edge_runtime.files import write_json_out
@@ -36,14 +35,7 @@ from edge_runtime.vehicles.ros2 import (
 )
 from edge_runtime.vehicles.ros2 import node as ros
 from edge_runtime.vehicles.ros2.node import Ros2Node
-from edge_runtime.wire import (
-    CONTROL_PERIOD_S,
-    FRAMES_SHAPE,
-    Command,
-    Feedback,
-    Rejection,
-    State,
-)
+from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE, Command, Feedback, Rejection, State
 
 MAX_RATE_HZ = 20.0
 RETRY_S = 2.0
@@ -54,9 +46,6 @@ ERROR_PER_METRE = 0.1
 UNKNOWN = 1e6
 """A variance for what a car on a plane does not know: height, roll and pitch."""
 
-# Not cmd_vel and not ackermann_cmd: this shows what is commanded, and must move nothing.
-IMAGE, ODOMETRY = "image_raw", "odom"
-DRIVE, TWIST = "command/ackermann", "command/twist"
 CAMERA_FRAME, ODOMETRY_FRAME, BASE_FRAME = "camera", "odom", "base_link"
 _, HEIGHT, WIDTH = FRAMES_SHAPE
 Ask = Callable[[], dict[str, Any]]
@@ -131,13 +120,8 @@ def run(arguments: Any) -> int:
         with contextlib.suppress(KeyboardInterrupt):
             for heard in listener.until_gone(arguments.duration_s):
                 outlet.take(heard)
-        counts = {
-            "sent": node.sent,
-            "rejected": dict(outlet.rejected),
-            "skipped": outlet.skipped,
-        }
-        report = {**counts, "dropped": listener.dropped}
-    write_json_out(arguments.out, report)
+        counts = {"sent": node.sent, "rejected": outlet.rejected, "skipped": outlet.skipped}
+    write_json_out(arguments.out, {**counts, "dropped": listener.dropped})
     parts = (
         f"{what}: " + ", ".join(f"{name} {count}" for name, count in found.items())
         for what, found in counts.items()
@@ -162,10 +146,11 @@ class Outlet:
             "feedback": self._show_feedback,
         }
         self._paces = {topic: Pace(1.0 / max_rate_hz) for topic in self._show}
-        self._image = node.publisher(IMAGE, ros.Image)
-        self._odometry = node.publisher(ODOMETRY, ros.Odometry)
-        self._drive = node.publisher(DRIVE, ros.AckermannDriveStamped)
-        self._twist = node.publisher(TWIST, ros.Twist)
+        self._image = node.publisher("image_raw", ros.Image)
+        self._odometry = node.publisher("odom", ros.Odometry)
+        # Not cmd_vel and not ackermann_cmd: this shows what is commanded, and must move nothing.
+        self._drive = node.publisher("command/ackermann", ros.AckermannDriveStamped)
+        self._twist = node.publisher("command/twist", ros.Twist)
         self._pose = DeadReckoning()
         self._speed_mps, self._scale = 0.0, 1.0
 
@@ -209,7 +194,7 @@ class Outlet:
         if feedback.scenario_speed_mps and feedback.speed_mps:
             self._scale = abs(feedback.speed_mps / feedback.scenario_speed_mps)
         policy = self._policies.newest
-        curvature = policy and feedback_curvature(feedback, policy, self._scale)
+        curvature = policy and policy.curvature(feedback.action, self._scale)
         self._pose.advance(feedback.speed_mps, curvature or 0.0, feedback.sent_ns)
         if may_publish:
             self._odometry(odometry_of(feedback, self._pose, curvature))
@@ -241,17 +226,16 @@ class Policies:
         return self.newest
 
     def _learn(self, status: dict[str, Any]) -> None:
-        manifest = status["manifest"]
-        scenario, car = manifest["scenario"], CARS.get(manifest["scenario"])
-        if car is None:
-            known = ", ".join(sorted(CARS))
+        scenario = status["manifest"]["scenario"]
+        names = [action["name"] for action in status["manifest"]["action"]]
+        known = Policy(names, CARS[scenario]) if scenario in CARS else None
+        self._known[status["policy_id"]] = known
+        if known is None:
             print(
                 f"commands are not shown: the car of scenario {scenario!r} is not known; it is for"
-                f" {known}",
+                f" {', '.join(sorted(CARS))}",
                 file=sys.stderr,
             )
-        names = [action["name"] for action in manifest["action"]]
-        self._known[status["policy_id"]] = None if car is None else Policy(names, car)
 
 
 class Policy(NamedTuple):
@@ -262,8 +246,15 @@ class Policy(NamedTuple):
 
     def action(self, values: Sequence[float], name: str) -> float | None:
         """Return one action; None where the policy has none of that name."""
-        named = dict(zip(self.action_names, values, strict=False))
-        return named.get(name)
+        return dict(zip(self.action_names, values, strict=False)).get(name)
+
+    def curvature(self, values: Sequence[float], scale: float = 1.0) -> float | None:
+        """Return the path's curvature (1/m) at that steering; None where there is none.
+
+        ``scale``: metres of the vehicle for one of the scenario.
+        """
+        steering = self.action(values, "steering")
+        return None if steering is None else self.car.curvature(steering) / scale
 
 
 def image_of(state: State) -> ros.Image:
@@ -289,7 +280,7 @@ def drive_of(command: Command, speed_mps: float, policy: Policy) -> ros.Ackerman
     pedal = policy.action(command.action, "pedal") or 0.0
     acceleration = pedal * (policy.car.throttle_mps2 if pedal > 0.0 else policy.car.brake_mps2)
     target_mps = speed_mps + acceleration * CONTROL_PERIOD_S
-    curvature = _curvature(policy, command.action, 1.0)
+    curvature = policy.curvature(command.action) or 0.0
     return ros.AckermannDriveStamped(
         header=ros.Header(ros.stamp_of(command.sent_ns), BASE_FRAME),
         drive=ros.AckermannDrive(
@@ -304,13 +295,6 @@ def twist_of(drive: ros.AckermannDrive, car: ScenarioCar) -> ros.Twist:
     """Return the same as speed and yaw rate."""
     yaw_radps = drive.speed * math.tan(drive.steering_angle) / car.wheelbase_m
     return ros.Twist(linear=ros.Vector3(x=drive.speed), angular=ros.Vector3(z=yaw_radps))
-
-
-def feedback_curvature(feedback: Feedback, policy: Policy, scale: float) -> float | None:
-    """Return the path's curvature (1/m) that the steering has reached; None if none is reported."""
-    if policy.action(feedback.action, "steering") is None:
-        return None
-    return _curvature(policy, feedback.action, scale)
 
 
 def odometry_of(feedback: Feedback, pose: DeadReckoning, curvature: float | None) -> ros.Odometry:
@@ -338,16 +322,10 @@ def odometry_of(feedback: Feedback, pose: DeadReckoning, curvature: float | None
     )
 
 
-def _curvature(policy: Policy, values: Sequence[float], scale: float) -> float:
-    steering = policy.action(values, "steering") or 0.0
-    return policy.car.curvature(steering) / scale
-
-
 def _diagonal(x: float, y: float, yaw: float) -> list[float]:
     """A 6x6 covariance, row by row: x, y, z, roll, pitch, yaw."""
     covariance = [0.0] * 36
-    for index, variance in enumerate((x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw)):
-        covariance[7 * index] = variance
+    covariance[::7] = x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw
     return covariance
 
 

@@ -11,19 +11,20 @@ from typing import Any
 import gymnasium
 from rich.progress import Progress
 
-from bridge.clocks import CLOCKS, REALTIME, Clock, VehicleClock
-from bridge.commands import add_options, progress_bar
+from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, VehicleClock
 from bridge.environments import (
     CONDITIONS,
     NOMINAL,
     SCENARIOS,
+    EpisodeRunner,
     make_environment,
+    policy_action,
     scenario_of,
     task_of,
+    vehicle_action,
 )
-from bridge.episode import EpisodeRunner, policy_action, vehicle_action
 from bridge.inbound import CommandCheck, FeedbackCheck
-from bridge.ports import SimulatorPort, open_port
+from bridge.ports import SimulatorPort, add_options, open_port, progress_bar
 from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.virtual_link import Decision
 from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
@@ -62,7 +63,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--clock",
         choices=sorted(CLOCKS),
-        default="lockstep",
+        default=LOCKSTEP,
         help="lockstep waits for each command; realtime waits for nobody",
     )
     parser.add_argument(
@@ -117,11 +118,11 @@ def _serve(asked: Namespace, environment: gymnasium.Env[Any, Any]) -> dict[str, 
             clock = CLOCKS[asked.clock](port.publish_state, check, asked.latency)
         with contextlib.closing(clock), progress_bar("episodes") as progress:
             bar = EpisodeBar(progress, asked.episodes)
-            port.on_command(clock.receive)
+            port.hear("command", clock.receive)
             port.wait_for_edge(wait_s, endpoint)
             manifest = port.edge_manifest()
             if isinstance(clock, VehicleClock):
-                port.on_feedback(clock.receive_feedback)
+                port.hear("feedback", clock.receive_feedback)
                 clock.wait_for_vehicle(wait_s, asked.vehicle_id)
             return _drive(asked, environment, port, clock, check, bar, manifest)
 
@@ -141,7 +142,8 @@ def _drive(
     edge = port.edge_counts
 
     def on_tick(episode: int, step: int, decision: Decision) -> None:
-        bar.tick(episode, step, decision, rearm if edge.waits_for_rearm else "")
+        waits = edge.newest is not None and edge.newest.needs_rearm
+        bar.tick(episode, step, decision, rearm if waits else "")
 
     runner = EpisodeRunner(
         environment,

@@ -87,7 +87,8 @@ class CommandHold:
         such a repetition is as good a heartbeat as a new answer. A repeated ``drive`` is not: it
         would keep a frozen controller alive.
         """
-        if self.newest is not None and not _supersedes(command, self.newest):
+        repeats_stop = command.step == self.newest_step and command.mode == SAFE_STOP
+        if command.step <= self.newest_step and not repeats_stop:
             return False
         self.newest = command
         self._heard_s, self._sent_s = now_s, sent_s
@@ -102,7 +103,11 @@ class CommandHold:
         ``edge_silence_s`` is given when lock-step has waited in vain: virtual time stood still
         meanwhile, so the wall time without an answer (s) counts in its place.
         """
-        brake_reason = self._brake_reason(now_s, edge_silence_s)
+        brake_reason = ""
+        if edge_silence_s is not None or now_s - self._heard_s > SILENCE_LIMIT_S + ROUNDING_S:
+            brake_reason = NO_COMMAND
+        elif self.newest is not None and self.newest.mode == SAFE_STOP:
+            brake_reason = self.newest.reason or UNKNOWN_SAFE_STOP
         obeys = self.newest is not None and not brake_reason
         decision = Decision(
             command=self.newest,
@@ -113,19 +118,6 @@ class CommandHold:
         )
         self._fresh = False
         return decision
-
-    def _brake_reason(self, now_s: float, edge_silence_s: float | None) -> str:
-        if edge_silence_s is not None or now_s - self._heard_s > SILENCE_LIMIT_S + ROUNDING_S:
-            return NO_COMMAND
-        if self.newest is not None and self.newest.mode == "safe_stop":
-            return self.newest.reason or UNKNOWN_SAFE_STOP
-        return ""
-
-
-def _supersedes(command: Command, newest: Command) -> bool:
-    if command.step == newest.step:
-        return command.mode == "safe_stop"
-    return command.step > newest.step
 
 
 STATE_BYTES = 7322

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from bridge.episode import vehicle_action
+from bridge.environments import vehicle_action
 from bridge.inbound import VehicleDecision
 from bridge.report import TrackingLog
 from edge_runtime.vehicles.base import VehicleReport

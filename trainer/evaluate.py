@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import cache, partial
 from typing import Any
 
@@ -112,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.out:
         print(json.dumps(report, indent=2))
         return 0
-    detail = [result.as_dict() for result in results]
+    detail = [asdict(result) for result in results]
     write_json_out(arguments.out, {**report, "per_episode": detail})
     distance_m = report["surviving_distance_m"]
     print(

@@ -25,7 +25,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bridge.rerun import APPLIED, HUMAN, POLICY
+from bridge.rerun import (
+    APPLIED,
+    HUMAN,
+    POLICY,
+    SERVE,
+    Sink,
+    ViewerGone,
+    add_sink,
+    check_sink,
+    flush,
+    open_sink,
+    read_sink,
+)
 
 # isort: split
 import rerun as rr
@@ -49,17 +61,6 @@ from bridge.rerun.draw import (
     road_view,
     style_lines,
     style_points,
-)
-from bridge.rerun.sinks import (
-    SERVE,
-    Sink,
-    ViewerGone,
-    add_sink,
-    check_sink,
-    chosen_sink,
-    flush,
-    open_sink,
-    read_sink,
 )
 from edge_runtime.cli import examples, sigterm_as_interrupt
 from edge_runtime.util import counted
@@ -132,8 +133,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Draw all of it; a page is served until somebody interrupts. Returns the exit status."""
     paths = find_recordings([Path(place) for place in arguments.recordings])
-    sink = chosen_sink(arguments)
-    check_sink(sink)
+    sink = check_sink(arguments.sink)
     for path in paths:  # Before a window opens, or a file takes another's place.
         next(read_steps(path), None)
     with open_sink(sink, SITTING_APPLICATION, make_blueprint(None, SITTINGS)) as recording:
@@ -155,9 +155,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def check_word(word: str) -> Sink:
     """The sink that ``--rerun`` names; UserError where nothing could be shown there."""
-    sink = read_sink(word)
-    check_sink(sink)
-    return sink
+    return check_sink(read_sink(word))
 
 
 class StepEntry(NamedTuple):

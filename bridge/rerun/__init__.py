@@ -1,9 +1,33 @@
-"""What bridge and trainer show in rerun alike, and the colours of every view."""
+"""What bridge and trainer show in rerun alike: the colours of every view, and where it goes.
+
+It goes to a window, a local web page, or a file. Window and page are rerun's viewer as a process of
+its own, on loopback: by itself it would bind all interfaces.
+"""
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
 from types import MappingProxyType
+from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import quote
+
+from edge_runtime.cli import sigterm_as_interrupt
+from edge_runtime.files import behind_link, check_writable, make_directory
+from edge_runtime.util import UserError
+
+if TYPE_CHECKING:  # rerun takes a second to load; options and checks go without it
+    import rerun as rr
+    import rerun.blueprint as rrb
 
 # Read when rerun is imported. It has several lines for a viewer that is gone; ours says it all.
 os.environ.setdefault("RUST_LOG", "warn,re_grpc_client=off,re_sdk=off")
@@ -19,3 +43,227 @@ APPLIED: Colour = (235, 140, 40)
 BY_NAME = MappingProxyType(
     {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
 )
+
+LOOPBACK = "127.0.0.1"
+START_S = 30.0
+"""How long it may take until it listens."""
+LOOK_S = 0.05
+FLUSH_S = 5.0
+"""How long it may take to receive what was drawn."""
+END_S = 1.0
+"""How long a viewer that takes no more may take to end."""
+GRPC_PORT = 9876
+WEB_PORT = 9090
+SPAWN, SERVE = "spawn", "serve"
+SUFFIX = ".rrd"
+
+
+class Sink(NamedTuple):
+    """``spawn`` (a window), ``serve`` (a page on loopback), or the file's path."""
+
+    kind: str
+    path: str = ""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether somebody looks while it is made."""
+        return not self.path
+
+
+class ViewerGone(UserError):  # noqa: N818 (to a training it is no error)
+    """The viewer has ended, hangs, or never came."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(f"viewer gone: {why}")
+        self.why = why
+
+
+def flush(recording: rr.RecordingStream) -> None:
+    """Wait until all that was drawn has arrived; ViewerGone where it does not."""
+    try:
+        recording.flush(timeout_sec=FLUSH_S)
+    except RuntimeError as error:
+        raise ViewerGone(str(error)) from None
+
+
+def add_sink(parser: argparse.ArgumentParser) -> None:
+    """``--spawn``, ``--serve`` or ``--save F.rrd``, kept as ``sink``; without any it is None."""
+    where = parser.add_mutually_exclusive_group()
+    page, window = "serve a web page on this machine's loopback only", "open a rerun window"
+    for kind, text in ((SPAWN, f"{window} (the default)"), (SERVE, page)):
+        where.add_argument(
+            f"--{kind}", dest="sink", action="store_const", const=Sink(kind), help=text
+        )
+    text = "write a recording instead of showing it"
+    where.add_argument("--save", dest="sink", metavar="F.rrd", type=_file, help=text)
+
+
+def _file(path: str) -> Sink:
+    if not path.endswith(SUFFIX):
+        raise UserError(f"{path}: rerun opens only what is called F{SUFFIX}")
+    return Sink("save", path)
+
+
+def read_sink(word: str) -> Sink:
+    """``spawn``, ``serve``, or a path that ends in .rrd; UserError for any other word."""
+    if word in (SPAWN, SERVE):
+        return Sink(word)
+    if not word.endswith(SUFFIX):
+        raise UserError(f"{word!r} is neither {SPAWN} nor {SERVE} nor a file FILE{SUFFIX}")
+    return Sink("save", word)
+
+
+def check_sink(sink: Sink | None) -> Sink:
+    """The sink (None: a window); UserError at once where nothing could be shown there."""
+    sink = sink or Sink(SPAWN)
+    if sink.path:
+        check_writable(sink.path)
+    elif sink.kind == SERVE:
+        for port in (GRPC_PORT, WEB_PORT):  # a view of somebody else may be there
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind((LOOPBACK, port))
+                except OSError:
+                    raise UserError(f"port {port} is in use; end the other rerun first") from None
+    elif sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise UserError("no display for a window here: serve a page, or save a file")
+    return sink
+
+
+@contextlib.contextmanager
+def open_sink(
+    sink: Sink, application: str, blueprint: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
+    """A recording that goes there; ``application`` keeps layouts of different kinds apart.
+
+    A window stays open afterwards; a page is served until then. SIGTERM raises KeyboardInterrupt
+    meanwhile, unless the command has another use for it: a file is to be finished, and a server
+    not to be left behind. ViewerGone: there is no viewer any more, or none has come.
+    """
+    import rerun as rr
+
+    recording = rr.RecordingStream(application)
+    opened = _saved(recording, sink.path, blueprint) if sink.path else None
+    with sigterm_as_interrupt(), opened or _shown(recording, sink.kind, blueprint):
+        yield recording
+
+
+@contextlib.contextmanager
+def _saved(recording: rr.RecordingStream, path: str, blueprint: rrb.Blueprint) -> Iterator[None]:
+    """Record into a file that appears under its name when it is complete."""
+    target = behind_link(path)
+    make_directory(target.parent)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        recording.save(temporary, default_blueprint=blueprint)
+        try:
+            yield
+        finally:
+            recording.flush()
+            recording.disconnect()  # Writes the footer.
+            os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _shown(recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint) -> Iterator[None]:
+    """Draw for a window or a page; ViewerGone where it does not last."""
+    port = GRPC_PORT if kind == SERVE else free_port()
+    if kind == SERVE:
+        page = ["--serve-web", "--port", str(port), "--web-viewer-port", str(WEB_PORT)]
+        viewer = Viewer(page, [port, WEB_PORT])
+    else:
+        viewer = Viewer(["--port", str(port), "--expect-data-soon"], [port])
+    try:
+        url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+        recording.connect_grpc(url, default_blueprint=blueprint)
+        if kind == SERVE:
+            print(f"open http://{LOOPBACK}:{WEB_PORT}/?url={quote(url, safe='')}", flush=True)
+        try:
+            yield
+        finally:
+            flush(recording)
+    except ViewerGone as gone:
+        why = viewer.last_words(END_S) or gone.why
+        viewer.end()
+        raise ViewerGone(why) from None
+    finally:
+        try:
+            viewer.leave(recording)
+        finally:
+            if kind == SERVE:
+                viewer.end()
+
+
+class Viewer:
+    """A viewer that listens at ``ports``, started with these options of rerun's command.
+
+    ViewerGone: it ends at once, or does not listen in time.
+    """
+
+    def __init__(self, options: Sequence[str], ports: Sequence[int]) -> None:
+        command = [sys.executable, "-m", "rerun_cli", "--bind", LOOPBACK, *options]
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 (open for as long as the viewer writes)
+        # A group of its own: ^C is not for it, and it ends with the child that the module starts.
+        self._process = subprocess.Popen(
+            command,
+            stdout=subprocess.DEVNULL,
+            stderr=self._said,
+            env={**os.environ, "RERUN_APP_ONLY": "true"},  # As rerun's own spawn: no questions.
+            start_new_session=True,
+        )
+        end_s = time.monotonic() + START_S
+        try:
+            while not all(map(_answers, ports)):
+                words = self.last_words()
+                if words or time.monotonic() > end_s:
+                    raise ViewerGone(words or f"it does not listen after {START_S:.0f} s")
+                time.sleep(LOOK_S)
+        except BaseException:
+            self.end()
+            raise
+
+    def end(self) -> None:
+        """End it, even where it hangs."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+    def leave(self, recording: rr.RecordingStream) -> None:
+        """Disconnect from it; ViewerGone where it hangs, which rerun would wait for, for ever."""
+        patience = threading.Timer(FLUSH_S, self.end)
+        patience.start()
+        recording.disconnect()
+        if not patience.is_alive():
+            raise ViewerGone("it hangs")
+        patience.cancel()
+
+    def last_words(self, wait_s: float = 0.0) -> str:
+        """Why it has ended; empty where it runs on for so long."""
+        try:
+            self._process.wait(wait_s)
+        except subprocess.TimeoutExpired:
+            return ""
+        self._said.seek(0)
+        lines = self._said.read().decode(errors="replace").split("\n")
+        words = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
+        return words[-1] if words else "it was closed"
+
+
+def free_port() -> int:
+    """A port that is not in use."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def _answers(port: int) -> bool:
+    try:
+        socket.create_connection((LOOPBACK, port), LOOK_S).close()
+    except OSError:
+        return False
+    return True

@@ -13,13 +13,11 @@ from typing import Any, NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bridge.commands import add_options, wait_to_be_told
 from bridge.messages import DECODERS, Heard, Pace, Scene
-from bridge.ports import open_listener
+from bridge.ports import add_options, open_listener, wait_to_be_told
 from bridge.recording import Recording, read_heard
-from bridge.rerun import APPLIED, POLICY, draw
+from bridge.rerun import APPLIED, POLICY, SERVE, Sink, add_sink, check_sink, draw, flush, open_sink
 from bridge.rerun.draw import Plot
-from bridge.rerun.sinks import SERVE, Sink, add_sink, check_sink, chosen_sink, flush, open_sink
 from bridge.virtual_link import SILENCE_LIMIT_S
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, sigterm_as_interrupt
@@ -52,8 +50,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Any) -> int:
     """Run the command until the simulator goes, the time is over, or somebody interrupts."""
-    sink = chosen_sink(arguments)
-    check_sink(sink)
+    sink = check_sink(arguments.sink)
     if arguments.recording is not None:
         _show_recording(arguments, sink)
     else:
@@ -69,7 +66,6 @@ def _show_recording(arguments: Any, sink: Sink) -> None:
     heard = read_heard(file, arguments.vehicle_id)
     first = next(heard, None)  # Says what is wrong with the file before anything is opened.
     with (
-        sigterm_as_interrupt(),
         open_sink(sink, APPLICATION, make_blueprint(None)) as recording,
         contextlib.suppress(KeyboardInterrupt),
     ):
@@ -102,13 +98,13 @@ def _watch(arguments: Any, sink: Sink, tls: TlsFiles | None) -> None:
         print(f"{listener.dropped} messages came faster than they could be drawn", file=sys.stderr)
 
 
+# From top to bottom.
 PLOTS = (
     Plot("action", "Command in [-1, 1]: asked and achieved", (-1.1, 1.1)),
     Plot("speed", "Speed, m/s: of the simulated car and of the vehicle"),
     Plot("latency", "Latency, ms: round trip, and its parts"),
     Plot("rejected", "Messages rejected so far, by reason"),
 )
-"""From top to bottom."""
 SERIES = {
     "action/asked": POLICY,
     "action/achieved": APPLIED,
@@ -159,10 +155,8 @@ SIDES = {"edge": draw.ORANGE, "simulator": draw.BLUE}
 class WireLog:
     """Draws the messages of one vehicle; used by one thread. Times are passed in.
 
-    Args:
-        recording: where.
-        picture_interval_s: frames and scenes are drawn no more often than this by their arrival;
-            numbers always are. 0: all, as in a file, where simulated time is what counts.
+    Frames and scenes are drawn no more often than every ``picture_interval_s`` by their arrival;
+    numbers always are. 0: all, as in a file, where simulated time is what counts.
     """
 
     def __init__(self, recording: rr.RecordingStream, picture_interval_s: float = 0.0) -> None:
@@ -201,7 +195,7 @@ class WireLog:
 
     def write_state(self, state: State, arrived_ns: int) -> None:
         """Draw the frames and the speed; a state after 2 T without a command shows the silence."""
-        self._stand_at(self._timeline.place(state.episode, state.step))
+        self._stand_at(state.episode, state.step)
         _keep(self._sent_ns, (state.episode, state.step), state.sent_ns)
         if self._frames_pace.due(arrived_ns * 1e-9):
             before, now = state.frames_array()
@@ -223,19 +217,17 @@ class WireLog:
 
     def write_command(self, command: Command, arrived_ns: int) -> None:
         """Draw what is asked, the mode, and where the time went."""
-        self._stand_at(self._timeline.place(command.episode, command.step))
+        self._stand_at(command.episode, command.step)
         self._heard_command_ns = arrived_ns
         self._recording.log("action/asked", rr.Scalars(list(command.action)))
-        sent_ns = self._sent_ns.get((command.episode, command.step))
-        if sent_ns is not None:
+        state = (command.episode, command.step)
+        if (sent_ns := self._sent_ns.get(state)) is not None:
             self._scalar("latency/uplink", (command.received_ns - sent_ns) * 1e-6)
             # A safe stop is repeated for as long as it lasts: only the first is the answer.
-            if (command.episode, command.step) not in self._answered_ns:
-                answered_ns = command.sent_ns - sent_ns
-                _keep(self._answered_ns, (command.episode, command.step), answered_ns)
+            if state not in self._answered_ns:
+                _keep(self._answered_ns, state, command.sent_ns - sent_ns)
         self._scalar("latency/inference", command.inference_ns * 1e-6)
-        driving = command.mode == "drive"
-        level = rr.TextLogLevel.INFO if driving else rr.TextLogLevel.WARN
+        level = rr.TextLogLevel.INFO if command.mode == "drive" else rr.TextLogLevel.WARN
         self._tell(command.mode, command.reason, level)
 
     def write_feedback(self, feedback: Feedback, _arrived_ns: int) -> None:
@@ -256,7 +248,7 @@ class WireLog:
 
     def write_scene(self, scene: Scene, arrived_ns: int) -> None:
         """Draw the road from above; the first scene also decides which ground is shown."""
-        self._stand_at(self._timeline.place(scene.episode, scene.step))
+        self._stand_at(scene.episode, scene.step)
         if self._drawn_episode < 0:
             self._recording.send_blueprint(make_blueprint(scene))
         if self._drawn_episode != scene.episode:
@@ -267,8 +259,8 @@ class WireLog:
         if self._cars_pace.due(arrived_ns * 1e-9):
             draw.draw_cars(self._recording, scene, EGO[self._told or SILENT])
 
-    def _stand_at(self, moment: Moment) -> None:
-        recording = self._recording
+    def _stand_at(self, episode: int, step: int) -> None:
+        recording, moment = self._recording, self._timeline.place(episode, step)
         recording.reset_time()
         recording.set_time("sim_time", duration=moment.sim_time_s)
         recording.set_time("step", sequence=moment.total_step)
@@ -279,22 +271,22 @@ class WireLog:
         if scene.round_trip_ms is None or scene.answered_step is None:
             return
         self._scalar("latency/round_trip", scene.round_trip_ms)
-        answered_ns = self._answered_ns.get((scene.episode, scene.answered_step))
+        state = (scene.episode, scene.answered_step)
         # It is told with every scene until the next one is known.
-        is_new = (scene.episode, scene.answered_step) != self._split
-        if answered_ns is not None and is_new:
-            self._split = (scene.episode, scene.answered_step)
-            self._scalar("latency/downlink", scene.round_trip_ms - answered_ns * 1e-6)
+        if state in self._answered_ns and state != self._split:
+            self._split, answered_ms = state, self._answered_ns[state] * 1e-6
+            self._scalar("latency/downlink", scene.round_trip_ms - answered_ms)
 
     def _rejections(self, side: str, counts: Mapping[str, int]) -> None:
         self._scalar(f"rejected/{side}/{ALL}", sum(counts.values()))
         for reason, count in counts.items():
-            if count and (side, reason) not in self._reasons:
+            if not count:
+                continue
+            if (side, reason) not in self._reasons:
                 self._reasons.add((side, reason))
                 self._style_rejections(side, reason, draw.GREY)
                 self._scalar(f"rejected/{side}/{reason}", 0)
-            if count:
-                self._scalar(f"rejected/{side}/{reason}", count)
+            self._scalar(f"rejected/{side}/{reason}", count)
 
     def _style_rejections(self, side: str, reason: str, colour: tuple[int, int, int]) -> None:
         style = rr.SeriesLines(colors=[colour], names=[f"{side}: {reason}"], widths=[2.0])
@@ -318,8 +310,18 @@ class WireLog:
 
     def _write_status(self) -> None:
         lines = [f"# {self._told or 'waiting'}", self._reason]
-        if self._health is not None:
-            lines += _health_lines(self._health)
+        if (health := self._health) is not None:
+            counts = ", ".join(
+                f"{name} {count}" for name, count in health.rejected.items() if count
+            )
+            lines += [
+                f"policy `{health.policy_id[:12]}`, vehicle `{health.vehicle}`",
+                f"states accepted {health.accepted}, rejected: {counts or 'none'}",
+                f"safe stops {health.safe_stops}, deadline misses {health.deadline_misses}",
+            ]
+            if {"p50", "p99"} <= set(health.inference_ms):
+                times = "inference p50 {p50:.2f} ms, p99 {p99:.2f} ms"
+                lines.append(times.format(**health.inference_ms))
         text = "\n\n".join(line for line in lines if line)
         self._recording.log("status", rr.TextDocument(text, media_type="text/markdown"))
 
@@ -331,36 +333,15 @@ def _keep(table: dict[tuple[int, int], int], key: tuple[int, int], value: int) -
         del table[next(iter(table))]
 
 
-def _health_lines(health: Health) -> list[str]:
-    rejected = ", ".join(f"{reason} {count}" for reason, count in health.rejected.items() if count)
-    return [
-        f"policy `{health.policy_id[:12]}`, vehicle `{health.vehicle}`",
-        f"states accepted {health.accepted}, rejected: {rejected or 'none'}",
-        f"safe stops {health.safe_stops}, deadline misses {health.deadline_misses}",
-        "inference p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**health.inference_ms)
-        if {"p50", "p99"} <= set(health.inference_ms)
-        else "",
-    ]
-
-
 class Moment(NamedTuple):
     """One place on all timelines."""
 
     episode: int
-    step: int
-    """Within the episode."""
+    episode_time_s: float
+    """Simulated time within the episode."""
     total_step: int
-    """Episodes end to end."""
-
-    @property
-    def sim_time_s(self) -> float:
-        """Simulated time with the episodes end to end, in seconds."""
-        return self.total_step * CONTROL_PERIOD_S
-
-    @property
-    def episode_time_s(self) -> float:
-        """Simulated time within the episode, in seconds."""
-        return self.step * CONTROL_PERIOD_S
+    """Episodes end to end, as ``sim_time_s``."""
+    sim_time_s: float
 
 
 class Timeline:
@@ -379,7 +360,6 @@ class Timeline:
     def place(self, episode: int, step: int) -> Moment:
         """Return the moment of a step."""
         # A viewer that comes late begins at zero as well: its first step is the first it saw.
-        start = self._starts.setdefault(episode, self._end_step)
-        moment = Moment(episode, step, start + step)
-        self._end_step = max(self._end_step, moment.total_step + 1)
-        return moment
+        total_step = self._starts.setdefault(episode, self._end_step) + step
+        self._end_step = max(self._end_step, total_step + 1)
+        return Moment(episode, step * CONTROL_PERIOD_S, total_step, total_step * CONTROL_PERIOD_S)

@@ -21,7 +21,7 @@ from bridge.__main__ import main
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.harness import PATIENCE_S, EdgeProcess, exit_status, wait_until
 from edge_runtime.tests.policies import write_policy
-from edge_runtime.wire import Command, Feedback
+from edge_runtime.wire import Command, Feedback, State, decode_state
 
 TOY = "bridge.tests.toy:BridgeToy-v0"
 SHORT_TOY = "bridge.tests.toy:BridgeToyShort-v0"
@@ -194,6 +194,13 @@ def make_feedback(step: int, **changes: Any) -> Feedback:
         "sent_ns": 1_000_000_000 + step * 100_000_000,
     }
     return Feedback(**{**fields, **changes})
+
+
+def decoded(payload: bytes) -> State:
+    """The state that a clock has published."""
+    state = decode_state(payload)
+    assert isinstance(state, State)
+    return state
 
 
 LEFT_TURN = Path(__file__).parents[2] / "hil_tests" / "recordings" / "left_turn.mcap"

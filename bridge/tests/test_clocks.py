@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 
 import pytest
@@ -9,10 +10,10 @@ import pytest
 from bridge.clocks import DelayLine, LockStepClock, RealTimeClock
 from bridge.inbound import CommandCheck
 from bridge.network import parse_spec
-from bridge.tests.harness import make_command
+from bridge.tests.harness import decoded, make_command
 from bridge.virtual_link import NO_COMMAND
 from edge_runtime.tests.harness import make_state, wait_until
-from edge_runtime.wire import State, decode_state, encode
+from edge_runtime.wire import encode
 
 
 def test_what_an_action_raises_reaches_the_caller():
@@ -35,28 +36,34 @@ def obedient(step):
 class Rig:
     """A clock whose publications are answered in the same call; ``answer`` None is a dead edge."""
 
-    def __init__(self, spec="none", answer=obedient):
+    def __init__(self, spec="none", answer=obedient, kind=LockStepClock):
         self.check = CommandCheck("here", action_size=1)
-        self.clock = LockStepClock(self.publish, self.check, parse_spec(spec))
+        self.clock = kind(self.publish, self.check, parse_spec(spec))
         self.published: list[int] = []
         self.answer = answer
 
     def publish(self, payload):
-        state = decode_state(payload)
-        assert isinstance(state, State)
+        step = decoded(payload).step
         # The edge runtime answers no state that is as old as one it has seen, or older.
-        refused = any(state.step <= step for step in self.published)
-        self.published.append(state.step)
+        refused = any(step <= before for before in self.published)
+        self.published.append(step)
         if not refused and self.answer is not None:
-            self.clock.receive(encode(self.answer(state.step)))
+            self.clock.receive(encode(self.answer(step)))
+
+    def exchange(self, *steps):
+        return [self.clock.exchange(make_state(step, session="here")) for step in steps]
 
     def drive(self, steps, seed=0):
         self.clock.begin(0, seed)
-        return [self.clock.exchange(make_state(step, session="here")) for step in range(steps)]
+        return self.exchange(*range(steps))
 
 
 def used(decisions):
     return [None if d.command is None else d.command.step for d in decisions]
+
+
+def reasons(decisions):
+    return [decision.brake_reason for decision in decisions]
 
 
 @pytest.mark.parametrize(
@@ -73,7 +80,7 @@ def test_a_command_acts_as_late_as_the_latency_says(spec, expected):
     rig = Rig(spec)
     decisions = rig.drive(6)
     assert used(decisions) == expected
-    assert not any(decision.brake_reason for decision in decisions)
+    assert not any(reasons(decisions))
     assert not rig.check.rejected
 
 
@@ -84,11 +91,18 @@ def test_the_latency_reported_is_the_virtual_one():
     assert len(rig.clock.latencies_ms) == 9
 
 
-def test_the_same_seed_is_the_same_run_and_another_seed_another():
-    spec = "60ms+-40ms,loss=10%"
-    first, again, other = (used(Rig(spec).drive(60, seed)) for seed in (3, 3, 4))
-    assert first == again
-    assert first != other
+EVERYTHING = (
+    "60ms+-40ms,tail=pareto,loss=5%,burst=3,reorder=5%,duplicate=5%,rate=2Mbit/s,outage=0.3s/2s"
+)
+
+
+@pytest.mark.parametrize("spec", ["60ms+-40ms,loss=10%", EVERYTHING])
+def test_the_same_seed_is_the_same_run_and_another_seed_another(spec):
+    first, again, other = (Rig(spec) for _ in range(3))
+    runs = [used(rig.drive(100, seed)) for rig, seed in ((first, 3), (again, 3), (other, 4))]
+    assert runs[0] == runs[1] != runs[2]
+    assert first.published == again.published != other.published
+    assert first.check.rejected == again.check.rejected
 
 
 def test_jitter_reorders_and_the_overtaken_state_is_not_waited_for():
@@ -118,46 +132,32 @@ def test_a_slow_line_carries_no_more_states_than_its_rate():
 
 
 def test_an_outage_brakes_and_ends_with_the_fifth_fresh_state():
-    reasons = [d.brake_reason for d in Rig("outage=0.5s@1s").drive(20)]
-    assert [bool(reason) for reason in reasons] == [11 <= step < 19 for step in range(20)]
-    assert set(reasons[11:15]) == {NO_COMMAND}
-    assert set(reasons[15:19]) == {"no_fresh_state"}
+    found = reasons(Rig("outage=0.5s@1s").drive(20))
+    assert [bool(reason) for reason in found] == [11 <= step < 19 for step in range(20)]
+    assert set(found[11:15]) == {NO_COMMAND}
+    assert set(found[15:19]) == {"no_fresh_state"}
 
 
 def test_one_lost_state_is_no_silence_and_two_are():
-    one, two = (Rig(f"up.outage={length}s@0.95s").drive(20) for length in (0.1, 0.2))
-    assert not any(decision.brake_reason for decision in one)
-    braking = [decision.brake_reason for decision in two if decision.brake_reason]
-    assert braking == [NO_COMMAND, *["no_fresh_state"] * 4]
+    one, two = (reasons(Rig(f"up.outage={length}s@0.95s").drive(20)) for length in (0.1, 0.2))
+    assert not any(one)
+    assert [reason for reason in two if reason] == [NO_COMMAND, *["no_fresh_state"] * 4]
 
 
 def test_a_machine_that_stalls_is_counted_apart_from_the_network():
     rig = Rig()
     rig.drive(3)
     rig.answer = lambda step: make_command(step, mode="safe_stop", reason="no_fresh_state")
-    rig.clock.exchange(make_state(3, session="here"))
+    rig.exchange(3)
     assert rig.clock.wall_clock_stalls == 1
     late = Rig("outage=0.5s@1s")
     late.drive(20)
     assert late.clock.wall_clock_stalls == 0
 
 
-def test_every_feature_at_once_repeats_itself():
-    spec = (
-        "60ms+-40ms,tail=pareto,loss=5%,burst=3,reorder=5%,duplicate=5%,rate=2Mbit/s,outage=0.3s/2s"
-    )
-    first, again, other = (Rig(spec) for _ in range(3))
-    runs = [used(rig.drive(100, seed)) for rig, seed in ((first, 3), (again, 3), (other, 4))]
-    assert runs[0] == runs[1] != runs[2]
-    assert first.published == again.published != other.published
-    assert first.check.rejected == again.check.rejected
-
-
-def test_a_dead_link_brakes_after_2_periods_of_virtual_time():
-    for spec in ("up.loss=100%", "down.loss=100%"):
-        rig = Rig(spec)
-        reasons = [decision.brake_reason for decision in rig.drive(6)]
-        assert reasons == ["", "", NO_COMMAND, NO_COMMAND, NO_COMMAND, NO_COMMAND]
+@pytest.mark.parametrize("spec", ["up.loss=100%", "down.loss=100%"])
+def test_a_dead_link_brakes_after_2_periods_of_virtual_time(spec):
+    assert reasons(Rig(spec).drive(6)) == ["", ""] + [NO_COMMAND] * 4
 
 
 def test_a_silent_edge_costs_2_periods_of_wall_time_once_then_one_a_step():
@@ -165,13 +165,12 @@ def test_a_silent_edge_costs_2_periods_of_wall_time_once_then_one_a_step():
     rig.drive(3)
     rig.answer = None
     started_s = time.monotonic()
-    decisions = [rig.clock.exchange(make_state(step, session="here")) for step in (3, 4)]
-    waited_s = time.monotonic() - started_s
-    assert [decision.brake_reason for decision in decisions] == [NO_COMMAND, NO_COMMAND]
+    decisions = rig.exchange(3, 4)
+    assert 0.28 <= time.monotonic() - started_s < 1.0
+    assert reasons(decisions) == [NO_COMMAND, NO_COMMAND]
     assert decisions[0].undriven_s >= 0.2
-    assert 0.28 <= waited_s < 1.0
     rig.answer = obedient
-    assert rig.clock.exchange(make_state(5, session="here")).brake_reason == ""
+    assert reasons(rig.exchange(5)) == [""]
 
 
 def test_a_safe_stop_command_brakes_with_its_reason():
@@ -182,44 +181,26 @@ def test_a_safe_stop_command_brakes_with_its_reason():
 def test_only_faults_are_counted_among_what_comes_unasked():
     rig = Rig()
     rig.drive(3)
-    rig.clock.receive(encode(make_command(2, mode="safe_stop")))  # The edge's own watchdog.
-    rig.clock.receive(encode(make_command(2, session="elsewhere")))
-    rig.clock.receive(b"junk")
-    rig.clock.exchange(make_state(3, session="here"))
+    watchdog, foreign = make_command(2, mode="safe_stop"), make_command(2, session="elsewhere")
+    for payload in (encode(watchdog), encode(foreign), b"junk"):
+        rig.clock.receive(payload)
+    rig.exchange(3)
     assert dict(rig.check.rejected) == {"foreign_session": 1, "malformed": 1}
 
 
 STEPS = 7
 
 
-class RealTimeRig:
-    """A clock whose first publication of each state is answered on the delay line's thread."""
-
-    def __init__(self, spec: str) -> None:
-        self.check = CommandCheck("here", action_size=1)
-        self.clock = RealTimeClock(self.publish, self.check, parse_spec(spec))
-        self.published: list[int] = []
-
-    def publish(self, payload):
-        state = decode_state(payload)
-        assert isinstance(state, State)
-        fresh = state.step not in self.published
-        self.published.append(state.step)
-        if fresh:
-            self.clock.receive(encode(make_command(state.step)))
-
-    def drive(self):
-        self.clock.begin(0, seed=0)
-        try:
-            for step in range(STEPS):
-                self.clock.exchange(make_state(step, session="here"))
-        finally:
-            self.clock.close()
+def drive_in_real_time(spec):
+    """Each state is answered on the delay line's thread."""
+    rig = Rig(spec, make_command, RealTimeClock)
+    with contextlib.closing(rig.clock):
+        rig.drive(STEPS)
+    return rig
 
 
 def test_duplicates_come_out_twice_on_both_ways():
-    rig = RealTimeRig("5ms,duplicate=100%")
-    rig.drive()
+    rig = drive_in_real_time("5ms,duplicate=100%")
     # The last command's copy may come after the last tick.
     assert rig.published == [step for step in range(STEPS) for _ in range(2)]
     assert STEPS - 1 <= rig.check.rejected["stale"] <= STEPS
@@ -227,7 +208,6 @@ def test_duplicates_come_out_twice_on_both_ways():
 
 
 def test_an_outage_is_timed_from_the_episodes_start():
-    rig = RealTimeRig("up.outage=1000s@0.25s")
-    rig.drive()
+    rig = drive_in_real_time("up.outage=1000s@0.25s")
     assert rig.published[0] == 0
     assert STEPS - 1 not in rig.published

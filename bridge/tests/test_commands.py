@@ -13,6 +13,8 @@ ROWS = [
     ("simulate --env phil/Nowhere-v0", "Nowhere"),
     ("simulate --env no_such_module:X-v0", "no_such_module"),
     ("simulate --env CartPole-v1", "uint8"),
+    ("simulate --env somebody/Creep-v0", "somebody"),
+    ("simulate --env somebody/Creep-v0", "a gymnasium id"),
     ("simulate --env bridge.tests.broken_module:X-v0", "RuntimeError: two"),
     ("simulate --env TOY --condition variant", "scene"),
     ("simulate --env congestion --condition foggy", "foggy"),

@@ -7,8 +7,7 @@ from collections import Counter
 
 import pytest
 
-from bridge.environments import make_environment, task_of
-from bridge.episode import EpisodeRunner
+from bridge.environments import EpisodeRunner, make_environment, task_of
 from bridge.tests.harness import (
     TOY,
     BridgeProcess,

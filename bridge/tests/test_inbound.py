@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.episode import vehicle_action
+from bridge.environments import vehicle_action
 from bridge.inbound import (
     NO_FEEDBACK,
     SELF_BRAKING,
@@ -32,24 +32,31 @@ def checking(newest_step=5):
     return check
 
 
+def checking_feedback():
+    check = FeedbackCheck("here", action_size=1)
+    check.sent(0, 5)
+    return check
+
+
+BOTH = [
+    ({"schema": 2}, "schema"),
+    ({"session": "elsewhere"}, "foreign_session"),
+    ({"action": [0.1, 0.1]}, "action_size"),
+    ({"step": 6}, "unknown_step"),
+    ({"step": 0, "episode": 1}, "unknown_step"),
+]
+"""What is wrong with a command and with feedback alike, and how it is counted."""
+
+
 @pytest.mark.parametrize(
-    ("payload", "reason"),
-    [
-        (b"\x00", "malformed"),
-        (bytes(70_000), "oversized"),
-        (encode(make_command(5, schema=2)), "schema"),
-        (encode(make_command(5, action=[float("nan")])), "not_finite"),
-        (encode(make_command(5, action=[1.5])), "malformed"),
-        (encode(make_command(5, session="elsewhere")), "foreign_session"),
-        (encode(make_command(5, action=[0.1, 0.1])), "action_size"),
-        (encode(make_command(5, action=[])), "malformed"),
-        (encode(make_command(6)), "unknown_step"),
-        (encode(make_command(0, episode=1)), "unknown_step"),
-    ],
-)
-def test_a_command_that_answers_nothing_is_counted_by_reason(payload, reason):
+    ("changes", "reason"),
+    [*BOTH, ({"action": [float("nan")]}, "not_finite"), ({"action": [1.5]}, "malformed"),
+     ({"action": []}, "malformed"), (b"\x00", "malformed"), (bytes(70_000), "oversized")],
+)  # fmt: skip
+def test_a_command_that_answers_nothing_is_counted_by_reason(changes, reason):
+    bad = changes if isinstance(changes, bytes) else encode(make_command(**{"step": 5} | changes))
     check = checking()
-    assert check.read(payload) is None
+    assert check.read(bad) is None
     assert dict(check.rejected) == {reason: 1}
 
 
@@ -75,36 +82,33 @@ def test_the_newest_command_is_held_for_2_periods_and_no_longer():
     hold = CommandHold(now_s=0.0)
     assert hold.admit(make_command(0), now_s=0.01, sent_s=0.01)
     assert hold.decide(0.025).brake_reason == ""
-    held = hold.decide(0.2)
+    held, braking = hold.decide(0.2), hold.decide(0.22)
     assert (held.brake_reason, held.fresh, held.command) == ("", False, make_command(0))
-    braking = hold.decide(0.22)
-    assert braking.brake_reason == NO_COMMAND
+    assert (braking.brake_reason, braking.command_age_s) == (NO_COMMAND, None)  # It obeys none.
     assert braking.undriven_s == pytest.approx(0.21)
-    assert braking.command_age_s is None  # It obeys none.
 
 
 def test_a_command_is_as_old_as_the_state_that_it_answers():
     hold = CommandHold(now_s=0.0)
     assert hold.decide(0.025).command_age_s is None
     hold.admit(make_command(0), now_s=0.06, sent_s=0.0)
-    assert hold.decide(0.125).command_age_s == pytest.approx(0.125)
-    assert hold.decide(0.225).command_age_s == pytest.approx(0.225)
+    ages_s = [hold.decide(now_s).command_age_s for now_s in (0.125, 0.225)]
+    assert ages_s == pytest.approx([0.125, 0.225])
 
 
 def test_without_any_command_it_brakes_after_2_periods():
     hold = CommandHold(now_s=5.0)
-    assert hold.decide(5.2).brake_reason == ""
-    assert hold.decide(5.201).brake_reason == NO_COMMAND
+    assert [hold.decide(now_s).brake_reason for now_s in (5.2, 5.201)] == ["", NO_COMMAND]
 
 
 def test_a_repeated_drive_command_is_no_heartbeat_but_a_repeated_safe_stop_is():
     hold = CommandHold(now_s=0.0)
-    assert hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
-    assert not hold.admit(make_command(3), now_s=0.1, sent_s=0.1)
-    assert not hold.admit(make_command(2), now_s=0.1, sent_s=0.1)
     stop = make_command(3, mode="safe_stop", reason="no_fresh_state")
-    assert hold.admit(stop, now_s=0.15, sent_s=0.15)
-    assert hold.admit(stop, now_s=0.25, sent_s=0.25)
+    for command, now_s, is_taken in [
+        (make_command(3), 0.0, True), (make_command(3), 0.1, False), (make_command(2), 0.1, False),
+        (stop, 0.15, True), (stop, 0.25, True),
+    ]:  # fmt: skip
+        assert hold.admit(command, now_s, sent_s=now_s) is is_taken
     assert hold.decide(0.4).brake_reason == "no_fresh_state"
 
 
@@ -138,40 +142,20 @@ def test_a_new_episode_closes_the_event_of_the_last():
     (braking,) = decisions("x")
     log.observe(0, 9, braking, 1.0)
     log.observe(1, 0, braking, 1.0)
-    assert [(event.episode, event.resumed_after_s) for event in log.events] == [
-        (0, None),
-        (1, None),
-    ]
-
-
-def checking_feedback(newest_step=5):
-    check = FeedbackCheck("here", action_size=1)
-    check.sent(0, newest_step)
-    return check
+    assert [(one.episode, one.resumed_after_s) for one in log.events] == [(0, None), (1, None)]
 
 
 @pytest.mark.parametrize(
-    ("payload", "reason"),
-    [
-        (b"\x00", "malformed"),
-        (bytes(70_000), "oversized"),
-        (encode(make_feedback(5, schema=2)), "schema"),
-        (encode(make_feedback(5, speed_mps=float("nan"))), "not_finite"),
-        (encode(make_feedback(5, scenario_speed_mps=float("inf"))), "not_finite"),
-        (encode(make_feedback(5, session="elsewhere")), "foreign_session"),
-        (encode(make_feedback(5, action=[0.1, 0.1])), "action_size"),
-        (encode(make_feedback(5, action=[1.01])), "action_range"),
-        (encode(make_feedback(6)), "unknown_step"),
-        (encode(make_feedback(0, episode=1)), "unknown_step"),
-        (encode(make_feedback(4)), "duplicate"),
-        (encode(make_feedback(3)), "stale"),
-    ],
-)
-def test_feedback_that_cannot_be_believed_is_counted_by_reason(payload, reason):
-    check = checking_feedback()
-    believed = make_feedback(4)
+    ("changes", "reason"),
+    [*BOTH, ({"speed_mps": float("nan")}, "not_finite"), ({"action": [1.01]}, "action_range"),
+     ({"scenario_speed_mps": float("inf")}, "not_finite"), ({"step": 4}, "duplicate"),
+     ({"step": 3}, "stale"), (b"\x00", "malformed"), (bytes(70_000), "oversized")],
+)  # fmt: skip
+def test_feedback_that_cannot_be_believed_is_counted_by_reason(changes, reason):
+    bad = changes if isinstance(changes, bytes) else encode(make_feedback(**{"step": 5} | changes))
+    check, believed = checking_feedback(), make_feedback(4)
     assert check.read(encode(believed), now_s=0.0) == believed
-    assert check.read(payload, now_s=0.05) is None
+    assert check.read(bad, now_s=0.05) is None
     assert dict(check.rejected) == {reason: 1}
 
 
@@ -222,8 +206,7 @@ def test_a_delay_on_the_way_makes_feedback_older_and_the_vehicle_not_silent():
     hold = FeedbackHold(now_s=0.0)
     hold.admit(make_feedback(3), received_s=1.0, now_s=1.3)
     decision = hold.decide(HEARD, 0, now_s=1.35)
-    assert decision.brake_reason == ""
-    assert decision.feedback_age_s == pytest.approx(0.35)
+    assert (decision.brake_reason, decision.feedback_age_s) == ("", pytest.approx(0.35))
 
 
 @pytest.mark.parametrize(
@@ -250,29 +233,22 @@ class PedalEnv(ToyEnv):
 
 
 @pytest.mark.parametrize(
-    ("environment", "changes", "applied"),
+    ("environment", "names", "changes", "applied"),
     [
-        (ToyEnv(), {"action": [0.25]}, 0.25),
-        (ToyEnv(), {"action": [1.0009]}, 1.0),
-        (ToyEnv(), {"action": [0.25], "scenario_speed_mps": 2.0}, 0.25),
-        (PedalEnv(), {"action": [0.5]}, 0.5),
-        (PedalEnv(), {"action": [0.5], "scenario_speed_mps": 2.0}, 0.25),
-        (PedalEnv(), {"action": [0.5], "scenario_speed_mps": 2.0, "mode": "safe_stop"}, 0.25),
+        (ToyEnv, "pedal", {"action": [0.25]}, [0.25]),
+        (ToyEnv, "pedal", {"action": [1.0009]}, [1.0]),
+        (ToyEnv, "pedal", {"action": [0.25], "scenario_speed_mps": 2.0}, [0.25]),
+        (PedalEnv, "pedal", {"action": [0.5]}, [0.5]),
+        (PedalEnv, "pedal", {"action": [0.5], "scenario_speed_mps": 2.0}, [0.25]),
+        (PedalEnv, "pedal", {"scenario_speed_mps": 2.0, "mode": "safe_stop"}, [0.25]),
+        # A pedal takes its own place only.
+        (PedalEnv, "x pedal", {"action": [0.7, 0.5], "scenario_speed_mps": 2.0}, [0.7, 0.25]),
+        (PedalEnv, "steering", {"action": [0.75], "scenario_speed_mps": 2.0}, [0.75]),
     ],
 )
-def test_the_car_does_what_the_vehicle_did(environment, changes, applied):
-    apply = vehicle_action(["pedal"])
-    action = apply(environment, decide(make_feedback(3, **changes)))
-    assert (action.dtype, action.tolist()) == (np.float32, [applied])
-
-
-def test_a_pedal_takes_its_own_place_only():
-    apply = vehicle_action(["steering", "pedal"])
-    feedback = make_feedback(3, action=[0.75, 0.5], scenario_speed_mps=2.0)
-    assert apply(PedalEnv(), decide(feedback)).tolist() == [0.75, 0.25]
-    assert vehicle_action(["steering"])(
-        PedalEnv(), decide(make_feedback(3, action=[0.75], scenario_speed_mps=2.0))
-    ).tolist() == [0.75]
+def test_the_car_does_what_the_vehicle_did(environment, names, changes, applied):
+    action = vehicle_action(names.split())(environment(), decide(make_feedback(3, **changes)))
+    assert (action.dtype, action.tolist()) == (np.float32, pytest.approx(applied))
 
 
 class SteeredEnv(ToyEnv):
@@ -301,9 +277,9 @@ def test_a_steered_car_brakes_when_its_vehicle_does():
 def test_a_command_that_nobody_obeys_has_no_age():
     hold = CommandHold(now_s=0.0)
     hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
-    heard = hold.decide(0.05)
+    heard, stopped = hold.decide(0.05), make_feedback(3, mode="safe_stop")
     assert decide(make_feedback(3), heard=heard).command_age_s == heard.command_age_s
-    assert decide(make_feedback(3, mode="safe_stop"), heard=heard).command_age_s is None
+    assert decide(stopped, heard=heard).command_age_s is None
     assert decide(make_feedback(3), after_s=1.0, heard=heard).command_age_s is None
 
 
@@ -347,10 +323,11 @@ def test_the_status_answer_counts_as_a_message_and_junk_does_not():
 
 
 def test_the_report_joins_both_sides():
-    report = rejections({"stale": 2}, {"stale": 1, "schema": 3})
-    assert report["rejected"] == {"stale": 3, "schema": 3}
-    assert report["rejected_by_edge"] == {"stale": 2}
-    assert report["rejected_by_simulator"] == {"stale": 1, "schema": 3}
+    assert rejections({"stale": 2}, {"stale": 1, "schema": 3}) == {
+        "rejected": {"stale": 3, "schema": 3},
+        "rejected_by_edge": {"stale": 2},
+        "rejected_by_simulator": {"stale": 1, "schema": 3},
+    }
 
 
 def test_health_that_cannot_be_read_is_counted_by_reason():

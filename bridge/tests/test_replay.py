@@ -45,11 +45,17 @@ class Hand:
         self.hear(at_s, "command", make_command(step, **{**stamps, **changes}))
 
     def drive(self, first, last, start_s=0.0, **changes):
-        """States at every T, each answered with ``drive``."""
+        """States at every T, each answered, with ``drive`` if ``changes`` say nothing else."""
         for step in range(first, last):
             at_s = start_s + step * 0.1
             self.state(at_s, step)
             self.command(at_s + ANSWER_S, step, **changes)
+
+    def stop(self, step, count):
+        """The watchdog speaks 2 T after the state at ``step`` * T, and repeats itself."""
+        for repetition in range(count):
+            late_s = 0.2001 + repetition * 0.1
+            self.command(step * 0.1 + late_s, step, answer_s=late_s, inference_ns=0, **SAFE_STOP)
 
     def close(self):
         if not self.closed:
@@ -119,13 +125,8 @@ def test_another_policy_differs_and_the_tolerance_decides(hand, tmp_path, capsys
 
 def test_a_gap_is_braked_for_as_it_was_and_five_states_later_it_drives(hand):
     hand.drive(0, 5)
-    # 0.6 s of silence: the watchdog speaks 2 T after the last state, and repeats itself.
-    for repetition in range(4):
-        at_s = 0.4 + 0.2001 + repetition * 0.1
-        hand.command(at_s, 4, answer_s=at_s - 0.4, inference_ns=0, **SAFE_STOP)
-    for step in range(5, 9):
-        hand.state(0.5 + step * 0.1, step)
-        hand.command(0.5 + step * 0.1 + ANSWER_S, step, **SAFE_STOP)
+    hand.stop(4, 4)  # 0.6 s of silence
+    hand.drive(5, 9, start_s=0.5, **SAFE_STOP)
     hand.drive(9, 12, start_s=0.5)
     status, report = replay(hand)
     assert status == 0, report["first_differences"]
@@ -144,9 +145,7 @@ def test_a_runtime_that_drives_too_early_is_found_out(hand):
 def test_a_runtime_that_was_started_anew_drives_at_once(hand):
     hand.hear(0.0, "health", health(ns(0.0), 5.0))
     hand.drive(0, 5)
-    for repetition in range(2):
-        at_s = 0.4 + 0.2001 + repetition * 0.1
-        hand.command(at_s, 4, answer_s=at_s - 0.4, inference_ns=0, **SAFE_STOP)
+    hand.stop(4, 2)
     hand.hear(2.9, "health", health(ns(2.9), 0.5))
     hand.drive(30, 33)
     assert is_the_same(hand)
@@ -196,11 +195,8 @@ def test_an_attached_vehicle_and_its_operator_are_the_recordings(hand):
     attached = {"vehicle": "mock", "needs_rearm": False}
     hand.hear(0.0, "health", health(ns(0.0), 5.0, **attached))
     hand.drive(0, 3)
-    at_s = 0.2 + 0.2001
-    hand.command(at_s, 2, answer_s=at_s - 0.2, inference_ns=0, **SAFE_STOP)
-    for step in range(10, 20):  # Nobody has re-armed it yet.
-        hand.state(step * 0.1, step)
-        hand.command(step * 0.1 + ANSWER_S, step, **SAFE_STOP)
+    hand.stop(2, 1)
+    hand.drive(10, 20, **SAFE_STOP)  # Nobody has re-armed it yet.
     hand.drive(20, 23)
     assert is_the_same(hand)
 
@@ -209,13 +205,9 @@ def test_a_hunter_and_its_faults_are_the_recordings(hand, tmp_path):
     hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="hunter", needs_rearm=False))
     hand.drive(0, 3)
     hand.command(0.25, 2, answer_s=0.05, inference_ns=0, **FAULT)  # While nothing else happens.
-    for step in range(3, 10):
-        hand.state(step * 0.1, step)
-        hand.command(step * 0.1 + ANSWER_S, step, **FAULT)
+    hand.drive(3, 10, **FAULT)
     hand.drive(10, 13)
-    for step in range(13, 20):  # Seen when a state was to be answered.
-        hand.state(step * 0.1, step)
-        hand.command(step * 0.1 + ANSWER_S, step, **FAULT)
+    hand.drive(13, 20, **FAULT)  # Seen when a state was to be answered.
     hand.drive(20, 23)
     assert is_the_same(hand, compared=23)
     settings = tmp_path / "edge.toml"
@@ -228,9 +220,7 @@ def test_a_hunter_and_its_faults_are_the_recordings(hand, tmp_path):
 def test_a_repeated_stop_just_before_or_after_the_next_state_is_no_difference(hand):
     hand.hear(0.0, "health", health(ns(0.0), 5.0, vehicle="mock", needs_rearm=False))
     hand.drive(0, 3)
-    for step in range(3, 10):
-        hand.state(step * 0.1, step)
-        hand.command(step * 0.1 + ANSWER_S, step, **FAULT)
+    hand.drive(3, 10, **FAULT)
     # The policy is a little slower this time: the repetition is due before its answer.
     hand.state(1.0, 10)
     hand.command(1.0 + 2 * ANSWER_S, 10, answer_s=2 * ANSWER_S, inference_ns=3 * 10**6)
@@ -271,8 +261,7 @@ def test_through_a_running_edge_runtime(hand, path, tmp_path):
         hand.command(step * 0.1 + ANSWER_S, step)
     hand.close()
     endpoint, out = free_endpoint(), tmp_path / "live.json"
-    policy = make_policy(tmp_path, "constant", 0.3)
-    with start_edge(endpoint, policy, "--vehicle-id", "v"):
+    with start_edge(endpoint, make_policy(tmp_path, "constant"), "--vehicle-id", "v"):
         for _ in range(3):  # A busy machine may stand still for over 2 T.
             arguments = ["replay", str(path), "--listen", endpoint, "--out", str(out)]
             with BridgeProcess(*arguments) as run:

@@ -17,10 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
+import bridge.rerun
 from bridge.messages import Pace, SeenCar, SeenScene, read_scene
-from bridge.rerun import sinks
+from bridge.rerun import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.draw import outline, view_bounds
-from bridge.rerun.sinks import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.wire_view import Timeline
 from bridge.tests.viewers import NO_GPU, in_place, listens
 from edge_runtime.util import UserError
@@ -95,17 +95,17 @@ def test_an_interval_of_zero_takes_all():
     assert all(pace.due(now_s) for now_s in [0.0, 0.0, 5.0, 5.0, 4.0])
 
 
+def opened(kind, path=""):
+    return open_sink(Sink(kind, str(path)), "test", rrb.Blueprint())
+
+
 def test_sigterm_finishes_the_file(tmp_path):
     out = tmp_path / "a.rrd"
 
-    def draw():
-        with open_sink(Sink("save", str(out)), "test", rrb.Blueprint()) as recording:
-            recording.log("speed", rr.Scalars(3.0))
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(5.0)
-
-    with pytest.raises(KeyboardInterrupt):
-        draw()
+    with pytest.raises(KeyboardInterrupt), opened("save", out) as recording:  # noqa: PT012
+        recording.log("speed", rr.Scalars(3.0))
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(5.0)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     assert [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
     found = [chunk.entity_path for chunk in RrdReader(str(out)).stream().to_chunks()]
@@ -115,7 +115,7 @@ def test_sigterm_finishes_the_file(tmp_path):
 def test_a_link_to_a_file_stays_and_the_file_is_written(tmp_path):
     target, link = tmp_path / "kept.rrd", tmp_path / "link.rrd"
     link.symlink_to(target)
-    with open_sink(Sink("save", str(link)), "test", rrb.Blueprint()):
+    with opened("save", link):
         pass
     assert link.is_symlink()
     assert target.stat().st_size > 0
@@ -125,7 +125,7 @@ def test_the_folder_of_a_file_is_made(tmp_path):
     path = tmp_path / "runs" / "today" / "drive.rrd"
     check_sink(Sink("save", str(path)))
     assert not path.parent.exists()
-    with open_sink(Sink("save", str(path)), "test", rrb.Blueprint()):
+    with opened("save", path):
         pass
     assert path.stat().st_size > 0
 
@@ -136,7 +136,7 @@ def test_a_command_with_another_use_for_sigterm_keeps_it(tmp_path):
 
     before = signal.signal(signal.SIGTERM, quit_softly)
     try:
-        with open_sink(Sink("save", str(tmp_path / "a.rrd")), "test", rrb.Blueprint()):
+        with opened("save", tmp_path / "a.rrd"):
             assert signal.getsignal(signal.SIGTERM) is quit_softly
     finally:
         signal.signal(signal.SIGTERM, before)
@@ -151,7 +151,7 @@ def test_a_sink_is_named_by_a_word():
 
 
 def show(kind, for_s=0.0):
-    with open_sink(Sink(kind), "test", rrb.Blueprint()) as recording:
+    with opened(kind) as recording:
         end_s = time.monotonic() + for_s
         while not for_s or time.monotonic() < end_s:
             recording.log("speed", rr.Scalars(3.0))
@@ -163,14 +163,11 @@ def show(kind, for_s=0.0):
 
 @pytest.mark.parametrize("kind", ["starts slowly", "works"])
 def test_a_page_is_told_of_when_it_answers(kind, tmp_path, monkeypatch, capsys):
-    with (
-        in_place(kind, tmp_path, monkeypatch),
-        open_sink(Sink("serve"), "test", rrb.Blueprint()) as recording,
-    ):
+    with in_place(kind, tmp_path, monkeypatch), opened("serve") as recording:
         (address,) = re.findall(r"http://([\d.]+):(\d+)/", capsys.readouterr().out)
         assert listens(*address)
-        assert listens("127.0.0.1", sinks.GRPC_PORT)
-        assert not listens("127.0.0.2", sinks.GRPC_PORT), "loopback's first address only"
+        assert listens("127.0.0.1", bridge.rerun.GRPC_PORT)
+        assert not listens("127.0.0.2", bridge.rerun.GRPC_PORT), "loopback's first address only"
         recording.log("speed", rr.Scalars(3.0))
     end_s = time.monotonic() + 5.0
     while listens(*address):
@@ -178,13 +175,8 @@ def test_a_page_is_told_of_when_it_answers(kind, tmp_path, monkeypatch, capsys):
 
 
 def test_a_window_listens_on_loopback_only_and_stays_open(tmp_path, monkeypatch):
-    ports = []
-
-    def remembered():
-        ports.append(free_port())
-        return ports[-1]
-
-    monkeypatch.setattr(sinks, "free_port", remembered)
+    ports = [free_port(), free_port()]
+    monkeypatch.setattr(bridge.rerun, "free_port", iter(ports).__next__)
     with in_place("works", tmp_path, monkeypatch):
         show("spawn")
         show("spawn")
@@ -213,7 +205,7 @@ def test_a_viewer_that_is_gone_is_one_plain_error(where, kind, why, tmp_path, mo
 
 def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
     """A scenario needs a colour of the view, and not the view; an evaluation needs no network."""
-    taken = ("messages", "network", "recording", "report", "virtual_link", "rerun.sinks")
+    taken = ("messages", "network", "recording", "report", "virtual_link", "rerun")
     code = "import sys\n" + "".join(f"import bridge.{name}\n" for name in taken)
     code += "assert not {'zenoh', 'rerun', 'gymnasium'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

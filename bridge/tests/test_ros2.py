@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import json
 import math
 import signal
@@ -22,7 +24,6 @@ from bridge.ros2 import (
     Policies,
     Policy,
     drive_of,
-    feedback_curvature,
     image_of,
     odometry_of,
     twist_of,
@@ -123,13 +124,11 @@ def test_the_odometry_says_what_it_does_not_know():
     pose = DeadReckoning()
     pose.advance(1.0, 0.0, 0)
     pose.advance(1.0, 0.0, S // 2)
-    unsteered = odometry_of(
-        make_feedback(1.0, 0.5), pose, feedback_curvature(make_feedback(1.0, 0.5), PEDAL, 1.0)
-    )
+    unsteered = odometry_of(make_feedback(1.0, 0.5), pose, PEDAL.curvature([0.5]))
     assert unsteered.pose.covariance[7] == unsteered.pose.covariance[35] == UNKNOWN
     assert unsteered.pose.covariance[0] == pytest.approx(0.05**2)
     steered = make_feedback(1.0, -1.0)
-    curvature = feedback_curvature(steered, STEERING, 0.25)
+    curvature = STEERING.curvature(steered.action, 0.25)
     assert curvature is not None
     assert curvature > 0  # to the left
     message = odometry_of(steered, pose, curvature)
@@ -174,9 +173,8 @@ def test_what_cannot_be_read_is_counted_by_topic_and_reason():
     node, outlet = outlet_with(left_turn_status)
     for topic in ("state", "command", "feedback", "health", "scene", "alive"):
         outlet.take(heard(topic, b"\xc1"))
-    assert outlet.rejected == {
-        "state_malformed": 1, "command_malformed": 1, "feedback_malformed": 1,
-    }  # fmt: skip
+    topics = ("state", "command", "feedback")
+    assert outlet.rejected == {f"{topic}_malformed": 1 for topic in topics}
     assert not any(node.published.values())
 
 
@@ -208,7 +206,7 @@ def test_the_vehicles_scale_is_its_speed_over_the_scenarios(scenario_mps, scale)
             scenario_speed_mps=None if scenario_mps is None else scenario_mps * speed_mps,
         )
         outlet.take(heard("feedback", encode(feedback), at_s=len(node.published["odom"])))
-    car_curvature = feedback_curvature(make_feedback(1.0, -1.0), STEERING, 1.0)
+    car_curvature = STEERING.curvature([-1.0])
     yaw_rates = [message.twist.twist.angular.z for message in node.published["odom"]]
     assert yaw_rates == pytest.approx([car_curvature / scale, 0.0, car_curvature / scale])
 
@@ -230,35 +228,25 @@ class Listener:
     def __init__(self, endpoint):
         self.session = open_session(connect=endpoint, mode="router")
         self.tokens, self.heard = set(), defaultdict(list)
-        self.declared = [
-            self.session.liveliness().declare_subscriber(
-                "@/*/@ros2_lv/**", self._token, history=True
-            )
-        ]
-        for key, type_name in {
-            "hunter01/image_raw": "sensor_msgs/msg/Image",
-            "hunter01/odom": "nav_msgs/msg/Odometry",
-            "hunter01/command/ackermann": "ackermann_msgs/msg/AckermannDriveStamped",
-            "hunter01/command/twist": "geometry_msgs/msg/Twist",
+        tokens = ("@/*/@ros2_lv/**", self._token)
+        self.declared = [self.session.liveliness().declare_subscriber(*tokens, history=True)]
+        for name, type_name in {
+            "image_raw": "sensor_msgs/msg/Image",
+            "odom": "nav_msgs/msg/Odometry",
+            "command/ackermann": "ackermann_msgs/msg/AckermannDriveStamped",
+            "command/twist": "geometry_msgs/msg/Twist",
         }.items():
-            self.declared.append(self.session.declare_subscriber(key, self._reader(key, type_name)))
+            hear = functools.partial(self._hear, name, type_name)
+            self.declared.append(self.session.declare_subscriber(f"hunter01/{name}", hear))
 
     def _token(self, sample):
-        if "PUT" in str(sample.kind):
-            self.tokens.add(str(sample.key_expr))
-        else:
-            self.tokens.discard(str(sample.key_expr))
+        change = self.tokens.add if "PUT" in str(sample.kind) else self.tokens.discard
+        change(str(sample.key_expr))
 
-    def _reader(self, key, type_name):
-        def hear(sample):
-            self.heard[key].append(ros2_side.deserialize(type_name, sample.payload.to_bytes()))
+    def _hear(self, name, type_name, sample):
+        self.heard[name].append(ros2_side.deserialize(type_name, sample.payload.to_bytes()))
 
-        return hear
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
+    def close(self):
         for declared in self.declared:
             declared.undeclare()
         self.session.close()
@@ -274,7 +262,7 @@ def test_a_drive_is_shown_to_ros_2_and_ends_with_the_simulator(tmp_path):
     with (
         start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY, "--episodes", "2") as run,
         start_ros2(endpoint, ros_endpoint, "--out", str(out)) as shown,
-        Listener(ros_endpoint) as ros_side,
+        contextlib.closing(Listener(ros_endpoint)) as ros_side,
     ):
         assert shown.process.stdout.readline().startswith("ready vehicle_id=hunter01")
         wait_until(lambda: len(ros_side.tokens) == 5, "the tokens of four topics and the node")
@@ -283,20 +271,17 @@ def test_a_drive_is_shown_to_ros_2_and_ends_with_the_simulator(tmp_path):
         assert shown.wait(20) == 0, shown.errors
         wait_until(lambda: not ros_side.tokens, "the tokens to go")
     assert len(ros_side.heard) == 4
-    for image in ros_side.heard["hunter01/image_raw"]:
+    for image in ros_side.heard["image_raw"]:
         assert (image["height"], image["width"], image["step"]) == (45, 80, 80)
         assert image["encoding"] == "mono8"
         # The toy's picture is of one brightness.
         assert len(image["data"]) == 3600 == image["data"].count(image["data"][0])
-    drives = [
-        message["drive"]
-        for message in ros_side.heard["hunter01/command/ackermann"]
-        if message["drive"]["acceleration"] == pytest.approx(1.5)
-    ]
+    drives = [message["drive"] for message in ros_side.heard["command/ackermann"]]
+    drives = [drive for drive in drives if drive["acceleration"] == pytest.approx(1.5)]
     assert drives  # half pedal of 3 m/s2; the others are the safe stop before and full brakes
     assert all(0.0 <= drive["speed"] <= 6.0 and drive["steering_angle"] == 0.0 for drive in drives)
-    assert any(twist["linear"]["x"] > 0 for twist in ros_side.heard["hunter01/command/twist"])
-    ways = [message["pose"]["pose"]["position"]["x"] for message in ros_side.heard["hunter01/odom"]]
+    assert any(twist["linear"]["x"] > 0 for twist in ros_side.heard["command/twist"])
+    ways = [message["pose"]["pose"]["position"]["x"] for message in ros_side.heard["odom"]]
     assert ways == sorted(ways)
     assert ways[-1] > 0
     report = read(out)

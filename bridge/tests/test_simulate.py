@@ -275,11 +275,3 @@ def test_an_installed_environment_is_served_by_its_id(site, tmp_path):
     (row,) = report["per_episode"]
     assert (row["steps"], row["outcome"]) == (20, "ended")
     assert row["reward"] == pytest.approx(20 * 0.3, rel=1e-6)
-
-
-def test_what_is_not_installed_is_one_line_and_status_2():
-    with BridgeProcess("simulate", "--env", "somebody/Creep-v0") as run:
-        assert run.wait() == 2
-    (line,) = run.errors.splitlines()
-    assert "somebody" in line
-    assert "a gymnasium id" in line

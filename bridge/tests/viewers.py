@@ -30,14 +30,14 @@ def in_place(kind, folder, monkeypatch):
     fake.chmod(0o755)
     monkeypatch.setenv("RERUN_CLI_PATH", str(fake))
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr("bridge.rerun.sinks.FLUSH_S", 1.0)
+    monkeypatch.setattr("bridge.rerun.FLUSH_S", 1.0)
     if kind == "never listens":
-        monkeypatch.setattr("bridge.rerun.sinks.START_S", 1.0)
+        monkeypatch.setattr("bridge.rerun.START_S", 1.0)
     with contextlib.ExitStack() as probes:
         for name in ("GRPC_PORT", "WEB_PORT"):
             probe = probes.enter_context(socket.socket())
             probe.bind(("127.0.0.1", 0))
-            monkeypatch.setattr(f"bridge.rerun.sinks.{name}", probe.getsockname()[1])
+            monkeypatch.setattr(f"bridge.rerun.{name}", probe.getsockname()[1])
     yield
     for pid in pids.read_text().split():
         with contextlib.suppress(ProcessLookupError):  # Windows stay open.

@@ -259,7 +259,7 @@ def test_edge_simulator_and_viewer_meet_at_a_router_that_comes_late_and_goes(par
         router = start_router(place, parties)
         with session(place, parties / "simulator-hunter01") as simulator:
             port = SimulatorPort(simulator, "hunter01")
-            port.on_command(answered.append)
+            port.hear("command", answered.append)
             port.wait_for_edge(10.0, place)
             with open_listener(place, "hunter01", 5.0, load_tls(parties / "viewer")) as feed:
                 drive(port, answered, 0)

@@ -16,8 +16,7 @@ import pytest
 import torch
 from rerun.chunk import RrdReader
 
-from bridge.rerun import APPLIED, HUMAN, POLICY
-from bridge.rerun.sinks import Sink
+from bridge.rerun import APPLIED, HUMAN, POLICY, Sink
 from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
 from trainer.__main__ import main

@@ -18,7 +18,7 @@ import pytest
 from msgspec.structs import replace
 
 from bridge import recording
-from bridge.tests.test_recording_damage import MIB, crafted, zeros
+from bridge.tests.test_recording import MIB, crafted, zeros
 from edge_runtime.files import try_to_lock_file
 from edge_runtime.util import UserError
 from trainer.learner.replay import ReplayBuffer

@@ -1,0 +1,716 @@
+"""Recordings: how they are written, cut off, damaged, mended, and made to keep a reader busy."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import io
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Chunk, Header, Message
+from mcap.writer import MCAP0_MAGIC
+
+from bridge import recording as records
+from bridge.messages import WIRE_TOPICS, Heard, Stamps, encode_scene
+from bridge.ports import QUEUE_MESSAGES, WireListener
+from bridge.record import RawImage, RecordingWriter, _listen, describe
+from bridge.recording import Recording, Stored
+from bridge.replay import RecordedDrive, replay_in_process
+from bridge.tests.harness import (
+    LEFT_TURN,
+    SLOW_TOY,
+    BridgeProcess,
+    bridge_status,
+    chunks,
+    flip,
+    flip_chunk,
+    make_command,
+    make_policy,
+    messages_of,
+    read,
+    rerun,
+    start_edge,
+    start_simulate,
+)
+from bridge.tests.test_inbound import health
+from bridge.tests.test_replay import Hand
+from edge_runtime.config import Config
+from edge_runtime.policy import load_policy
+from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
+from edge_runtime.transport import free_endpoint, open_session
+from edge_runtime.util import UserError
+from edge_runtime.wire import FRAMES_BYTES, MAX_PAYLOAD_BYTES, State, decode_state, encode
+
+
+def heard(topic: str, payload: bytes, arrived_ns: int = 1) -> Heard:
+    return Heard(f"phil/v/{topic}", topic, payload, arrived_ns, len(payload))
+
+
+@contextlib.contextmanager
+def writing(path: Path, dropped: int = 0):
+    """A recording that is finished at the end of the block."""
+    with contextlib.closing(RecordingWriter(path)) as writer:
+        yield writer
+        writer.finish(dropped)
+
+
+def told_in(path: Path) -> list[tuple[str, int, bytes]]:
+    return [told(stored) for stored in Recording(path).messages()]
+
+
+def told(stored: Stored) -> tuple[str, int, bytes]:
+    return stored.channel.topic, stored.message.log_time, stored.message.data
+
+
+def test_the_picture_is_what_the_policy_saw(tmp_path):
+    frames = bytes(range(256)) * (FRAMES_BYTES // 256) + bytes(FRAMES_BYTES % 256)
+    path = tmp_path / "runs" / "a.mcap"
+    with writing(path) as writer:
+        state = encode(make_state(3, frames=frames))
+        writer.write(heard("state", state, arrived_ns=5 * 10**9 + 7))
+    (data,) = (data for topic, _, data in told_in(path) if topic == "view/v/frames")
+    image = describe(RawImage).make.FromString(data)
+    assert (image.width, image.height, image.step, image.encoding) == (80, 90, 80, "mono8")
+    assert (image.timestamp.seconds, image.timestamp.nanos) == (5, 7)
+    assert image.data == frames
+
+
+def test_what_cannot_be_read_is_kept_and_what_is_too_large_is_not(tmp_path):
+    with writing(tmp_path / "a.mcap", dropped=3) as writer:
+        writer.write(heard("state", b"junk"))
+        writer.write(Heard("phil/v/state", "state", b"", 2, MAX_PAYLOAD_BYTES + 1))
+        writer.write(heard("alive", b"\x01"))
+    recording = Recording(tmp_path / "a.mcap")
+    found = [(topic, data) for topic, _, data in map(told, recording.messages())]
+    assert ("phil/v/state", b"junk") in found
+    assert ("phil/v/alive", b'{"here": true}') in found
+    events = [data for topic, data in found if topic == "view/v/events"]
+    assert b"unreadable" in events[0]
+    assert b"65537 bytes" in events[1]
+    assert recording.metadata == {"messages": "3", "dropped": "3"}
+
+
+def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
+    """Ints beyond 64 bits signed, and 3,000 mutated messages of every topic."""
+    random = np.random.default_rng(1)
+    good = [
+        encode(make_state(1, episode=2**63)),
+        encode(make_state(1)),
+        encode(make_command(1)),
+        encode(health(1, 2.0, stale=2**63)),
+        encode_scene({"vehicles": []}, Stamps(1, 1, 0.1)),
+    ]
+    with writing(tmp_path / "a.mcap") as writer:
+        for number in range(3000):
+            payload = bytearray(good[number % len(good)])
+            for _ in range(number // 1000):
+                payload[random.integers(len(payload))] = random.integers(256)
+            topic = WIRE_TOPICS[(number // len(good)) % len(WIRE_TOPICS)]
+            writer.write(heard(topic, bytes(payload), arrived_ns=number))
+    raw = [stored for stored in Recording(tmp_path / "a.mcap").messages() if stored.schema is None]
+    assert len(raw) == 3000
+    drive = RecordedDrive(tmp_path / "a.mcap", None)
+    policy = load_policy(make_policy(tmp_path), allow_unsigned=True)
+    assert ("here", 0, 1) in drive.exchanges
+    replay_in_process(drive, policy, Config())
+
+
+def test_an_empty_file_is_no_recording(tmp_path):
+    (tmp_path / "empty.mcap").touch()
+    with pytest.raises(UserError, match="no MCAP recording"):
+        list(Recording(tmp_path / "empty.mcap").messages())
+
+
+def start_record(endpoint: str, path: Path, *options: str) -> BridgeProcess:
+    """Start ``record`` and wait until it writes."""
+    run = BridgeProcess("record", "--out", str(path), "--connect", endpoint, *options)
+    # A file is made before its first bytes are in it.
+    wait_until(lambda: path.exists() and path.stat().st_size > 0, "the recording to begin")
+    return run
+
+
+def states_in(path: Path) -> list[tuple[int, Any]]:
+    """Return the states of a recording with the times of their arrival (ns)."""
+    found = [
+        (arrived_ns, decode_state(data))
+        for topic, arrived_ns, data in told_in(path)
+        if topic.startswith("phil/") and topic.endswith("/state")
+    ]
+    assert all(isinstance(state, State) for _, state in found)
+    return found
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A recorded drive in lock-step, and its report."""
+    folder, endpoint = tmp_path_factory.mktemp("drive"), free_endpoint()
+    recording, out = folder / "drive.mcap", folder / "r.json"
+    with (
+        start_simulate(endpoint, out, SLOW_TOY) as run,
+        start_record(endpoint, recording) as recorder,
+        start_edge(endpoint, make_policy(folder)),
+    ):
+        assert run.wait() == 0, run.errors
+        assert recorder.wait(PATIENCE_S) == 0, recorder.errors
+    return recording, read(out)
+
+
+def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
+    recording, report = drive
+    steps = report["per_episode"][0]["steps"]
+    counts: collections.Counter[str] = collections.Counter()
+    with recording.open("rb") as stream:
+        for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
+            counts[channel.topic] += 1
+    assert counts["phil/hunter01/state"] == counts["view/hunter01/frames"] == steps + 1
+    assert counts["phil/hunter01/scene"] == counts["view/hunter01/scene"] == steps + 1
+    assert counts["phil/hunter01/command"] >= steps
+    assert counts["phil/hunter01/health"] >= 1
+    assert counts["phil/hunter01/alive"] >= 1  # It came.
+    assert counts["phil/hunter01/simulator"] == 2  # It came, and it went.
+    assert [state.step for _, state in states_in(recording)] == list(range(steps + 1))
+
+
+def test_rerun_draws_frames_texts_and_values(drive, tmp_path):
+    recording, _ = drive
+    drawn = tmp_path / "drive.rrd"
+    rerun("mcap", "convert", str(recording), "-o", str(drawn))
+    found = rerun("rrd", "stats", str(drawn))
+    parts = ("/view/hunter01/frames", "Image:buffer", "TextLog:text", "phil.Command:message")
+    assert [part for part in parts if part not in found] == []
+
+
+def record_and_kill(folder: Path) -> tuple[Path, float]:
+    """Kill a recorder of a drive in real time; the file, and how many seconds it has lost."""
+    endpoint, recording = free_endpoint(), folder / f"cut-{time.monotonic_ns()}.mcap"
+    with (
+        start_simulate(endpoint, folder / "r.json", SLOW_TOY, "--clock", "realtime"),
+        start_record(endpoint, recording) as run,
+        start_edge(endpoint, make_policy(folder)),
+    ):
+        wait_until(lambda: recording.exists() and len(states_in(recording)) > 10, "a second")
+        assert bridge_status(["repair", str(recording)]) == 2  # Not while it grows.
+        run.process.send_signal(signal.SIGKILL)
+        killed_ns = time.time_ns()
+        run.process.wait()
+    return recording, (killed_ns - states_in(recording)[-1][0]) * 1e-9
+
+
+def test_a_kill_loses_at_most_the_last_second_and_repair_gives_the_index_back(tmp_path, capsys):
+    for _ in range(4):  # On a busy machine no state may come, or be written, for over a second.
+        recording, lost_s = record_and_kill(tmp_path)
+        if lost_s < 1.0:
+            break
+    assert lost_s < 1.0
+    states = states_in(recording)
+    assert [state.step for _, state in states] == list(range(len(states)))
+    # The library's own reader for streams gets as far, and then finds the end missing.
+    with recording.open("rb") as stream, contextlib.suppress(Exception):
+        count = 0
+        for _ in NonSeekingReader(stream).iter_messages(
+            "phil/hunter01/state", log_time_order=False
+        ):
+            count += 1
+    assert count == len(states)
+    assert "is being written" in capsys.readouterr().err
+    assert bridge_status(["repair", str(recording)]) == 0
+    with recording.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert len(states_in(recording)) == len(states)
+    assert bridge_status(["repair", str(recording)]) == 0
+    assert "is whole" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("keep", [0.2, 0.5, 0.9, 0.999])
+def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
+    recording, _ = drive
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(recording.read_bytes()[: int(recording.stat().st_size * keep)])
+    whole, part = states_in(recording), states_in(torn)
+    assert part == whole[: len(part)]
+    read_again = Recording(torn)
+    collections.deque(read_again.messages(), maxlen=0)
+    assert read_again.cut_off
+
+
+def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
+    """A limit on the file's size stands in for the disk: the same error path of write(2)."""
+    endpoint, recording = free_endpoint(), tmp_path / "full.mcap"
+    out = tmp_path / "r.json"
+    with (
+        start_simulate(endpoint, out, SLOW_TOY) as run,
+        start_record(endpoint, recording) as recorder,
+        start_edge(endpoint, make_policy(tmp_path)),
+    ):
+        wait_until(lambda: states_in(recording), "the first states")
+        written, full = states_in(recording), recording.stat().st_size + 100
+        resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (full, full))
+        assert recorder.wait() == 1, recorder.errors
+        assert run.wait() == 0, run.errors
+    (line,) = recorder.errors.splitlines()
+    assert "File too large" in line
+    assert "repair" in line
+    assert states_in(recording)[: len(written)] == written
+    assert read(out)["per_episode"][0]["steps"] == 60  # The loop went on to its end.
+
+
+def test_a_feed_that_falls_behind_drops_and_counts():
+    feed, endpoint = WireListener(), free_endpoint()
+    session = open_session(listen=endpoint, mode="router")
+    try:
+        subscriber = session.declare_subscriber("phil/v/state", feed.hearer("state"))
+        for _ in range(QUEUE_MESSAGES + 5):
+            session.put("phil/v/state", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_until(lambda: feed.dropped == 5, "the queue to be full")
+        subscriber.undeclare()
+    finally:
+        session.close()
+    assert feed.waiting == QUEUE_MESSAGES
+
+
+class WithoutSimulator(WireListener):
+    """An edge runtime behind a router, whose simulator has gone: it goes on saying how it is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.simulator_gone.set()
+        self.said = 0
+
+    def next(self, timeout_s: float) -> Heard | None:
+        time.sleep(0.005)
+        self.said += 1
+        if self.said > 1000:
+            raise AssertionError("it listens on")
+        return Heard("phil/car/health", "health", b"", 1, 0)
+
+
+def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path):
+    with writing(tmp_path / "drive.mcap") as writer:
+        _listen(WithoutSimulator(), writer, SimpleNamespace(duration_s=None, linger_s=0.05))
+    assert writer.messages > 0
+
+
+def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
+    endpoint, recording = free_endpoint(), tmp_path / "both.mcap"
+    policy = make_policy(tmp_path, "constant")
+    with start_edge(endpoint, policy):
+        with start_simulate(endpoint, tmp_path / "1.json", SLOW_TOY) as first:
+            recorder = start_record(endpoint, recording, "--linger-s", "10")
+            wait_until(lambda: len(states_in(recording)) > 5, "the first drive")
+            first.process.kill()
+        with recorder, start_simulate(endpoint, tmp_path / "2.json", SLOW_TOY) as second:
+            assert second.wait() == 0, second.errors
+            recorder.process.send_signal(signal.SIGTERM)
+            assert recorder.wait(PATIENCE_S) == 0, recorder.errors
+    sessions = {state.session for _, state in states_in(recording)}
+    assert len(sessions) == 2
+
+
+HELD_OPEN = """
+import sys
+from pathlib import Path
+from bridge.record import FlushedFile
+file = FlushedFile(Path(sys.argv[1]))
+file.write(sys.stdin.buffer.read(int(sys.argv[2])))
+file.flush()
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def copy(tmp_path):
+    path = tmp_path / "drive.mcap"
+    shutil.copy(LEFT_TURN, path)
+    return path
+
+
+def without_chunk(number: int) -> list[tuple[str, int, bytes]]:
+    """The messages of the undamaged file but those of one chunk."""
+    sizes = [messages_of(LEFT_TURN, index) for index in chunks(LEFT_TURN)]
+    first, whole = sum(sizes[:number]), told_in(LEFT_TURN)
+    return whole[:first] + whole[first + sizes[number] :]
+
+
+@pytest.fixture
+def repair(capsys):
+    """Run ``bridge repair`` to a good end; return what it prints."""
+
+    def repaired(*arguments):
+        capsys.readouterr()
+        assert bridge_status(["repair", *map(str, arguments)]) == 0
+        return capsys.readouterr().out
+
+    return repaired
+
+
+def damage_contents(path, number):
+    flip_chunk(path, number)
+
+
+def damage_length(path, number):
+    flip(path, chunks(path)[number].chunk_start_offset + 1, 8)
+
+
+def damage_opcode(path, number):
+    flip(path, chunks(path)[number].chunk_start_offset, 1)
+
+
+def zero_the_chunk(path, number):
+    """As a disk does: neither the record nor its length is left."""
+    index = chunks(path)[number]
+    start, end = index.chunk_start_offset, index.chunk_start_offset + index.chunk_length
+    data = path.read_bytes()
+    path.write_bytes(data[:start] + bytes(end - start) + data[end:])
+
+
+@pytest.mark.parametrize("number", [0, 3, 29], ids=["first", "middle", "last"])
+@pytest.mark.parametrize("damage", [damage_contents, damage_length, damage_opcode, zero_the_chunk])
+def test_only_the_broken_chunk_is_lost(copy, damage, number):
+    damage(copy, number)
+    recording = Recording(copy)
+    assert [told(stored) for stored in recording.messages()] == without_chunk(number)
+    assert (recording.damaged_places, recording.cut_off) == (1, False)
+    whole = Recording(LEFT_TURN)
+    list(whole.messages())
+    assert recording.metadata == whole.metadata
+
+
+def test_repair_says_what_it_leaves_out_and_keeps_the_file_as_it_was(copy, repair):
+    flip_chunk(copy, 3)
+    damaged, kept = copy.read_bytes(), copy.with_name("drive.mcap.damaged")
+    left = without_chunk(3)
+    assert 2000 < len(left) < len(told_in(LEFT_TURN))
+    assert repair(copy) == (
+        f"wrote {copy}: {len(left)} messages; left out: 1 damaged place of"
+        f" {chunks(LEFT_TURN)[3].chunk_length} bytes; the file as it was: {kept}\n"
+    )
+    assert kept.read_bytes() == damaged
+    assert told_in(copy) == left
+    with copy.open("rb") as stream:
+        assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == len(left)
+    assert "is whole" in repair(copy)
+
+
+def test_a_replay_says_damaged_and_replays_the_rest(tmp_path, capsys):
+    path, out = tmp_path / "by_hand.mcap", tmp_path / "r.json"
+    hand = Hand(path)
+    for first in (0, 20, 40):
+        hand.drive(first, first + 20)
+        hand.writer.flush()
+    hand.close()
+    flip_chunk(path, 1)
+    trust = ["--policy", str(make_policy(tmp_path, "constant", 0.3)), "--allow-unsigned"]
+    bridge_status(["replay", str(path), *trust, "--out", str(out)])
+    report = json.loads(out.read_text())
+    assert (report["states"], report["cut_off"], report["damaged_places"]) == (40, False, 1)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("the recording is damaged (1 damaged place of")
+
+
+def test_a_broken_index_is_written_anew_and_no_message_is_lost(copy, repair):
+    flip(copy, copy.stat().st_size - 100)
+    count = len(told_in(LEFT_TURN))
+    assert f"{count} messages; left out: 1 damaged place" in repair(copy)
+    with copy.open("rb") as stream:
+        assert len(list(make_reader(stream).iter_messages())) == count
+
+
+def test_bytes_that_are_gone_take_no_more_with_them(copy):
+    """The index is not where it says; its names are good all the same."""
+    data = copy.read_bytes()
+    copy.write_bytes(data[:300] + data[320:])
+    assert told_in(copy) == without_chunk(0)
+
+
+def test_of_a_cut_file_with_a_broken_first_chunk_the_nameless_messages_are_counted(copy, repair):
+    data = copy.read_bytes()
+    copy.write_bytes(data[: chunks(copy)[20].chunk_start_offset])
+    flip(copy, 300)
+    out = repair(copy)
+    assert "messages whose topic was in a damaged place" in out
+    assert "the file as it was" in out
+
+
+def test_a_damaged_file_is_not_kept_over_an_earlier_one(copy, refusal):
+    flip_chunk(copy, 3)
+    damaged, kept = copy.read_bytes(), copy.with_name("drive.mcap.damaged")
+    kept.write_text("mine")
+    assert "drive.mcap.damaged exists" in refusal("repair", copy)
+    assert (kept.read_text(), copy.read_bytes()) == ("mine", damaged)
+
+
+def test_a_file_without_a_checksum_over_all_of_it_is_not_called_whole(copy, tmp_path, repair):
+    """As other programs write them. --out writes it with one."""
+    data, out = bytearray(copy.read_bytes()), tmp_path / "out.mcap"
+    end = data.index(b"\x0f" + (4).to_bytes(8, "little"), chunks(copy)[-1].chunk_start_offset)
+    data[end + 9 : end + 13] = bytes(4)
+    copy.write_bytes(data)
+    said = repair(copy)
+    assert f"can be read to its end: {len(told_in(LEFT_TURN))} messages; nothing done" in said
+    assert copy.read_bytes() == data
+    repair(copy, "--out", out)
+    assert "is whole" in repair(out)
+
+
+def test_a_change_outside_of_the_chunks_is_said_and_mended(copy, tmp_path, repair):
+    whole = tmp_path / "whole.mcap"
+    repair(copy, "--out", whole)
+    flip(whole, chunks(whole)[3].chunk_start_offset + 9)  # when its first message came
+    said = repair(whole)
+    assert (
+        f"{len(told_in(LEFT_TURN))} messages; left out: bytes that changed outside of its chunks"
+        in said
+    )
+    assert whole.with_name("whole.mcap.damaged").exists()
+    assert "is whole" in repair(whole)
+
+
+def test_a_repair_that_was_killed_can_be_done_again(copy, repair):
+    flip_chunk(copy, 3)
+    copy.with_name("drive.mcap.damaged").hardlink_to(copy)
+    repair(copy)
+    assert told_in(copy) == without_chunk(3)
+
+
+def test_through_a_link_the_file_is_repaired_and_kept_where_it_is(copy, tmp_path, repair):
+    flip_chunk(copy, 3)
+    link = tmp_path / "elsewhere" / "link.mcap"
+    link.parent.mkdir()
+    link.symlink_to(copy)
+    repair(link)
+    assert link.is_symlink()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "drive.mcap", "drive.mcap.damaged", "elsewhere",
+    ]  # fmt: skip
+
+
+def test_out_writes_a_new_file_only(copy, tmp_path, refusal, repair):
+    flip_chunk(copy, 3)
+    damaged, out = copy.read_bytes(), tmp_path / "ok.mcap"
+    repair(copy, "--out", out)
+    assert copy.read_bytes() == damaged
+    whole = out.read_bytes()
+    line = refusal("repair", copy, "--out", out)
+    assert "exists; choose another name: no recording is lost" in line
+    assert out.read_bytes() == whole
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drive.mcap", "ok.mcap"]
+
+
+def test_what_is_being_written_is_not_repaired_and_a_kill_frees_it(tmp_path, refusal, repair):
+    path, data = tmp_path / "growing.mcap", LEFT_TURN.read_bytes()[:100_000]
+    command = [sys.executable, "-c", HELD_OPEN, str(path), str(len(data))]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdin is not None
+        assert writer.stdout is not None
+        writer.stdin.write(data)
+        writer.stdin.flush()
+        assert writer.stdout.readline() == b"ready\n"
+        for options in ([], ["--out", tmp_path / "other.mcap"]):
+            assert "is being written" in refusal("repair", path, *options)
+        assert path.read_bytes() == data
+        writer.kill()
+        writer.wait()
+    assert "a torn end of" in repair(path)
+    assert [place.name for place in tmp_path.iterdir()] == ["growing.mcap"]
+
+
+def test_a_pipe_is_no_recording_and_nobody_waits_for_it(tmp_path, refusal):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for command, option, out in (("repair", "--out", "out.mcap"), ("view", "--save", "out.rrd")):
+        assert "no regular file" in refusal(command, pipe, option, tmp_path / out)
+
+
+OVERWRITTEN = 10
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Two chunks, an index and metadata: each kind of record that `record` writes."""
+    path = tmp_path_factory.mktemp("recordings") / "small.mcap"
+    payloads = {"state": encode(make_state(1)), "command": encode(make_command(1))}
+    with writing(path) as writer:
+        for number, (topic, payload) in enumerate(payloads.items()):
+            writer.write(heard(topic, payload, number))
+            writer.flush()
+    return path
+
+
+def is_whole(path) -> bool:
+    """Whether `repair` would say so."""
+    recording = Recording(path)
+    try:
+        for _ in recording.messages():
+            pass
+    except UserError:
+        return False
+    return not recording.trouble() and recording.has_checksums
+
+
+def overwritten(small, at: int, new: bytes) -> bool:
+    """Whether a recording with those bytes at that place is no longer whole, or the same."""
+    data = small.read_bytes()
+    changed = data[:at] + new + data[at + len(new) :]
+    path = small.with_name("changed.mcap")
+    path.write_bytes(changed)
+    return changed == data or not is_whole(path)
+
+
+def test_ten_bytes_overwritten_at_any_place_are_noticed(small):
+    assert is_whole(small)
+    data = small.read_bytes()
+    for at in range(0, len(data) - OVERWRITTEN + 1, 5):
+        flipped = bytes(byte ^ 0xFF for byte in data[at : at + OVERWRITTEN])
+        assert overwritten(small, at, flipped), at
+        assert overwritten(small, at, bytes(OVERWRITTEN)), at
+
+
+@given(place=st.floats(0, 1), new=st.binary(min_size=1, max_size=OVERWRITTEN))
+def test_any_bytes_overwritten_are_noticed(small, place, new):
+    at = round(place * (small.stat().st_size - len(new)))
+    assert overwritten(small, at, new)
+
+
+MIB = 1 << 20
+HEADER_BYTES = 17
+
+
+def zeros(mib: int, tells_size: bool = True) -> bytes:
+    """That many MiB, compressed to almost nothing."""
+    stream = io.BytesIO()
+    compressor = zstandard.ZstdCompressor(write_content_size=tells_size)
+    with compressor.stream_writer(stream, size=mib * MIB, closefd=False) as writer:
+        for _ in range(mib):
+            writer.write(bytes(MIB))
+    return stream.getvalue()
+
+
+def crafted(path, *chunks: tuple[bytes, int], filling: bytes = b""):
+    """A recording of chunks, each of its data and of what it announces to unpack to."""
+    builder = RecordBuilder()
+    builder.write(MCAP0_MAGIC)
+    Header("", "").write(builder)
+    for data, announced in chunks:
+        Chunk("zstd", data, 0, 0, 0, announced).write(builder)
+    path.write_bytes(builder.end() + filling)
+    return path
+
+
+class Counted:
+    """How many bytes are unpacked."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.unpacked = 0
+        self._breakup = records.breakup_chunk
+        monkeypatch.setattr(records, "breakup_chunk", self)
+
+    def __call__(self, chunk, validate_crc):
+        self.unpacked += chunk.uncompressed_size
+        return self._breakup(chunk, validate_crc)
+
+
+@pytest.mark.parametrize(("announced", "tells_size"), [(1024, True), (1, True), (1024, False)])
+def test_a_chunk_that_unpacks_to_too_much_is_passed_over(
+    tmp_path, monkeypatch, announced, tells_size
+):
+    """Whether the chunk says so itself, or its data alone do."""
+    counted = Counted(monkeypatch)
+    bomb = zeros(1024, tells_size)
+    path = crafted(tmp_path / "bomb.mcap", *[(bomb, announced * MIB)] * 40)
+    recording = Recording(path)
+    assert list(recording.messages()) == []
+    assert recording.damaged_bytes == path.stat().st_size - len(MCAP0_MAGIC) - HEADER_BYTES
+    assert counted.unpacked == 0
+
+
+def test_data_that_do_not_say_their_size_are_unpacked_as_far_as_the_chunk_says(tmp_path):
+    recording = Recording(crafted(tmp_path / "bomb.mcap", (zeros(64, False), MIB)))
+    assert list(recording.messages()) == []
+    assert recording.damaged_places == 1
+
+
+def test_chunks_that_unpack_to_too_much_together_are_refused(tmp_path, monkeypatch, refusal):
+    counted = Counted(monkeypatch)
+    monkeypatch.setattr(records, "MAX_CHUNK_BYTES", MIB)
+    path = crafted(tmp_path / "bomb.mcap", *[(zeros(1), MIB)] * 100)
+    for command in (["repair"], ["view", "--save", str(tmp_path / "a.rrd")]):
+        assert "bomb.mcap is refused" in refusal(*command, path)
+    assert counted.unpacked <= 4 * MIB
+    assert [file.name for file in tmp_path.iterdir()] == ["bomb.mcap"]
+
+
+def test_empty_messages_count_though_they_hardly_have_bytes(tmp_path):
+    builder = RecordBuilder()
+    for _ in range(20_000):
+        Message(channel_id=0, log_time=0, data=b"", publish_time=0, sequence=0).write(builder)
+    data = builder.end()
+    packed = zstandard.compress(data)
+    path = crafted(tmp_path / "empty.mcap", *[(packed, len(data))] * 20)
+    with pytest.raises(UserError, match="takes more than 200 times"):
+        list(Recording(path).messages())
+
+
+class ReadCounting(io.BytesIO):
+    """A file in memory that counts what is read of it."""
+
+    name = "crafted.mcap"
+    read_bytes = 0
+
+    def read(self, count: int | None = -1) -> bytes:
+        data = super().read(count)
+        self.read_bytes += len(data)
+        return data
+
+
+def fake_chunks(size: int) -> bytes:
+    """Beginnings of chunks, each as long as the rest of the file."""
+    lengths = range(size // 45 * 45 - 9, 0, -45)
+    rest = bytes(28) + b"\x04\0\0\0zstd"
+    return b"".join(b"\x06" + length.to_bytes(8, "little") + rest for length in lengths)
+
+
+def fake_ends(size: int) -> bytes:
+    """Ends of files, each with an index as long as all before it."""
+    end = b"\x02" + b"".join(value.to_bytes(8, "little") for value in (20, 8, 0)) + b"\1\2\3\4"
+    return (end + MCAP0_MAGIC) * (size // 37)
+
+
+def true_data_ends(size: int) -> bytes:
+    """Ends of the data, each with the right checksum over all before it."""
+    ends, crc = [], zlib.crc32(MCAP0_MAGIC)
+    for _ in range(size // 13):
+        ends.append(b"\x0f" + (4).to_bytes(8, "little") + crc.to_bytes(4, "little"))
+        crc = zlib.crc32(ends[-1], crc)
+    return b"".join(ends)
+
+
+@pytest.mark.parametrize("make", [fake_chunks, fake_ends, true_data_ends])
+def test_the_work_is_bounded_by_the_size(make):
+    """Landmarks at which nothing stands, or whose checksum takes the whole file."""
+    size = 1_000_000
+    data = MCAP0_MAGIC + make(size)
+    stream = ReadCounting(data)
+    with pytest.raises(UserError, match="takes more than 200 times"):
+        list(records.Records(stream, len(data)).walk())
+    assert stream.read_bytes <= 2 * (records.MAX_CHUNK_BYTES + records.MAX_WORK * size)
