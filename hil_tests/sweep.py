@@ -33,8 +33,8 @@ from hil_tests.processes import (
 )
 from hil_tests.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
+from trainer.experiments.data import Estimate, mean_estimate, success_estimate
 from trainer.experiments.plan import digest
-from trainer.experiments.statistics import Estimate, mean_estimate, success_estimate
 from trainer.util import ProgressBar
 
 LOOPS = POLICY, VEHICLE = ("policy", "vehicle")

@@ -17,7 +17,7 @@ from edge_runtime.util import UserError
 from trainer.drivers import ACTIONS, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver, Guide, HumanGuide, Intervention
 from trainer.options import add_scenario, add_seed, check_suffix
-from trainer.scenarios.scene import COLOURS
+from trainer.scenarios.picture import COLOURS
 
 EXAMPLE = examples(
     "python -m trainer picture expert --seed 8 --time 3.4 --out scene.png",

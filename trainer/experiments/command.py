@@ -18,10 +18,8 @@ from trainer.experiments.plan import (
     obstacle,
     units_of,
 )
-from trainer.experiments.ray_runner import run_on_ray
 from trainer.experiments.report import write_report
-from trainer.experiments.run import Task, run_units, say
-from trainer.experiments.store import FAILED, FINISHED, Store
+from trainer.experiments.run import FAILED, FINISHED, Store, Task, run_on_ray, run_units, say
 from trainer.options import add_time_limit, deadline_s
 
 EXAMPLE = examples(

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from trainer.person.interface import LET_GO, WISHES, Moving, Reading, View, Wish
-from trainer.scenarios.scene import HEIGHT_M, VIEW, WIDTH_M
+from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
 SILENCE_S = 0.5
 """A driver who is not heard for this long has let go."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.interface import View
-from trainer.scenarios.scene import draw_scene
+from trainer.scenarios.picture import draw_scene
 
 SIZE = (1040, 680)
 """The drawn picture's; the window shows it larger or smaller."""

@@ -4,9 +4,17 @@ from dataclasses import replace
 
 import pytest
 
-from trainer.experiments.ray_runner import compute_parcel, keep, pack, run_on_ray
-from trainer.experiments.run import Task, compute
-from trainer.experiments.store import FAILED, FINISHED, STOPPED
+from trainer.experiments.run import (
+    FAILED,
+    FINISHED,
+    STOPPED,
+    Task,
+    compute,
+    compute_parcel,
+    keep,
+    pack,
+    run_on_ray,
+)
 from trainer.tests.experiments import UNIT, Soon, store_in, without_times
 
 UNITS = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]

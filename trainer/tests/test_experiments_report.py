@@ -26,17 +26,23 @@ from trainer.experiments.claims import (
     sooner,
     sooner_by,
 )
-from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, load
-from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
-from trainer.experiments.report import write_report
-from trainer.experiments.statistics import (
+from trainer.experiments.data import (
+    ALONE,
+    DISTANCE,
+    SUCCESS,
+    TRAINING,
     Estimate,
     Holds,
+    Line,
+    Scene,
     above,
     all_of,
+    load,
     mean_estimate,
     within,
 )
+from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
+from trainer.experiments.report import write_report
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
 
 SEEDS = 3

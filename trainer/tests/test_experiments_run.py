@@ -31,8 +31,7 @@ from trainer.experiments.plan import (
     unit_id,
     units_of,
 )
-from trainer.experiments.run import Task, compute, run_units
-from trainer.experiments.store import BUSY, FAILED, FINISHED, STOPPED
+from trainer.experiments.run import BUSY, FAILED, FINISHED, STOPPED, Task, compute, run_units
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE

@@ -29,10 +29,10 @@ from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
     MetricsWriter,
+    Validation,
     read_metrics,
     totals,
 )
-from trainer.training.validation import Validation
 from trainer.util import load_torch, save_torch, source_revision
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
