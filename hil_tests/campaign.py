@@ -63,9 +63,8 @@ from hil_tests.sweep import (
     run_rig,
     worth_keeping,
 )
-from trainer.evaluate import cores
 from trainer.options import add_scenario
-from trainer.util import ProgressBar
+from trainer.util import ProgressBar, cores
 
 PART_EPISODES, LOOP_EPISODES = 50, 5
 """Of a network, in virtual time; of a loop, in real time: short, so that all rigs end at about the

@@ -1,6 +1,6 @@
 """Small things that several parts of the trainer need.
 
-In this order: ranges of settings, torch files, one process in a directory, ending in order,
+In this order: ranges of settings, torch files, one process in a directory, processes and their end,
 progress, and what made a result. torch takes two seconds to load, so it is imported only where a
 function needs it: ``--help`` and the configs need none of it.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import multiprocessing
 import os
 import platform
 import shutil
@@ -197,6 +198,34 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
         yield
     finally:
         restore()
+
+
+def cores() -> int:
+    """Processor cores that this process may use, where the system tells; else all."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Processes started here never see ^C, which a terminal sends to all: their parent ends them.
+
+    Blocked, not ignored: a ^C of this moment reaches the parent afterwards.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def die_with_parent() -> None:
+    """End this process when its parent has ended; to be run in a thread."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 class ProgressBar:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from edge_runtime.cli import examples, not_negative, whole_number
 from edge_runtime.util import UserError
-from trainer.evaluate import cores
 from trainer.experiments.plan import (
     DEFAULT_SEEDS,
     EXPERIMENTS,
@@ -21,6 +20,7 @@ from trainer.experiments.plan import (
 from trainer.experiments.report import write_report
 from trainer.experiments.run import FAILED, FINISHED, Store, Task, run_on_ray, run_units, say
 from trainer.options import add_time_limit, deadline_s
+from trainer.util import cores
 
 EXAMPLE = examples(
     "python -m trainer experiment status",

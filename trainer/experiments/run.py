@@ -42,7 +42,7 @@ from trainer.drivers import (
     make_environment,
 )
 from trainer.drivers import CONSTANT as CONSTANT_DRIVER
-from trainer.evaluate import die_with_parent, drive_together, interrupts_blocked
+from trainer.evaluate import drive_together
 from trainer.experiments.plan import (
     CONSTANT,
     SCENARIOS,
@@ -61,7 +61,15 @@ from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import multiplies_bfloat16
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
-from trainer.util import ProgressBar, held, holder, processor_model, source_revision
+from trainer.util import (
+    ProgressBar,
+    die_with_parent,
+    held,
+    holder,
+    interrupts_blocked,
+    processor_model,
+    source_revision,
+)
 
 FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
 """How work on a unit ends: with its record; at a checkpoint, for lack of time; at once, since

@@ -1,8 +1,8 @@
 """Pictures of a scene: the 45x80 grey values that the policy sees, and a larger one for people.
 
-Both show oriented rectangles. In the policy's, a pixel's value is the class of what covers it, mixed
-by the covered area: a car that moves by a tenth of a pixel changes the picture, so two frames show
-speed (eq. 28 stacks two). A picture takes tens of microseconds.
+Both show oriented rectangles. In the policy's, a pixel's value is the class of what covers it,
+mixed by the covered area: a car that moves by a tenth of a pixel changes the picture, so two frames
+show speed (eq. 28 stacks two). A picture takes tens of microseconds.
 """
 
 from __future__ import annotations

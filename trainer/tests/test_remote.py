@@ -39,7 +39,7 @@ class Remote:
 
 
 class Kept:
-    """Stands for ``Learning``: keeps what would be learned, as the replay's chain would."""
+    """Stands for ``LearningThread``: keeps what would be learned, as the replay's chain would."""
 
     def __init__(self):
         self.rows: list[tuple] = []

@@ -21,7 +21,7 @@ from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.learner.config import LearnerConfig
 from trainer.learner.replay import ReplayBuffer
 from trainer.plots import moving_average, write_learning_curve
-from trainer.training import validation
+from trainer.training import metrics as metrics_module
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.config import RunConfig
 from trainer.training.learning import LearningThread
@@ -219,7 +219,7 @@ def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path
     def drive(*_, **__) -> list[SimpleNamespace]:
         return [SimpleNamespace(outcome=COLLISION, reward=rewards[next(episodes)], distance_m=1.0)]
 
-    monkeypatch.setattr(validation, "drive_together", drive)
+    monkeypatch.setattr(metrics_module, "drive_together", drive)
     train(TINY, tmp_path / "whole")
     parts = tmp_path / "parts"
     parts.mkdir()

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,52 +23,9 @@ from trainer import seeds
 from trainer.learner.config import Algorithm, LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
-from trainer.training.delayed import Store
 
 Observation = NDArray[np.uint8]
 Action = NDArray[np.float32]
-
-
-class Learning(Store, Protocol):
-    """What a training loop asks of a learner with its replay buffer, wherever they are."""
-
-    @property
-    def added(self) -> int:
-        """Transitions stored since the run began."""
-
-    @property
-    def learner(self) -> TD3Learner:
-        """The networks, as of the last finished update."""
-
-    def act(self, observation: Observation) -> Action:
-        """The actor's action, float32 [action size]; not while updating."""
-
-    def act_together(self, observations: Observation, averaged: bool) -> Action:
-        """The actor's actions, or the target actor's, [n, action size]; not while updating."""
-
-    def begin(self, beta: float) -> None:
-        """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
-
-    def finish(self) -> float:
-        """Wait until the update that was begun is done, if one was; the seconds waited.
-
-        FloatingPointError: what it has learned is not finite; it may come out later, too.
-        """
-
-    def end_episode(self, progress: float) -> EpisodeLearning:
-        """What was learned since the last call; learning rates fall.
-
-        ``progress`` is the share of the run that is over. FloatingPointError: it is not finite.
-        """
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
-
-    def close(self) -> None:
-        """Let go of threads and memory."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +46,7 @@ NO_LOSSES = (math.nan,) * 4
 
 
 class LearningThread:
-    """``Learning`` whose updates run in a thread of their own.
+    """A learner with its replay buffer; the updates run in a thread of their own.
 
     The policy acts in that thread, too, in validation as well: another would bring a second pool
     of OpenMP threads, and the two would fight for the same cores. Only a human who is a network

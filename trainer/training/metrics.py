@@ -26,7 +26,7 @@ from trainer import seeds
 from trainer.drivers import BEST_FILE, NetworkDriver, make_environment
 from trainer.evaluate import NO_NETWORK, drive_episodes, drive_together
 from trainer.training.config import RunConfig
-from trainer.training.learning import Action, Learning, Observation
+from trainer.training.learning import Action, LearningThread, Observation
 from trainer.util import save_torch
 
 NAN = float("nan")
@@ -206,7 +206,7 @@ def totals(rows: Sequence[dict[str, str]]) -> dict[str, Any]:
 class LearningDriver(NetworkDriver):
     """The policy that is being learned, or its running average, asked where it is learned."""
 
-    def __init__(self, learning: Learning, averaged: bool) -> None:
+    def __init__(self, learning: LearningThread, averaged: bool) -> None:
         self.learning, self.averaged = learning, averaged
 
     def act_together(self, observations: Observation) -> Action:
@@ -225,7 +225,7 @@ class Validation:
     """
 
     def __init__(
-        self, config: RunConfig, run_dir: Path, learning: Learning, network: LatencySpec
+        self, config: RunConfig, run_dir: Path, learning: LearningThread, network: LatencySpec
     ) -> None:
         self.config, self.run_dir = config, run_dir
         self.learning, self.network = learning, network

@@ -24,7 +24,7 @@ from trainer.learner.config import ALGORITHMS, HUMANS_ACTION
 from trainer.learner.td3 import TD3Learner
 from trainer.training.config import BIASED, RunConfig
 from trainer.training.delayed import behind
-from trainer.training.learning import Action, Learning, LearningThread
+from trainer.training.learning import Action, LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
@@ -218,7 +218,7 @@ class TrainingRun:
         """Whether the episode just driven is the last of this call."""
         return time.monotonic() > deadline_s
 
-    def _around(self, learning: LearningThread) -> Learning:
+    def _around(self, learning: LearningThread) -> LearningThread:
         """What the loop asks in the learner's place."""
         return learning
 
