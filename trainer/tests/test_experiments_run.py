@@ -31,7 +31,19 @@ from trainer.experiments.plan import (
     unit_id,
     units_of,
 )
-from trainer.experiments.run import BUSY, FAILED, FINISHED, STOPPED, Task, compute, run_units
+from trainer.experiments.run import (
+    BUSY,
+    FAILED,
+    FINISHED,
+    STOPPED,
+    Task,
+    compute,
+    compute_parcel,
+    keep,
+    pack,
+    run_on_ray,
+    run_units,
+)
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
@@ -247,3 +259,42 @@ def test_the_record_says_what_was_trained(straight):
     config = run_config(UNIT, TINY, straight.humans).as_dict()
     assert {**config, **record["config"]} == json.loads(json.dumps(config))
     assert (straight.run_dir(UNIT) / METRICS_FILE).is_file()
+
+
+UNITS = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]
+
+
+def test_a_parcel_goes_on_elsewhere_and_brings_back_the_same_record(tmp_path):
+    store, other = store_in(tmp_path / "ours"), store_in(tmp_path / "theirs")
+    task = Task(UNIT, store, stop_at_s=Soon(1e18))
+    assert keep(task, *compute_parcel(pack(task))) == STOPPED
+    task = replace(task, stop_at_s=float("inf"))
+    assert "checkpoint.pt" in pack(task)[2]
+    assert keep(task, *compute_parcel(pack(task))) == FINISHED
+    assert compute(Task(UNIT, other)) == FINISHED
+    assert without_times(store, UNIT) == without_times(other, UNIT)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A head without a processor of its own and two nodes of one each."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    for _ in range(2):
+        cluster.add_node(num_cpus=1)
+    cluster.wait_for_nodes()
+    yield cluster
+    cluster.shutdown()
+
+
+@pytest.mark.ray
+def test_a_cluster_computes_all_units_but_the_one_that_fails(cluster, tmp_path):
+    store = store_in(tmp_path)
+    run_dir = store.run_dir(UNITS[0])
+    run_dir.mkdir(parents=True)
+    (run_dir / "checkpoint.pt").write_bytes(b"no checkpoint")
+    ends = run_on_ray([Task(unit, store) for unit in UNITS], cluster.address)
+    assert ends == {FAILED: 1, FINISHED: 2}
+    assert list(store.find(UNITS)[0]) == UNITS[1:]

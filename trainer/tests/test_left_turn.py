@@ -1,3 +1,5 @@
+"""The left turn: road, car and reward; then who drives it instead of the policy, and when."""
+
 import itertools
 from dataclasses import replace
 
@@ -6,8 +8,10 @@ import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.drivers import make_environment
+from trainer.human.guide import HumanGuide
+from trainer.human.left_turn import Crossing, LeftTurnExpert, LeftTurnTrigger, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, NOTHING, drive
+from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes, drive
 
 EMPTY_ROAD = LeftTurnConfig(traffic_cars=0)
 
@@ -128,3 +132,173 @@ def test_a_speed_out_of_reach_is_made_up_for_later():
         env.step(np.array([env.pedal_for_speed(1.0)], np.float32))
     assert env.ego.speed == pytest.approx(1.0, abs=1e-6)
     assert env.pedal_for_speed(0.0) == -1.0
+
+
+ONE_CAR = LeftTurnConfig(traffic_cars=1, traffic_speed_mps=(5.0, 5.0), ego_speed_mps=(4.0, 4.0))
+
+
+def environment(**changes) -> LeftTurnEnv:
+    env = LeftTurnEnv(replace(ONE_CAR, **changes))
+    env.reset(seed=0)
+    return env
+
+
+def test_foresight_agrees_with_what_then_happens():
+    env = LeftTurnEnv()
+    crossing = Crossing(env, side_clearance_m=0.0)
+    agreed = 0
+    for seed in range(80):
+        env.reset(seed=seed)
+        plan = PedalPlan(pedal=1.0, hold_s=10.0)
+        foreseen = crossing.clear(5.0, margin_m=0.0, plan=plan)
+        info: dict = {}
+        while "outcome" not in info:
+            *_, info = env.step(FULL)
+        agreed += foreseen == (info["outcome"] == "goal")
+    # Traffic is foreseen at constant speed; IDM speeds differ a little.
+    assert agreed >= 74
+
+
+@pytest.mark.parametrize(("first_car_m", "clear"), [(9.0, False), (60.0, True)])
+def test_a_near_car_blocks_and_a_far_one_does_not(first_car_m, clear):
+    env = environment(first_car_m=(first_car_m, first_car_m))
+    assert LeftTurnExpert(env).crossing.clear(6.0, 1.5, LeftTurnExpert.GO) is clear
+
+
+def test_foresight_takes_each_car_at_its_own_length():
+    env = environment(first_car_m=(60.0, 60.0))
+    crossing = LeftTurnExpert(env).crossing
+    assert crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
+    env.traffic[0].LENGTH = 90.0
+    assert not crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
+
+
+def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
+    env = environment(first_car_m=(9.0, 9.0))
+    trigger = LeftTurnTrigger(LeftTurnExpert(env))
+    reasons: list[str | None] = []
+    for _ in range(60):
+        reasons.append(trigger.judge(NOTHING))
+        if reasons[-1]:
+            break
+        env.step(NOTHING)
+    assert len(reasons) > 2
+    assert reasons[-1] == "collision"
+    assert trigger.judge(BRAKE) is None
+    for _ in range(20):
+        env.step(BRAKE)
+    assert env.ego.speed == 0.0
+    assert env.distance_m < LeftTurnTrigger.STOP_BY_M
+
+
+def test_a_car_that_stands_short_of_the_lane_may_stay_but_not_creep_on():
+    env = environment(first_car_m=(9.0, 9.0))
+    trigger = LeftTurnTrigger(LeftTurnExpert(env))
+    env.traffic[0].position[0] = -2.0
+    env.ego.speed = 0.0
+    for place_m, stays in ((7.8, None), (8.1, "collision")):
+        env.distance_m = place_m
+        assert trigger.judge(BRAKE) == stays
+        assert trigger.judge(np.array([0.1], np.float32)) == "collision"
+
+
+@pytest.mark.parametrize(
+    ("place_m", "speed_mps", "pedal", "reason"),
+    [
+        (9.0, 2.0, -1.0, "lane"),
+        (9.0, 0.0, 0.1, "lane"),
+        (9.0, 0.0, 0.2, None),  # it drives on
+        (9.0, 4.0, -1.0, "lane"),  # it hesitates
+        (9.0, 4.0, -0.5, None),  # still fast after a second
+        (6.0, 1.0, -1.0, None),  # short of the lane
+        (19.0, 1.0, -1.0, None),  # through it
+    ],
+)
+def test_nobody_stops_in_the_lane_even_where_nothing_comes(place_m, speed_mps, pedal, reason):
+    env = environment(traffic_cars=0)
+    env.distance_m, env.ego.speed = place_m, speed_mps
+    trigger = LeftTurnTrigger(LeftTurnExpert(env))
+    assert trigger.judge(np.array([pedal], np.float32)) == reason
+
+
+def test_a_plan_may_end_in_a_stop():
+    env = environment(first_car_m=(60.0, 60.0))
+    crossing = LeftTurnExpert(env).crossing
+    # 0.5 s at 4 m/s, then 2 m/s2: 2 m and 4 m, and a little for whole control periods.
+    plan = PedalPlan(pedal=0.0, hold_s=0.5, then_brake=0.5)
+    reached_m, speed_mps = crossing.state_after(6.0, plan)
+    assert (reached_m, speed_mps) == (pytest.approx(6.0 + 0.5 * 4.0 * 0.1, abs=0.01), 0.0)
+    assert crossing.state_after(9.0, plan) == (reached_m, speed_mps)
+    assert crossing.state_after(0.5, plan) == (pytest.approx(2.0), pytest.approx(4.0))
+
+
+@pytest.mark.parametrize("pedal", [0.3, 1.0])
+def test_a_pedal_that_never_looks_arrives_with_a_human_beside_it(pedal):
+    env = LeftTurnEnv()
+    for seed in range(15):
+        env.reset(seed=seed)
+        expert = LeftTurnExpert(env)
+        guide = HumanGuide(expert, LeftTurnTrigger(expert))
+        info: dict = {}
+        while "outcome" not in info:
+            action = np.array([pedal], np.float32)
+            intervention = guide.watch(env.frames, action)
+            *_, info = env.step(action if intervention is None else intervention.action)
+        assert info["outcome"] == "goal"
+
+
+def test_trigger_takes_over_from_a_car_that_waits_for_nothing():
+    env = environment(traffic_cars=0)
+    trigger = LeftTurnTrigger(LeftTurnExpert(env))
+    reasons = []
+    for _ in range(40):
+        reasons.append(trigger.judge(BRAKE))
+        env.step(BRAKE)
+    assert reasons[0] is None
+    first = reasons.index("stuck")
+    assert first > LeftTurnTrigger.STANDING_STEPS + LeftTurnTrigger.OPEN_STEPS
+    assert set(reasons[first:]) == {"stuck"}
+    assert trigger.judge(FULL) is None  # it starts by itself
+
+
+def test_waiting_for_traffic_is_not_stuck():
+    env = environment(first_car_m=(12.0, 12.0), ego_speed_mps=(3.0, 3.0))
+    env.traffic[0].target_speed = 0.01
+    env.traffic[0].speed = 0.0
+    trigger = LeftTurnTrigger(LeftTurnExpert(env))
+    env.traffic[0].position[0] = 0.0
+    reasons = set()
+    for _ in range(40):
+        reasons.add(trigger.judge(BRAKE))
+        env.step(BRAKE)
+    assert reasons == {None}
+
+
+def test_the_left_turn_is_given_back_short_of_the_lane_or_behind_it():
+    env = environment(traffic_cars=0)
+    trigger = LeftTurnTrigger(LeftTurnExpert(env))
+    env.ego.speed = 3.0
+    for place_m, may in ((6.0, True), (9.0, False), (14.0, False), (19.0, True)):
+        env.distance_m = place_m
+        assert trigger.may_return() == may
+
+
+def test_a_human_who_stops_in_the_lane_gives_up_and_the_policy_drives_on():
+    env = environment(traffic_cars=0)
+    guide = HumanGuide(Brakes(), LeftTurnTrigger(LeftTurnExpert(env)), hold_steps=5)
+    while env.distance_m < 8.5:
+        env.step(NOTHING)
+    assert (first := guide.watch(env.frames, BRAKE)) is not None
+    assert first.reason == "lane"
+    info: dict = {}
+    while "outcome" not in info:
+        intervention = guide.watch(env.frames, FULL)
+        *_, info = env.step(FULL if intervention is None else intervention.action)
+    assert info["outcome"] == "goal"
+
+
+def test_the_lane_begins_behind_the_point_of_no_return():
+    """Who stands short of it may stay; who stands in the lane may not."""
+    crossing = LeftTurnExpert(LeftTurnEnv()).crossing
+    assert not crossing.in_lane(LeftTurnExpert.POINT_OF_NO_RETURN_M)
+    assert crossing.in_lane(LeftTurnExpert.POINT_OF_NO_RETURN_M + 0.5)

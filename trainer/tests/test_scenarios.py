@@ -1,12 +1,26 @@
-"""What holds for every scenario."""
+"""What holds for every scenario: spaces, test conditions, and the board's table of cars."""
+
+import itertools
+import json
+import math
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from highway_env.vehicle.kinematics import Vehicle
 
-from trainer.drivers import ACTIONS, make_environment
+from bridge.environments import CONDITIONS as SERVED
+from edge_runtime.vehicles.mapping import CARS
+from trainer.__main__ import main
+from trainer.drivers import ACTIONS, CONDITIONS, EXPERTS, make_environment
+from trainer.evaluate import drive_episodes
 from trainer.scenarios import SCENARIOS
+from trainer.scenarios.congestion import CongestionConfig
+from trainer.scenarios.environment import EgoVehicle
+from trainer.scenarios.left_turn import LeftTurnConfig
+from trainer.scenarios.picture import overlap
+from trainer.scenarios.traffic import CAR, CARS_ONLY, MIXED
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
 
@@ -54,3 +68,144 @@ def test_standing_changes_the_ego_cars_speed_and_nothing_else(scenario):
     assert np.array_equal(standing, moving)
     env.reset(seed=4)
     assert env.ego.speed == speed_mps
+
+
+NAMES = ("nominal", "variant", "dense")
+
+
+def gaps_m(env, of_the_ego_lane=False):
+    """Bumper to bumper, of each two vehicles one behind the other in a lane."""
+    others = [car for car in env.traffic if of_the_ego_lane or abs(car.position[1]) > 1.0]
+    cars = sorted(others, key=lambda car: (car.lane_index, car.position[0]))
+    return [
+        ahead.position[0] - behind.position[0] - 0.5 * (ahead.LENGTH + behind.LENGTH)
+        for behind, ahead in itertools.pairwise(cars)
+        if behind.lane_index == ahead.lane_index
+    ]
+
+
+@every_scenario
+@pytest.mark.parametrize("condition", ["variant", "dense"])
+def test_the_expert_drives_it(scenario, condition):
+    env = make_environment(scenario, condition)
+    results = drive_episodes(env, EXPERTS[scenario](env), range(25), condition)
+    assert sum(result.outcome == "goal" for result in results) >= 24
+
+
+@every_scenario
+def test_there_are_more_vehicles_of_every_type_in_the_variant_and_of_no_other_in_the_dense(
+    scenario,
+):
+    nominal, variant, dense = (make_environment(scenario, name) for name in NAMES)
+    assert dense.config.traffic_mix == nominal.config.traffic_mix
+    usual, seen = set(), set()
+    for seed in range(20):
+        for env in (nominal, variant, dense):
+            env.reset(seed=seed)
+        assert len(variant.traffic) > len(nominal.traffic) < len(dense.traffic)
+        usual |= {(car.LENGTH, car.WIDTH) for car in nominal.traffic}
+        seen |= {(car.LENGTH, car.WIDTH) for car in variant.traffic}
+    assert usual == {(kind.length_m, kind.width_m) for kind, _ in CARS_ONLY}
+    assert seen == {(kind.length_m, kind.width_m) for kind, _ in MIXED}
+
+
+@every_scenario
+def test_noise_is_the_nominal_scene(scenario):
+    nominal, noise = make_environment(scenario), make_environment(scenario, "noise")
+    assert noise.config == nominal.config
+    assert np.array_equal(nominal.reset(seed=1)[0], noise.reset(seed=1)[0])
+
+
+@every_scenario
+def test_vehicles_do_not_start_inside_each_other(scenario):
+    env = make_environment(scenario, "variant")
+    for seed in range(30):
+        env.reset(seed=seed)
+        assert min(gaps_m(env, of_the_ego_lane=True)) > 3.0
+
+
+@every_scenario
+def test_cars_never_touch_each_other(scenario):
+    env = make_environment(scenario, "dense")
+    expert = EXPERTS[scenario](env)
+    for seed in range(6):
+        observation, _ = env.reset(seed=seed)
+        expert.reset()
+        ended = False
+        while not ended:
+            observation, _, terminated, truncated, _ = env.step(expert.act(observation))
+            ended = terminated or truncated
+            shapes = [car.footprint for car in env.traffic]
+            assert not any(overlap(a, b) for a, b in itertools.combinations(shapes, 2))
+
+
+def test_the_gaps_of_the_left_turn_are_of_one_range_most_of_them_near_the_limit():
+    env, gaps = make_environment("left_turn", "dense"), []
+    for seed in range(200):
+        env.reset(seed=seed)
+        gaps += [gap + CAR.length_m for gap in gaps_m(env)]
+    counts, _ = np.histogram(gaps, bins=8, range=(12.0, 28.0))
+    assert counts.sum() == len(gaps) == 200 * 5
+    assert counts.min() > 0.7 * counts.mean()
+    assert 0.5 < np.mean([16.0 < gap < 25.0 for gap in gaps]) < 0.62
+
+
+def test_the_jam_is_closer_and_less_even():
+    spread, nearest = {}, {}
+    for condition in ("nominal", "dense"):
+        env, gaps, room = make_environment("congestion", condition), [], []
+        for seed in range(30):
+            env.reset(seed=seed)
+            gaps += gaps_m(env)
+            room += [abs(car.position[1]) - 0.5 * car.WIDTH for car in env.traffic]
+        spread[condition] = np.std(gaps)
+        nearest[condition] = min(m for m in room if m > 0.0) - 0.5 * env.ego.WIDTH
+    assert spread["dense"] > 2.0 * spread["nominal"]
+    assert nearest["nominal"] == pytest.approx(1.25, abs=0.1)
+    assert nearest["dense"] == pytest.approx(0.5, abs=0.1)
+
+
+def test_every_scene_can_be_served():
+    assert set(SERVED) == {condition.scene for condition in CONDITIONS.values()}
+
+
+def test_evaluate_takes_the_condition(tmp_path):
+    out = tmp_path / "r.json"
+    arguments = ["evaluate", "expert", "--scenario", "congestion", "--condition", "variant"]
+    assert main([*arguments, "--runs", "2", "--out", str(out)]) == 0
+    report = json.loads(out.read_text())
+    assert (report["scenario"], report["condition"]) == ("congestion", "variant")
+    assert report["success_rate"] == 1.0
+    assert report["surviving_distance_m"]["mean"] == pytest.approx(80.2, abs=0.4)
+
+
+TURN, JAM = LeftTurnConfig(), CongestionConfig()
+NUMBERS = {
+    "left_turn": (
+        TURN.throttle_mps2, TURN.brake_mps2, TURN.max_speed_mps, EgoVehicle.MAX_STEERING_RAD
+    ),
+    # Its +1 turns right.
+    "congestion": (
+        CAR.acceleration_mps2, JAM.brake_mps2, JAM.desired_speed_mps, -JAM.lambda_rad
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_every_scenario_has_its_car_as_long_as_highway_envs(scenario):
+    car = CARS[scenario]
+    numbers = (car.throttle_mps2, car.brake_mps2, car.max_speed_mps, car.full_steering_rad)
+    assert numbers == NUMBERS[scenario]
+    assert car.wheelbase_m == EgoVehicle.LENGTH == Vehicle.LENGTH
+
+
+def test_the_curvature_is_the_bicycles_own():
+    """One step of highway-env's model: heading gained over way covered."""
+    action = 0.5
+    ego = EgoVehicle(None, (0.0, 0.0), 0.0, 4.0)
+    ego.drive(0.0, action * CongestionConfig().lambda_rad, 6.0, 0.1)
+    left_rad = -ego.heading  # its y axis points down: positive turns right
+    way_m = math.hypot(*ego.position)
+    assert way_m == pytest.approx(0.4)
+    curvature = CARS["congestion"].curvature(action)
+    assert left_rad / way_m == pytest.approx(curvature)
