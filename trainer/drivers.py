@@ -81,15 +81,12 @@ CONDITIONS = {
 """Only the first is trained and validated in."""
 
 
-class NetworkDriver:
+class NetworkDriver(Driver):
     """A policy network at the wheel."""
 
     def __init__(self, actor: Actor) -> None:
         self.actor = actor.eval()
         self.device = next(actor.parameters()).device
-
-    def reset(self) -> None:
-        """Networks have no memory."""
 
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         """pi(s), float32 [action size]."""
@@ -103,16 +100,13 @@ class NetworkDriver:
         return actions
 
 
-class ConstantDriver:
+class ConstantDriver(Driver):
     """One action throughout, whatever it sees; ValueError unless it is from -1 to 1."""
 
     def __init__(self, action: float) -> None:
         if not -1.0 <= action <= 1.0:
             raise ValueError(action)
         self.action = np.array([action], np.float32)
-
-    def reset(self) -> None:
-        """It has no memory."""
 
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The action, float32 [1]."""
@@ -123,16 +117,13 @@ class ConstantDriver:
         return np.tile(self.action, (len(observations), 1))
 
 
-class OnnxDriver:
+class OnnxDriver(Driver):
     """An exported policy file at the wheel, run by the edge runtime's own loader."""
 
     def __init__(self, path: Path, public_key: str | None = None) -> None:
         from edge_runtime.policy import load_policy
 
         self.policy = load_policy(str(path), public_key, allow_unsigned=True)
-
-    def reset(self) -> None:
-        """Policies have no memory."""
 
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The policy's action, float32 [action size], within its domain as the edge sends it.

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import importlib
 import math
 import os
 import sys
 import textwrap
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -140,31 +141,47 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> int:
-    sink = _sink(arguments.rerun)
-    with _training(arguments, config, run_dir) as training:
+    view: Any = None
+    if arguments.rerun is not None:
+        view = importlib.import_module("trainer.view")
+        sink = view.check_word(arguments.rerun)
+    with ExitStack() as stack:
+        training: TrainingRun
+        if arguments.human in HUMANS:
+            from trainer.person.run import training_with_person
+
+            training = stack.enter_context(training_with_person(arguments, config, run_dir))
+        else:
+            check_person_options(arguments)
+            training = TrainingRun(config, run_dir, arguments.resume)
         end_s = deadline_s(arguments)
         extent = (
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
-        with (
-            ProgressBar("training", *extent) as bar,
-            _watched(training, sink) as watch,
-            # The last: behind the first signal is what a viewer makes of them.
-            quit_on_signals(partial(_quit, training)),
-        ):
-            recent: deque[EpisodeMetrics] = deque(maxlen=20)
-            validation = "-"
+        bar = stack.enter_context(ProgressBar("training", *extent))
+        watch = stack.enter_context(view.watched(training, sink)) if view else None
+        # The last: behind the first signal is what a viewer makes of them.
+        stack.enter_context(quit_on_signals(partial(_quit, training)))
+        recent: deque[EpisodeMetrics] = deque(maxlen=20)
+        validation = "-"
 
-            def on_episode(metrics: EpisodeMetrics) -> None:
-                nonlocal validation
-                recent.append(metrics)
-                if not math.isnan(metrics.validation_success):
-                    validation = f"{metrics.validation_success:.2f}"
-                figures = {**_means(recent), "validation": validation}
-                bar.advance(figures, metrics.steps if config.steps else 1)
+        def on_episode(metrics: EpisodeMetrics) -> None:
+            nonlocal validation
+            recent.append(metrics)
+            if not math.isnan(metrics.validation_success):
+                validation = f"{metrics.validation_success:.2f}"
+            count = len(recent)
+            figures = {
+                "return": f"{sum(m.episode_return for m in recent) / count:.1f}",
+                "distance": f"{sum(m.distance_m for m in recent) / count:.1f} m",
+                "success": f"{sum(m.outcome == GOAL for m in recent) / count:.2f}",
+                "validation": validation,
+            }
+            bar.advance(figures, metrics.steps if config.steps else 1)
+            if watch:
                 watch(metrics)
 
-            training.train(on_episode, end_s)
+        training.train(on_episode, end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
     print(f"{_summary(run_dir)}: {run_dir}")
@@ -172,52 +189,6 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
         return INTERRUPTED
     return 0
-
-
-def _means(episodes: Collection[EpisodeMetrics]) -> dict[str, str]:
-    """What the progress bar shows of the last episodes."""
-    count = len(episodes)
-    return {
-        "return": f"{sum(m.episode_return for m in episodes) / count:.1f}",
-        "distance": f"{sum(m.distance_m for m in episodes) / count:.1f} m",
-        "success": f"{sum(m.outcome == GOAL for m in episodes) / count:.2f}",
-    }
-
-
-@contextmanager
-def _training(
-    arguments: argparse.Namespace, config: RunConfig, run_dir: Path
-) -> Iterator[TrainingRun]:
-    """The run, and the person in it where one guides."""
-    if arguments.human in HUMANS:
-        from trainer.person.run import training_with_person
-
-        with training_with_person(arguments, config, run_dir) as guided:
-            yield guided
-    else:
-        check_person_options(arguments)
-        yield TrainingRun(config, run_dir, arguments.resume)
-
-
-def _sink(word: str | None) -> Any:
-    """Where ``--rerun`` shows the run; None, and nothing imported, where it is not asked for."""
-    if word is None:
-        return None
-    from trainer.view import check_word
-
-    return check_word(word)
-
-
-@contextmanager
-def _watched(training: TrainingRun, sink: Any) -> Iterator[Callable[[EpisodeMetrics], None]]:
-    """Show the run for as long as it lasts; what it yields is to be called after each episode."""
-    if sink is None:
-        yield lambda metrics: None
-        return
-    from trainer.view import watched
-
-    with watched(training, sink) as on_episode:
-        yield on_episode
 
 
 def _quit(training: TrainingRun) -> bool:
@@ -234,14 +205,10 @@ def _summary(run_dir: Path) -> str:
     found = totals(read_metrics(run_dir))
     if not found:
         return "no episodes"
-    parts = [
-        counted(found["episodes"], "episode"),
-        counted(found["steps"], "step"),
-        counted(found["updates"], "update"),
-        f"{counted(found['takeovers'], 'take-over')} with {counted(found['human_steps'], 'step')}",
-        counted(sum(found["failures"].values()), "failure"),
-    ]
-    return ", ".join(parts)
+    amounts = [counted(found[f"{name}s"], name) for name in ("episode", "step", "update")]
+    steps = counted(found["human_steps"], "step")
+    human = f"{counted(found['takeovers'], 'take-over')} with {steps}"
+    return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
 
 
 class _Set(argparse.Action):

@@ -16,16 +16,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
 from trainer import seeds
+from trainer.human.guide import Action, Observation
 from trainer.learner.config import Algorithm, LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
-
-Observation = NDArray[np.uint8]
-Action = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
