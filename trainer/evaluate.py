@@ -141,26 +141,6 @@ class Drive:
         )
 
 
-def drive_episode(
-    env: Any,
-    driver: Driver,
-    seed: int,
-    noise_std: float = 0.0,
-    latency: LatencySpec = NO_NETWORK,
-) -> EpisodeResult:
-    """Drive one episode; ``latency`` is the network between driver and vehicle, in virtual time.
-
-    The other arguments are as for ``Drive``.
-    """
-    drive = Drive(env, seed, noise_std)
-    driver.reset()
-    network = None if latency == NO_NETWORK else VehicleEnd(env, latency, seed)
-    while not drive.over:
-        seen = drive.observation
-        drive.step(network.tick(seen, driver.act) if network else driver.act(seen))
-    return drive.result()
-
-
 def drive_together(
     envs: Sequence[Any], act: ActTogether, seeds: Sequence[int], condition: str = "nominal"
 ) -> list[EpisodeResult]:
@@ -202,10 +182,16 @@ def drive_episodes(
     """Drive one episode for each seed under a condition.
 
     Its noise is added here; its scene is the environment's own (``drivers.make_environment``).
+    ``latency`` is the network between driver and vehicle, in virtual time.
     """
-    noise_std = CONDITIONS[condition].noise_std
     results = []
     for seed in seeds:
-        results.append(drive_episode(env, driver, seed, noise_std, latency))
+        drive = Drive(env, seed, CONDITIONS[condition].noise_std)
+        driver.reset()
+        network = None if latency == NO_NETWORK else VehicleEnd(env, latency, seed)
+        while not drive.over:
+            seen = drive.observation
+            drive.step(network.tick(seen, driver.act) if network else driver.act(seen))
+        results.append(drive.result())
         on_episode(results[-1])
     return results

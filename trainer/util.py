@@ -1,8 +1,8 @@
 """Small things that several parts of the trainer need.
 
-In this order: ranges of settings, torch files, one process in a directory, processes and their end,
-progress, and what made a result. torch takes two seconds to load, so it is imported only where a
-function needs it: ``--help`` and the configs need none of it.
+In this order: seeds, ranges of settings, torch files, one process in a directory, processes and
+their end, progress, and what made a result. torch takes two seconds to load, so it is imported only
+where a function needs it: ``--help`` and the configs need none of it.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from enum import IntEnum
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -46,6 +48,31 @@ FROM_ZERO: Range = (0, math.inf)
 ABOVE_ZERO: Range = (2.0**-126, math.inf)
 """From float32's smallest normal number on: what is less may become zero on its way."""
 SHARE: Range = (0, 1)
+
+
+class Purpose(IntEnum):
+    """What is drawn at random in a run: each purpose has a stream of its own."""
+
+    TRAINING = 0
+    VALIDATION = 1
+    EXPLORATION = 2
+    REPLAY = 3
+    HUMAN_EPISODES = 4
+    HUMAN_BATCHES = 5
+    GUIDANCE = 6
+    SITTINGS = 7
+    """Episodes that a person drives without learning."""
+
+
+def episode_seed(run_seed: int, purpose: Purpose, episode: int) -> int:
+    """The environment's seed for an episode: above 2**31, so that tests may use small numbers."""
+    (word,) = np.random.SeedSequence([run_seed, purpose, episode]).generate_state(1)
+    return (1 << 31) + int(word) // 2
+
+
+def random_stream(run_seed: int, purpose: Purpose) -> np.random.Generator:
+    """A random stream for one purpose."""
+    return np.random.default_rng([run_seed, purpose])
 
 
 def check_ranges(config: Any, ranges: Mapping[str, Range]) -> None:
@@ -298,18 +325,6 @@ def _git(directory: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     return done.stdout.strip()
-
-
-def about() -> dict[str, Any]:
-    """Machine, threads and versions; no date, so that equal runs write equal words."""
-    import torch
-
-    return {
-        "machine": {"processor": processor_model(), "cores": os.cpu_count()},
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-        "source_revision": source_revision(),
-    }
 
 
 def processor_model() -> str:

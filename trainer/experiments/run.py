@@ -31,7 +31,6 @@ import torch
 from bridge.report import GOAL
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer import seeds
 from trainer.drivers import (
     BEST_FILE,
     CHECKPOINT_FILE,
@@ -63,7 +62,9 @@ from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics,
 from trainer.training.run import TrainingRun
 from trainer.util import (
     ProgressBar,
+    Purpose,
     die_with_parent,
+    episode_seed,
     held,
     holder,
     interrupts_blocked,
@@ -358,7 +359,7 @@ def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
     Searched on two grids: from -1 to 1, then a step to either side of the best one.
     """
     envs = [make_environment(scenario) for _ in range(plan.together)]
-    drives = [seeds.episode_seed(0, seeds.VALIDATION, run) for run in range(plan.search_runs)]
+    drives = [episode_seed(0, Purpose.VALIDATION, run) for run in range(plan.search_runs)]
     worth: dict[float, tuple[float, float]] = {}
 
     def search(grid: Iterable[float]) -> float:

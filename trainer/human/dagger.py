@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 from edge_runtime.cli import examples
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
-from trainer import seeds
 from trainer.drivers import EXPERTS, TRIGGERS, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE, REFINING_PARTS, HumanModel, HumanModelConfig
@@ -31,7 +30,7 @@ from trainer.options import (
     until,
 )
 from trainer.person.recording import demonstrate, find_recordings
-from trainer.util import ProgressBar, claimed
+from trainer.util import ProgressBar, Purpose, claimed, episode_seed
 
 EXAMPLE = examples(
     "python -m trainer human --scenario left_turn --out runs/human",
@@ -181,7 +180,7 @@ class HumanTraining:
             c.demonstrated_share - 1
         )
         unaided = c.unaided_share and episode % c.unaided_share == 0
-        seed = seeds.episode_seed(self.seed, seeds.HUMAN_EPISODES, episode)
+        seed = episode_seed(self.seed, Purpose.HUMAN_EPISODES, episode)
         observation, info = self.env.reset(seed=seed)
         self.guide.reset()
         self.adviser.reset()

@@ -12,10 +12,17 @@ import torch
 from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
-from trainer import seeds
 from trainer.human.guide import Driver
 from trainer.learner.networks import Actor
-from trainer.util import FROM_ONE, FROM_ZERO, check_ranges, load_torch, save_torch
+from trainer.util import (
+    FROM_ONE,
+    FROM_ZERO,
+    Purpose,
+    check_ranges,
+    load_torch,
+    random_stream,
+    save_torch,
+)
 
 MODEL_FILE = "human_model.pt"
 REFINING_PARTS = 20
@@ -87,7 +94,7 @@ class HumanModel(Driver):
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames)
         self.optimiser = torch.optim.Adam(self.actor.parameters(), config.learning_rate)
-        self.random = seeds.stream(seed, seeds.HUMAN_BATCHES)
+        self.random = random_stream(seed, Purpose.HUMAN_BATCHES)
         self._observations: list[NDArray[np.uint8]] = []
         self._actions: list[NDArray[np.float32]] = []
 

@@ -11,7 +11,7 @@ from trainer.drivers import make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.left_turn import Crossing, LeftTurnExpert, LeftTurnTrigger, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes, drive
+from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes, drive, episode
 
 EMPTY_ROAD = LeftTurnConfig(traffic_cars=0)
 
@@ -27,14 +27,12 @@ def test_on_an_empty_road_full_throttle_reaches_the_goal():
 def test_the_tracker_keeps_the_car_on_its_path_at_every_speed():
     for speed_mps in (2.0, 4.0, 6.0):
         env = LeftTurnEnv(replace(EMPTY_ROAD, ego_speed_mps=(speed_mps, speed_mps)))
-        env.reset(seed=0)
-        offsets, ended = [], False
-        while not ended:
-            pedal = np.clip(speed_mps - env.ego.speed, -1, 1)
-            _, _, terminated, truncated, _ = env.step(np.array([pedal], np.float32))
-            offsets.append(abs(env.path.project(*env.ego.position)[1]))
-            ended = terminated or truncated
-        assert max(offsets) < 0.2
+
+        def keep(_, env=env, speed_mps=speed_mps):
+            return np.array([np.clip(speed_mps - env.ego.speed, -1, 1)], np.float32)
+
+        for _ in episode(env, keep, seed=0):
+            assert abs(env.path.project(*env.ego.position)[1]) < 0.2
 
 
 def test_the_brake_stops_the_car_and_does_not_reverse_it():
@@ -105,28 +103,12 @@ def test_accelerations_are_those_of_the_motion():
     assert info["longitudinal_acceleration_mps2"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_render_shows_road_cars_and_frames():
-    env = LeftTurnEnv(render_mode="rgb_array")
-    env.reset(seed=0)
-    picture = env.render()
-    assert picture.dtype == np.uint8
-    assert picture.shape[2] == 3
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
-    scene = env.scene()
-    assert [v["ego"] for v in scene["vehicles"]] == [True, False, False, False]
-
-
-def test_the_pedal_for_a_speed_gives_the_car_that_speed():
+def test_the_pedal_for_a_speed_gives_the_car_that_speed_and_makes_up_later_for_what_is_missed():
     env = LeftTurnEnv(EMPTY_ROAD)
     env.reset(seed=0, options={"standing": True})
     for speed_mps in (0.1, 0.4, 0.7, 0.55, 0.2, 0.2, 0.0):
         env.step(np.array([env.pedal_for_speed(speed_mps)], np.float32))
         assert env.ego.speed == pytest.approx(speed_mps, abs=1e-6)
-
-
-def test_a_speed_out_of_reach_is_made_up_for_later():
-    env = LeftTurnEnv(EMPTY_ROAD)
-    env.reset(seed=0, options={"standing": True})
     assert env.pedal_for_speed(1.0) == 1.0  # 0.3 m/s a step is all that the engine gives
     for _ in range(4):
         env.step(np.array([env.pedal_for_speed(1.0)], np.float32))
@@ -151,39 +133,30 @@ def test_foresight_agrees_with_what_then_happens():
         env.reset(seed=seed)
         plan = PedalPlan(pedal=1.0, hold_s=10.0)
         foreseen = crossing.clear(5.0, margin_m=0.0, plan=plan)
-        info: dict = {}
-        while "outcome" not in info:
-            *_, info = env.step(FULL)
+        *_, (_, _, info) = episode(env, FULL)
         agreed += foreseen == (info["outcome"] == "goal")
     # Traffic is foreseen at constant speed; IDM speeds differ a little.
     assert agreed >= 74
 
 
-@pytest.mark.parametrize(("first_car_m", "clear"), [(9.0, False), (60.0, True)])
-def test_a_near_car_blocks_and_a_far_one_does_not(first_car_m, clear):
+@pytest.mark.parametrize(
+    ("first_car_m", "length_m", "clear"),
+    [(9.0, 5.0, False), (60.0, 5.0, True), (60.0, 90.0, False)],
+)
+def test_a_near_car_blocks_and_a_far_one_does_not_unless_it_is_long(first_car_m, length_m, clear):
     env = environment(first_car_m=(first_car_m, first_car_m))
+    env.traffic[0].LENGTH = length_m
     assert LeftTurnExpert(env).crossing.clear(6.0, 1.5, LeftTurnExpert.GO) is clear
-
-
-def test_foresight_takes_each_car_at_its_own_length():
-    env = environment(first_car_m=(60.0, 60.0))
-    crossing = LeftTurnExpert(env).crossing
-    assert crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
-    env.traffic[0].LENGTH = 90.0
-    assert not crossing.clear(6.0, 1.5, LeftTurnExpert.GO)
 
 
 def test_the_trigger_lets_a_brisk_approach_pass_until_only_the_brake_helps():
     env = environment(first_car_m=(9.0, 9.0))
-    trigger = LeftTurnTrigger(LeftTurnExpert(env))
-    reasons: list[str | None] = []
-    for _ in range(60):
-        reasons.append(trigger.judge(NOTHING))
-        if reasons[-1]:
-            break
+    trigger, steps = LeftTurnTrigger(LeftTurnExpert(env)), 0
+    while (reason := trigger.judge(NOTHING)) is None:
         env.step(NOTHING)
-    assert len(reasons) > 2
-    assert reasons[-1] == "collision"
+        steps += 1
+    assert steps > 1
+    assert reason == "collision"
     assert trigger.judge(BRAKE) is None
     for _ in range(20):
         env.step(BRAKE)
@@ -232,18 +205,23 @@ def test_a_plan_may_end_in_a_stop():
     assert crossing.state_after(0.5, plan) == (pytest.approx(2.0), pytest.approx(4.0))
 
 
+def guided(guide: HumanGuide, action: np.ndarray):
+    """What a policy of one action and the human beside it do."""
+
+    def act(observation):
+        intervention = guide.watch(observation, action)
+        return action if intervention is None else intervention.action
+
+    return act
+
+
 @pytest.mark.parametrize("pedal", [0.3, 1.0])
 def test_a_pedal_that_never_looks_arrives_with_a_human_beside_it(pedal):
     env = LeftTurnEnv()
+    expert = LeftTurnExpert(env)
     for seed in range(15):
-        env.reset(seed=seed)
-        expert = LeftTurnExpert(env)
         guide = HumanGuide(expert, LeftTurnTrigger(expert))
-        info: dict = {}
-        while "outcome" not in info:
-            action = np.array([pedal], np.float32)
-            intervention = guide.watch(env.frames, action)
-            *_, info = env.step(action if intervention is None else intervention.action)
+        _, info = drive(env, guided(guide, np.array([pedal], np.float32)), seed)
         assert info["outcome"] == "goal"
 
 
@@ -290,10 +268,7 @@ def test_a_human_who_stops_in_the_lane_gives_up_and_the_policy_drives_on():
         env.step(NOTHING)
     assert (first := guide.watch(env.frames, BRAKE)) is not None
     assert first.reason == "lane"
-    info: dict = {}
-    while "outcome" not in info:
-        intervention = guide.watch(env.frames, FULL)
-        *_, info = env.step(FULL if intervention is None else intervention.action)
+    *_, (_, _, info) = episode(env, guided(guide, FULL))
     assert info["outcome"] == "goal"
 
 

@@ -1,5 +1,6 @@
-"""What holds for every scenario: spaces, test conditions, and the board's table of cars."""
+"""What holds for every scenario: spaces, test conditions, traffic, the board's table of cars."""
 
+import copy
 import itertools
 import json
 import math
@@ -8,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from bridge.environments import CONDITIONS as SERVED
@@ -20,7 +22,8 @@ from trainer.scenarios.congestion import CongestionConfig
 from trainer.scenarios.environment import EgoVehicle
 from trainer.scenarios.left_turn import LeftTurnConfig
 from trainer.scenarios.picture import overlap
-from trainer.scenarios.traffic import CAR, CARS_ONLY, MIXED
+from trainer.scenarios.traffic import CAR, CARS_ONLY, MIXED, draw_types, idm_acceleration
+from trainer.tests.humans import episode
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
 
@@ -84,12 +87,22 @@ def gaps_m(env, of_the_ego_lane=False):
     ]
 
 
-@every_scenario
-@pytest.mark.parametrize("condition", ["variant", "dense"])
-def test_the_expert_drives_it(scenario, condition):
+@pytest.mark.parametrize(
+    ("scenario", "condition", "drives", "arriving"),
+    [
+        ("left_turn", "nominal", 60, 60),
+        ("left_turn", "variant", 25, 24),
+        ("left_turn", "dense", 25, 24),
+        ("congestion", "nominal", 20, 20),
+        ("congestion", "noise", 20, 20),
+        ("congestion", "variant", 25, 24),
+        ("congestion", "dense", 25, 24),
+    ],
+)
+def test_the_expert_arrives(scenario, condition, drives, arriving):
     env = make_environment(scenario, condition)
-    results = drive_episodes(env, EXPERTS[scenario](env), range(25), condition)
-    assert sum(result.outcome == "goal" for result in results) >= 24
+    results = drive_episodes(env, EXPERTS[scenario](env), range(drives), condition)
+    assert sum(result.outcome == "goal" for result in results) >= arriving
 
 
 @every_scenario
@@ -125,18 +138,27 @@ def test_vehicles_do_not_start_inside_each_other(scenario):
 
 
 @every_scenario
-def test_cars_never_touch_each_other(scenario):
-    env = make_environment(scenario, "dense")
+@pytest.mark.parametrize("condition", NAMES)
+def test_cars_never_touch_each_other(scenario, condition):
+    env = make_environment(scenario, condition)
     expert = EXPERTS[scenario](env)
     for seed in range(6):
-        observation, _ = env.reset(seed=seed)
         expert.reset()
-        ended = False
-        while not ended:
-            observation, _, terminated, truncated, _ = env.step(expert.act(observation))
-            ended = terminated or truncated
+        for _ in episode(env, expert, seed):
             shapes = [car.footprint for car in env.traffic]
             assert not any(overlap(a, b) for a, b in itertools.combinations(shapes, 2))
+            fastest_mps = 6.01 if condition != "dense" else 7.01
+            assert all(0.0 <= car.speed <= fastest_mps for car in env.traffic)
+
+
+@pytest.mark.parametrize(("scenario", "cars"), [("left_turn", 3), ("congestion", 8)])
+def test_render_shows_road_cars_and_frames(scenario, cars):
+    env = make_environment(scenario)
+    env.reset(seed=0)
+    picture = env.render()
+    assert (picture.dtype, picture.shape[2]) == (np.uint8, 3)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
+    assert [v["ego"] for v in env.scene()["vehicles"]] == [True] + cars * [False]
 
 
 def test_the_gaps_of_the_left_turn_are_of_one_range_most_of_them_near_the_limit():
@@ -209,3 +231,86 @@ def test_the_curvature_is_the_bicycles_own():
     assert way_m == pytest.approx(0.4)
     curvature = CARS["congestion"].curvature(action)
     assert left_rad / way_m == pytest.approx(curvature)
+
+
+def by_highway_env(car, dt_s):
+    """Acceleration, place, heading and speed after a step of highway-env's own methods."""
+    twin = copy.copy(car)
+    twin.position = car.position.copy()
+    wanted = IDMVehicle.acceleration(twin, twin, twin.leader)
+    wanted = float(min(max(wanted, -car.ACC_MAX), car.ACC_MAX))
+    twin.action = {"steering": 0.0, "acceleration": max(wanted, -car.speed / dt_s)}
+    Vehicle.step(twin, dt_s)
+    return wanted, twin.position.tolist(), float(twin.heading), float(twin.speed)
+
+
+@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
+@pytest.mark.parametrize("condition", ["nominal", "variant"])
+def test_cars_move_to_the_bit_as_highway_envs_idm_vehicles(scenario, condition):
+    env, random = make_environment(scenario, condition), np.random.default_rng(0)
+    dt_s = env.config.control_period_s
+    for seed in range(4):
+        env.reset(seed=seed)
+        for _ in range(40):
+            # Speeds, gaps and headings of the ego car, a leader too, that no episode would bring.
+            car = env.traffic[random.integers(len(env.traffic))]
+            car.speed = float(random.uniform(0.0, 12.0))
+            car.position[0] += random.uniform(-1.0, 1.0)
+            env.ego.heading = float(random.uniform(-0.3, 0.3))
+            for car in env.traffic:
+                expected = by_highway_env(car, dt_s)
+                start = car.position.copy(), car.speed
+                car.act()
+                acceleration = car.action["acceleration"]
+                car.step(dt_s)
+                moved = car.position.tolist(), float(car.heading), car.speed
+                assert (acceleration, *moved) == expected
+                car.position[:], car.speed = start
+            env.step(np.zeros(1, np.float32))
+
+
+def test_whoever_brakes_to_a_stop_stands():
+    env = make_environment("congestion")
+    env.reset(seed=0)
+    car = env.traffic[0]
+    car.speed, car.action = 0.2, {"steering": 0.0, "acceleration": -6.0}
+    car.step(0.1)
+    assert car.speed == 0.0
+
+
+def test_types_accelerate_as_they_are():
+    env = make_environment("congestion", "variant")
+    for seed in range(10):
+        env.reset(seed=seed)
+        for car in env.traffic:
+            (kind,) = (kind for kind, _ in MIXED if kind.length_m == car.LENGTH)
+            car.speed, car.target_speed, car.leader = 0.0, 6.0, None
+            car.act()
+            assert car.action["acceleration"] == pytest.approx(kind.acceleration_mps2)
+
+
+def test_shares_of_the_mix_and_no_draw_for_one_type():
+    random = np.random.default_rng(0)
+    before = random.bit_generator.state
+    assert draw_types(((CAR, 1.0),), 3, random) == [CAR] * 3
+    assert random.bit_generator.state == before
+    drawn = draw_types(MIXED, 4000, random)
+    for kind, share in MIXED:
+        assert drawn.count(kind) / 4000 == pytest.approx(share, abs=0.03)
+    assert sum(share for _, share in MIXED) == pytest.approx(1.0)
+
+
+def test_idm_by_hand():
+    # Free road at half the desired speed: 3 x (1 - 1/16).
+    assert idm_acceleration(CAR, 3.0, 6.0) == pytest.approx(2.8125)
+    assert idm_acceleration(CAR, 6.0, 6.0) == pytest.approx(0.0)
+    # Standing 2 m behind a standing car: the free road's pull and the gap's push are equal.
+    assert idm_acceleration(CAR, 0.0, 6.0, gap_m=2.0) == pytest.approx(0.0)
+    # 5 m/s, 1 m/s faster, 10 m behind: wanted 2 + 5 x 0.8 + 5 / (2 sqrt 15) m.
+    wanted_m = 6.0 + 5.0 / (2.0 * math.sqrt(15.0))
+    expected = 3.0 * (1.0 - (5.0 / 6.0) ** 4 - (wanted_m / 10.0) ** 2)
+    assert idm_acceleration(CAR, 5.0, 6.0, 10.0, 1.0) == pytest.approx(expected)
+    half = 3.0 * (1.0 - (5.0 / 6.0) ** 4 - 0.16)
+    assert idm_acceleration(CAR, 5.0, 6.0, 10.0, 0.0, 0.5) == pytest.approx(half)
+    # A leader that pulls away asks for no less than the room at rest.
+    assert idm_acceleration(CAR, 1.0, 6.0, 2.0, -50.0) == pytest.approx(-3.0 / 6.0**4)

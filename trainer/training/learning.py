@@ -18,11 +18,11 @@ import numpy as np
 import torch
 
 from edge_runtime.util import UserError
-from trainer import seeds
 from trainer.human.guide import Action, Observation
 from trainer.learner.config import Algorithm, LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
+from trainer.util import Purpose, random_stream
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class LearningThread:
                 f"there is no memory for a replay buffer of {config.replay_capacity} "
                 "transitions: --set replay_capacity=N, a smaller one"
             ) from None
-        self._random = seeds.stream(seed, seeds.REPLAY)
+        self._random = random_stream(seed, Purpose.REPLAY)
         self._thread = ThreadPoolExecutor(1, "learner")
         self._begun: tuple[Batch, Future[tuple[Losses, float]]] | None = None
         self._forget_episode()

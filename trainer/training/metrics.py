@@ -22,12 +22,11 @@ from bridge.network import LatencySpec
 from bridge.report import GOAL, EpisodeResult
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer import seeds
 from trainer.drivers import BEST_FILE, NetworkDriver, make_environment
 from trainer.evaluate import NO_NETWORK, drive_episodes, drive_together
 from trainer.training.config import RunConfig
 from trainer.training.learning import Action, LearningThread, Observation
-from trainer.util import save_torch
+from trainer.util import Purpose, episode_seed, save_torch
 
 NAN = float("nan")
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
@@ -149,28 +148,18 @@ def _rows(text: str) -> list[dict[str, str]]:
     if lines and not lines[-1].endswith(("\r", "\n")):
         lines.pop()
     reader = csv.DictReader(lines, strict=True)
-    names = reader.fieldnames or []
-    if not {*ALWAYS, "outcome"} <= set(names) <= set(NAMES):
+    if not {*ALWAYS, "outcome"} <= set(reader.fieldnames or []) <= set(NAMES):
         raise ValueError("its columns are others")
     rows = list(reader)
     for number, row in enumerate(rows, start=1):
-        if not _whole(row):
-            raise ValueError(f"row {number} is broken")
+        try:
+            int(row["episode"])
+            for name, value in row.items():  # None stands for a column too few or too many.
+                if name in ALWAYS or (value != "" and name != "outcome"):
+                    float(value)
+        except (ValueError, TypeError):
+            raise ValueError(f"row {number} is broken") from None
     return rows
-
-
-def _whole(row: dict[str, str]) -> bool:
-    """Whether a row has a value in each column, and a number wherever there must be one."""
-    if None in row or None in row.values():  # More of them than columns, or fewer.
-        return False
-    try:
-        int(row["episode"])
-        for name, value in row.items():
-            if name in ALWAYS or (value and name != "outcome"):
-                float(value)
-    except ValueError:
-        return False
-    return True
 
 
 def totals(rows: Sequence[dict[str, str]]) -> dict[str, Any]:
@@ -230,7 +219,7 @@ class Validation:
         self.config, self.run_dir = config, run_dir
         self.learning, self.network = learning, network
         self._seeds = [
-            seeds.episode_seed(config.seed, seeds.VALIDATION, run)
+            episode_seed(config.seed, Purpose.VALIDATION, run)
             for run in range(config.evaluation_runs)
         ]
         self.envs = [

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from bridge.network import parse_spec
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
-from trainer import seeds
 from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
@@ -33,7 +32,14 @@ from trainer.training.metrics import (
     read_metrics,
     totals,
 )
-from trainer.util import load_torch, save_torch, source_revision
+from trainer.util import (
+    Purpose,
+    episode_seed,
+    load_torch,
+    random_stream,
+    save_torch,
+    source_revision,
+)
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 
@@ -113,8 +119,8 @@ class TrainingRun:
         self.validation = Validation(config, run_dir, self.learning, self.network)
         self.policy = behind(self.network, self.learning, self.env)
         self.guide = self._make_guide()
-        self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
-        self.guidance = seeds.stream(config.seed, seeds.GUIDANCE)
+        self.exploration = random_stream(config.seed, Purpose.EXPLORATION)
+        self.guidance = random_stream(config.seed, Purpose.GUIDANCE)
         self.episode = self.steps = 0
         self.on_step: OnStep | None = None
         """Called at the end of each control period, if anybody looks on."""
@@ -232,7 +238,7 @@ class TrainingRun:
 
     def _episode(self) -> EpisodeMetrics:
         config, metrics = self.config, EpisodeMetrics(self.episode)
-        seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
+        seed = episode_seed(config.seed, Purpose.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
         self.policy.start(observation, seed)
         self._drawn = np.zeros(self.env.action_space.shape)
