@@ -9,14 +9,13 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bridge.network import LatencySpec, parse_spec
 from bridge.report import GOAL, EpisodeResult, summarise
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.files import check_writable, write_json_out
 from edge_runtime.util import counted
-from trainer.drivers import CONDITIONS, load_driver, make_environment
+from trainer.drivers import CONDITIONS, ActTogether, load_driver, make_environment
 from trainer.human.guide import Action, Driver
 from trainer.options import add_latency, add_scenario, add_seed, set_threads
 from trainer.training.delayed import VehicleEnd
@@ -29,7 +28,6 @@ EXAMPLE = examples(
     "python -m trainer evaluate runs/phil_1 --condition variant --latency 50ms+-10ms,loss=1%",
 )
 NO_NETWORK = LatencySpec()
-ActTogether = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -98,10 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
 class Drive:
     """One episode under way; ``observation`` is what its driver sees next.
 
-    Args:
-        env: a scenario.
-        seed: of the episode, and of the noise.
-        noise_std: standard deviation of Gaussian noise on the command.
+    Its seed is also that of the Gaussian noise on the command, of standard deviation ``noise_std``.
     """
 
     def __init__(self, env: Any, seed: int, noise_std: float = 0.0) -> None:

@@ -146,7 +146,7 @@ def held(path: Path, patience_s: float = 0.0) -> Iterator[bool]:
     """Hold a lock against other processes; gives whether that was possible within so many seconds.
 
     The lock is the kernel's: when a process dies, however it dies, its lock is gone with it, and
-    the file that it leaves behind keeps nobody out. Its directory must be there.
+    the file that it leaves behind excludes no other process. Its directory must be there.
 
     Raises:
         UserError: the file cannot be written or locked.
@@ -182,7 +182,7 @@ def _locked(path: Path) -> int:
         os.close(descriptor)
         return -1
     if not _is(path, descriptor):
-        # The process before has just let go and removed the file: this lock excludes nobody.
+        # The process before has just let go and removed the file: this lock excludes no process.
         os.close(descriptor)
         return _locked(path)
     os.ftruncate(descriptor, 0)
@@ -203,10 +203,8 @@ def _is(path: Path, descriptor: int) -> bool:
 def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
     """Let the first signal ask for the end.
 
-    A second one ends the process as ever, and so does the first if nobody heeds it any more.
-
-    Args:
-        ask: asks for it; whether somebody will heed.
+    A second one ends the process, and so does the first where ``ask`` returns False: then nothing
+    is left that could end in order.
     """
     before = {number: signal.getsignal(number) for number in SIGNALS}
 

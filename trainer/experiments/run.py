@@ -35,7 +35,7 @@ from trainer.drivers import (
     BEST_FILE,
     CHECKPOINT_FILE,
     CONDITIONS,
-    ConstantDriver,
+    constant_driver,
     load_actor,
     load_driver,
     make_environment,
@@ -365,7 +365,7 @@ def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
     def search(grid: Iterable[float]) -> float:
         for action in (round(float(value), 3) for value in grid):
             if action not in worth:
-                results = drive_together(envs, ConstantDriver(action).act_together, drives)
+                results = drive_together(envs, constant_driver(action).act_together, drives)
                 success = np.mean([result.outcome == GOAL for result in results])
                 worth[action] = float(success), float(np.mean([r.distance_m for r in results]))
         return max(worth, key=lambda action: (*worth[action], -abs(action)))

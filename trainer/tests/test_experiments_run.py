@@ -53,6 +53,11 @@ GUIDED = Unit("left_turn", "phil_td3", NORMAL, 1)
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.fixture
+def store(tmp_path):
+    return store_in(tmp_path)
+
+
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory):
     """A unit that was never stopped."""
@@ -79,8 +84,7 @@ def test_a_unit_ends_as_a_record_and_an_actor(straight):
     assert str(straight.runs.parent) not in text
 
 
-def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
-    store = store_in(tmp_path)
+def test_stops_at_checkpoints_change_nothing(store, straight):
     assert compute(Task(UNIT, store, stop_at_s=1.0)) == STOPPED, "time was over before it began"
     ends = [compute(Task(UNIT, store, stop_at_s=Soon(1e18))) for _ in range(2)]
     assert ends == [STOPPED, STOPPED]
@@ -88,9 +92,8 @@ def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
-def test_a_killed_command_goes_on_to_the_same_record(straight, tmp_path):
+def test_a_killed_command_goes_on_to_the_same_record(store, straight, tmp_path):
     """The whole command, killed at a checkpoint as a power cut would."""
-    store = store_in(tmp_path)
     code = (
         "from pathlib import Path; from trainer.tests.experiments import *; "
         "from trainer.experiments.run import *; "
@@ -109,9 +112,8 @@ def test_a_killed_command_goes_on_to_the_same_record(straight, tmp_path):
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
-def test_two_processes_share_one_file_of_records(tmp_path):
+def test_two_processes_share_one_file_of_records(store):
     """Each of three units is computed once, and no record is lost."""
-    store = store_in(tmp_path)
     write_human(store)
     units = [UNIT, GUIDED, Unit("left_turn", HUMAN_MODEL, NORMAL, 0)]
     ends = run_units([Task(unit, store) for unit in units], 2)
@@ -120,8 +122,7 @@ def test_two_processes_share_one_file_of_records(tmp_path):
     assert set(store.find(units)[0]) == set(units)
 
 
-def test_a_unit_that_another_process_has_is_left_to_it(straight, tmp_path, monkeypatch):
-    store = store_in(tmp_path)
+def test_a_unit_that_another_process_has_is_left_to_it(store, monkeypatch):
     monkeypatch.setattr(running, "PATIENCE_S", 0.0)
     with store.lock(UNIT) as mine:
         assert mine
@@ -144,8 +145,7 @@ def test_tests_that_change_are_driven_with_the_actor_that_was_kept(straight, tmp
         assert len(ours["tests"][condition]["outcome"]) == 5
 
 
-def test_a_failure_is_one_units_failure(tmp_path, capfd):
-    store = store_in(tmp_path)
+def test_a_failure_is_one_units_failure(store, capfd):
     write_human(store).write_bytes(b"no human")
     ends = run_units([Task(GUIDED, store)], 1)
     assert ends == {FAILED: 1}
@@ -153,8 +153,7 @@ def test_a_failure_is_one_units_failure(tmp_path, capfd):
     assert str(GUIDED) in line
 
 
-def test_the_floor_is_searched_and_driven(tmp_path):
-    store = store_in(tmp_path)
+def test_the_floor_is_searched_and_driven(store):
     unit = Unit("left_turn", CONSTANT, NORMAL, 0)
     assert compute(Task(unit, store)) == FINISHED
     record = store.records("left_turn")[unit]
@@ -172,8 +171,8 @@ def test_damaged_records_are_refused_in_one_line(straight, tmp_path, damage):
 
 
 class TestIds:
-    def test_what_decides_changes_the_id_and_nothing_else_does(self, tmp_path, monkeypatch):
-        store, elsewhere = store_in(tmp_path), store_in(tmp_path / "elsewhere")
+    def test_what_decides_changes_the_id_and_nothing_else_does(self, store, tmp_path, monkeypatch):
+        elsewhere = store_in(tmp_path / "elsewhere")
         human = write_human(store)
         write_human(elsewhere)
         first = unit_id(GUIDED, TINY, store.humans)
@@ -235,13 +234,11 @@ class TestPlan:
         assert [unit.seed for unit in first] == sorted(unit.seed for unit in first)
         assert units[44].setting == "biased"
 
-    def test_the_settings_are_what_they_say(self, tmp_path):
-        humans = tmp_path
-        write_human(store_in(tmp_path))
-        humans = tmp_path / "humans"
+    def test_the_settings_are_what_they_say(self, store):
+        write_human(store)
 
         def config(setting):
-            return run_config(GUIDED._replace(setting=setting), planned.PLAN, humans)
+            return run_config(GUIDED._replace(setting=setting), planned.PLAN, store.humans)
 
         assert {setting for _, setting, _ in LINES} == set(SETTINGS)
         assert config("one_frame").learner.frames == 1
@@ -290,8 +287,7 @@ def cluster():
 
 
 @pytest.mark.ray
-def test_a_cluster_computes_all_units_but_the_one_that_fails(cluster, tmp_path):
-    store = store_in(tmp_path)
+def test_a_cluster_computes_all_units_but_the_one_that_fails(store, cluster):
     run_dir = store.run_dir(UNITS[0])
     run_dir.mkdir(parents=True)
     (run_dir / "checkpoint.pt").write_bytes(b"no checkpoint")

@@ -22,7 +22,7 @@ from trainer.plots import moving_average, write_learning_curve
 from trainer.training import metrics as metrics_module
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.config import RunConfig
-from trainer.training.metrics import NAMES, read_metrics
+from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import TrainingRun
 from trainer.util import Purpose, episode_seed, load_torch, save_torch
 
@@ -156,7 +156,12 @@ def test_who_quits_gets_one_more_episode_and_a_deadline_none_but_both_a_checkpoi
     quits, late_s, episodes, tmp_path
 ):
     run = TrainingRun(replace(TINY, checkpoint_every=100), tmp_path)
-    run.train(lambda _: quits and run.quit(), deadline_s=time.monotonic() + late_s)
+
+    def on_episode(_: EpisodeMetrics) -> None:
+        if quits:
+            run.quit()
+
+    run.train(on_episode, deadline_s=time.monotonic() + late_s)
     assert run.episode == episodes
     assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == episodes
     assert (tmp_path / BEST_FILE).exists()

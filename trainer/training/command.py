@@ -23,20 +23,9 @@ from bridge.network import parse_spec
 from bridge.report import GOAL
 from edge_runtime.cli import INTERRUPTED, examples
 from edge_runtime.util import UserError, counted
+from trainer import options
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.learner.config import ALGORITHMS, LearnerConfig
-from trainer.options import (
-    add_fields,
-    add_latency,
-    add_scenario,
-    add_seed,
-    add_threads,
-    add_time_limit,
-    deadline_s,
-    meanings,
-    read_json,
-    set_threads,
-)
 from trainer.person.interface import HUMANS, PERSON, add_person, check_person_options
 from trainer.plots import write_learning_curve
 from trainer.training.config import PRESETS, RunConfig
@@ -70,7 +59,7 @@ _ENDING = b"ending after this episode; a second time: at once, back to the last 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     what = parser.add_argument_group("what is trained")
-    add_scenario(what)
+    options.add_scenario(what)
     what.add_argument(
         "--algorithm",
         choices=list(ALGORITHMS),
@@ -78,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"the learner: {', '.join(ALGORITHMS)}",
     )
-    add_seed(what, "everything that is drawn at random")
-    add_fields(what, DEFAULTS, *EXTENT)
+    options.add_seed(what, "everything that is drawn at random")
+    options.add_fields(what, DEFAULTS, *EXTENT)
     what.add_argument(
         "--preset",
         choices=list(PRESETS),
@@ -95,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="change a setting, as often as you like; without a value: list all with their "
         "defaults and meanings",
     )
-    add_latency(what, "the network between policy and vehicle, also in validation")
+    options.add_latency(what, "the network between policy and vehicle, also in validation")
     guide = parser.add_argument_group("the human")
     guide.add_argument(
         "--human",
@@ -107,11 +96,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how = parser.add_argument_group("the run")
     how.add_argument("--out", required=True, metavar="RUN_DIR", help="the directory of the run")
     how.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
-    add_time_limit(how, "stop after the episode that passes this time")
+    options.add_time_limit(how, "stop after the episode that passes this time")
     how.add_argument(
         "--device", choices=["cpu", "cuda"], default="cpu", help="where the learner computes"
     )
-    add_threads(how)
+    options.add_threads(how)
     how.add_argument(
         "--rerun",
         metavar="spawn|serve|F.rrd",
@@ -123,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Train, showing progress; returns the exit status."""
     if arguments.device == "cuda" and not torch.cuda.is_available():
         raise UserError("no CUDA device is available; use --device cpu")
-    set_threads(arguments.threads)
+    options.set_threads(arguments.threads)
     human = arguments.human
     if human != DEFAULTS.human and human not in HUMANS and not Path(human).exists():
         known = ", ".join([DEFAULTS.human, *HUMANS])
@@ -154,7 +143,7 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
         else:
             check_person_options(arguments)
             training = TrainingRun(config, run_dir, arguments.resume)
-        end_s = deadline_s(arguments)
+        end_s = options.deadline_s(arguments)
         extent = (
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
@@ -234,7 +223,7 @@ def settings() -> dict[str, Any]:
 
 def setting_lines() -> Iterator[str]:
     """Every setting as it is typed by default, and what it means."""
-    said = meanings(RunConfig) | meanings(LearnerConfig)
+    said = options.meanings(RunConfig) | options.meanings(LearnerConfig)
     for name, default in settings().items():
         typed = str(default).lower() if isinstance(default, bool) else str(default)
         begin, indent = f"  {f'{name}={typed}':<33} ", 36 * " "
@@ -278,7 +267,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
 
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
-    saved, wanted = _flat(read_json(path, "run config")), _flat(config.as_dict())
+    saved, wanted = _flat(options.read_json(path, "run config")), _flat(config.as_dict())
     if not all(isinstance(saved.get(name), int) for name in EXTENT):
         raise UserError(f"run config {path} does not say how many episodes and steps")
     changed = []

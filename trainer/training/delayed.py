@@ -112,8 +112,7 @@ class Store(Protocol):
 class DirectPolicy:
     """A policy as the training loop has it, without a network: it acts on what is there.
 
-    Args:
-        store: where each tick goes as a transition.
+    Each tick goes to ``store`` as a transition.
     """
 
     def __init__(self, store: Store) -> None:

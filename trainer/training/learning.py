@@ -46,8 +46,8 @@ class LearningThread:
     """A learner with its replay buffer; the updates run in a thread of their own.
 
     The policy acts in that thread, too, in validation as well: another would bring a second pool
-    of OpenMP threads, and the two would fight for the same cores. Only a human who is a network
-    acts in the loop's thread, beside the update: a batch of one, which takes that thread alone.
+    of OpenMP threads, and the two would fight for the same cores. Only a human model acts in the
+    loop's thread, beside the update: a batch of one needs no other thread.
 
     Args:
         config: hyper-parameters.

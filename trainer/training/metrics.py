@@ -22,10 +22,10 @@ from bridge.network import LatencySpec
 from bridge.report import GOAL, EpisodeResult
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
-from trainer.drivers import BEST_FILE, NetworkDriver, make_environment
+from trainer.drivers import BEST_FILE, TogetherDriver, make_environment
 from trainer.evaluate import NO_NETWORK, drive_episodes, drive_together
 from trainer.training.config import RunConfig
-from trainer.training.learning import Action, LearningThread, Observation
+from trainer.training.learning import LearningThread
 from trainer.util import Purpose, episode_seed, save_torch
 
 NAN = float("nan")
@@ -143,7 +143,7 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
 
 
 def _rows(text: str) -> list[dict[str, str]]:
-    """Of the whole lines; ValueError where one is not as ``MetricsWriter`` has it."""
+    """The rows of the whole lines; ValueError where one is not as ``MetricsWriter`` writes it."""
     lines = text.splitlines(keepends=True)
     if lines and not lines[-1].endswith(("\r", "\n")):
         lines.pop()
@@ -192,25 +192,10 @@ def totals(rows: Sequence[dict[str, str]]) -> dict[str, Any]:
     }
 
 
-class LearningDriver(NetworkDriver):
-    """The policy that is being learned, or its running average, asked where it is learned."""
-
-    def __init__(self, learning: LearningThread, averaged: bool) -> None:
-        self.learning, self.averaged = learning, averaged
-
-    def act_together(self, observations: Observation) -> Action:
-        """Actions float32 [n, action size] for observations [n, 2, 45, 80]."""
-        return self.learning.act_together(observations, self.averaged)
-
-
 class Validation:
     """Drives the policy as it stands, without help, and keeps the best actor so far.
 
-    Args:
-        config: of the run.
-        run_dir: where the actor goes.
-        learning: whose policy it is.
-        network: between policy and vehicle, as in the training.
+    It drives over the same ``network`` as the training.
     """
 
     def __init__(
@@ -248,7 +233,9 @@ class Validation:
                 self.best, self._best_actor = (success, reward), copy.deepcopy(state)
 
     def _drive(self) -> list[EpisodeResult]:
-        driver = LearningDriver(self.learning, self.config.averaged_actor)
+        driver = TogetherDriver(
+            lambda seen: self.learning.act_together(seen, self.config.averaged_actor)
+        )
         if self.network == NO_NETWORK:
             return drive_together(self.envs, driver.act_together, self._seeds)
         return drive_episodes(self.envs[0], driver, self._seeds, latency=self.network)
@@ -260,7 +247,7 @@ class Validation:
         return state
 
     def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint holds of it."""
+        """Its part of a checkpoint."""
         return {"best_validation": self.best, "best_actor": self._best_actor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

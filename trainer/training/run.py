@@ -68,7 +68,7 @@ def finite_action(action: Action) -> Action:
 
 
 def check_weights(learner: TD3Learner) -> None:
-    """Raise FloatingPointError unless every weight is finite: a checkpoint without is worthless."""
+    """Raise FloatingPointError unless every weight is finite: no such checkpoint is kept."""
     for name in NETWORKS:
         for parameter in getattr(learner, name).parameters():
             if not parameter.isfinite().all():
@@ -77,7 +77,7 @@ def check_weights(learner: TD3Learner) -> None:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the loop knows of it once it is stored; nothing in it changes afterwards."""
+    """One control period, once it is stored; nothing in it changes afterwards."""
 
     observation: NDArray[np.uint8]
     """s, [2, 45, 80]."""
@@ -91,21 +91,13 @@ class Seen:
 
 
 OnStep = Callable[[Seen], None]
-
-
 CONFIG_FILE = "config.json"
 WRONG_ACTIONS = {"left_turn": 1.0, "congestion": 0.5}
 """What a human of biased guidance does whenever wrong: full throttle; half of the full angle."""
 
 
 class TrainingRun:
-    """Trains for some episodes and keeps everything in a directory.
-
-    Args:
-        config: what to train.
-        run_dir: where config, metrics, checkpoint and the best actor go.
-        resume: go on from the checkpoint in ``run_dir``.
-    """
+    """Trains for some episodes; settings, metrics, checkpoint and best actor go to ``run_dir``."""
 
     def __init__(self, config: RunConfig, run_dir: Path, resume: bool = False) -> None:
         self.config, self.run_dir = config, run_dir
@@ -123,7 +115,7 @@ class TrainingRun:
         self.guidance = random_stream(config.seed, Purpose.GUIDANCE)
         self.episode = self.steps = 0
         self.on_step: OnStep | None = None
-        """Called at the end of each control period, if anybody looks on."""
+        """Called at the end of each control period, where the run is watched."""
         self.quitting = False
         """The episode under way is to be the last of this call."""
         if resume:
@@ -203,7 +195,7 @@ class TrainingRun:
         )
 
     def _more_state(self) -> dict[str, Any]:
-        """What another kind of run needs to go on, besides."""
+        """What a subclass adds to the checkpoint."""
         return {}
 
     def _load(self) -> None:
@@ -225,7 +217,7 @@ class TrainingRun:
         return time.monotonic() > deadline_s
 
     def _around(self, learning: LearningThread) -> LearningThread:
-        """What the loop asks in the learner's place."""
+        """The learner, or what a subclass puts around it."""
         return learning
 
     def _make_guide(self) -> Guide | None:
