@@ -17,11 +17,10 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
-from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from typing import Any
 
@@ -110,12 +109,8 @@ PATIENCE_S = 1.0
 """How long a unit may be held before it counts as another process's work."""
 NICENESS = 5
 """So that a machine on which somebody works stays usable."""
-EXITS = (FINISHED, FAILED, STOPPED, BUSY)
+EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
 """Exit status of a unit's process -> how the unit ended."""
-POLL_S = 1.0
-"""Between two looks at how far the processes are."""
-OnSteps = Callable[[int], object]
-"""Told how many environment steps of the unit are done."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +226,7 @@ class Task:
     """Seconds of the epoch after which work stops at its next checkpoint."""
 
 
-def compute(task: Task, on_steps: OnSteps = lambda steps: None) -> str:
+def compute(task: Task) -> str:
     """Compute a unit from where it stands into its record; how that ended."""
     unit, store = task.unit, task.store
     with store.lock(unit, PATIENCE_S) as free:
@@ -240,12 +235,10 @@ def compute(task: Task, on_steps: OnSteps = lambda steps: None) -> str:
             return BUSY
         if unit in store.find([unit])[0]:
             return FINISHED
-        return store.keep(unit, make_record(task, store.run_dir(unit), on_steps))
+        return store.keep(unit, make_record(task, store.run_dir(unit)))
 
 
-def make_record(
-    task: Task, run_dir: Path, on_steps: OnSteps = lambda steps: None
-) -> dict[str, Any] | None:
+def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     """Train and test a unit; its record, or None where time ran out.
 
     torch works on one thread: the last bits must not depend on the machine's cores.
@@ -263,7 +256,7 @@ def make_record(
     seconds = {}
     if unit.trained:
         make_directory(run_dir)
-        if not _train(task, run_dir, on_steps):
+        if not _train(task, run_dir):
             return None
         rows = read_metrics(run_dir)
         validated = [row for row in rows if row["validation_success"] not in NOT_VALIDATED]
@@ -299,7 +292,7 @@ class _OutOfTimeError(Exception):
     """Ends training at a checkpoint."""
 
 
-def _train(task: Task, run_dir: Path, on_steps: OnSteps) -> bool:
+def _train(task: Task, run_dir: Path) -> bool:
     """Train to the budget's end; whether it was reached.
 
     Time is looked at only where a checkpoint was just written, and not through the deadline of
@@ -314,7 +307,6 @@ def _train(task: Task, run_dir: Path, on_steps: OnSteps) -> bool:
     run = TrainingRun(config, run_dir, resume=(run_dir / CHECKPOINT_FILE).is_file())
 
     def after(metrics: EpisodeMetrics) -> None:
-        on_steps(run.steps)
         at_checkpoint = run.episode % config.checkpoint_every == 0
         if at_checkpoint and not run.over and time.time() > task.stop_at_s:
             raise _OutOfTimeError
@@ -384,38 +376,28 @@ def run_units(tasks: Sequence[Task], jobs: int) -> Counter[str]:
     """
     context = multiprocessing.get_context("spawn")
     ends: Counter[str] = Counter()
-    waiting, working, gone_by = deque(tasks), dict[Any, tuple[Any, Task, Any]](), 0
-    with ProgressBar("steps", sum(map(_steps, tasks)) or 1) as bar:
+    waiting, working = deque(tasks), dict[Any, tuple[Any, Task]]()
+    with ProgressBar("units", len(tasks)) as bar:
         try:
             while waiting or working:
                 while waiting and len(working) < jobs:
-                    # Without a lock: a process that is killed would take that along.
-                    task, steps = waiting.popleft(), RawValue("L", 0)
-                    process = context.Process(target=_work, args=(task, steps), daemon=True)
+                    task = waiting.popleft()
+                    process = context.Process(target=_work, args=(task,), daemon=True)
                     with interrupts_blocked():
                         process.start()
-                    working[process.sentinel] = process, task, steps
-                for sentinel in wait([*working], POLL_S):
-                    process, task, _ = working.pop(sentinel)
+                    working[process.sentinel] = process, task
+                for sentinel in wait([*working]):
+                    process, task = working.pop(sentinel)
                     process.join()
-                    if process.exitcode not in range(len(EXITS)):
+                    end = EXITS.get(process.exitcode, FAILED)
+                    if process.exitcode not in EXITS:
                         say(f"failed: {task.unit}: its process died ({process.exitcode})")
-                        ends[FAILED] += 1
-                        continue
-                    end = EXITS[process.exitcode]
                     ends[end] += 1
-                    gone_by += _steps(task) if end == FINISHED else 0
-                at = gone_by + sum(min(now.value, _steps(one)) for _, one, now in working.values())
-                bar.advance({"units": f"{ends[FINISHED]}/{len(tasks)}"}, at - bar.done)
+                    bar.advance({"last": str(task.unit)})
         finally:
-            for process, _, _ in working.values():
+            for process, _ in working.values():
                 process.kill()
     return ends
-
-
-def _steps(task: Task) -> int:
-    """What a unit counts in the progress bar."""
-    return task.store.plan.steps[task.unit.scenario] if task.unit.trained else 0
 
 
 def say(line: str) -> None:
@@ -423,13 +405,13 @@ def say(line: str) -> None:
     print(" ".join(line.split()), file=sys.stderr, flush=True)
 
 
-def _work(task: Task, steps: Any) -> None:
-    """A process's life: it tells how many steps are done, and by its exit status how it ended."""
+def _work(task: Task) -> None:
+    """A process's life: its exit status tells how the unit ended."""
     os.nice(NICENESS)
     threading.Thread(target=die_with_parent, daemon=True).start()
     end, why = FAILED, ""
     try:
-        end = compute(task, lambda done: setattr(steps, "value", done))
+        end = compute(task)
     except UserError as error:
         why = str(error)
     except BaseException as error:
@@ -438,7 +420,7 @@ def _work(task: Task, steps: Any) -> None:
         why = f"{type(error).__name__}: {error} ({path})"
     if end == FAILED:
         say(f"failed: {task.unit}: {why}")
-    sys.exit(EXITS.index(end))
+    sys.exit(list(EXITS.values()).index(end))
 
 
 WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)
@@ -478,9 +460,7 @@ def keep(task: Task, record: dict[str, Any] | None, working: Files) -> str:
 def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
     """Compute units as Ray tasks of one processor each; how many ended in which way.
 
-    Args:
-        tasks: what to compute.
-        address: of the cluster, as ``ray.init`` takes it; ``local`` starts one on this machine.
+    ``address`` is the cluster's, as ``ray.init`` takes it; ``local`` starts one on this machine.
 
     Raises:
         UserError: Ray is not installed, or nothing answers at the address.
