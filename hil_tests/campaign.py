@@ -22,9 +22,8 @@ from edge_runtime.util import UserError
 from hil_tests import report, sweep
 from hil_tests.faults.run import choose_rows, run_faults
 from hil_tests.mock_hunter.hunter import make_parameters, read_changes
-from trainer.evaluate import cores
 from trainer.options import add_scenario
-from trainer.util import ProgressBar
+from trainer.util import ProgressBar, cores
 
 PART_EPISODES, LOOP_EPISODES = 50, 5
 """Of a network, in virtual time; of a loop, in real time: short, so that all rigs end at about the

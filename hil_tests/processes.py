@@ -281,7 +281,7 @@ def in_parallel(
 
 def _follow_the_parent() -> None:
     """Leave ^C to the parent, and end where it is killed."""
-    from trainer.evaluate import die_with_parent
+    from trainer.util import die_with_parent
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=die_with_parent, daemon=True).start()

@@ -28,8 +28,8 @@ from hil_tests.mock_hunter.hunter import make_parameters
 from hil_tests.processes import CommandTimeoutError, Process, in_parallel, operator, trusting
 from hil_tests.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
+from trainer.experiments.data import Estimate, mean_estimate, success_estimate
 from trainer.experiments.plan import digest
-from trainer.experiments.statistics import Estimate, mean_estimate, success_estimate
 from trainer.util import ProgressBar
 
 LOOPS = POLICY, VEHICLE = ("policy", "vehicle")

@@ -44,7 +44,7 @@ from trainer.scenarios.picture import COLUMNS, ROWS
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
-from trainer.util import ProgressBar, about
+from trainer.util import ProgressBar, processor_model, source_revision
 
 EXAMPLE = examples(
     "python -m trainer bench --quick --threads 1",
@@ -124,7 +124,10 @@ def measure(effort: Effort, tick: Tick) -> dict[str, Any]:
     environment = {name: measure_environment(name, effort, tick) for name in SCENARIOS}
     training = measure_training(effort, tick)
     return {
-        **about(),
+        "machine": {"processor": processor_model(), "cores": os.cpu_count()},
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "source_revision": source_revision(),
         "learner_ms_per_update": learner["ms_per_update"],
         "environment_steps_per_s": {
             name: figures["steps_per_s"] for name, figures in environment.items()

@@ -12,12 +12,11 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from edge_runtime.policy import Action
+from edge_runtime.policy import Action as ActionEntry
 from edge_runtime.util import UserError
 from trainer.human.congestion import CongestionExpert, CongestionTrigger
-from trainer.human.guide import Driver, Trigger
+from trainer.human.guide import Action, Driver, Observation, Trigger
 from trainer.human.left_turn import LeftTurnExpert, LeftTurnTrigger
 from trainer.human.model import MODEL_FILE, load_human_model
 from trainer.learner.networks import Actor
@@ -27,14 +26,14 @@ from trainer.scenarios.environment import Scene
 from trainer.util import load_torch
 
 ACTIONS = {
-    "left_turn": Action(
+    "left_turn": ActionEntry(
         name="pedal",
         meaning="positive opens the throttle, negative brakes",
         unit="aperture",
         low=-1.0,
         high=1.0,
     ),
-    "congestion": Action(
+    "congestion": ActionEntry(
         name="steering",
         meaning="positive turns right, negative left (eq. 29)",
         unit=f"share of the front wheels' {CongestionConfig().lambda_rad:g} rad",
@@ -53,12 +52,16 @@ EXPERTS: dict[str, Callable[[Any], Driver]] = {
     "left_turn": LeftTurnExpert,
     "congestion": CongestionExpert,
 }
-"""Scenario -> who knows how to drive it, made from its environment."""
+"""Scenario -> its scripted expert, made from the environment."""
 TRIGGERS: dict[str, Callable[[Any], Trigger]] = {
     "left_turn": LeftTurnTrigger,
     "congestion": CongestionTrigger,
 }
-"""Scenario -> when that expert, from whom it is made, would take over."""
+"""Scenario -> when a person would take over, made from that expert."""
+
+
+ActTogether = Callable[[Observation], Action]
+"""Many actions for many observations."""
 
 
 class Condition(NamedTuple):
@@ -66,7 +69,7 @@ class Condition(NamedTuple):
 
     scene: Scene
     noise_std: float
-    """Of Gaussian noise on the command."""
+    """Standard deviation of the Gaussian noise on the command."""
     meaning: str
 
 
@@ -81,60 +84,48 @@ CONDITIONS = {
 """Only the first is trained and validated in."""
 
 
-class NetworkDriver:
-    """A policy network at the wheel."""
+class TogetherDriver(Driver):
+    """Drives without a memory, one picture at a time or many at once.
 
-    def __init__(self, actor: Actor) -> None:
-        self.actor = actor.eval()
-        self.device = next(actor.parameters()).device
+    ``act_together`` gives actions float32 [n, action size] for observations [n, 2, 45, 80].
+    """
 
-    def reset(self) -> None:
-        """Networks have no memory."""
+    def __init__(self, act_together: ActTogether) -> None:
+        self.act_together = act_together
 
-    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """pi(s), float32 [action size]."""
+    def act(self, observation: Observation) -> Action:
+        """The action, float32 [action size]."""
         return self.act_together(observation[None])[0]
 
+
+def network_driver(actor: Actor) -> TogetherDriver:
+    """A policy network that drives: pi(s)."""
+    device = next(actor.eval().parameters()).device
+
     @torch.no_grad()
-    def act_together(self, observations: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The same for observations [n, 2, 45, 80]: float32 [n, action size]."""
-        frames = torch.from_numpy(observations).to(self.device)
-        actions: NDArray[np.float32] = self.actor(frames).cpu().numpy()
+    def act_together(observations: Observation) -> Action:
+        actions: Action = actor(torch.from_numpy(observations).to(device)).cpu().numpy()
         return actions
 
-
-class ConstantDriver:
-    """One action throughout, whatever it sees; ValueError unless it is from -1 to 1."""
-
-    def __init__(self, action: float) -> None:
-        if not -1.0 <= action <= 1.0:
-            raise ValueError(action)
-        self.action = np.array([action], np.float32)
-
-    def reset(self) -> None:
-        """It has no memory."""
-
-    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The action, float32 [1]."""
-        return self.action
-
-    def act_together(self, observations: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The same for n observations: float32 [n, 1]."""
-        return np.tile(self.action, (len(observations), 1))
+    return TogetherDriver(act_together)
 
 
-class OnnxDriver:
-    """An exported policy file at the wheel, run by the edge runtime's own loader."""
+def constant_driver(action: float) -> TogetherDriver:
+    """One action throughout, whatever the picture; ValueError unless it is from -1 to 1."""
+    if not -1.0 <= action <= 1.0:
+        raise ValueError(action)
+    return TogetherDriver(lambda seen: np.full((len(seen), 1), action, np.float32))
+
+
+class OnnxDriver(Driver):
+    """An exported policy file that drives, run by the edge runtime's own loader."""
 
     def __init__(self, path: Path, public_key: str | None = None) -> None:
         from edge_runtime.policy import load_policy
 
         self.policy = load_policy(str(path), public_key, allow_unsigned=True)
 
-    def reset(self) -> None:
-        """Policies have no memory."""
-
-    def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def act(self, observation: Observation) -> Action:
         """The policy's action, float32 [action size], within its domain as the edge sends it.
 
         onnxruntime's tanh exceeds 1 by a last bit now and then.
@@ -173,7 +164,7 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
         return EXPERTS[env.scenario](env), "expert"
     if policy.startswith(CONSTANT):
         try:
-            return ConstantDriver(float(policy.removeprefix(CONSTANT))), policy
+            return constant_driver(float(policy.removeprefix(CONSTANT))), policy
         except ValueError:
             message = f"{policy}: expected an action from -1 to 1, as in {CONSTANT}0.5"
             raise UserError(message) from None
@@ -199,7 +190,7 @@ def load_driver(policy: str, env: Any, public_key: str | None = None) -> tuple[D
         )
     if about["scenario"] != env.scenario:
         raise UserError(f"{policy} was trained in {about['scenario']}, not in {env.scenario}")
-    return NetworkDriver(actor), policy_id
+    return network_driver(actor), policy_id
 
 
 def load_actor(run_dir: Path) -> tuple[Actor, dict[str, Any]]:

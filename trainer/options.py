@@ -116,7 +116,7 @@ def meanings(config: type) -> dict[str, str]:
 def set_threads(count: int) -> None:
     """Limit torch's threads; 0 leaves them as they are."""
     if count:
-        import torch  # takes two seconds, which whoever asks for help need not wait
+        import torch  # takes two seconds, which --help need not wait
 
         torch.set_num_threads(count)
 

@@ -21,7 +21,7 @@ from edge_runtime.util import UserError
 from trainer.drivers import ACTIONS, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Driver, Guide, HumanGuide, Intervention
 from trainer.options import add_scenario, add_seed, check_suffix, existing_directory
-from trainer.scenarios.scene import COLOURS
+from trainer.scenarios.picture import COLOURS
 from trainer.training.metrics import read_metrics
 
 CURVE_FILE = "learning_curve.png"

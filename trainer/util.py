@@ -1,8 +1,8 @@
 """Small things that several parts of the trainer need.
 
-In this order: ranges of settings, torch files, one process in a directory, ending in order,
-progress, and what made a result. torch takes two seconds to load, so it is imported only where a
-function needs it: ``--help`` and the configs need none of it.
+In this order: seeds, ranges of settings, torch files, one process in a directory, processes and
+their end, progress, and what made a result. torch takes two seconds to load, so it is imported only
+where a function needs it: ``--help`` and the configs need none of it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import multiprocessing
 import os
 import platform
 import shutil
@@ -20,10 +21,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from enum import IntEnum
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -45,6 +48,31 @@ FROM_ZERO: Range = (0, math.inf)
 ABOVE_ZERO: Range = (2.0**-126, math.inf)
 """From float32's smallest normal number on: what is less may become zero on its way."""
 SHARE: Range = (0, 1)
+
+
+class Purpose(IntEnum):
+    """What is drawn at random in a run: each purpose has a stream of its own."""
+
+    TRAINING = 0
+    VALIDATION = 1
+    EXPLORATION = 2
+    REPLAY = 3
+    HUMAN_EPISODES = 4
+    HUMAN_BATCHES = 5
+    GUIDANCE = 6
+    SITTINGS = 7
+    """Episodes that a person drives without learning."""
+
+
+def episode_seed(run_seed: int, purpose: Purpose, episode: int) -> int:
+    """The environment's seed for an episode: above 2**31, so that tests may use small numbers."""
+    (word,) = np.random.SeedSequence([run_seed, purpose, episode]).generate_state(1)
+    return (1 << 31) + int(word) // 2
+
+
+def random_stream(run_seed: int, purpose: Purpose) -> np.random.Generator:
+    """A random stream for one purpose."""
+    return np.random.default_rng([run_seed, purpose])
 
 
 def check_ranges(config: Any, ranges: Mapping[str, Range]) -> None:
@@ -118,7 +146,7 @@ def held(path: Path, patience_s: float = 0.0) -> Iterator[bool]:
     """Hold a lock against other processes; gives whether that was possible within so many seconds.
 
     The lock is the kernel's: when a process dies, however it dies, its lock is gone with it, and
-    the file that it leaves behind keeps nobody out. Its directory must be there.
+    the file that it leaves behind excludes no other process. Its directory must be there.
 
     Raises:
         UserError: the file cannot be written or locked.
@@ -154,7 +182,7 @@ def _locked(path: Path) -> int:
         os.close(descriptor)
         return -1
     if not _is(path, descriptor):
-        # The process before has just let go and removed the file: this lock excludes nobody.
+        # The process before has just let go and removed the file: this lock excludes no process.
         os.close(descriptor)
         return _locked(path)
     os.ftruncate(descriptor, 0)
@@ -175,10 +203,8 @@ def _is(path: Path, descriptor: int) -> bool:
 def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
     """Let the first signal ask for the end.
 
-    A second one ends the process as ever, and so does the first if nobody heeds it any more.
-
-    Args:
-        ask: asks for it; whether somebody will heed.
+    A second one ends the process, and so does the first where ``ask`` returns False: then nothing
+    is left that could end in order.
     """
     before = {number: signal.getsignal(number) for number in SIGNALS}
 
@@ -197,6 +223,34 @@ def quit_on_signals(ask: Callable[[], bool]) -> Iterator[None]:
         yield
     finally:
         restore()
+
+
+def cores() -> int:
+    """Processor cores that this process may use, where the system tells; else all."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Processes started here never see ^C, which a terminal sends to all: their parent ends them.
+
+    Blocked, not ignored: a ^C of this moment reaches the parent afterwards.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def die_with_parent() -> None:
+    """End this process when its parent has ended; to be run in a thread."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 class ProgressBar:
@@ -269,18 +323,6 @@ def _git(directory: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     return done.stdout.strip()
-
-
-def about() -> dict[str, Any]:
-    """Machine, threads and versions; no date, so that equal runs write equal words."""
-    import torch
-
-    return {
-        "machine": {"processor": processor_model(), "cores": os.cpu_count()},
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-        "source_revision": source_revision(),
-    }
 
 
 def processor_model() -> str:

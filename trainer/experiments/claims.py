@@ -23,6 +23,7 @@ from trainer.experiments.data import (
     KEPT,
     LATERAL,
     LONGITUDINAL,
+    NOTHING,
     PAPER_SCENES,
     REWARD,
     SECONDS,
@@ -30,24 +31,21 @@ from trainer.experiments.data import (
     SUCCESS,
     TIME_S,
     TRAINING,
+    Estimate,
+    Holds,
     Line,
+    Numbers,
     Place,
     Result,
     Results,
-    words,
-)
-from trainer.experiments.plan import FOUR, GUIDED, HUMAN_MODEL, ONE_FRAME, RANDOM, SCENARIOS
-from trainer.experiments.statistics import (
-    NOTHING,
-    Estimate,
-    Holds,
-    Numbers,
     above,
     all_of,
     bootstrap,
     mean_estimate,
     within,
+    words,
 )
+from trainer.experiments.plan import FOUR, GUIDED, HUMAN_MODEL, ONE_FRAME, RANDOM, SCENARIOS
 
 UNITS = {
     SUCCESS: (100.0, 1, " points"),

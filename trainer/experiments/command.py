@@ -8,7 +8,6 @@ from pathlib import Path
 
 from edge_runtime.cli import examples, not_negative, whole_number
 from edge_runtime.util import UserError
-from trainer.evaluate import cores
 from trainer.experiments.plan import (
     DEFAULT_SEEDS,
     EXPERIMENTS,
@@ -18,11 +17,10 @@ from trainer.experiments.plan import (
     obstacle,
     units_of,
 )
-from trainer.experiments.ray_runner import run_on_ray
 from trainer.experiments.report import write_report
-from trainer.experiments.run import Task, run_units, say
-from trainer.experiments.store import FAILED, FINISHED, Store
+from trainer.experiments.run import FAILED, FINISHED, Store, Task, run_on_ray, run_units, say
 from trainer.options import add_time_limit, deadline_s
+from trainer.util import cores
 
 EXAMPLE = examples(
     "python -m trainer experiment status",

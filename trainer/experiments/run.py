@@ -1,23 +1,26 @@
-"""One unit from its first step to its record, and many of them in a pool of processes.
+"""One unit from its first step to its record, and many of them in processes or on a Ray cluster.
 
+The record of a unit, one JSON object, is a line of ``results/paper/<scenario>.jsonl``. Its
+checkpoint and its actor lie in a directory of its own under ``runs``, which is not committed.
 Whatever is killed goes on from its last checkpoint, to the same bits.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import multiprocessing
 import os
 import sys
+import tempfile
 import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
-from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from typing import Any
 
@@ -26,27 +29,53 @@ import torch
 
 from bridge.report import GOAL
 from edge_runtime.files import make_directory, write_atomic
-from edge_runtime.util import UserError
-from trainer import seeds
+from edge_runtime.util import UserError, read_bytes
 from trainer.drivers import (
     BEST_FILE,
     CHECKPOINT_FILE,
     CONDITIONS,
-    ConstantDriver,
+    constant_driver,
     load_actor,
     load_driver,
     make_environment,
 )
 from trainer.drivers import CONSTANT as CONSTANT_DRIVER
-from trainer.evaluate import die_with_parent, drive_together, interrupts_blocked
-from trainer.experiments.plan import CONSTANT, Plan, Unit, deciding, run_config, testing
-from trainer.experiments.store import BUSY, FAILED, FINISHED, STOPPED, Store
+from trainer.evaluate import drive_together
+from trainer.experiments.plan import (
+    CONSTANT,
+    SCENARIOS,
+    Plan,
+    Unit,
+    deciding,
+    obstacle,
+    run_config,
+    testing,
+    training_id,
+    unit_id,
+    units_of,
+)
+from trainer.human.model import MODEL_FILE
 from trainer.learner.kernel import load as load_kernel
 from trainer.learner.networks import multiplies_bfloat16
-from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
+from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
-from trainer.util import ProgressBar, holder, processor_model, source_revision
+from trainer.util import (
+    ProgressBar,
+    Purpose,
+    die_with_parent,
+    episode_seed,
+    held,
+    holder,
+    interrupts_blocked,
+    processor_model,
+    source_revision,
+)
 
+FINISHED, STOPPED, BUSY, FAILED = "finished", "stopped", "busy", "failed"
+"""How work on a unit ends: with its record; at a checkpoint, for lack of time; at once, since
+another process has it; with an error."""
+WRITING_PATIENCE_S = 60.0
+"""How long one waits for a file of records, into which another process writes a megabyte."""
 TRAINING_COLUMNS = {
     "end_step": "total_steps",
     "return": "episode_return",
@@ -80,12 +109,111 @@ PATIENCE_S = 1.0
 """How long a unit may be held before it counts as another process's work."""
 NICENESS = 5
 """So that a machine on which somebody works stays usable."""
-EXITS = (FINISHED, FAILED, STOPPED, BUSY)
+EXITS = dict(enumerate((FINISHED, FAILED, STOPPED, BUSY)))
 """Exit status of a unit's process -> how the unit ended."""
-POLL_S = 1.0
-"""Between two looks at how far the processes are."""
-OnSteps = Callable[[int], object]
-"""Told how many environment steps of the unit are done."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """Where the units of a plan are."""
+
+    plan: Plan
+    """What they have in common."""
+    results: Path
+    """Directory of the records, to be committed."""
+    runs: Path
+    """Directory of checkpoints and actors, which is not."""
+    humans: Path
+    """Directory with a human model for each scenario."""
+
+    def id(self, unit: Unit) -> str:
+        """The id of the unit's record."""
+        return unit_id(unit, self.plan, self.humans)
+
+    def records_file(self, scenario: str) -> Path:
+        """The records of a scenario, a line each."""
+        return self.results / f"{scenario}.jsonl"
+
+    def run_dir(self, unit: Unit) -> Path:
+        """Where the unit is trained; its actor stays there."""
+        return self.runs / f"{'-'.join(map(str, unit))}-{training_id(unit, self.plan, self.humans)}"
+
+    def lock_file(self, unit: Unit) -> Path:
+        """Beside the unit's directory."""
+        run_dir = self.run_dir(unit)
+        return run_dir.with_name(f"{run_dir.name}.lock")
+
+    @contextmanager
+    def lock(self, unit: Unit, patience_s: float = 0.0) -> Iterator[bool]:
+        """Hold a unit against other processes; gives whether that was possible."""
+        make_directory(self.runs)
+        with held(self.lock_file(unit), patience_s) as mine:
+            yield mine
+
+    def records(self, scenario: str) -> dict[Unit, dict[str, Any]]:
+        """All records of a scenario, current or not; none where there is no file.
+
+        Raises:
+            UserError: a line is not what ``put`` writes.
+        """
+        path, found = self.records_file(scenario), {}
+        text = read_bytes(path, "records").decode(errors="replace") if path.exists() else ""
+        for number, line in enumerate(text.splitlines(), start=1):
+            try:
+                record = json.loads(line)
+                if not isinstance(record["id"], str) or not isinstance(record["tests"], dict):
+                    raise TypeError("no record")
+                found[Unit(**record["unit"])] = record
+            except (ValueError, KeyError, TypeError) as error:
+                raise UserError(f"{path}, line {number}, is no record of a unit: {error}") from None
+        return found
+
+    def find(self, units: Iterable[Unit]) -> tuple[dict[Unit, dict[str, Any]], list[Unit]]:
+        """The records of these units, and those units whose record is of other settings."""
+        records = {scenario: self.records(scenario) for scenario in SCENARIOS}
+        found, stale = {}, []
+        for unit in units:
+            record = records[unit.scenario].get(unit)
+            if record is None:
+                continue
+            if obstacle(unit, self.humans) or record["id"] != self.id(unit):
+                stale.append(unit)
+            else:
+                found[unit] = record
+        return found, stale
+
+    def put(self, unit: Unit, record: dict[str, Any]) -> None:
+        """Add a record, in place of an older one of the unit: whole or not at all."""
+        path = self.records_file(unit.scenario)
+        make_directory(path.parent)
+        with held(path.with_name(f".{path.name}.lock"), WRITING_PATIENCE_S) as mine:
+            if not mine:
+                raise UserError(f"{path} is held by another process")
+            records = {**self.records(unit.scenario), unit: record}
+            lines = [
+                json.dumps(records[each], separators=(",", ":"), allow_nan=False) + "\n"
+                for each in sorted(records)
+            ]
+            write_atomic(path, "".join(lines).encode())
+
+    def keep(self, unit: Unit, record: dict[str, Any] | None) -> str:
+        """Put what work on a unit came to, and tidy up; how it ended."""
+        if record is None:
+            return STOPPED
+        self.put(unit, record)
+        # The actor stays, for export and for tests to come; what learning needs is large.
+        (self.run_dir(unit) / CHECKPOINT_FILE).unlink(missing_ok=True)
+        return FINISHED
+
+    def status_lines(self, seeds: int) -> Iterator[str]:
+        """A line for each algorithm and setting: how many of its units are done."""
+        units = units_of(["all"], seeds)
+        found, stale = self.find(units)
+        done = Counter(unit[:3] for unit in found)
+        for line, count in Counter(unit[:3] for unit in units).items():
+            scenario, algorithm, setting = line
+            yield f"{setting:10} {algorithm:24} {scenario:11} {done[line]} of {count} done"
+        yield f"{len(found)} of {len(units)} units done; {len(stale)} records of other settings"
 
 
 @dataclass(frozen=True)
@@ -98,7 +226,7 @@ class Task:
     """Seconds of the epoch after which work stops at its next checkpoint."""
 
 
-def compute(task: Task, on_steps: OnSteps = lambda steps: None) -> str:
+def compute(task: Task) -> str:
     """Compute a unit from where it stands into its record; how that ended."""
     unit, store = task.unit, task.store
     with store.lock(unit, PATIENCE_S) as free:
@@ -107,12 +235,10 @@ def compute(task: Task, on_steps: OnSteps = lambda steps: None) -> str:
             return BUSY
         if unit in store.find([unit])[0]:
             return FINISHED
-        return store.keep(unit, make_record(task, store.run_dir(unit), on_steps))
+        return store.keep(unit, make_record(task, store.run_dir(unit)))
 
 
-def make_record(
-    task: Task, run_dir: Path, on_steps: OnSteps = lambda steps: None
-) -> dict[str, Any] | None:
+def make_record(task: Task, run_dir: Path) -> dict[str, Any] | None:
     """Train and test a unit; its record, or None where time ran out.
 
     torch works on one thread: the last bits must not depend on the machine's cores.
@@ -130,7 +256,7 @@ def make_record(
     seconds = {}
     if unit.trained:
         make_directory(run_dir)
-        if not _train(task, run_dir, on_steps):
+        if not _train(task, run_dir):
             return None
         rows = read_metrics(run_dir)
         validated = [row for row in rows if row["validation_success"] not in NOT_VALIDATED]
@@ -166,7 +292,7 @@ class _OutOfTimeError(Exception):
     """Ends training at a checkpoint."""
 
 
-def _train(task: Task, run_dir: Path, on_steps: OnSteps) -> bool:
+def _train(task: Task, run_dir: Path) -> bool:
     """Train to the budget's end; whether it was reached.
 
     Time is looked at only where a checkpoint was just written, and not through the deadline of
@@ -181,7 +307,6 @@ def _train(task: Task, run_dir: Path, on_steps: OnSteps) -> bool:
     run = TrainingRun(config, run_dir, resume=(run_dir / CHECKPOINT_FILE).is_file())
 
     def after(metrics: EpisodeMetrics) -> None:
-        on_steps(run.steps)
         at_checkpoint = run.episode % config.checkpoint_every == 0
         if at_checkpoint and not run.over and time.time() > task.stop_at_s:
             raise _OutOfTimeError
@@ -226,13 +351,13 @@ def best_constant(scenario: str, plan: Plan) -> tuple[float, dict[str, float]]:
     Searched on two grids: from -1 to 1, then a step to either side of the best one.
     """
     envs = [make_environment(scenario) for _ in range(plan.together)]
-    drives = [seeds.episode_seed(0, seeds.VALIDATION, run) for run in range(plan.search_runs)]
+    drives = [episode_seed(0, Purpose.VALIDATION, run) for run in range(plan.search_runs)]
     worth: dict[float, tuple[float, float]] = {}
 
     def search(grid: Iterable[float]) -> float:
         for action in (round(float(value), 3) for value in grid):
             if action not in worth:
-                results = drive_together(envs, ConstantDriver(action).act_together, drives)
+                results = drive_together(envs, constant_driver(action).act_together, drives)
                 success = np.mean([result.outcome == GOAL for result in results])
                 worth[action] = float(success), float(np.mean([r.distance_m for r in results]))
         return max(worth, key=lambda action: (*worth[action], -abs(action)))
@@ -251,38 +376,28 @@ def run_units(tasks: Sequence[Task], jobs: int) -> Counter[str]:
     """
     context = multiprocessing.get_context("spawn")
     ends: Counter[str] = Counter()
-    waiting, working, gone_by = deque(tasks), dict[Any, tuple[Any, Task, Any]](), 0
-    with ProgressBar("steps", sum(map(_steps, tasks)) or 1) as bar:
+    waiting, working = deque(tasks), dict[Any, tuple[Any, Task]]()
+    with ProgressBar("units", len(tasks)) as bar:
         try:
             while waiting or working:
                 while waiting and len(working) < jobs:
-                    # Without a lock: a process that is killed would take that along.
-                    task, steps = waiting.popleft(), RawValue("L", 0)
-                    process = context.Process(target=_work, args=(task, steps), daemon=True)
+                    task = waiting.popleft()
+                    process = context.Process(target=_work, args=(task,), daemon=True)
                     with interrupts_blocked():
                         process.start()
-                    working[process.sentinel] = process, task, steps
-                for sentinel in wait([*working], POLL_S):
-                    process, task, _ = working.pop(sentinel)
+                    working[process.sentinel] = process, task
+                for sentinel in wait([*working]):
+                    process, task = working.pop(sentinel)
                     process.join()
-                    if process.exitcode not in range(len(EXITS)):
+                    end = EXITS.get(process.exitcode, FAILED)
+                    if process.exitcode not in EXITS:
                         say(f"failed: {task.unit}: its process died ({process.exitcode})")
-                        ends[FAILED] += 1
-                        continue
-                    end = EXITS[process.exitcode]
                     ends[end] += 1
-                    gone_by += _steps(task) if end == FINISHED else 0
-                at = gone_by + sum(min(now.value, _steps(one)) for _, one, now in working.values())
-                bar.advance({"units": f"{ends[FINISHED]}/{len(tasks)}"}, at - bar.done)
+                    bar.advance({"last": str(task.unit)})
         finally:
-            for process, _, _ in working.values():
+            for process, _ in working.values():
                 process.kill()
     return ends
-
-
-def _steps(task: Task) -> int:
-    """What a unit counts in the progress bar."""
-    return task.store.plan.steps[task.unit.scenario] if task.unit.trained else 0
 
 
 def say(line: str) -> None:
@@ -290,13 +405,13 @@ def say(line: str) -> None:
     print(" ".join(line.split()), file=sys.stderr, flush=True)
 
 
-def _work(task: Task, steps: Any) -> None:
-    """A process's life: it tells how many steps are done, and by its exit status how it ended."""
+def _work(task: Task) -> None:
+    """A process's life: its exit status tells how the unit ended."""
     os.nice(NICENESS)
     threading.Thread(target=die_with_parent, daemon=True).start()
     end, why = FAILED, ""
     try:
-        end = compute(task, lambda done: setattr(steps, "value", done))
+        end = compute(task)
     except UserError as error:
         why = str(error)
     except BaseException as error:
@@ -305,4 +420,106 @@ def _work(task: Task, steps: Any) -> None:
         why = f"{type(error).__name__}: {error} ({path})"
     if end == FAILED:
         say(f"failed: {task.unit}: {why}")
-    sys.exit(EXITS.index(end))
+    sys.exit(list(EXITS.values()).index(end))
+
+
+WORKING_FILES = (CHECKPOINT_FILE, BEST_FILE, METRICS_FILE)
+"""What a unit goes on from."""
+RETRIES = 3
+"""How often a unit is begun again when the node under it dies."""
+Files = dict[str, bytes]
+Parcel = tuple[Task, Files, Files]
+"""A task on its way to a node: with its human model, and with what it goes on from."""
+
+
+def pack(task: Task) -> Parcel:
+    """A task with all that a node needs for it."""
+    human = task.store.humans / task.unit.scenario
+    return task, read(human, [MODEL_FILE]), read(task.store.run_dir(task.unit), WORKING_FILES)
+
+
+def compute_parcel(parcel: Parcel) -> tuple[dict[str, Any] | None, Files]:
+    """Compute a unit on a node: its record, None where time ran out, and its working files."""
+    task, human, working = parcel
+    with tempfile.TemporaryDirectory() as directory:
+        root = Path(directory)
+        store = replace(task.store, results=root, runs=root, humans=root / "humans")
+        write(store.humans / task.unit.scenario, human)
+        run_dir = store.run_dir(task.unit)
+        write(run_dir, working)
+        record = make_record(replace(task, store=store), run_dir)
+        return record, read(run_dir, WORKING_FILES)
+
+
+def keep(task: Task, record: dict[str, Any] | None, working: Files) -> str:
+    """Keep what a node made; how the unit ended."""
+    write(task.store.run_dir(task.unit), working)
+    return task.store.keep(task.unit, record)
+
+
+def run_on_ray(tasks: Sequence[Task], address: str) -> Counter[str]:
+    """Compute units as Ray tasks of one processor each; how many ended in which way.
+
+    ``address`` is the cluster's, as ``ray.init`` takes it; ``local`` starts one on this machine.
+
+    Raises:
+        UserError: Ray is not installed, or nothing answers at the address.
+    """
+    ray = _connected(address)
+    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(compute_parcel)
+    ends: Counter[str] = Counter()
+    with ExitStack() as locks:
+        waiting = {}
+        for task in tasks:
+            if not locks.enter_context(task.store.lock(task.unit, PATIENCE_S)):
+                ends[BUSY] += 1
+            elif task.unit in task.store.find([task.unit])[0]:  # made elsewhere in the meantime
+                ends[FINISHED] += 1
+            else:
+                waiting[remote.remote(pack(task))] = task
+        while waiting:
+            (ready, *_), _ = ray.wait(list(waiting))
+            task = waiting.pop(ready)
+            try:
+                end = keep(task, *ray.get(ready))
+            except ray.exceptions.RayError as error:
+                cause = getattr(error, "cause", None) or error
+                last = str(cause).strip().splitlines()[-1:]  # a MemoryError says nothing
+                end = FAILED
+                say(": ".join((end, str(task.unit), type(cause).__name__, *last)))
+            ends[end] += 1
+            say(f"{task.unit}: {end}, {ends.total()} of {len(tasks)}")
+    return ends
+
+
+def _connected(address: str) -> Any:
+    """The library, with a cluster behind it."""
+    try:
+        import ray
+    except ImportError:
+        raise UserError("--ray needs Ray: python -m pip install '.[ray]'") from None
+    if not ray.is_initialized():
+        import bridge
+        import edge_runtime
+        import trainer
+
+        # Nodes need the libraries; our own code is sent to them.
+        modules = {"py_modules": [edge_runtime, bridge, trainer]}
+        try:
+            ray.init(address=address, runtime_env=modules, log_to_driver=False)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise UserError(f"--ray {address}: no cluster answers: {error}") from error
+    return ray
+
+
+def read(directory: Path, names: Sequence[str]) -> Files:
+    """Those of the files that are there."""
+    paths = [directory / name for name in names]
+    return {path.name: path.read_bytes() for path in paths if path.is_file()}
+
+
+def write(directory: Path, files: Files) -> None:
+    """Write the files, each whole or not at all."""
+    make_directory(directory)
+    for name, data in files.items():
+        write_atomic(directory / name, data)

@@ -7,13 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.human.guide import Reason
+from trainer.human.guide import Driver, Reason, Trigger
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.environment import Observation
 from trainer.scenarios.picture import Rectangle, overlap
 
 
-class CongestionExpert:
+class CongestionExpert(Driver):
     """Heading control towards the middle between the neighbours to the left and to the right.
 
     A cascade: the offset from the middle asks for a heading, the heading error for a steering
@@ -34,9 +34,6 @@ class CongestionExpert:
 
     def __init__(self, env: CongestionEnv) -> None:
         self.env = env
-
-    def reset(self) -> None:
-        """Nothing to forget: the scene says everything."""
 
     def act(self, observation: Observation) -> NDArray[np.float32]:
         """The expert's steering, float32 [1]: from the true state, whatever the picture shows."""
@@ -65,7 +62,7 @@ class CongestionExpert:
         return min(max(0.5 * (left_m + right_m), -limit), limit)
 
 
-class CongestionTrigger:
+class CongestionTrigger(Trigger):
     """Judges the policy's action before it is carried out."""
 
     HORIZON_S = 1.0
@@ -84,13 +81,6 @@ class CongestionTrigger:
 
     def __init__(self, expert: CongestionExpert) -> None:
         self.expert = expert
-
-    def reset(self) -> None:
-        """Nothing to forget."""
-
-    def may_return(self) -> bool:
-        """Whether control can be handed back: anywhere, the clock alone decides."""
-        return True
 
     def judge(self, action: NDArray) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""

@@ -16,22 +16,12 @@ from typing import Any, NamedTuple
 from edge_runtime.cli import examples
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
-from trainer import seeds
+from trainer import options
 from trainer.drivers import EXPERTS, TRIGGERS, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE, REFINING_PARTS, HumanModel, HumanModelConfig
-from trainer.options import (
-    add_fields,
-    add_scenario,
-    add_seed,
-    add_threads,
-    add_time_limit,
-    deadline_s,
-    set_threads,
-    until,
-)
 from trainer.person.recording import demonstrate, find_recordings
-from trainer.util import ProgressBar, claimed
+from trainer.util import ProgressBar, Purpose, claimed, episode_seed
 
 EXAMPLE = examples(
     "python -m trainer human --scenario left_turn --out runs/human",
@@ -45,12 +35,12 @@ FIELDS = [field.name for field in fields(HumanModelConfig) if field.name not in 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_scenario(parser)
+    options.add_scenario(parser)
     parser.add_argument(
         "--out", required=True, metavar="HUMAN_DIR", help="the directory of the model"
     )
-    add_seed(parser, "everything that is drawn at random")
-    add_fields(parser, HumanModelConfig(), *FIELDS)
+    options.add_seed(parser, "everything that is drawn at random")
+    options.add_fields(parser, HumanModelConfig(), *FIELDS)
     parser.add_argument(
         "--from",
         dest="recordings",
@@ -69,11 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "the window shows it; an episode that was discarded at the wheel is left out anyway "
         "(default: nothing)",
     )
-    add_time_limit(
+    options.add_time_limit(
         parser,
         "begin no episode after this time; the refining steps shrink in proportion to the episodes",
     )
-    add_threads(parser)
+    options.add_threads(parser)
 
 
 def _place(word: str) -> str:
@@ -85,7 +75,7 @@ def _place(word: str) -> str:
 
 def run(arguments: argparse.Namespace) -> int:
     """Train the model, showing progress; returns the exit status."""
-    set_threads(arguments.threads)
+    options.set_threads(arguments.threads)
     scripted = arguments.recordings is None
     if not scripted and (arguments.label_every_step or arguments.unaided_share):
         raise UserError(
@@ -104,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: Path) -> None:
-    end_s = deadline_s(arguments)
+    end_s = options.deadline_s(arguments)
     about: dict[str, Any] = {"scenario": arguments.scenario, "seed": arguments.seed}
     if arguments.recordings is None:
         training = HumanTraining(make_environment(arguments.scenario), config, arguments.seed)
@@ -120,7 +110,7 @@ def _train(arguments: argparse.Namespace, config: HumanModelConfig, directory: P
             for _ in range(config.episodes)
         )
     with ProgressBar("human model", config.episodes) as bar:
-        for episode in until(end_s, episodes):
+        for episode in options.until(end_s, episodes):
             bar.advance(episode.figures())
     if bar.done < config.episodes:
         print(f"the time is over after {bar.done} of {config.episodes} episodes", file=sys.stderr)
@@ -181,7 +171,7 @@ class HumanTraining:
             c.demonstrated_share - 1
         )
         unaided = c.unaided_share and episode % c.unaided_share == 0
-        seed = seeds.episode_seed(self.seed, seeds.HUMAN_EPISODES, episode)
+        seed = episode_seed(self.seed, Purpose.HUMAN_EPISODES, episode)
         observation, info = self.env.reset(seed=seed)
         self.guide.reset()
         self.adviser.reset()

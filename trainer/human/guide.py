@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from trainer.scenarios.environment import Action, Observation
 
-Observation = NDArray[np.uint8]
-Action = NDArray[np.float32]
 Reason = Literal["collision", "lane", "stuck", "heading", "offset", "person"]
 """Why the human takes over: hardly a way out of a crash, a car that stops in the traffic's lane,
 one that waits for nothing, one that turns aside, one that is or drifts aside; a person has reasons
@@ -20,7 +17,8 @@ class Driver(Protocol):
     """Anything that drives: expert, human model, policy."""
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Forget the last episode; most have nothing to forget."""
+        return
 
     def act(self, observation: Observation) -> Action:
         """The action for an observation uint8 [2, 45, 80]."""
@@ -31,15 +29,16 @@ class Trigger(Protocol):
     """The activation conditions of section V: when a person would take over."""
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Forget the last episode, where there is something to forget."""
+        return
 
     def judge(self, action: Action) -> Reason | None:
         """Why a person would take over from ``action`` now, or None. Once a control period."""
         ...
 
     def may_return(self) -> bool:
-        """Whether a person would give the wheel back here."""
-        ...
+        """Whether a person would give the wheel back here: by default anywhere."""
+        return True
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from trainer.human.guide import Reason
+from trainer.human.guide import Driver, Reason, Trigger
 from trainer.scenarios.environment import EgoVehicle, Observation
 from trainer.scenarios.left_turn import LeftTurnEnv
 from trainer.scenarios.picture import Rectangle, corners
@@ -117,7 +117,7 @@ def _stretch_in_strip(shape: Rectangle, low_y: float, high_y: float) -> tuple[fl
     return (min(xs), max(xs)) if xs else (math.inf, -math.inf)
 
 
-class LeftTurnExpert:
+class LeftTurnExpert(Driver):
     """Waits at the stop line, picks a gap, and then commits.
 
     A driver who changes their mind with the nose in the lane is hit; one who needs a wide gap to
@@ -178,7 +178,7 @@ class LeftTurnExpert:
         return min(max(wanted_mps - self.env.ego.speed, -1.0), 0.3)
 
 
-class LeftTurnTrigger:
+class LeftTurnTrigger(Trigger):
     """Judges the policy's action before it is carried out.
 
     A person lets an action pass that leaves a way out and does not stop in the lane. A judge that

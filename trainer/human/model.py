@@ -12,9 +12,17 @@ import torch
 from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
-from trainer import seeds
+from trainer.human.guide import Driver
 from trainer.learner.networks import Actor
-from trainer.util import FROM_ONE, FROM_ZERO, check_ranges, load_torch, save_torch
+from trainer.util import (
+    FROM_ONE,
+    FROM_ZERO,
+    Purpose,
+    check_ranges,
+    load_torch,
+    random_stream,
+    save_torch,
+)
 
 MODEL_FILE = "human_model.pt"
 REFINING_PARTS = 20
@@ -71,7 +79,7 @@ class HumanModelConfig:
             raise UserError("--unaided-share needs --label-every-step: nothing else teaches there")
 
 
-class HumanModel:
+class HumanModel(Driver):
     """A regression of the human's action on the picture (eq. 24 to 27).
 
     Until the first intervention it is what eq. 25 starts from, an untrained policy network (with
@@ -86,7 +94,7 @@ class HumanModel:
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames)
         self.optimiser = torch.optim.Adam(self.actor.parameters(), config.learning_rate)
-        self.random = seeds.stream(seed, seeds.HUMAN_BATCHES)
+        self.random = random_stream(seed, Purpose.HUMAN_BATCHES)
         self._observations: list[NDArray[np.uint8]] = []
         self._actions: list[NDArray[np.float32]] = []
 
@@ -94,9 +102,6 @@ class HumanModel:
     def demonstrations(self) -> int:
         """How many of the human's steps it has seen."""
         return len(self._actions)
-
-    def reset(self) -> None:
-        """Nothing to forget: the model has no state within an episode."""
 
     @torch.no_grad()
     def act(self, observation: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -27,7 +27,7 @@ from trainer.person.interface import (
     Wish,
 )
 from trainer.person.profile import SHIPPED, Profile, read_profile
-from trainer.scenarios.scene import draw_scene
+from trainer.scenarios.picture import draw_scene
 
 WISH_KEYS: dict[int, Wish] = {
     pygame.K_p: "pause",

@@ -32,7 +32,7 @@ from trainer.person.recording import DIRECTORY, DISCARDED, Recorder, steps_since
 from trainer.person.session import Sitting, SittingOver
 from trainer.training.config import RunConfig
 from trainer.training.delayed import Store, behind, ticks_late
-from trainer.training.learning import Action, Learning, LearningThread, Observation
+from trainer.training.learning import Action, LearningThread, Observation
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun, divergence_said
 
@@ -146,8 +146,8 @@ class PersonRun(TrainingRun):
             return f"not learning yet ({self.learning.added} of {warmup} steps)"
         return "critic loss –" if math.isnan(critic_loss) else f"critic loss {critic_loss:.3f}"
 
-    def _around(self, learning: LearningThread) -> Learning:
-        return cast(Learning, UnhurriedLearning(learning))
+    def _around(self, learning: LearningThread) -> LearningThread:
+        return cast(LearningThread, UnhurriedLearning(learning))
 
     def _make_guide(self) -> Guide | None:
         return None  # The sitting is opened when all else is known to work.
@@ -238,7 +238,7 @@ class KeptBack:
 
 
 class UnhurriedLearning:
-    """``Learning`` whose ``act``, ``begin`` and ``finish`` never wait for an update.
+    """``LearningThread`` whose ``act``, ``begin`` and ``finish`` never wait for an update.
 
     All else is the inner learner's own, and waits for the update that is under way.
     """

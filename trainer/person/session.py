@@ -17,7 +17,6 @@ from msgspec import structs
 
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.util import UserError, counted
-from trainer import seeds
 from trainer.drivers import load_driver, make_environment
 from trainer.human.guide import Driver
 from trainer.options import add_scenario, add_seed, add_threads, set_threads
@@ -26,7 +25,7 @@ from trainer.person.recording import DISCARDED, Recorder, Step
 from trainer.person.takeover import Applied, Intent, TakeOver
 from trainer.scenarios.environment import Action, Observation
 from trainer.scenarios.environment import Step as EnvironmentStep
-from trainer.util import quit_on_signals
+from trainer.util import Purpose, episode_seed, quit_on_signals
 
 EXAMPLE = examples(
     "python -m trainer drive --human keyboard --out runs/drives",
@@ -106,7 +105,7 @@ def drive(
     outcomes = Counter[str]()
     number = sitting.recorder.sitting
     while not sitting.stop and outcomes.total() != episodes:
-        seed = seeds.episode_seed(run_seed, seeds.SITTINGS, (number << 32) + sitting.episode)
+        seed = episode_seed(run_seed, Purpose.SITTINGS, (number << 32) + sitting.episode)
         try:
             observation, _ = sitting.reset(seed)
         except SittingOver:

@@ -31,7 +31,7 @@ from bridge.rerun import BY_NAME
 from edge_runtime.util import UserError
 from trainer.person.interface import KEY_HELP, WISH_HELP, Moving, Reading, View
 from trainer.person.takeover import Input, Seat
-from trainer.scenarios.scene import HEIGHT_M, VIEW, WIDTH_M
+from trainer.scenarios.picture import HEIGHT_M, VIEW, WIDTH_M
 
 TOKEN_BYTES = 16
 MAX_INPUT_BYTES = 1024

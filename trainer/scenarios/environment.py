@@ -13,8 +13,7 @@ from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from trainer.scenarios.picture import COLUMNS, ROWS, Rasteriser, Rectangle
-from trainer.scenarios.scene import BODY, draw_scene
+from trainer.scenarios.picture import BODY, COLUMNS, ROWS, Rasteriser, Rectangle, draw_scene
 from trainer.scenarios.traffic import TrafficVehicle
 
 Observation = NDArray[np.uint8]

@@ -14,7 +14,7 @@ from trainer.drivers import MODEL_FILE
 from trainer.evaluate import CONDITIONS
 from trainer.experiments.data import Result, Results
 from trainer.experiments.plan import CONSTANT, FULL_PATH_M, HUMAN_MODEL, QUICK, SCENARIOS, Unit
-from trainer.experiments.store import Store
+from trainer.experiments.run import Store
 from trainer.human.model import HumanModel, HumanModelConfig
 
 TINY = replace(QUICK, steps=dict.fromkeys(SCENARIOS, 290))

@@ -18,17 +18,26 @@ class Brakes:
         return BRAKE
 
 
-def drive(env, driver, seed=0):
-    """An episode of a driver, or of one action throughout: its rewards, and the last info."""
-    act = driver.act if hasattr(driver, "act") else lambda _: driver
-    observation, info = env.reset(seed=seed)
-    rewards, ended = [], False
+def episode(env, driver, seed=None):
+    """Drive until the end with a driver, a function of the picture or one action throughout.
+
+    Gives the action, reward and info of each step; without a seed it begins where the car is.
+    """
+    act = getattr(driver, "act", driver if callable(driver) else lambda _: driver)
+    observation = env.frames if seed is None else env.reset(seed=seed)[0]
+    ended = False
     while not ended:
-        observation, reward, terminated, truncated, info = env.step(act(observation))
-        rewards.append(reward)
+        action = act(observation)
+        observation, reward, terminated, truncated, info = env.step(action)
         assert terminated == (info.get("outcome") in ("goal", "collision", "off_road"))
         ended = terminated or truncated
-    return rewards, info
+        yield action, reward, info
+
+
+def drive(env, driver, seed=0):
+    """The rewards of an episode, and its last info."""
+    _, rewards, infos = zip(*episode(env, driver, seed), strict=True)
+    return list(rewards), infos[-1]
 
 
 def objections(env, driver, drives):
@@ -36,14 +45,16 @@ def objections(env, driver, drives):
     trigger = TRIGGERS[env.scenario](EXPERTS[env.scenario](env))
     arrived = objected = 0
     for seed in range(drives):
-        observation, info = env.reset(seed=seed)
         driver.reset()
         trigger.reset()
-        reasons = set()
-        while "outcome" not in info:
+        reasons: set[str | None] = set()
+
+        def judged(observation, reasons=reasons):
             action = driver.act(observation)
             reasons.add(trigger.judge(action))
-            observation, _, _, _, info = env.step(action)
+            return action
+
+        _, info = drive(env, judged, seed)
         arrived += info["outcome"] == GOAL
         objected += info["outcome"] == GOAL and reasons != {None}
     return {"drives": drives, "arrived": arrived, "objected_of_these": objected}

@@ -29,6 +29,14 @@ def call(capsys, *arguments: str) -> tuple[int, str, str]:
     return status, captured.out, captured.err
 
 
+def refusal(capsys, *arguments: str) -> str:
+    """The one line with which a command ends that is given bad input."""
+    status, out, err = call(capsys, *arguments)
+    assert (status, out, len(err.strip().splitlines())) == (2, "", 1)
+    assert "Traceback" not in err
+    return err
+
+
 WRONG = [
     ("train", "--scenario", "moon", "--out", "x"),
     ("train", "--algorithm", "magic", "--out", "x"),
@@ -85,11 +93,7 @@ WRONG = [
 def test_bad_input_gets_one_line_and_status_2(arguments, capsys, tmp_path):
     (tmp_path / "file").write_text("a file")
     before = sorted(tmp_path.rglob("*"))
-    status, out, err = call(capsys, *(a.format(tmp=tmp_path) for a in arguments))
-    assert status == 2
-    assert out == ""
-    assert len(err.strip().splitlines()) == 1
-    assert "Traceback" not in err
+    refusal(capsys, *(a.format(tmp=tmp_path) for a in arguments))
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -123,17 +127,14 @@ def test_a_shipped_policy_is_verified_with_the_key_beside_it(workshop, capsys):
         status, _, err = call(capsys, *command)
         assert status == 0, err
     drive = ["drive", "--human", "keyboard", "--policy", POLICY, "--public-key", "none.pub"]
-    status, _, err = call(capsys, *drive)
-    assert (status, "public key none.pub does not exist" in err) == (2, True)
+    assert "public key none.pub does not exist" in refusal(capsys, *drive)
 
 
-@pytest.mark.parametrize("jobs", ["1", "2"])
-def test_a_named_key_decides_in_every_process(jobs, workshop, capsys):
+def test_a_named_key_decides(workshop, capsys):
     for end in ("", ".sig"):
         shutil.copy(POLICY + end, f"p.onnx{end}")
-    evaluate = ["evaluate", "p.onnx", "--runs", "2", "--jobs", jobs]
-    status, _, err = call(capsys, *evaluate)
-    assert status == 2
+    evaluate = ["evaluate", "p.onnx", "--runs", "2"]
+    err = refusal(capsys, *evaluate)
     assert "public key keys/policy.pub: " in err
     assert "--public-key" in err
     key = str(Path(POLICY).with_name("policy.pub"))
@@ -173,22 +174,15 @@ def test_the_whole_way_from_human_to_policy_file(capsys, tmp_path):
     for step in steps:
         status, _, err = call(capsys, *step)
         assert status == 0, err
-    again = ("train", "--human", human, "--out", run, "--episodes", "2")
-    status, _, err = call(capsys, *again)
-    assert status == 2
-    assert "--resume" in err
-    fewer = ("train", "--out", run, "--human", human, "--episodes", "2", "--set", "batch_size=4",
-             "--set", "evaluation_runs=1", "--resume")  # fmt: skip
-    status, _, err = call(capsys, *fewer)
-    assert status == 2
-    assert "not fewer" in err
-    other = ("train", "--out", run, "--human", human, "--episodes", "4", "--seed", "8", "--resume")
-    status, _, err = call(capsys, *other)
-    assert status == 2
-    assert "--seed 0 (now 8), --set evaluation_runs=1 (now 30), --set batch_size=4 (now 128)" in err
-    status, _, err = call(capsys, *steps[0])
-    assert status == 2
-    assert "holds a human model" in err
+    again = ("train", "--human", human, "--out", run, "--episodes")
+    changed = "--seed 0 (now 8), --set evaluation_runs=1 (now 30), --set batch_size=4 (now 128)"
+    for arguments, said in (
+        ((*again, "2"), "--resume"),
+        ((*steps[2][:6], "2", *steps[2][7:]), "not fewer"),
+        ((*again, "4", "--seed", "8", "--resume"), changed),
+        (steps[0], "holds a human model"),
+    ):
+        assert said in refusal(capsys, *arguments)
 
 
 def test_a_replay_buffer_beyond_the_memory_is_one_line(capsys, tmp_path, monkeypatch):
@@ -196,8 +190,7 @@ def test_a_replay_buffer_beyond_the_memory_is_one_line(capsys, tmp_path, monkeyp
         raise MemoryError("Unable to allocate 3.4 TiB")
 
     monkeypatch.setattr("trainer.learner.replay.np.empty", too_much)
-    status, _, err = call(capsys, "train", "--out", str(tmp_path / "x"), "--episodes", "1")
-    assert (status, len(err.splitlines())) == (2, 1)
+    err = refusal(capsys, "train", "--out", str(tmp_path / "x"), "--episodes", "1")
     assert "no memory for a replay buffer of 100000 transitions: --set replay_capacity=N" in err
     assert list(tmp_path.iterdir()) == []
 
@@ -205,8 +198,7 @@ def test_a_replay_buffer_beyond_the_memory_is_one_line(capsys, tmp_path, monkeyp
 @pytest.mark.parametrize("name", ["checkpoint.pt", "best_actor.pt", "human_model.pt"])
 def test_a_foreign_torch_file_is_said_in_one_line(name, capsys, tmp_path):
     save_torch(tmp_path / name, {"something": 1})
-    status, _, err = call(capsys, "evaluate", str(tmp_path), "--runs", "1")
-    assert (status, len(err.strip().splitlines())) == (2, 1)
+    refusal(capsys, "evaluate", str(tmp_path), "--runs", "1")
 
 
 @pytest.mark.parametrize(
@@ -239,30 +231,24 @@ GIVEN = (
 
 
 def test_changed_settings_are_named_as_they_are_given(run_dir, capsys):
-    status, _, err = call(capsys, "train", "--out", str(run_dir), "--resume")
-    assert (status, len(err.splitlines())) == (2, 1)
     assert (
         "was trained with --seed 3 (now 0), --human keyboard|gamepad|wheel|web (now expert), "
         "--set evaluate_every_steps=7 (now 500), --set batch_size=8 (now 128): repeat"
-    ) in err
+    ) in refusal(capsys, "train", "--out", str(run_dir), "--resume")
 
 
-def test_the_same_settings_are_let_in_as_far_as_the_checkpoint(run_dir, capsys):
+def test_what_the_run_had_is_let_in_as_far_as_the_checkpoint_and_what_it_lacked_named(
+    run_dir, capsys
+):
     path = run_dir / "config.json"
     values = json.loads(path.read_text())
-    values["human"] = "expert"
-    path.write_text(json.dumps(values))
+    path.write_text(json.dumps({**values, "human": "expert"}))
     given = tuple("expert" if word == "keyboard" else word for word in GIVEN)
-    _, _, err = call(capsys, "train", "--out", str(run_dir), *given)
-    assert "is not a checkpoint of this project" in err
-
-
-def test_a_setting_that_the_run_did_not_have_is_named(run_dir, capsys):
-    path = run_dir / "config.json"
-    values = json.loads(path.read_text())
+    resume = ("train", "--out", str(run_dir))
+    assert "is not a checkpoint of this project" in refusal(capsys, *resume, *given)
     del values["learner"]["gamma"], values["averaged_actor"]
     path.write_text(json.dumps(values))
-    _, _, err = call(capsys, "train", "--out", str(run_dir), *GIVEN)
+    err = refusal(capsys, *resume, *GIVEN)
     assert "no averaged_actor (now True), no gamma (now 0.95): repeat" in err
 
 
@@ -274,8 +260,7 @@ def test_a_config_that_is_none_is_one_line(spoilt, run_dir, capsys):
     if isinstance(spoilt, dict):
         spoilt = json.dumps({**json.loads(path.read_text()), **spoilt})
     path.write_text(spoilt)
-    status, _, err = call(capsys, "train", "--out", str(run_dir), *GIVEN)
-    assert (status, len(err.splitlines())) == (2, 1)
+    refusal(capsys, "train", "--out", str(run_dir), *GIVEN)
 
 
 def limit(*arguments: str) -> float:
@@ -329,12 +314,8 @@ def test_the_settings_are_listed_with_defaults_and_meanings(capsys):
 
 def test_a_misspelt_setting_or_command_is_told_what_comes_near(capsys, tmp_path):
     given = ("train", "--out", str(tmp_path / "x"), "--set", "bach_size=4")
-    status, _, err = call(capsys, *given)
-    assert (status, "did you mean batch_size?" in err) == (2, True)
-    status, _, err = call(capsys, "trian")
-    assert (status, "did you mean train?" in err, len(err.splitlines())) == (2, True, 1)
-
-
-def test_a_bare_command_prints_its_help(capsys):
+    assert "did you mean batch_size?" in refusal(capsys, *given)
+    assert "did you mean train?" in refusal(capsys, "trian")
+    # A bare command prints its help.
     status, out, _ = call(capsys)
     assert (status, "experiment" in out) == (0, True)

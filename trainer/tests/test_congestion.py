@@ -1,15 +1,18 @@
+"""The congestion: road, cars and reward; then its expert, and when it takes over."""
+
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
 from trainer.drivers import make_environment
+from trainer.human.congestion import CongestionExpert, CongestionTrigger
 from trainer.scenarios.congestion import CongestionConfig, CongestionEnv
-from trainer.scenarios.picture import corners, overlap
-from trainer.tests.humans import drive
+from trainer.scenarios.picture import corners
+from trainer.scenarios.traffic import CAR
+from trainer.tests.humans import drive, episode
 
 STRAIGHT, RIGHT, LEFT = (np.array([steering], np.float32) for steering in (0.0, 1.0, -1.0))
 CENTRED = CongestionConfig(
@@ -27,17 +30,6 @@ def test_eight_cars_within_20_m_and_the_ego_car_between_them():
         assert (y < -2.0).sum() == (y > 2.0).sum() == 3
         assert all(4.0 <= car.speed <= 6.0 for car in env.traffic)
         assert 4.0 <= env.ego.speed <= 6.0
-
-
-def test_traffic_never_touches_itself_in_either_scene():
-    for scene in ("nominal", "variant"):
-        env = CongestionEnv(scene=scene)
-        for seed in range(8):
-            drive(env, STRAIGHT, seed)
-            shapes = [car.footprint for car in env.traffic]
-            pairs = [(a, b) for i, a in enumerate(shapes) for b in shapes[:i]]
-            assert not any(overlap(a, b) for a, b in pairs)
-            assert all(0.0 <= car.speed <= 6.01 for car in env.traffic)
 
 
 def test_straight_from_mid_lane_reaches_the_goal_behind_the_car_ahead():
@@ -62,7 +54,10 @@ def test_the_printed_reward_is_eq_32_without_a_weight():
 
 def test_zero_steering_succeeds_in_less_than_half_and_random_rarely():
     env, random = CongestionEnv(), np.random.default_rng(0)
-    wandering = SimpleNamespace(act=lambda _: random.uniform(-1, 1, 1).astype(np.float32))
+
+    def wandering(_):
+        return random.uniform(-1, 1, 1).astype(np.float32)
+
     arrived = [
         sum(drive(env, driver, seed)[1]["outcome"] == "goal" for seed in range(drives))
         for driver, drives in ((STRAIGHT, 40), (wandering, 20))
@@ -151,11 +146,8 @@ def test_nobody_behind_a_car_that_stays_standing_drives_backwards(condition):
     for seed in range(4):
         env.reset(seed=seed)
         env.press_brake(True)
-        for _ in range(120):
-            *_, terminated, truncated, _ = env.step(env.brake_action)
+        for _ in zip(range(120), episode(env, lambda _: env.brake_action), strict=False):
             assert min(car.speed for car in env.traffic) > -1e-9
-            if terminated or truncated:
-                break
 
 
 def test_the_brake_action_is_the_last_steering():
@@ -214,18 +206,115 @@ def test_no_lane_marking_is_in_the_picture():
     assert np.unique(frames[1][inside][free[inside]]).tolist() == [70]
 
 
-def test_render_and_scene_show_what_is_there():
+def test_the_view_goes_with_the_car():
+    """It stays where it is in the picture."""
     env = CongestionEnv(render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
-    assert first.dtype == np.uint8
-    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 10
-    scene = env.scene()
-    assert [v["ego"] for v in scene["vehicles"]] == [True] + 8 * [False]
-    assert scene["road_width_m"] == 10.5
+    assert env.scene()["road_width_m"] == 10.5
     for _ in range(100):
         env.step(STRAIGHT)
-    # The view goes with the car: it stays where it is in the picture.
     blue = (40, 120, 230)
     columns = [np.flatnonzero((p == blue).all(axis=2).any(axis=0)) for p in (first, env.render())]
     assert columns[0].min() == pytest.approx(columns[1].min(), abs=2)
+
+
+ALONE = replace(CENTRED, side_cars=1, side_front_m=(60.0, 60.0))
+
+
+def environment(
+    offset_m: float = 0.0, heading_rad: float = 0.0, config: CongestionConfig = CENTRED
+) -> CongestionEnv:
+    start, course = (offset_m, offset_m), (heading_rad, heading_rad)
+    env = CongestionEnv(replace(config, start_offset_m=start, start_heading_rad=course))
+    env.reset(seed=0)
+    return env
+
+
+def test_the_expert_steers_back_and_then_straight():
+    for offset_m, sign in ((0.3, -1.0), (-0.3, 1.0)):
+        env = environment(offset_m)
+        expert = CongestionExpert(env)
+        assert expert.act(env.frames)[0] * sign > 0.3
+        for _ in range(80):
+            env.step(expert.act(env.frames))
+        assert abs(env.ego.position[1]) < 0.05
+        assert abs(env.ego.heading) < 0.01
+
+
+def test_the_expert_seeks_the_middle_of_the_gap():
+    env = environment(config=replace(CENTRED, traffic_mix=((CAR, 1.0),)))
+    expert = CongestionExpert(env)
+    assert expert.middle_m() == pytest.approx(0.0)
+    for car in env.traffic:
+        if car.position[1] < -2.0:
+            car.position[1] += 0.4
+    assert expert.middle_m() == pytest.approx(0.2)
+    assert expert.act(env.frames)[0] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("offset_m", "heading_rad", "config", "action", "reason"),
+    [
+        (0.0, 0.11, CENTRED, LEFT, None),
+        (0.0, 0.14, CENTRED, LEFT, "heading"),
+        (0.0, -0.14, CENTRED, RIGHT, "heading"),
+        # A side that will touch a car.
+        (0.75, 0.1, CENTRED, RIGHT, "collision"),
+        (-0.75, 0.1, CENTRED, STRAIGHT, None),
+        # Even where the road is free; steered back in time it is no matter.
+        (0.7, 0.0, ALONE, STRAIGHT, None),
+        (0.9, 0.0, ALONE, STRAIGHT, "offset"),
+        (-0.9, 0.0, ALONE, STRAIGHT, "offset"),
+        (0.9, 0.0, ALONE, LEFT, None),
+        (-0.9, 0.0, ALONE, RIGHT, None),
+        # A drift that nobody steers against.
+        (0.1, 0.06, ALONE, STRAIGHT, "offset"),
+        (0.1, 0.06, ALONE, RIGHT, "offset"),
+        (0.1, 0.06, ALONE, LEFT, None),
+        (0.1, -0.06, ALONE, RIGHT, None),
+        (-0.1, -0.06, ALONE, STRAIGHT, "offset"),
+        (-0.1, -0.06, ALONE, LEFT, "offset"),
+        (-0.1, -0.06, ALONE, RIGHT, None),
+        (-0.1, 0.06, ALONE, LEFT, None),
+    ],
+)
+def test_who_turns_or_drifts_aside_is_taken_over(offset_m, heading_rad, config, action, reason):
+    expert = CongestionExpert(environment(offset_m, heading_rad, config))
+    assert CongestionTrigger(expert).judge(action) == reason
+
+
+def test_on_the_way_back_to_the_middle_nobody_is_taken_over():
+    for offset_m in (0.2, 0.45, 0.7):
+        env = environment(offset_m, -0.08, replace(ALONE, ego_speed_mps=(6.0, 6.0)))
+        trigger = CongestionTrigger(CongestionExpert(env))
+        for _ in range(40):
+            action = trigger.expert.act(env.frames)
+            assert trigger.judge(action) is None
+            env.step(action)
+
+
+class OnlyCollisions(CongestionTrigger):
+    """Objects to nothing but cars that would be hit."""
+
+    HEADING_RAD = OFFSET_M = math.inf
+
+
+@pytest.mark.parametrize("kind", [CongestionTrigger, OnlyCollisions])
+def test_every_crash_is_foreseen_in_its_last_second(kind):
+    env, random = CongestionEnv(), np.random.default_rng(1)
+    trigger = kind(CongestionExpert(env))
+    crashes = 0
+    for seed in range(25):
+        objected: list[bool] = []
+
+        def judged(_, objected=objected):
+            action = random.uniform(-1, 1, 1).astype(np.float32)
+            objected.append(trigger.judge(action) is not None)
+            return action
+
+        _, info = drive(env, judged, seed)
+        if info["outcome"] == "collision":
+            crashes += 1
+            assert any(objected[-round(trigger.HORIZON_S / env.config.control_period_s) :])
+    assert crashes > 10

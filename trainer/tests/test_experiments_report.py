@@ -1,6 +1,8 @@
 """Records out of the air, judged, drawn and reported; and the command around it."""
 
+import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,17 +28,23 @@ from trainer.experiments.claims import (
     sooner,
     sooner_by,
 )
-from trainer.experiments.data import ALONE, DISTANCE, SUCCESS, TRAINING, Line, Scene, load
-from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
-from trainer.experiments.report import write_report
-from trainer.experiments.statistics import (
+from trainer.experiments.data import (
+    ALONE,
+    DISTANCE,
+    SUCCESS,
+    TRAINING,
     Estimate,
     Holds,
+    Line,
+    Scene,
     above,
     all_of,
+    load,
     mean_estimate,
     within,
 )
+from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
+from trainer.experiments.report import write_report
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
 
 SEEDS = 3
@@ -274,3 +282,13 @@ def test_stopping_soon_leaves_it_to_the_same_command(tmp_path, capsys):
     assert main(arguments) == 0
     assert "the same command goes on" in capsys.readouterr().out
     assert not (store.runs / "quick/results/left_turn.jsonl").exists()
+
+
+PAPER = Path(__file__).parents[2] / "results" / "paper"
+
+
+@pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
+def test_each_record_lies_in_its_scenarios_file_once(scenario):
+    records = list(map(json.loads, (PAPER / f"{scenario}.jsonl").read_text().splitlines()))
+    assert {record["unit"]["scenario"] for record in records} == {scenario}
+    assert len({record["id"] for record in records}) == len(records)

@@ -31,8 +31,19 @@ from trainer.experiments.plan import (
     unit_id,
     units_of,
 )
-from trainer.experiments.run import Task, compute, run_units
-from trainer.experiments.store import BUSY, FAILED, FINISHED, STOPPED
+from trainer.experiments.run import (
+    BUSY,
+    FAILED,
+    FINISHED,
+    STOPPED,
+    Task,
+    compute,
+    compute_parcel,
+    keep,
+    pack,
+    run_on_ray,
+    run_units,
+)
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
@@ -40,6 +51,11 @@ from trainer.training.run import TrainingRun
 
 GUIDED = Unit("left_turn", "phil_td3", NORMAL, 1)
 ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def store(tmp_path):
+    return store_in(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +84,7 @@ def test_a_unit_ends_as_a_record_and_an_actor(straight):
     assert str(straight.runs.parent) not in text
 
 
-def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
-    store = store_in(tmp_path)
+def test_stops_at_checkpoints_change_nothing(store, straight):
     assert compute(Task(UNIT, store, stop_at_s=1.0)) == STOPPED, "time was over before it began"
     ends = [compute(Task(UNIT, store, stop_at_s=Soon(1e18))) for _ in range(2)]
     assert ends == [STOPPED, STOPPED]
@@ -77,9 +92,8 @@ def test_stops_at_checkpoints_change_nothing(straight, tmp_path):
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
-def test_a_killed_command_goes_on_to_the_same_record(straight, tmp_path):
+def test_a_killed_command_goes_on_to_the_same_record(store, straight, tmp_path):
     """The whole command, killed at a checkpoint as a power cut would."""
-    store = store_in(tmp_path)
     code = (
         "from pathlib import Path; from trainer.tests.experiments import *; "
         "from trainer.experiments.run import *; "
@@ -98,9 +112,8 @@ def test_a_killed_command_goes_on_to_the_same_record(straight, tmp_path):
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
-def test_two_processes_share_one_file_of_records(tmp_path):
+def test_two_processes_share_one_file_of_records(store):
     """Each of three units is computed once, and no record is lost."""
-    store = store_in(tmp_path)
     write_human(store)
     units = [UNIT, GUIDED, Unit("left_turn", HUMAN_MODEL, NORMAL, 0)]
     ends = run_units([Task(unit, store) for unit in units], 2)
@@ -109,8 +122,7 @@ def test_two_processes_share_one_file_of_records(tmp_path):
     assert set(store.find(units)[0]) == set(units)
 
 
-def test_a_unit_that_another_process_has_is_left_to_it(straight, tmp_path, monkeypatch):
-    store = store_in(tmp_path)
+def test_a_unit_that_another_process_has_is_left_to_it(store, monkeypatch):
     monkeypatch.setattr(running, "PATIENCE_S", 0.0)
     with store.lock(UNIT) as mine:
         assert mine
@@ -133,8 +145,7 @@ def test_tests_that_change_are_driven_with_the_actor_that_was_kept(straight, tmp
         assert len(ours["tests"][condition]["outcome"]) == 5
 
 
-def test_a_failure_is_one_units_failure(tmp_path, capfd):
-    store = store_in(tmp_path)
+def test_a_failure_is_one_units_failure(store, capfd):
     write_human(store).write_bytes(b"no human")
     ends = run_units([Task(GUIDED, store)], 1)
     assert ends == {FAILED: 1}
@@ -142,8 +153,7 @@ def test_a_failure_is_one_units_failure(tmp_path, capfd):
     assert str(GUIDED) in line
 
 
-def test_the_floor_is_searched_and_driven(tmp_path):
-    store = store_in(tmp_path)
+def test_the_floor_is_searched_and_driven(store):
     unit = Unit("left_turn", CONSTANT, NORMAL, 0)
     assert compute(Task(unit, store)) == FINISHED
     record = store.records("left_turn")[unit]
@@ -161,8 +171,8 @@ def test_damaged_records_are_refused_in_one_line(straight, tmp_path, damage):
 
 
 class TestIds:
-    def test_what_decides_changes_the_id_and_nothing_else_does(self, tmp_path, monkeypatch):
-        store, elsewhere = store_in(tmp_path), store_in(tmp_path / "elsewhere")
+    def test_what_decides_changes_the_id_and_nothing_else_does(self, store, tmp_path, monkeypatch):
+        elsewhere = store_in(tmp_path / "elsewhere")
         human = write_human(store)
         write_human(elsewhere)
         first = unit_id(GUIDED, TINY, store.humans)
@@ -224,13 +234,11 @@ class TestPlan:
         assert [unit.seed for unit in first] == sorted(unit.seed for unit in first)
         assert units[44].setting == "biased"
 
-    def test_the_settings_are_what_they_say(self, tmp_path):
-        humans = tmp_path
-        write_human(store_in(tmp_path))
-        humans = tmp_path / "humans"
+    def test_the_settings_are_what_they_say(self, store):
+        write_human(store)
 
         def config(setting):
-            return run_config(GUIDED._replace(setting=setting), planned.PLAN, humans)
+            return run_config(GUIDED._replace(setting=setting), planned.PLAN, store.humans)
 
         assert {setting for _, setting, _ in LINES} == set(SETTINGS)
         assert config("one_frame").learner.frames == 1
@@ -248,3 +256,41 @@ def test_the_record_says_what_was_trained(straight):
     config = run_config(UNIT, TINY, straight.humans).as_dict()
     assert {**config, **record["config"]} == json.loads(json.dumps(config))
     assert (straight.run_dir(UNIT) / METRICS_FILE).is_file()
+
+
+UNITS = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]
+
+
+def test_a_parcel_goes_on_elsewhere_and_brings_back_the_same_record(tmp_path):
+    store, other = store_in(tmp_path / "ours"), store_in(tmp_path / "theirs")
+    task = Task(UNIT, store, stop_at_s=Soon(1e18))
+    assert keep(task, *compute_parcel(pack(task))) == STOPPED
+    task = replace(task, stop_at_s=float("inf"))
+    assert "checkpoint.pt" in pack(task)[2]
+    assert keep(task, *compute_parcel(pack(task))) == FINISHED
+    assert compute(Task(UNIT, other)) == FINISHED
+    assert without_times(store, UNIT) == without_times(other, UNIT)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A head without a processor of its own and two nodes of one each."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    for _ in range(2):
+        cluster.add_node(num_cpus=1)
+    cluster.wait_for_nodes()
+    yield cluster
+    cluster.shutdown()
+
+
+@pytest.mark.ray
+def test_a_cluster_computes_all_units_but_the_one_that_fails(store, cluster):
+    run_dir = store.run_dir(UNITS[0])
+    run_dir.mkdir(parents=True)
+    (run_dir / "checkpoint.pt").write_bytes(b"no checkpoint")
+    ends = run_on_ray([Task(unit, store) for unit in UNITS], cluster.address)
+    assert ends == {FAILED: 1, FINISHED: 2}
+    assert list(store.find(UNITS)[0]) == UNITS[1:]

@@ -1,3 +1,5 @@
+"""Rectangles and the picture that they are drawn into, and the path of the left turn."""
+
 import itertools
 import math
 
@@ -7,7 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trainer.scenarios.left_turn import LeftTurnPath
-from trainer.scenarios.picture import Rectangle, corners, overlap
+from trainer.scenarios.picture import (
+    COLUMNS,
+    EGO,
+    GROUND,
+    ROWS,
+    TRAFFIC,
+    Rasteriser,
+    Rectangle,
+    corners,
+    overlap,
+)
 
 CAR = Rectangle(0.0, 0.0, 0.0, 5.0, 2.0)
 
@@ -90,3 +102,82 @@ def test_highway_lanes_follow_the_path():
         assert tuple(middle) == pytest.approx((pose.x, pose.y), abs=1e-6)
         s_m += lane.length
     assert s_m == pytest.approx(21.0)
+
+
+view = Rasteriser(left_m=-20.0, top_m=-11.25, metres_per_pixel=0.5)
+roads = [Rectangle(0.0, 0.4, 0.0, 90.0, 7.3), Rectangle(3.0, 9.0, 1.5, 20.0, 8.0)]
+paved = Rasteriser(view.left_m, view.top_m, view.metres_per_pixel, roads)
+
+
+def _drawn(shape: Rectangle) -> np.ndarray:
+    picture = np.zeros((45, 80), np.float32)
+    view.draw(picture, shape, 1.0)
+    return picture
+
+
+@given(st.floats(-12, 12), st.floats(-6, 6), st.floats(-4, 4))
+def test_the_drawn_area_is_the_rectangles(x, y, heading):
+    area_m2 = _drawn(Rectangle(x, y, heading, 5.0, 2.0)).sum() * 0.25
+    assert area_m2 == pytest.approx(10.0, rel=0.06)
+
+
+@given(st.floats(-12, 12), st.floats(-6, 6), st.floats(-4, 4))
+def test_the_centre_of_mass_shows_movements_below_a_pixel(x, y, heading):
+    picture = _drawn(Rectangle(x, y, heading, 5.0, 2.0))
+    rows, columns = np.mgrid[:45, :80]
+    mass_x = (columns * picture).sum() / picture.sum() * 0.5 - 20.0 + 0.25
+    mass_y = (rows * picture).sum() / picture.sum() * 0.5 - 11.25 + 0.25
+    assert (mass_x, mass_y) == pytest.approx((x, y), abs=0.06)
+
+
+def test_what_lies_outside_leaves_no_trace_and_what_is_cut_off_no_error():
+    assert not _drawn(Rectangle(100.0, 0.0, 0.3, 5.0, 2.0)).any()
+    assert _drawn(Rectangle(-20.0, -11.0, 0.3, 5.0, 2.0)).any()
+
+
+def test_classes_are_told_apart_and_the_ego_car_is_on_top():
+    car = Rectangle(0.0, 0.0, 0.0, 5.0, 2.0)
+    frame = view.frame([car], car._replace(x=10.0))
+    assert frame.dtype == np.uint8
+    assert frame[22, 40] == TRAFFIC
+    assert frame[22, 60] == EGO
+    assert frame[0, 0] == GROUND
+    assert view.frame([car], car)[22, 40] == EGO
+    assert view.frame([], car._replace(heading=math.pi))[22, 40] == EGO
+
+
+def _plain_frame(traffic: list[Rectangle], ego: Rectangle) -> np.ndarray:
+    """One rectangle after another, each blended into the whole picture."""
+    picture = paved.background.copy()
+    x = view.left_m + (np.arange(COLUMNS) + 0.5) * view.metres_per_pixel
+    y = view.top_m + (np.arange(ROWS)[:, None] + 0.5) * view.metres_per_pixel
+    for shape, value in [*((car, TRAFFIC) for car in traffic), (ego, EGO)]:
+        cos, sin = math.cos(shape.heading), math.sin(shape.heading)
+        along = np.abs((x - shape.x) * cos + (y - shape.y) * sin)
+        across = np.abs((y - shape.y) * cos - (x - shape.x) * sin)
+        inside = np.ones_like(along)
+        for offset_m, side_m in ((along, shape.length), (across, shape.width)):
+            inside *= np.clip((0.5 * side_m - offset_m) / view.metres_per_pixel + 0.5, 0.0, 1.0)
+        picture += inside * (value - picture)
+    return (picture + 0.5).astype(np.uint8)
+
+
+def _cars(headings: st.SearchStrategy[float]) -> st.SearchStrategy[Rectangle]:
+    """Also outside the picture, across its edges, and into each other."""
+    sides = st.floats(2.0, 8.0), st.floats(0.8, 2.5)
+    return st.builds(Rectangle, st.floats(-26, 26), st.floats(-14, 14), headings, *sides)
+
+
+straight, turned = _cars(st.just(0.0)), _cars(st.floats(-4, 4))
+
+
+@given(st.lists(straight, max_size=11) | st.lists(straight | turned, max_size=4), turned)
+def test_cars_drawn_at_once_are_to_the_bit_those_drawn_one_after_another(traffic, ego):
+    assert np.array_equal(paved.frame(traffic, ego), _plain_frame(traffic, ego))
+
+
+@pytest.mark.parametrize("apart_m", [4.0, 5.0, 5.2, 5.5, 6.0])
+def test_cars_that_share_pixels_are_drawn_as_ever(apart_m):
+    traffic = [Rectangle(x, 0.1, 0.0, 5.0, 1.9) for x in (0.2, 0.2 + apart_m)]
+    ego = Rectangle(0.0, 9.0, 0.3, 5.0, 2.0)
+    assert np.array_equal(paved.frame(traffic, ego), _plain_frame(traffic, ego))

@@ -1,19 +1,21 @@
-"""The human model: what it learns from whom, and that it is kept."""
+"""The human beside the policy, when it takes over, and the human model that learns from it."""
 
 from dataclasses import replace
+from itertools import repeat
 
 import numpy as np
 import pytest
 import torch
 
 from edge_runtime.util import UserError
-from trainer.drivers import load_driver
+from trainer.drivers import EXPERTS, load_driver, make_environment
 from trainer.human.dagger import HumanTraining
+from trainer.human.guide import HumanGuide
 from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL
+from trainer.tests.humans import BRAKE, FULL, Brakes, objections
 
 LABELLED = HumanModelConfig(updates_per_episode=1, batch_size=8, label_every_step=True)
 
@@ -129,3 +131,63 @@ def test_a_model_of_one_scenario_does_not_drive_in_the_other(tmp_path):
     HumanModel(HumanModelConfig(), seed=1).save(tmp_path, {"scenario": "congestion"})
     with pytest.raises(UserError, match="trained in congestion, not in left_turn"):
         load_driver(str(tmp_path), LeftTurnEnv())
+
+
+ANYWHERE = repeat(True)
+
+
+class ScriptedTrigger:
+    def __init__(self, reasons, places=ANYWHERE):
+        self.reasons, self.places = iter(reasons), iter(places)
+
+    def reset(self):
+        pass
+
+    def judge(self, action):
+        return next(self.reasons)
+
+    def may_return(self):
+        return next(self.places)
+
+
+@pytest.mark.parametrize(("scenario", "drives"), [("left_turn", 20), ("congestion", 10)])
+def test_the_trigger_lets_the_expert_drive(scenario, drives):
+    """Or the policy would be punished for driving like the human: theorem 1's assumption."""
+    env = make_environment(scenario)
+    counted = objections(env, EXPERTS[scenario](env), drives)
+    assert counted == {"drives": drives, "arrived": drives, "objected_of_these": 0}
+
+
+def watch(reasons: list, places=ANYWHERE, **hold: int) -> list:
+    guide = HumanGuide(Brakes(), ScriptedTrigger(reasons, places), **hold)
+    observation = np.zeros((2, 45, 80), np.uint8)
+    return [guide.watch(observation, FULL) for _ in reasons]
+
+
+def test_the_wheel_is_not_given_back_in_the_lane():
+    none, in_lane, through = None, False, True
+    reasons = ["collision", none, none, none, none, none, none]
+    steps = watch(reasons, hold_steps=2, places=[in_lane, in_lane, through])
+    assert [step is not None for step in steps] == [True] * 4 + [False] * 3
+    assert {step.reason for step in steps if step} == {"collision"}
+
+
+def test_the_human_holds_on_and_only_the_first_step_is_an_intervention():
+    none, crash = None, "collision"
+    steps = watch([none, crash, none, none, none, crash, none, none, none], hold_steps=3)
+    in_control = [step is not None for step in steps]
+    assert in_control == [False, True, True, True, False, True, True, True, False]
+    assert [step.first for step in steps if step] == [True, False, False, True, False, False]
+    assert all(step.action is BRAKE for step in steps if step)
+
+
+def test_by_default_the_human_holds_for_a_second_and_a_half():
+    steps = watch(["collision", *[None] * 20])
+    assert [step is not None for step in steps] == [True] * 15 + [False] * 6
+
+
+def test_a_reason_that_lasts_prolongs_the_same_intervention():
+    steps = watch(["stuck", "stuck", "collision", None, None], hold_steps=2)
+    assert [step is not None for step in steps] == [True, True, True, True, False]
+    assert [step.first for step in steps if step] == [True, False, False, False]
+    assert {step.reason for step in steps if step} == {"stuck"}

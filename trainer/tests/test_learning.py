@@ -8,21 +8,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trainer.learner.config import PHIL
+from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.td3 import Losses
-from trainer.tests.filled import SMALL, fill, observation
 from trainer.tests.scripted import CONFIG, ScriptedEnv, scripted_run
 from trainer.training import run as run_module
 from trainer.training.learning import LearningThread
 
+SMALL = LearnerConfig(batch_size=8, replay_capacity=60, warmup_steps=1)
 PRIORITIES = np.full(SMALL.batch_size, 2.0)
+PICTURE = np.random.default_rng(1).integers(0, 255, (2, 45, 80)).astype(np.uint8)
 
 
 @pytest.fixture
 def learning():
-    """One that is filled, and whose learner is yet to be scripted."""
+    """One that is filled, with every third step the human's; its learner is yet to be scripted."""
     made: Any = LearningThread(SMALL, PHIL, 1, 1)
-    fill(made)
+    made.start_episode(PICTURE)
+    for step in range(20):
+        made.add(np.full(1, step / 20, np.float32), float(step % 5), PICTURE, False, step % 3 == 0)
     yield made
     made.close()
 
@@ -77,7 +80,7 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
         return np.zeros(1, np.float32)
 
     learning.learner.update, learning.learner.act = update, act
-    learning.act(observation(1))
+    learning.act(PICTURE)
     learning.begin(0.0)
     learning.finish()
     assert len(threads) == 2

@@ -7,7 +7,7 @@ import pytest
 
 from bridge.network import LatencySpec, parse_spec
 from trainer.drivers import make_environment
-from trainer.evaluate import drive_episode
+from trainer.evaluate import drive_episodes
 from trainer.training.delayed import (
     DelayedPolicy,
     DirectPolicy,
@@ -39,7 +39,7 @@ class Remote:
 
 
 class Kept:
-    """Stands for ``Learning``: keeps what would be learned, as the replay's chain would."""
+    """Stands for ``LearningThread``: keeps what would be learned, as the replay's chain would."""
 
     def __init__(self):
         self.rows: list[tuple] = []
@@ -99,17 +99,16 @@ def test_a_perfect_network_is_none_to_the_bit(scenario):
     env = make_environment(scenario)
     policy = Brightness()
     for seed in (0, 1):
-        bare = drive_episode(env, policy, seed)
         remote = Remote(policy, env, LatencySpec(), seed)
-        assert drive_episode(env, remote, seed) == bare
+        assert drive_episodes(env, remote, [seed]) == drive_episodes(env, policy, [seed])
 
 
 def test_a_delayed_driver_is_another_and_the_same_each_time():
     env = make_environment("left_turn")
     spec = parse_spec("100ms+-40ms,loss=5%")
-    first, again = (drive_episode(env, Brightness(), 3, latency=spec) for _ in range(2))
+    first, again = (drive_episodes(env, Brightness(), [3], latency=spec) for _ in range(2))
     assert first == again
-    assert first.actions != drive_episode(env, Brightness(), 3).actions
+    assert first[0].actions != drive_episodes(env, Brightness(), [3])[0].actions
 
 
 def test_a_reward_stands_beside_the_action_that_earned_it():

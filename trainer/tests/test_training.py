@@ -16,18 +16,15 @@ import torch
 from bridge.report import COLLISION
 from edge_runtime.cli import INTERRUPTED
 from edge_runtime.util import UserError
-from trainer import seeds
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE, load_actor
 from trainer.learner.config import LearnerConfig
-from trainer.learner.replay import ReplayBuffer
 from trainer.pictures import moving_average, write_learning_curve
-from trainer.training import validation
+from trainer.training import metrics as metrics_module
 from trainer.training.command import _quit as ask_to_quit
 from trainer.training.config import RunConfig
-from trainer.training.learning import LearningThread
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import TrainingRun
-from trainer.util import load_torch, save_torch
+from trainer.util import Purpose, episode_seed, load_torch, save_torch
 
 TINY = RunConfig(
     seed=3,
@@ -52,11 +49,6 @@ def actor_weights(run: TrainingRun) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in run.learning.learner.actor.parameters()])
 
 
-def replay(run: TrainingRun) -> ReplayBuffer:
-    assert isinstance(run.learning, LearningThread)
-    return run.learning.replay
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> TrainingRun:
     return train(TINY, tmp_path_factory.mktemp("run"))
@@ -75,31 +67,29 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
     assert list((directory / "tensorboard").iterdir())
     _, label = load_actor(directory)
     assert (label["scenario"], label["algorithm"], label["seed"]) == ("left_turn", "phil_td3", 3)
-
-
-def test_the_human_is_in_the_replay_buffer_and_in_the_metrics(trained):
-    human_steps = sum(int(row["human_steps"]) for row in read_metrics(trained.run_dir))
-    assert human_steps == replay(trained).human_count > 0
+    with (directory / "metrics.csv").open(newline="") as file:
+        assert len(list(csv.reader(file))) == 5
+    assert write_learning_curve(directory).read_bytes().startswith(b"\x89PNG")
+    human_steps = sum(int(row["human_steps"]) for row in rows)
+    assert human_steps == trained.learning.replay.human_count > 0
 
 
 def test_the_same_seed_gives_the_same_weights(trained, tmp_path):
-    again = train(TINY, tmp_path / "again")
+    again = train(TINY, tmp_path)
     assert torch.equal(actor_weights(trained), actor_weights(again))
 
 
 def test_a_run_in_two_parts_ends_with_the_same_weights_and_metrics(trained, tmp_path):
-    directory = tmp_path / "parts"
-    directory.mkdir()
-    first = TrainingRun(TINY, directory)
+    first = TrainingRun(TINY, tmp_path)
     first.train(lambda _: setattr(first, "quitting", True))
     assert first.episode == 2
-    resumed = train(TINY, directory, resume=True)
+    resumed = train(TINY, tmp_path, resume=True)
     assert torch.equal(actor_weights(trained), actor_weights(resumed))
-    for ours, whole in zip(read_metrics(directory), read_metrics(trained.run_dir), strict=True):
-        timed = {"environment_s", "acting_s", "storing_s", "learning_s", "waiting_s"}
-        assert {k: v for k, v in ours.items() if k not in timed} == {
-            k: v for k, v in whole.items() if k not in timed
-        }
+    parts, whole = (
+        [{k: v for k, v in row.items() if not k.endswith("_s")} for row in read_metrics(directory)]
+        for directory in (tmp_path, trained.run_dir)
+    )
+    assert parts == whole
 
 
 def command(directory: Path, *extra: str) -> list[str]:
@@ -161,15 +151,20 @@ def test_a_run_that_is_asked_to_end_keeps_all_its_episodes(tmp_path, whole):
     resume_and_compare(tmp_path, whole, *seldom)
 
 
-def test_who_quits_late_gets_one_more_episode_and_its_checkpoint(tmp_path):
+@pytest.mark.parametrize(("quits", "late_s", "episodes"), [(True, 1e9, 2), (False, -1.0, 1)])
+def test_who_quits_gets_one_more_episode_and_a_deadline_none_but_both_a_checkpoint(
+    quits, late_s, episodes, tmp_path
+):
     run = TrainingRun(replace(TINY, checkpoint_every=100), tmp_path)
 
-    def late(_: EpisodeMetrics) -> None:
-        run.quit()
+    def on_episode(_: EpisodeMetrics) -> None:
+        if quits:
+            run.quit()
 
-    run.train(late)
-    assert run.episode == 2
-    assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == 2
+    run.train(on_episode, deadline_s=time.monotonic() + late_s)
+    assert run.episode == episodes
+    assert load_torch(tmp_path / CHECKPOINT_FILE)["episode"] == episodes
+    assert (tmp_path / BEST_FILE).exists()
 
 
 def test_a_reader_of_stderr_that_is_gone_ends_no_training(tmp_path, monkeypatch):
@@ -197,19 +192,9 @@ def test_a_watched_run_that_is_told_twice_ends_at_once_with_its_recording(tmp_pa
 
 
 def test_an_unguided_algorithm_never_meets_the_human(tmp_path):
-    run = train(replace(TINY, algorithm="per_td3", episodes=2), tmp_path / "per")
-    assert replay(run).human_count == 0
+    run = train(replace(TINY, algorithm="per_td3", episodes=2), tmp_path)
+    assert run.learning.replay.human_count == 0
     assert all(row["interventions"] == "0" for row in read_metrics(run.run_dir))
-
-
-def test_a_deadline_ends_the_run_with_a_checkpoint(tmp_path):
-    directory = tmp_path / "late"
-    directory.mkdir()
-    run = TrainingRun(replace(TINY, checkpoint_every=100), directory)
-    run.train(deadline_s=time.monotonic() - 1)
-    assert run.episode == 1
-    assert load_torch(directory / CHECKPOINT_FILE)["episode"] == 1
-    assert (directory / BEST_FILE).exists()
 
 
 def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path, monkeypatch):
@@ -219,7 +204,7 @@ def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path
     def drive(*_, **__) -> list[SimpleNamespace]:
         return [SimpleNamespace(outcome=COLLISION, reward=rewards[next(episodes)], distance_m=1.0)]
 
-    monkeypatch.setattr(validation, "drive_together", drive)
+    monkeypatch.setattr(metrics_module, "drive_together", drive)
     train(TINY, tmp_path / "whole")
     parts = tmp_path / "parts"
     parts.mkdir()
@@ -233,18 +218,16 @@ def test_when_a_run_is_stopped_does_not_decide_which_actor_it_ends_with(tmp_path
         assert torch.equal(weights, resumed["actor"][name])
 
 
-def test_a_foreign_checkpoint_is_refused(tmp_path):
+def test_a_foreign_checkpoint_is_refused_and_a_pipe_not_waited_for(tmp_path):
     path = tmp_path / "x.pt"
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(UserError):
         load_torch(path)
     save_torch(path, {"a": torch.ones(2)})
     assert load_torch(path)["a"].tolist() == [1, 1]
-
-
-def test_learning_curve_is_a_picture(trained):
-    picture = write_learning_curve(trained.run_dir)
-    assert picture.read_bytes().startswith(b"\x89PNG")
+    os.mkfifo(tmp_path / CHECKPOINT_FILE)
+    with pytest.raises(UserError, match="no regular file"):
+        load_torch(tmp_path / CHECKPOINT_FILE)
 
 
 def test_moving_average_by_hand():
@@ -252,14 +235,9 @@ def test_moving_average_by_hand():
 
 
 def test_episode_seeds_never_meet_small_test_seeds():
-    drawn = [seeds.episode_seed(1, purpose, e) for purpose in range(4) for e in range(500)]
+    drawn = [episode_seed(1, purpose, e) for purpose in list(Purpose)[:4] for e in range(500)]
     assert min(drawn) >= 2**31
     assert len(set(drawn)) == len(drawn)
-
-
-def test_metrics_are_plain_csv(trained):
-    with (trained.run_dir / "metrics.csv").open(newline="") as file:
-        assert len(list(csv.reader(file))) == 5
 
 
 @pytest.mark.parametrize(("averaged", "name"), [(True, "target_actor"), (False, "actor")])
@@ -288,9 +266,3 @@ def test_what_is_kept_is_the_network_that_was_validated(averaged, name, tmp_path
             (tmp_path / BEST_FILE).unlink()
         kept = load_actor(tmp_path)[0].state_dict()
         assert all(torch.equal(kept[key], wanted[key]) for key in wanted)
-
-
-def test_a_checkpoint_that_is_a_pipe_is_refused_and_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / CHECKPOINT_FILE)
-    with pytest.raises(UserError, match="no regular file"):
-        load_torch(tmp_path / CHECKPOINT_FILE)

@@ -10,7 +10,7 @@ import pytest
 
 from edge_runtime.util import UserError
 from trainer.learner.config import LearnerConfig
-from trainer.tests.test_commands import call
+from trainer.tests.test_commands import refusal
 from trainer.util import (
     LOCK_FILE,
     SIGNALS,
@@ -28,8 +28,7 @@ def test_a_second_training_in_a_directory_is_refused(command, capsys, tmp_path):
     run_dir = tmp_path / "run"
     with claimed(run_dir):
         (run_dir / "metrics.csv").write_text("the first's")
-        status, out, err = call(capsys, command, "--out", str(run_dir), "--episodes", "1")
-        assert (status, out, len(err.splitlines())) == (2, "", 1)
+        err = refusal(capsys, command, "--out", str(run_dir), "--episodes", "1")
         assert f"{run_dir} is being trained in by process {os.getpid()} on " in err
     assert [path.name for path in run_dir.iterdir()] == ["metrics.csv"]
     assert (run_dir / "metrics.csv").read_text() == "the first's"
@@ -86,8 +85,7 @@ def test_a_lock_that_cannot_be_had_is_one_line(tmp_path):
 def test_a_human_model_is_not_written_over(capsys, tmp_path):
     (tmp_path / "human_model.pt").write_bytes(b"mine")
     (tmp_path / "nominal.json").write_text("{}")
-    status, out, err = call(capsys, "human", "--out", str(tmp_path), "--episodes", "1")
-    assert (status, out, len(err.splitlines())) == (2, "", 1)
+    err = refusal(capsys, "human", "--out", str(tmp_path), "--episodes", "1")
     assert "holds a human model; choose another --out" in err
     assert (tmp_path / "human_model.pt").read_bytes() == b"mine"
     assert len(list(tmp_path.iterdir())) == 2
@@ -114,22 +112,21 @@ def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number,
     assert [signal.getsignal(each) for each in SIGNALS] == before
 
 
-@pytest.mark.parametrize("offset", [0.0, -1e-3, 1e-45, float("inf"), float("nan")])
-def test_the_constant_that_keeps_transitions_drawable_is_above_zero(offset):
-    with pytest.raises(UserError, match=r"priority_offset = .* out of range: it must be above 0"):
-        LearnerConfig(priority_offset=offset)
-
-
 @pytest.mark.parametrize(
-    ("name", "value", "range_"),
+    ("name", "value", "said"),
     [
+        *(
+            ("priority_offset", offset, "it must be above 0")
+            for offset in (0.0, -1e-3, 1e-45, float("inf"), float("nan"))
+        ),
         ("gamma", 1.5, "0 to 1"),
         ("batch_size", 0, "at least 1"),
         ("intervention_penalty", float("nan"), "it must be a finite number"),
     ],
 )
-def test_what_is_out_of_range_is_told_the_range(name, value, range_):
-    with pytest.raises(UserError, match=f"{name} = {value} is out of range: {range_}"):
+def test_what_is_out_of_range_is_told_the_range(name, value, said):
+    """The offset keeps every transition drawable."""
+    with pytest.raises(UserError, match=rf"{name} = {value} is out of range: {said}"):
         LearnerConfig(**{name: value})
     LearnerConfig(priority_offset=1e-30, gamma=1.0, batch_size=1)
 
@@ -162,9 +159,6 @@ def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
         path.write_text("as committed")
 
 
-def test_outside_of_a_repository_it_is_unknown(tmp_path):
+def test_outside_of_a_repository_it_is_unknown_and_a_process_keeps_the_one_it_began_with(tmp_path):
     assert revision_of(tmp_path) == "unknown"
-
-
-def test_a_process_names_the_code_that_it_began_with():
     assert source_revision() is source_revision()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import importlib
 import math
 import os
 import sys
 import textwrap
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -22,20 +23,9 @@ from bridge.network import parse_spec
 from bridge.report import GOAL
 from edge_runtime.cli import INTERRUPTED, examples
 from edge_runtime.util import UserError, counted
+from trainer import options
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.learner.config import ALGORITHMS, LearnerConfig
-from trainer.options import (
-    add_fields,
-    add_latency,
-    add_scenario,
-    add_seed,
-    add_threads,
-    add_time_limit,
-    deadline_s,
-    meanings,
-    read_json,
-    set_threads,
-)
 from trainer.person.interface import HUMANS, PERSON, add_person, check_person_options
 from trainer.pictures import write_learning_curve
 from trainer.training.config import PRESETS, RunConfig
@@ -69,7 +59,7 @@ _ENDING = b"ending after this episode; a second time: at once, back to the last 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     what = parser.add_argument_group("what is trained")
-    add_scenario(what)
+    options.add_scenario(what)
     what.add_argument(
         "--algorithm",
         choices=list(ALGORITHMS),
@@ -77,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"the learner: {', '.join(ALGORITHMS)}",
     )
-    add_seed(what, "everything that is drawn at random")
-    add_fields(what, DEFAULTS, *EXTENT)
+    options.add_seed(what, "everything that is drawn at random")
+    options.add_fields(what, DEFAULTS, *EXTENT)
     what.add_argument(
         "--preset",
         choices=list(PRESETS),
@@ -94,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="change a setting, as often as you like; without a value: list all with their "
         "defaults and meanings",
     )
-    add_latency(what, "the network between policy and vehicle, also in validation")
+    options.add_latency(what, "the network between policy and vehicle, also in validation")
     guide = parser.add_argument_group("the human")
     guide.add_argument(
         "--human",
@@ -106,11 +96,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how = parser.add_argument_group("the run")
     how.add_argument("--out", required=True, metavar="RUN_DIR", help="the directory of the run")
     how.add_argument("--resume", action="store_true", help="go on from RUN_DIR's checkpoint")
-    add_time_limit(how, "stop after the episode that passes this time")
+    options.add_time_limit(how, "stop after the episode that passes this time")
     how.add_argument(
         "--device", choices=["cpu", "cuda"], default="cpu", help="where the learner computes"
     )
-    add_threads(how)
+    options.add_threads(how)
     how.add_argument(
         "--rerun",
         metavar="spawn|serve|F.rrd",
@@ -122,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Train, showing progress; returns the exit status."""
     if arguments.device == "cuda" and not torch.cuda.is_available():
         raise UserError("no CUDA device is available; use --device cpu")
-    set_threads(arguments.threads)
+    options.set_threads(arguments.threads)
     human = arguments.human
     if human != DEFAULTS.human and human not in HUMANS and not Path(human).exists():
         known = ", ".join([DEFAULTS.human, *HUMANS])
@@ -140,31 +130,47 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> int:
-    sink = _sink(arguments.rerun)
-    with _training(arguments, config, run_dir) as training:
-        end_s = deadline_s(arguments)
+    view: Any = None
+    if arguments.rerun is not None:
+        view = importlib.import_module("trainer.view")
+        sink = view.check_word(arguments.rerun)
+    with ExitStack() as stack:
+        training: TrainingRun
+        if arguments.human in HUMANS:
+            from trainer.person.run import training_with_person
+
+            training = stack.enter_context(training_with_person(arguments, config, run_dir))
+        else:
+            check_person_options(arguments)
+            training = TrainingRun(config, run_dir, arguments.resume)
+        end_s = options.deadline_s(arguments)
         extent = (
             (config.steps, training.steps) if config.steps else (config.episodes, training.episode)
         )
-        with (
-            ProgressBar("training", *extent) as bar,
-            _watched(training, sink) as watch,
-            # The last: behind the first signal is what a viewer makes of them.
-            quit_on_signals(partial(_quit, training)),
-        ):
-            recent: deque[EpisodeMetrics] = deque(maxlen=20)
-            validation = "-"
+        bar = stack.enter_context(ProgressBar("training", *extent))
+        watch = stack.enter_context(view.watched(training, sink)) if view else None
+        # The last: behind the first signal is what a viewer makes of them.
+        stack.enter_context(quit_on_signals(partial(_quit, training)))
+        recent: deque[EpisodeMetrics] = deque(maxlen=20)
+        validation = "-"
 
-            def on_episode(metrics: EpisodeMetrics) -> None:
-                nonlocal validation
-                recent.append(metrics)
-                if not math.isnan(metrics.validation_success):
-                    validation = f"{metrics.validation_success:.2f}"
-                figures = {**_means(recent), "validation": validation}
-                bar.advance(figures, metrics.steps if config.steps else 1)
+        def on_episode(metrics: EpisodeMetrics) -> None:
+            nonlocal validation
+            recent.append(metrics)
+            if not math.isnan(metrics.validation_success):
+                validation = f"{metrics.validation_success:.2f}"
+            count = len(recent)
+            figures = {
+                "return": f"{sum(m.episode_return for m in recent) / count:.1f}",
+                "distance": f"{sum(m.distance_m for m in recent) / count:.1f} m",
+                "success": f"{sum(m.outcome == GOAL for m in recent) / count:.2f}",
+                "validation": validation,
+            }
+            bar.advance(figures, metrics.steps if config.steps else 1)
+            if watch:
                 watch(metrics)
 
-            training.train(on_episode, end_s)
+        training.train(on_episode, end_s)
     if training.episode:  # a person may quit before the first
         write_learning_curve(run_dir)
     print(f"{_summary(run_dir)}: {run_dir}")
@@ -172,52 +178,6 @@ def _train(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> i
         print("interrupted; the same command with --resume goes on", file=sys.stderr)
         return INTERRUPTED
     return 0
-
-
-def _means(episodes: Collection[EpisodeMetrics]) -> dict[str, str]:
-    """What the progress bar shows of the last episodes."""
-    count = len(episodes)
-    return {
-        "return": f"{sum(m.episode_return for m in episodes) / count:.1f}",
-        "distance": f"{sum(m.distance_m for m in episodes) / count:.1f} m",
-        "success": f"{sum(m.outcome == GOAL for m in episodes) / count:.2f}",
-    }
-
-
-@contextmanager
-def _training(
-    arguments: argparse.Namespace, config: RunConfig, run_dir: Path
-) -> Iterator[TrainingRun]:
-    """The run, and the person in it where one guides."""
-    if arguments.human in HUMANS:
-        from trainer.person.run import training_with_person
-
-        with training_with_person(arguments, config, run_dir) as guided:
-            yield guided
-    else:
-        check_person_options(arguments)
-        yield TrainingRun(config, run_dir, arguments.resume)
-
-
-def _sink(word: str | None) -> Any:
-    """Where ``--rerun`` shows the run; None, and nothing imported, where it is not asked for."""
-    if word is None:
-        return None
-    from trainer.view import check_word
-
-    return check_word(word)
-
-
-@contextmanager
-def _watched(training: TrainingRun, sink: Any) -> Iterator[Callable[[EpisodeMetrics], None]]:
-    """Show the run for as long as it lasts; what it yields is to be called after each episode."""
-    if sink is None:
-        yield lambda metrics: None
-        return
-    from trainer.view import watched
-
-    with watched(training, sink) as on_episode:
-        yield on_episode
 
 
 def _quit(training: TrainingRun) -> bool:
@@ -234,14 +194,10 @@ def _summary(run_dir: Path) -> str:
     found = totals(read_metrics(run_dir))
     if not found:
         return "no episodes"
-    parts = [
-        counted(found["episodes"], "episode"),
-        counted(found["steps"], "step"),
-        counted(found["updates"], "update"),
-        f"{counted(found['takeovers'], 'take-over')} with {counted(found['human_steps'], 'step')}",
-        counted(sum(found["failures"].values()), "failure"),
-    ]
-    return ", ".join(parts)
+    amounts = [counted(found[f"{name}s"], name) for name in ("episode", "step", "update")]
+    steps = counted(found["human_steps"], "step")
+    human = f"{counted(found['takeovers'], 'take-over')} with {steps}"
+    return ", ".join([*amounts, human, counted(sum(found["failures"].values()), "failure")])
 
 
 class _Set(argparse.Action):
@@ -267,7 +223,7 @@ def settings() -> dict[str, Any]:
 
 def setting_lines() -> Iterator[str]:
     """Every setting as it is typed by default, and what it means."""
-    said = meanings(RunConfig) | meanings(LearnerConfig)
+    said = options.meanings(RunConfig) | options.meanings(LearnerConfig)
     for name, default in settings().items():
         typed = str(default).lower() if isinstance(default, bool) else str(default)
         begin, indent = f"  {f'{name}={typed}':<33} ", 36 * " "
@@ -311,7 +267,7 @@ def check_directory(run_dir: Path, config: RunConfig, resume: bool) -> None:
 
 def _check_settings(run_dir: Path, config: RunConfig) -> None:
     path = run_dir / CONFIG_FILE
-    saved, wanted = _flat(read_json(path, "run config")), _flat(config.as_dict())
+    saved, wanted = _flat(options.read_json(path, "run config")), _flat(config.as_dict())
     if not all(isinstance(saved.get(name), int) for name in EXTENT):
         raise UserError(f"run config {path} does not say how many episodes and steps")
     changed = []

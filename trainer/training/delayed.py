@@ -20,14 +20,12 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bridge.network import LatencySpec
 from bridge.virtual_link import COMMAND_WINDOW_S, ROUNDING_S, VirtualLink
 from edge_runtime.wire import CONTROL_PERIOD_S, DRIVE, Command
+from trainer.human.guide import Action, Observation
 
-Observation = NDArray[np.uint8]
-Action = NDArray[np.float32]
 Policy = Callable[[Observation], Action]
 
 
@@ -85,17 +83,11 @@ class VehicleEnd:
 
 
 def _command(step: int, action: Action) -> Command:
+    """As an edge runtime's, as far as a virtual link looks at it."""
     return Command(
-        session="",
-        episode=0,
-        step=step,
-        mode=DRIVE,
-        action=[float(value) for value in action],
-        policy_id="",
-        received_ns=0,
-        inference_ns=0,
-        sent_ns=0,
-    )
+        session="", episode=0, step=step, mode=DRIVE, action=action.tolist(), policy_id="",
+        received_ns=0, inference_ns=0, sent_ns=0,
+    )  # fmt: skip
 
 
 class Store(Protocol):
@@ -120,8 +112,7 @@ class Store(Protocol):
 class DirectPolicy:
     """A policy as the training loop has it, without a network: it acts on what is there.
 
-    Args:
-        store: where each tick goes as a transition.
+    Each tick goes to ``store`` as a transition.
     """
 
     def __init__(self, store: Store) -> None:

@@ -12,63 +12,17 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from edge_runtime.util import UserError
-from trainer import seeds
+from trainer.human.guide import Action, Observation
 from trainer.learner.config import Algorithm, LearnerConfig
 from trainer.learner.replay import Batch, ReplayBuffer
 from trainer.learner.td3 import Losses, TD3Learner, charges_overruled
-from trainer.training.delayed import Store
-
-Observation = NDArray[np.uint8]
-Action = NDArray[np.float32]
-
-
-class Learning(Store, Protocol):
-    """What a training loop asks of a learner with its replay buffer, wherever they are."""
-
-    @property
-    def added(self) -> int:
-        """Transitions stored since the run began."""
-
-    @property
-    def learner(self) -> TD3Learner:
-        """The networks, as of the last finished update."""
-
-    def act(self, observation: Observation) -> Action:
-        """The actor's action, float32 [action size]; not while updating."""
-
-    def act_together(self, observations: Observation, averaged: bool) -> Action:
-        """The actor's actions, or the target actor's, [n, action size]; not while updating."""
-
-    def begin(self, beta: float) -> None:
-        """Start an update on what is stored; ``beta`` is eq. 15's exponent."""
-
-    def finish(self) -> float:
-        """Wait until the update that was begun is done, if one was; the seconds waited.
-
-        FloatingPointError: what it has learned is not finite; it may come out later, too.
-        """
-
-    def end_episode(self, progress: float) -> EpisodeLearning:
-        """What was learned since the last call; learning rates fall.
-
-        ``progress`` is the share of the run that is over. FloatingPointError: it is not finite.
-        """
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that is needed to go on."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave."""
-
-    def close(self) -> None:
-        """Let go of threads and memory."""
+from trainer.util import Purpose, random_stream
 
 
 @dataclass(frozen=True)
@@ -89,11 +43,11 @@ NO_LOSSES = (math.nan,) * 4
 
 
 class LearningThread:
-    """``Learning`` whose updates run in a thread of their own.
+    """A learner with its replay buffer; the updates run in a thread of their own.
 
     The policy acts in that thread, too, in validation as well: another would bring a second pool
-    of OpenMP threads, and the two would fight for the same cores. Only a human who is a network
-    acts in the loop's thread, beside the update: a batch of one, which takes that thread alone.
+    of OpenMP threads, and the two would fight for the same cores. Only a human model acts in the
+    loop's thread, beside the update: a batch of one needs no other thread.
 
     Args:
         config: hyper-parameters.
@@ -131,7 +85,7 @@ class LearningThread:
                 f"there is no memory for a replay buffer of {config.replay_capacity} "
                 "transitions: --set replay_capacity=N, a smaller one"
             ) from None
-        self._random = seeds.stream(seed, seeds.REPLAY)
+        self._random = random_stream(seed, Purpose.REPLAY)
         self._thread = ThreadPoolExecutor(1, "learner")
         self._begun: tuple[Batch, Future[tuple[Losses, float]]] | None = None
         self._forget_episode()

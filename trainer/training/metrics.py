@@ -1,7 +1,11 @@
-"""A run's metrics: what an episode adds up, as one row of CSV and of TensorBoard."""
+"""What a run is worth: its episodes as rows of CSV and of TensorBoard, and its policy alone.
+
+Validation drives on seeds of their own, without help; the best actor is kept.
+"""
 
 from __future__ import annotations
 
+import copy
 import csv
 import io
 from collections import Counter
@@ -11,11 +15,18 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
-from bridge.report import GOAL
+from bridge.network import LatencySpec
+from bridge.report import GOAL, EpisodeResult
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError, read_bytes
+from trainer.drivers import BEST_FILE, TogetherDriver, make_environment
+from trainer.evaluate import NO_NETWORK, drive_episodes, drive_together
+from trainer.training.config import RunConfig
+from trainer.training.learning import LearningThread
+from trainer.util import Purpose, episode_seed, save_torch
 
 NAN = float("nan")
 METRICS_FILE, REPORT_FILE = "metrics.csv", "report.json"
@@ -132,33 +143,23 @@ def read_metrics(run_dir: Path) -> list[dict[str, str]]:
 
 
 def _rows(text: str) -> list[dict[str, str]]:
-    """Of the whole lines; ValueError where one is not as ``MetricsWriter`` has it."""
+    """The rows of the whole lines; ValueError where one is not as ``MetricsWriter`` writes it."""
     lines = text.splitlines(keepends=True)
     if lines and not lines[-1].endswith(("\r", "\n")):
         lines.pop()
     reader = csv.DictReader(lines, strict=True)
-    names = reader.fieldnames or []
-    if not {*ALWAYS, "outcome"} <= set(names) <= set(NAMES):
+    if not {*ALWAYS, "outcome"} <= set(reader.fieldnames or []) <= set(NAMES):
         raise ValueError("its columns are others")
     rows = list(reader)
     for number, row in enumerate(rows, start=1):
-        if not _whole(row):
-            raise ValueError(f"row {number} is broken")
+        try:
+            int(row["episode"])
+            for name, value in row.items():  # None stands for a column too few or too many.
+                if name in ALWAYS or (value != "" and name != "outcome"):
+                    float(value)
+        except (ValueError, TypeError):
+            raise ValueError(f"row {number} is broken") from None
     return rows
-
-
-def _whole(row: dict[str, str]) -> bool:
-    """Whether a row has a value in each column, and a number wherever there must be one."""
-    if None in row or None in row.values():  # More of them than columns, or fewer.
-        return False
-    try:
-        int(row["episode"])
-        for name, value in row.items():
-            if name in ALWAYS or (value and name != "outcome"):
-                float(value)
-    except ValueError:
-        return False
-    return True
 
 
 def totals(rows: Sequence[dict[str, str]]) -> dict[str, Any]:
@@ -189,3 +190,69 @@ def totals(rows: Sequence[dict[str, str]]) -> dict[str, Any]:
         "failures": dict(sorted(failures.items())),
         "validation": validation,
     }
+
+
+class Validation:
+    """Drives the policy as it stands, without help, and keeps the best actor so far.
+
+    It drives over the same ``network`` as the training.
+    """
+
+    def __init__(
+        self, config: RunConfig, run_dir: Path, learning: LearningThread, network: LatencySpec
+    ) -> None:
+        self.config, self.run_dir = config, run_dir
+        self.learning, self.network = learning, network
+        self._seeds = [
+            episode_seed(config.seed, Purpose.VALIDATION, run)
+            for run in range(config.evaluation_runs)
+        ]
+        self.envs = [
+            make_environment(config.scenario, printed_reward=config.printed_reward)
+            for _ in self._seeds
+        ]
+        self.best = (-1.0, -1.0)
+        """Success and return of the best actor of those validated when it was due."""
+        self._best_actor: dict[str, Any] | None = None
+        """As in its file; None before the first one."""
+
+    def judge(self, metrics: EpisodeMetrics, episode: int, due: bool = True) -> None:
+        """Add to ``metrics`` how the policy drives after ``episode`` episodes.
+
+        One that was not ``due``, since the run stops early, may be kept as the best so far, but a
+        resumed run forgets it: which actor a run ends with must not depend on when it was stopped.
+        """
+        results = self._drive()
+        success = float(np.mean([result.outcome == GOAL for result in results]))
+        reward = float(np.mean([result.reward for result in results]))
+        metrics.validation_success, metrics.validation_reward = success, reward
+        metrics.validation_distance_m = float(np.mean([result.distance_m for result in results]))
+        if (success, reward) >= self.best:
+            state = self._keep(episode)
+            if due:
+                self.best, self._best_actor = (success, reward), copy.deepcopy(state)
+
+    def _drive(self) -> list[EpisodeResult]:
+        driver = TogetherDriver(
+            lambda seen: self.learning.act_together(seen, self.config.averaged_actor)
+        )
+        if self.network == NO_NETWORK:
+            return drive_together(self.envs, driver.act_together, self._seeds)
+        return drive_episodes(self.envs[0], driver, self._seeds, latency=self.network)
+
+    def _keep(self, episode: int) -> dict[str, Any]:
+        actor = getattr(self.learning.learner, self.config.kept_actor)
+        state = {**self.config.label(episode), "actor": actor.state_dict()}
+        save_torch(self.run_dir / BEST_FILE, state)
+        return state
+
+    def state_dict(self) -> dict[str, Any]:
+        """Its part of a checkpoint."""
+        return {"best_validation": self.best, "best_actor": self._best_actor}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave, and keep that actor again."""
+        self.best = tuple(state["best_validation"])
+        self._best_actor = state["best_actor"]
+        if self._best_actor is not None:
+            save_torch(self.run_dir / BEST_FILE, self._best_actor)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from bridge.network import parse_spec
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
-from trainer import seeds
 from trainer.drivers import CHECKPOINT_FILE, EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import Guide, HumanGuide, Intervention
 from trainer.learner import equations
@@ -24,16 +23,23 @@ from trainer.learner.config import ALGORITHMS, HUMANS_ACTION
 from trainer.learner.td3 import TD3Learner
 from trainer.training.config import BIASED, RunConfig
 from trainer.training.delayed import behind
-from trainer.training.learning import Action, Learning, LearningThread
+from trainer.training.learning import Action, LearningThread
 from trainer.training.metrics import (
     REPORT_FILE,
     EpisodeMetrics,
     MetricsWriter,
+    Validation,
     read_metrics,
     totals,
 )
-from trainer.training.validation import Validation
-from trainer.util import load_torch, save_torch, source_revision
+from trainer.util import (
+    Purpose,
+    episode_seed,
+    load_torch,
+    random_stream,
+    save_torch,
+    source_revision,
+)
 
 NETWORKS = ("actor", "critics", "target_actor", "target_critics")
 
@@ -62,7 +68,7 @@ def finite_action(action: Action) -> Action:
 
 
 def check_weights(learner: TD3Learner) -> None:
-    """Raise FloatingPointError unless every weight is finite: a checkpoint without is worthless."""
+    """Raise FloatingPointError unless every weight is finite: no such checkpoint is kept."""
     for name in NETWORKS:
         for parameter in getattr(learner, name).parameters():
             if not parameter.isfinite().all():
@@ -71,7 +77,7 @@ def check_weights(learner: TD3Learner) -> None:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the loop knows of it once it is stored; nothing in it changes afterwards."""
+    """One control period, once it is stored; nothing in it changes afterwards."""
 
     observation: NDArray[np.uint8]
     """s, [2, 45, 80]."""
@@ -85,21 +91,13 @@ class Seen:
 
 
 OnStep = Callable[[Seen], None]
-
-
 CONFIG_FILE = "config.json"
 WRONG_ACTIONS = {"left_turn": 1.0, "congestion": 0.5}
 """What a human of biased guidance does whenever wrong: full throttle; half of the full angle."""
 
 
 class TrainingRun:
-    """Trains for some episodes and keeps everything in a directory.
-
-    Args:
-        config: what to train.
-        run_dir: where config, metrics, checkpoint and the best actor go.
-        resume: go on from the checkpoint in ``run_dir``.
-    """
+    """Trains for some episodes; settings, metrics, checkpoint and best actor go to ``run_dir``."""
 
     def __init__(self, config: RunConfig, run_dir: Path, resume: bool = False) -> None:
         self.config, self.run_dir = config, run_dir
@@ -113,11 +111,11 @@ class TrainingRun:
         self.validation = Validation(config, run_dir, self.learning, self.network)
         self.policy = behind(self.network, self.learning, self.env)
         self.guide = self._make_guide()
-        self.exploration = seeds.stream(config.seed, seeds.EXPLORATION)
-        self.guidance = seeds.stream(config.seed, seeds.GUIDANCE)
+        self.exploration = random_stream(config.seed, Purpose.EXPLORATION)
+        self.guidance = random_stream(config.seed, Purpose.GUIDANCE)
         self.episode = self.steps = 0
         self.on_step: OnStep | None = None
-        """Called at the end of each control period, if anybody looks on."""
+        """Called at the end of each control period, where the run is watched."""
         self.quitting = False
         """The episode under way is to be the last of this call."""
         if resume:
@@ -197,7 +195,7 @@ class TrainingRun:
         )
 
     def _more_state(self) -> dict[str, Any]:
-        """What another kind of run needs to go on, besides."""
+        """What a subclass adds to the checkpoint."""
         return {}
 
     def _load(self) -> None:
@@ -218,8 +216,8 @@ class TrainingRun:
         """Whether the episode just driven is the last of this call."""
         return time.monotonic() > deadline_s
 
-    def _around(self, learning: LearningThread) -> Learning:
-        """What the loop asks in the learner's place."""
+    def _around(self, learning: LearningThread) -> LearningThread:
+        """The learner, or what a subclass puts around it."""
         return learning
 
     def _make_guide(self) -> Guide | None:
@@ -232,7 +230,7 @@ class TrainingRun:
 
     def _episode(self) -> EpisodeMetrics:
         config, metrics = self.config, EpisodeMetrics(self.episode)
-        seed = seeds.episode_seed(config.seed, seeds.TRAINING, self.episode)
+        seed = episode_seed(config.seed, Purpose.TRAINING, self.episode)
         observation, info = self.env.reset(seed=seed)
         self.policy.start(observation, seed)
         self._drawn = np.zeros(self.env.action_space.shape)
