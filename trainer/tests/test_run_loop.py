@@ -92,7 +92,7 @@ def test_beta_falls_to_zero_over_the_episodes(tmp_path, importance_sampling, bet
 
 
 def test_learning_rates_fall_once_an_episode(tmp_path):
-    learner = replace(LEARNER, learning_rate_decay=0.9)
+    learner = replace(LEARNER, actor_learning_rate=2e-4, learning_rate_decay=0.9)
     run = scripted_run(tmp_path, replace(CONFIG, episodes=2, learner=learner), length=3)
     rates = []
     run.train(
