@@ -152,7 +152,7 @@ class Plan:
     """Hyper-parameters changed for every algorithm alike."""
 
 
-PLAN = Plan(steps={"left_turn": 6_000, "congestion": 8_000})
+PLAN = Plan(steps={"left_turn": 6_000, "congestion": 6_000})
 QUICK = Plan(
     steps={"left_turn": 250, "congestion": 250},
     evaluate_every_steps=100,

@@ -125,7 +125,7 @@ class LearnerConfig:
     """Exact eq. 22 and 23: separate means over policy and human samples. Off: one mean over the
     batch, as in the authors' code, since the exact form gives a handful of demonstrations half of
     the critic's loss."""
-    cloning_weight: float = 10.0
+    cloning_weight: float = 20.0
     """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). Chosen
     on single runs, in which a small weight let the policy forget the human before the critic knew
     better."""
