@@ -36,17 +36,19 @@ from edge_runtime.tests.harness import Simulator, make_state, wait_until
 RUN = "edge_runtime/run.py"
 MOCK = "edge_runtime/vehicles/mock.py"
 WITH_VEHICLE = """\
-                if self._config.vehicle != "none":
-                    import threading
-
-                    threading.Timer(0.3, os._exit, (5,)).start()
-                self.loop.run()"""
-RUNS = "                self.loop.run()"
+            if config.vehicle != "none":
+                threading.Timer(0.3, os._exit, (5,)).start()
+            loop.run()"""
+RUNS = "            loop.run()"
 FAULTS = {
     "it answers for a while, then ends": (RUN, RUNS, WITH_VEHICLE),
     "it cannot open the vehicle": (MOCK, "self._commanded_s = -math.inf", "1 / 0"),
-    "it never says that it is ready": (RUN, "self._say_ready()", "pass"),
-    "it ends as soon as it is ready": (RUN, RUNS, RUNS.replace("self.loop.run()", "os._exit(3)")),
+    "it never says that it is ready": (RUN, "ready vehicle_id", "almost vehicle_id"),
+    "it ends as soon as it is ready": (
+        RUN,
+        RUNS,
+        RUNS.replace("loop.run()", "os._exit(3)"),
+    ),
 }
 
 

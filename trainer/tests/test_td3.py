@@ -122,7 +122,7 @@ def test_an_update_is_the_papers_losses_and_plain_adam(split):
     policy_loss = -(policy_values[~human] if split else policy_values).mean()
     cloning_loss = ((policy - actions) ** 2)[human].mean()
     actor_gradients = torch.autograd.grad(
-        policy_loss + 10.0 * cloning_loss, list(learner.actor.parameters())
+        policy_loss + config.cloning_weight * cloning_loss, list(learner.actor.parameters())
     )
     before = weights_of(learner)
     with torch.no_grad():

@@ -9,13 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from edge_runtime.util import UserError
 from trainer.drivers import CHECKPOINT_FILE
 from trainer.person.recording import DIRECTORY, Step, read_steps, sittings
 from trainer.person.takeover import MAX_SLEW
@@ -80,7 +81,9 @@ class Training:
 def newest_sitting(run_dir: Path) -> list[Step]:
     """The steps of the sitting that is going on, or was last."""
     there = sittings(run_dir / DIRECTORY)
-    return list(read_steps(there[-1])) if there else []
+    with suppress(UserError):  # one that has just begun is an empty file
+        return list(read_steps(there[-1])) if there else []
+    return []
 
 
 def all_in_replay(run_dir: Path) -> list[Step]:
