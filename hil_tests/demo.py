@@ -25,9 +25,9 @@ GOOD_SUCCESS = 0.8
 """What the drives without latency should reach."""
 FIRST_SEED = 0
 RECORDED_RUNS = 2
-TRAINING_EPISODES = 150
+TRAINING_STEPS = 1500
 HUMAN_MINUTES = 1.5
-"""With them, the training and what follows a demo takes eight at most, on a slow machine, too."""
+"""With them, a demo takes eight at most, on a slow machine, too."""
 TRAINING_MINUTES = 4.5
 
 EXAMPLE = examples(
@@ -44,8 +44,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     for name, kind, default, text in (
         ("--seed", not_negative, 1, "of the training"),
-        ("--episodes", positive, TRAINING_EPISODES, "of the PHIL-TD3 training, at most"),
-        ("--human-episodes", positive, 60, "of the human model's training"),
+        ("--steps", positive, TRAINING_STEPS, "environment steps of the PHIL-TD3 training"),
+        ("--human-episodes", positive, 40, "of the human model's training"),
         ("--human-minutes", positive_number, HUMAN_MINUTES, "limit of the human model's training"),
         ("--minutes", positive_number, TRAINING_MINUTES, "limit of the PHIL-TD3 training"),
         ("--runs", positive, RUNS, "test episodes of each drive"),
@@ -139,7 +139,7 @@ class Demo:
         heading("2  PHIL-TD3 learns to drive; the human model takes over when it must")
         run_command(
             "trainer", "train", "--human", str(self.human_dir), "--out", str(self.run_dir),
-            "--seed", seed, "--episodes", str(arguments.episodes),
+            "--seed", seed, "--steps", str(arguments.steps),
             "--max-minutes", f"{arguments.minutes:g}", "--set", "batch_size=64",
             "--set", "evaluate_every_steps=500", "--set", "evaluation_runs=30", *resume,
         )  # fmt: skip

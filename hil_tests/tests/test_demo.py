@@ -16,7 +16,7 @@ from hil_tests.demo import Demo
 from hil_tests.processes import Process
 
 SMALL = (
-    "--episodes", "2", "--human-episodes", "20", "--human-minutes", "0.001", "--runs", "1",
+    "--steps", "100", "--human-episodes", "20", "--human-minutes", "0.001", "--runs", "1",
     "--minutes", "1",
 )  # fmt: skip
 
@@ -30,7 +30,7 @@ def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(
         [sys.executable, "-m", "hil_tests", *words],
         capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False,
     )  # fmt: skip
-    # A policy of two episodes may well drive badly (status 1); anything else is a fault.
+    # A policy of a hundred steps may well drive badly (status 1); anything else is a fault.
     assert first.returncode in (0, 1), first.stderr
     made = {path.name for path in (tmp_path / "demo").iterdir()}
     assert made >= {
