@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import socket
+import socketserver
 import threading
 import time
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
 from edge_runtime.run import Waiting
-from edge_runtime.transport import free_endpoint, look, open_session
+from edge_runtime.transport import look, open_session
 from edge_runtime.util import UserError
 from edge_runtime.wire import Health
 
@@ -24,6 +24,7 @@ HEALTH = Health(
     accepted=0, superseded=0, rejected={}, deadline_misses=0, safe_stops=0, policy_id="p",
     inference_ms={}, uptime_s=0.0, sent_ns=0,
 )  # fmt: skip
+NO_MANIFEST: Any = None
 
 
 class FakeSession:
@@ -61,9 +62,9 @@ class FakeSession:
             raise OSError("gone")
 
 
-def make_presence(session: Any, give_way: Any = None, open_client: Any = None) -> Presence:
+def make_presence(session: Any, calls: Any = None, open_client: Any = None) -> Presence:
     client: Any = open_client or Router().open
-    return Presence(session, "k", client, give_way or (lambda: None))
+    return Presence(session, "k", client, lambda: calls.append("way"))
 
 
 def test_the_tokens_are_declared_again_for_each_router_that_comes():
@@ -96,19 +97,18 @@ class Router:
 
 def test_the_younger_of_two_gives_way_at_the_second_look():
     router, calls = Router(), []
-    presence = make_presence(FakeSession(), lambda: calls.append("way"), router.open)
+    presence = make_presence(FakeSession(), calls, router.open)
     router.tokens = [f"k/{presence.claim}", "k/0000000000000001-elder"]
     presence.look()
     assert calls == []  # it may be the leftover of a lost connection
     presence.look()
     presence.look()
-    assert calls == ["way"]
-    assert presence.rivals == 1
+    assert (calls, presence.rivals) == (["way"], 1)
 
 
 def test_the_elder_of_two_goes_on_and_counts():
     router, calls = Router(), []
-    presence = make_presence(FakeSession(), lambda: calls.append("way"), router.open)
+    presence = make_presence(FakeSession(), calls, router.open)
     for claim in ("f" * 16, "f" * 16, "e" * 16, "f" * 16, "e" * 16, "e" * 16):
         router.tokens = [f"k/{presence.claim}", f"k/{claim}"]
         presence.look()
@@ -127,16 +127,10 @@ def test_nobody_there_is_nobody_else():
     assert require_free(Router().open, "hunter01")
 
 
-def make_link(session: Any) -> Link:
-    manifest: Any = None
-    return Link(session, "hunter01", manifest)
-
-
 def test_a_link_that_gave_way_sends_nothing():
-    session = FakeSession()
-    link = make_link(session)
+    session: Any = FakeSession()
+    link = Link(session, "hunter01", NO_MANIFEST)
     link.send("health", HEALTH)
-    assert session.sent == 1
     link.gave_way = True
     link.send("health", HEALTH)
     assert session.sent == 1
@@ -153,22 +147,24 @@ def test_only_a_query_by_its_own_name_re_arms():
         calls.append("rearm")
         return ""
 
-    make_link(session).declare(lambda payload: None, lambda: HEALTH, rearm)
+    link = Link(session, "hunter01", NO_MANIFEST)
+    link.declare(lambda payload: None, lambda: HEALTH, rearm)
+
+    def ask(selector: str) -> None:
+        query = SimpleNamespace(key_expr=selector, reply=lambda *_, **__: None)
+        asked["phil/hunter01/rearm"](query)
+
     for selector in ("phil/**", "phil/*/rearm", "phil/hunter01/*", "phil/hunter01/re$*"):
-        asked["phil/hunter01/rearm"](query_of(selector))
+        ask(selector)
     assert calls == []  # somebody looked at everything that is there
-    asked["phil/hunter01/rearm"](query_of("phil/hunter01/rearm"))
+    ask("phil/hunter01/rearm")
     assert calls == ["rearm"]
 
 
-def query_of(selector: str) -> Any:
-    return SimpleNamespace(key_expr=selector, reply=lambda *_, **__: None)
-
-
 def test_the_session_is_closed_even_where_nothing_can_be_undeclared():
-    session = FakeSession(fails=True)
+    session: Any = FakeSession(fails=True)
     with pytest.raises(OSError, match="gone"):
-        make_link(session).close()
+        Link(session, "hunter01", NO_MANIFEST).close()
     assert session.events[-1] == "close"
 
 
@@ -189,19 +185,17 @@ def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
 
 @contextlib.contextmanager
 def server(answer):
-    """Accepts on loopback and answers each connection with these bytes, then closes it."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
+    """Answers each connection with these bytes, then closes it."""
 
-        def run():
-            with contextlib.suppress(OSError):
-                while True:
-                    link, _ = listening.accept()
-                    with link:
-                        link.recv(1)
-                        link.sendall(answer)
+    class Answers(socketserver.BaseRequestHandler):
+        def handle(self):
+            self.request.recv(1)
+            self.request.sendall(answer)
 
-        threading.Thread(target=run, daemon=True).start()
-        yield f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+    with socketserver.TCPServer(("127.0.0.1", 0), Answers) as listening:
+        threading.Thread(target=listening.serve_forever, daemon=True).start()
+        yield f"tcp/127.0.0.1:{listening.server_address[1]}"
+        listening.shutdown()
 
 
 def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
@@ -213,42 +207,45 @@ def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
         open_session(listen="tcp/a..b:7447", mode="router")
 
 
-def test_a_port_where_nobody_listens():
-    endpoint = free_endpoint()
-    port = endpoint.rsplit(":", 1)[1]
-    words = f"nobody listens on port {port} of 127.0.0.1 (connection refused)"
-    assert look(endpoint, None) == (False, words)
+TLS_ALERT = b"\x15\x03\x03\x00\x02\x02\x28"  # TLS 1.2, fatal, handshake failure
 
 
-def test_a_server_that_speaks_tls_and_one_that_speaks_something_else():
-    alert = b"\x15\x03\x03\x00\x02\x02\x28"  # TLS 1.2, fatal, handshake failure
-    with server(alert) as endpoint:
-        assert "listens with TLS and wants --tls" in look(endpoint, None)[1]
-    with server(b"SSH-2.0-OpenSSH_9.6\r\n") as endpoint:
-        assert "answers, but not as a simulator" in look(endpoint, None)[1]
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (TLS_ALERT, "listens with TLS and wants --tls"),
+        (b"SSH-2.0-OpenSSH_9.6\r\n", "answers, but not as a simulator"),
+    ],
+)
+def test_a_server_that_speaks_tls_and_one_that_speaks_something_else(answer, words):
+    with server(answer) as endpoint:
+        assert words in look(endpoint, None)[1]
 
 
-def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(monkeypatch):
-    said: List[str] = []
+@pytest.fixture
+def said(monkeypatch) -> List[str]:
+    """Why it waits, of each line in the log."""
+    lines: List[str] = []
+    monkeypatch.setattr(log, "event", lambda level, name, **fields: lines.append(fields["why"]))
+    return lines
+
+
+def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(said):
     heard: List[str] = []
-    monkeypatch.setattr(log, "event", lambda level, name, **fields: said.append(fields["why"]))
     look = Waiting(lambda: bool(heard), lambda: f"because {len(said)}").look
     assert [look(now_s) for now_s in (100.0, 100.1, 104.9)] == [True] * 3
     assert said == ["because 0"]
-    assert look(105.0)
-    assert look(109.9)
+    assert [look(now_s) for now_s in (105.0, 109.9)] == [True] * 2
     assert said == ["because 0", "because 1"]
     heard.append("a state")
     assert not look(110.0)
     assert len(said) == 2
 
 
-def test_a_state_that_comes_during_the_look_is_not_waited_for(monkeypatch):
-    said: List[dict] = []
+def test_a_state_that_comes_during_the_look_is_not_waited_for(said):
     heard: List[str] = []
-    monkeypatch.setattr(log, "event", lambda *_, **fields: said.append(fields))
 
-    def why():
+    def why() -> str:
         heard.append("a state")
         return "too late"
 
@@ -256,11 +253,10 @@ def test_a_state_that_comes_during_the_look_is_not_waited_for(monkeypatch):
     assert said == []
 
 
-def test_one_that_is_linked_has_time_for_its_first_state(monkeypatch):
-    said = threading.Event()
-    monkeypatch.setattr(log, "event", lambda *_, **fields: said.set())
+def test_one_that_is_linked_has_time_for_its_first_state(said):
     one = Waiting(lambda: False, lambda: "why")
     one.next_s = time.monotonic() + 5.0
     one.start()
-    assert not said.wait(0.3)
+    time.sleep(0.3)
+    assert said == []
     one.ended.set()
