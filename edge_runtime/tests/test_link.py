@@ -8,6 +8,7 @@ import threading
 import time
 from types import SimpleNamespace
 from typing import Any, List
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -15,172 +16,108 @@ from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
 from edge_runtime.run import Waiting
+from edge_runtime.tests.harness import HEALTH
 from edge_runtime.transport import look, open_session
 from edge_runtime.util import UserError
-from edge_runtime.wire import Health
-
-HEALTH = Health(
-    vehicle_id="hunter01", vehicle="none", mode="standby", reason="", needs_rearm=False,
-    accepted=0, superseded=0, rejected={}, deadline_misses=0, safe_stops=0, policy_id="p",
-    inference_ms={}, uptime_s=0.0, sent_ns=0,
-)  # fmt: skip
-NO_MANIFEST: Any = None
 
 
-class FakeSession:
-    """Notes declarations; `routers` are those that are connected."""
-
-    def __init__(self, fails: bool = False) -> None:
-        self.routers: List[str] = []
-        self.sent = 0
-        self.events: List[str] = []
-        self.info = SimpleNamespace(routers_zid=lambda: list(self.routers))
-        self._fails = fails
-
-    def liveliness(self) -> Any:
-        return self
-
-    def get(self, *_: Any, **__: Any) -> list:
-        return []
-
-    def declare_token(self, key: str) -> Any:
-        self.events.append(f"declare {key}")
-        return SimpleNamespace(undeclare=self._undeclare)
-
-    def declare_publisher(self, key: str, **_: Any) -> Any:
-        return SimpleNamespace(undeclare=self._undeclare, put=self._put)
-
-    def close(self) -> None:
-        self.events.append("close")
-
-    def _put(self, payload: bytes) -> None:
-        self.sent += 1
-
-    def _undeclare(self) -> None:
-        self.events.append("undeclare")
-        if self._fails:
-            raise OSError("gone")
+@pytest.fixture
+def session() -> Any:
+    """Nobody else is there; `routers_zid` gives the routers that are connected."""
+    session = MagicMock()
+    session.liveliness().get.return_value = []
+    session.info.routers_zid.return_value = []
+    return session
 
 
-def make_presence(session: Any, calls: Any = None, open_client: Any = None) -> Presence:
-    client: Any = open_client or Router().open
-    return Presence(session, "k", client, lambda: calls.append("way"))
+def declared(session: Any) -> List[str]:
+    """The tokens in order, and "" where one was taken back."""
+    calls = [(name, args) for name, args, _ in session.mock_calls if "declare" in name]
+    return [args[0] if args else "" for _, args in calls]
 
 
-def test_the_tokens_are_declared_again_for_each_router_that_comes():
-    session: Any = FakeSession()
-    presence = make_presence(session)
+def test_the_tokens_are_declared_again_for_each_router_that_comes(session):
+    presence = Presence(session, "k", lambda: session, lambda: None)
     claims = [presence.claim]
     for routers in ([], ["b", "a"], ["a", "b"], [], ["c"], ["c"]):
-        session.routers = routers
+        session.info.routers_zid.return_value = routers
         if presence.refresh():
             claims.append(presence.claim)
     assert claims == sorted(set(claims))  # each is younger than the one before
-    expected = [["declare k", f"declare k/{claim}"] for claim in claims]
-    gone = ["undeclare", "undeclare"]
-    assert session.events == [*expected[0], *gone, *expected[1], *gone, *expected[2]]
+    first, *later = [["k", f"k/{claim}"] for claim in claims]
+    assert declared(session) == [*first, *(key for keys in later for key in ["", "", *keys])]
     presence.undeclare()
-    assert session.events[-2:] == gone
+    assert declared(session)[-2:] == ["", ""]
 
 
-class Router:
-    """What a client session hears of a router that knows these tokens."""
-
-    def __init__(self) -> None:
-        self.tokens: List[str] = []
-
-    def open(self) -> Any:
-        ok = [SimpleNamespace(ok=SimpleNamespace(key_expr=token)) for token in self.tokens]
-        liveliness = SimpleNamespace(get=lambda selector, timeout: ok)
-        return SimpleNamespace(liveliness=lambda: liveliness, close=lambda: None)
-
-
-def test_the_younger_of_two_gives_way_at_the_second_look():
-    router, calls = Router(), []
-    presence = make_presence(FakeSession(), calls, router.open)
-    router.tokens = [f"k/{presence.claim}", "k/0000000000000001-elder"]
-    presence.look()
-    assert calls == []  # it may be the leftover of a lost connection
-    presence.look()
-    presence.look()
-    assert (calls, presence.rivals) == (["way"], 1)
-
-
-def test_the_elder_of_two_goes_on_and_counts():
-    router, calls = Router(), []
-    presence = make_presence(FakeSession(), calls, router.open)
-    for claim in ("f" * 16, "f" * 16, "e" * 16, "f" * 16, "e" * 16, "e" * 16):
-        router.tokens = [f"k/{presence.claim}", f"k/{claim}"]
+@pytest.mark.parametrize(
+    ("claims", "given", "rivals"),
+    [
+        # At first an elder one may be the leftover of a lost connection.
+        (["0000000000000001-elder"] * 3, [0, 1, 1], 1),
+        ([letter * 16 for letter in "ffefee"], [0] * 6, 2),
+    ],
+    ids=["the younger of two gives way at the second look", "the elder goes on and counts"],
+)
+def test_of_two_runtimes(session, claims, given, rivals):
+    give_way = MagicMock()
+    presence = Presence(session, "k", lambda: session, give_way)
+    for claim, times_given in zip(claims, given):
+        keys = [f"k/{presence.claim}", f"k/{claim}"]
+        replies = [SimpleNamespace(ok=SimpleNamespace(key_expr=key)) for key in keys]
+        session.liveliness().get.return_value = replies
         presence.look()
-    assert (calls, presence.rivals) == ([], 2)
+        assert give_way.call_count == times_given
+    assert presence.rivals == rivals
 
 
-def test_nobody_there_is_nobody_else():
-    def fail() -> Any:
-        raise UserError("nobody answers")
-
-    presence = make_presence(FakeSession(), open_client=fail)
+def test_nobody_there_is_nobody_else(session):
+    fail = MagicMock(side_effect=UserError("nobody answers"))
+    presence = Presence(session, "k", fail, fail)
     presence.look()
     presence.look()
     assert presence.rivals == 0
     assert not require_free(fail, "hunter01")
-    assert require_free(Router().open, "hunter01")
+    assert require_free(lambda: session, "hunter01")
 
 
-def test_a_link_that_gave_way_sends_nothing():
-    session: Any = FakeSession()
-    link = Link(session, "hunter01", NO_MANIFEST)
+@pytest.fixture
+def link(session) -> Link:
+    return Link(session, "hunter01", MagicMock())
+
+
+def test_a_link_that_gave_way_sends_nothing(session, link):
     link.send("health", HEALTH)
     link.gave_way = True
     link.send("health", HEALTH)
-    assert session.sent == 1
+    assert session.declare_publisher().put.call_count == 1
 
 
-def test_only_a_query_by_its_own_name_re_arms():
-    session: Any = FakeSession()
-    asked: dict = {}
-    session.declare_subscriber = lambda key, handler: None
-    session.declare_queryable = asked.__setitem__
-    calls: List[str] = []
-
-    def rearm() -> str:
-        calls.append("rearm")
-        return ""
-
-    link = Link(session, "hunter01", NO_MANIFEST)
+def test_only_a_query_by_its_own_name_re_arms(session, link):
+    rearm = MagicMock(return_value="")
     link.declare(lambda payload: None, lambda: HEALTH, rearm)
-
-    def ask(selector: str) -> None:
-        query = SimpleNamespace(key_expr=selector, reply=lambda *_, **__: None)
-        asked["phil/hunter01/rearm"](query)
-
+    asked = dict(call.args for call in session.declare_queryable.call_args_list)
     for selector in ("phil/**", "phil/*/rearm", "phil/hunter01/*", "phil/hunter01/re$*"):
-        ask(selector)
-    assert calls == []  # somebody looked at everything that is there
-    ask("phil/hunter01/rearm")
-    assert calls == ["rearm"]
+        asked["phil/hunter01/rearm"](MagicMock(key_expr=selector))
+    assert not rearm.called  # somebody looked at everything that is there
+    asked["phil/hunter01/rearm"](MagicMock(key_expr="phil/hunter01/rearm"))
+    assert rearm.call_count == 1
 
 
-def test_the_session_is_closed_even_where_nothing_can_be_undeclared():
-    session: Any = FakeSession(fails=True)
+def test_the_session_is_closed_even_where_nothing_can_be_undeclared(session, link):
+    session.declare_publisher().undeclare.side_effect = OSError("gone")
     with pytest.raises(OSError, match="gone"):
-        Link(session, "hunter01", NO_MANIFEST).close()
-    assert session.events[-1] == "close"
+        link.close()
+    assert session.close.called
 
 
-def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
-    session, stop = FakeSession(), None
-    policy = SimpleNamespace(manifest=SimpleNamespace(action=[], task=""))
-
-    def fail(*_: Any) -> None:
-        raise OSError("no link")
-
-    monkeypatch.setattr(run, "load_policy", lambda *_: policy)
+def test_the_session_is_closed_where_the_link_cannot_be_made(session, monkeypatch):
+    monkeypatch.setattr(run, "load_policy", MagicMock())
     monkeypatch.setattr(run, "open_session", lambda **_: session)
-    monkeypatch.setattr(run, "Link", fail)
+    monkeypatch.setattr(run, "Link", MagicMock(side_effect=OSError("no link")))
     with pytest.raises(OSError, match="no link"):
-        run._drive(Config(), stop)  # type: ignore[arg-type]
-    assert session.events == ["close"] * 2  # the one that asked for other runtimes, and its own
+        run._drive(Config(), MagicMock())
+    assert session.close.call_count == 2  # the one that asked for other runtimes, and its own
 
 
 @contextlib.contextmanager

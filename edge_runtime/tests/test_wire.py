@@ -9,16 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge_runtime import wire
-from edge_runtime.tests.harness import make_state
+from edge_runtime.tests.harness import HEALTH, make_command, make_state
 from edge_runtime.util import UserError
 from edge_runtime.wire import Command, Feedback, Health, Reason, Rejection, State
 
-HEALTH = Health(
-    vehicle_id="hunter01", vehicle="none", mode="standby", reason="", needs_rearm=False,
-    accepted=0, superseded=0, rejected={}, deadline_misses=0, safe_stops=0, policy_id="p",
-    inference_ms={}, uptime_s=0.0, sent_ns=0, command_ms={"p50": 1.5}, temperature_c=40.0,
-    load_1min=0.5, rss_mb=90.0, rivals=1,
-)  # fmt: skip
 DECODERS = {
     State: wire.decode_state,
     Command: wire.decode_command,
@@ -152,10 +146,7 @@ def test_a_missing_field_is_malformed():  # and a further one is ignored: see `p
     ],
 )
 def test_a_bad_command_is_rejected_by_reason(action, mode, found):
-    command = Command(
-        session="a", episode=0, step=0, mode=mode, action=action, policy_id="p",
-        received_ns=0, inference_ns=0, sent_ns=0,
-    )  # fmt: skip
+    command = make_command(mode, action=action)
     assert wire.decode_command(wire.encode(command)) == (found or command)
 
 
