@@ -97,27 +97,6 @@ def test_tokens_are_the_bridges_with_the_second_librarys_hash(role, reliable, ki
     )
 
 
-TWIST = ros.Twist(ros.Vector3(1.5, 0.0, -0.25), ros.Vector3(0.0, 0.0, 0.5))
-DRIVE = ros.AckermannDriveStamped(
-    ros.Header(ros.Time(7, 9), "abc"), ros.AckermannDrive(0.5, 0.0, 1.25)
-)
-LONGER = ros.AckermannDriveStamped(ros.Header(ros.Time(), "abcd"), DRIVE.drive)
-
-
-@pytest.mark.parametrize(
-    ("message", "by_hand"),
-    [
-        (TWIST, struct.pack("<6d", 1.5, 0.0, -0.25, 0.0, 0.0, 0.5)),
-        # sec, nanosec, 4 bytes with the ending zero, no padding; then five floats.
-        (DRIVE, struct.pack("<iII4s5f", 7, 9, 4, b"abc\0", 0.5, 0.0, 1.25, 0.0, 0.0)),
-        (LONGER, struct.pack("<iII8s5f", 0, 0, 5, b"abcd", 0.5, 0.0, 1.25, 0.0, 0.0)),
-    ],
-    ids=["a twist is six doubles", "a drive", "a drive aligns after its text"],
-)
-def test_bytes_by_hand(message, by_hand):
-    assert ros.encode(message) == b"\x00\x01\x00\x00" + by_hand
-
-
 @settings(deadline=None)
 @given(MESSAGES)
 def test_the_second_library_and_ours_understand_each_other(message):
@@ -133,19 +112,11 @@ def test_the_second_library_and_ours_understand_each_other(message):
 
 @settings(max_examples=500)
 @given(
-    st.sampled_from([b"", b"\0\0\0\0", b"\0\1\0\0"]),
-    st.binary(max_size=1200),
-    st.sampled_from([ros.Twist, ros.Odometry, ros.Image]),
+    MESSAGES, st.sampled_from([b"", b"\0\0\0\0", b"\0\1\0\0"]), st.binary(max_size=1200), st.data()
 )
-def test_random_bytes_never_raise_after_a_good_header_neither(header, body, kind):
+def test_random_damaged_and_cut_off_bytes_never_raise(message, header, body, data):
+    kind, payload = type(message), bytearray(ros.encode(message))
     assert isinstance(ros.decode(header + body, kind), (kind, Rejection))
-
-
-@settings(max_examples=300)
-@given(MESSAGES, st.data())
-def test_a_message_that_is_cut_off_or_damaged_never_raises(message, data):
-    payload = bytearray(ros.encode(message))
-    kind = type(message)
     cut = data.draw(st.integers(0, len(payload) - 1))
     assert isinstance(ros.decode(bytes(payload[:cut]), kind), Rejection)
     payload[data.draw(st.integers(0, len(payload) - 1))] ^= data.draw(st.integers(1, 255))
@@ -161,7 +132,7 @@ LE = b"\0\1\0\0"  # how a message of little-endian CDR begins
         (b"", ros.Twist, Reason.MALFORMED),
         (b"\0\1\0", ros.Twist, Reason.MALFORMED),
         (b"\0\7\0\0" + bytes(48), ros.Twist, Reason.SCHEMA),  # XCDR version 2
-        (ros.encode(TWIST), ros.Odometry, Reason.MALFORMED),
+        (ros.encode(ros.Twist()), ros.Odometry, Reason.MALFORMED),
         (ros.encode(ros.Odometry()), ros.Twist, Reason.MALFORMED),
         (LE + struct.pack("<6d", *[0.0] * 5, float("nan")), ros.Twist, Reason.NOT_FINITE),
         (LE + struct.pack("<6d", float("inf"), *[0.0] * 5), ros.Twist, Reason.NOT_FINITE),
@@ -177,7 +148,7 @@ def test_what_is_no_message_says_why(payload, kind, reason):
     assert rejection.reason == reason
 
 
-def test_a_nan_in_a_covariance_is_not_finite():
+def test_a_rejection_names_the_field():
     odometry = ros.Odometry()
     odometry.twist.covariance[3] = float("nan")
     found = ros.decode(ros.encode(odometry), ros.Odometry)
@@ -263,53 +234,21 @@ def test_dds_refuses_another_type(through_dds):
     assert through_dds(ros.encode(ros.Twist()), ros.Odometry) is None
 
 
-SLOW_TURN = ros.Twist(ros.Vector3(0.5), ros.Vector3(0.0, 0.0, -0.25))
-
-
-@pytest.fixture
-def sessions():
-    """Ours that listens, and a bridge's in its place: a router that connects, as by `-e`."""
-    endpoint = free_endpoint()
-    with open_session(listen=endpoint, mode="router") as ours, open_session(
-        connect=endpoint, mode="router"
-    ) as theirs:
-        yield ours, theirs
-
-
-def test_what_we_publish_arrives_and_is_announced(sessions):
-    ours, theirs = sessions
-    heard = []
-    listener = theirs.declare_subscriber("hunter01/cmd_vel", heard.append)
-    with closing(Ros2Node(ours, "/hunter01")) as node:
-        publish = node.publisher("cmd_vel", ros.Twist)
-        tokens, watcher = second.watch_tokens(theirs)  # a late bridge learns of us, too
-        wait_until(lambda: len(tokens) == 2, "the tokens of the node and its publisher")
-        zid = str(ours.info.zid())
-        assert f"@/{zid}/@ros2_lv" in tokens
-        assert any(token.startswith(f"@/{zid}/@ros2_lv/MP/hunter01§cmd_vel/") for token in tokens)
-        wait_until(lambda: publish(SLOW_TURN) or heard, "the twist")
-        read = second.deserialize("geometry_msgs/msg/Twist", heard[0].payload.to_bytes())
-        assert read == asdict(SLOW_TURN)
-        assert node.sent["hunter01/cmd_vel"] >= 1
-        node.subscribe("odom", ros.Odometry, lambda _: None)
-        wait_until(lambda: any("/MS/hunter01§odom/" in token for token in tokens), "a later token")
-    wait_until(lambda: not tokens, "the tokens to go with the node")
-    listener.undeclare()
-    watcher.undeclare()
-
-
-def test_we_hear_the_second_library_and_count_what_is_none(sessions):
-    ours, theirs = sessions
-    heard: list[ros.Odometry] = []
+def test_we_hear_the_second_library_and_count_what_is_none():
     odometry = ros.Odometry(ros.Header(ros.Time(5, 6), "odom"), "base_link")
     odometry.twist.twist.linear.x = 0.75
     good = second.serialize("nav_msgs/msg/Odometry", asdict(odometry))
-    with closing(Ros2Node(ours, "/hunter01")) as node:
+    heard: list[ros.Odometry] = []
+    # Theirs is in a bridge's place: a router that connects, as by `-e`.
+    endpoint = free_endpoint()
+    with open_session(listen=endpoint, mode="router") as ours, open_session(
+        connect=endpoint, mode="router"
+    ) as theirs, closing(Ros2Node(ours, "/hunter01")) as node:
         node.subscribe("odom", ros.Odometry, heard.append)
         wait_until(lambda: theirs.put("hunter01/odom", good) or heard, "the odometry")
         assert heard[0] == odometry
         huge = bytes(ros.MAX_PAYLOAD_BYTES + 1)
-        for payload in (b"", b"\0\7\0\0", huge, ros.encode(SLOW_TURN)):
+        for payload in (b"", b"\0\7\0\0", huge, ros.encode(ros.Twist())):
             theirs.put("hunter01/odom", payload)
         wait_until(lambda: sum(node.rejected.values()) >= 4, "the rejections")
         assert node.rejected == {"malformed": 2, "schema": 1, "oversized": 1}
