@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge_runtime.vehicles import stream
 from edge_runtime.vehicles.hunter import protocol
 from edge_runtime.vehicles.hunter.protocol import FRAMES, PROFILES, decode, encode, status_faults
 from edge_runtime.vehicles.mapping import SPECS
@@ -128,4 +129,4 @@ def test_motor_faults_name_the_motor():
 def test_the_tables_rows():
     assert {frame.can_id for frame in protocol.COMMANDS} == {0x111, 0x131, 0x421, 0x441}
     assert protocol.SYSTEM_STATUS.period_s == 0.1
-    assert FRAMES[0x111].period_s == 0.02
+    assert FRAMES[0x111].period_s == stream.PERIOD_S == 0.02

@@ -307,21 +307,22 @@ def test_a_systemd_that_is_gone_or_full_holds_nobody(tmp_path):
     notifier.tell("STOPPING=1")
 
 
+PERIOD = {"WATCHDOG_USEC": "3000000"}
+
+
 @pytest.mark.parametrize(
     ("environment", "period_s"),
     [
-        ({"WATCHDOG_USEC": "3000000"}, 1.5),
-        ({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())}, 1.5),
-        ({"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"}, None),
-        *[
-            (environment, None)
-            for environment in (
-                {"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "soon"}, {}, {"NOTIFY_SOCKET": ""},
-                {"NOTIFY_SOCKET": "vsock:2"},
-            )
-        ],
+        (PERIOD, 1.5),
+        ({**PERIOD, "WATCHDOG_PID": str(os.getpid())}, 1.5),
+        ({**PERIOD, "WATCHDOG_PID": "1"}, None),
+        ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "soon"}, None),
+        ({}, None),
+        ({"NOTIFY_SOCKET": ""}, None),
+        ({"NOTIFY_SOCKET": "vsock:2"}, None),
     ],
-)  # fmt: skip
+)
 def test_the_watchdog_period_is_half_of_systemds_and_without_it_nothing_is_said(
     environment, period_s
 ):

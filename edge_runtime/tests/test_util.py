@@ -89,12 +89,13 @@ def test_run_cli_turns_errors_into_one_line(tmp_path, capsys):
     def fails(error):
         raise error
 
-    for run, status, line in (
+    cases: list = [
         (lambda _: fails(UserError("two\nlines")), 2, "error: two lines\n"),
         (lambda _: fails(KeyboardInterrupt), 130, "interrupted\n"),
         (lambda _: os.listdir(below), 2, f"error: {below}: Not a directory\n"),
         (len, 1, ""),
-    ):
+    ]
+    for run, status, line in cases:
         assert (run_cli(run, ["a"]), capsys.readouterr().err) == (status, line)
     with pytest.raises(OSError, match="about a socket"):  # an error about no file is not hidden
         run_cli(lambda _: fails(OSError("about a socket")), [])
