@@ -3,7 +3,6 @@
 import contextlib
 import itertools
 import math
-import threading
 import time
 
 import pytest
@@ -103,49 +102,27 @@ def make():
         )
 
 
-@contextlib.contextmanager
-def commanded(vehicle, action, scenario_speed_mps=None):
-    """A control loop in its place: one action again and again, at 20 Hz."""
-    stopping = threading.Event()
-
-    def run():
-        while not stopping.wait(0.05):
-            vehicle.command(action, time.monotonic(), scenario_speed_mps)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    yield
-    stopping.set()
-    thread.join()
-
-
 def report(vehicle):
     return vehicle.feedback(time.monotonic())
 
 
-def rearm_until(vehicle, condition, what):
-    """As an operator would: a vehicle that stopped while this machine paused is enabled again."""
+def command_until(vehicle, action, condition, what, scenario_speed_mps=None):
+    """A control loop in its place, and an operator: where it stopped while this machine paused,
+    it is enabled again.
+    """
 
     def holds():
         if vehicle.state is State.STOPPED:
             vehicle.enable(time.monotonic())
+        vehicle.command(action, time.monotonic(), scenario_speed_mps)
         return condition()
 
     wait_until(holds, what)
 
 
-def enable(vehicle):
-    vehicle.enable(time.monotonic())
-    rearm_until(vehicle, lambda: vehicle.state is State.ENABLED, "odometry to confirm")
-
-
-def drive(vehicle, hunter, over_mps):
-    rearm_until(vehicle, lambda: hunter.speed_mps > over_mps, "the Hunter to drive")
-
-
 @pytest.fixture
 def linked(make):
-    """An enabled vehicle and the Hunter; one of them listens, and starts first."""
+    """A vehicle that was told to enable, and the Hunter; one of them listens, and starts first."""
     with contextlib.ExitStack() as hunters:
 
         def link(similarity=LEFT_TURN, bridge_listens=False, namespace="", **changes):
@@ -157,7 +134,7 @@ def linked(make):
             ours = {"connect" if bridge_listens else "listen": endpoint}
             vehicle = make(similarity, **ours, namespace=f"/{namespace}", **changes)
             hunter = hunter or meet("connect")
-            enable(vehicle)
+            vehicle.enable(time.monotonic())
             return vehicle, hunter
 
         yield link
@@ -167,16 +144,20 @@ def linked(make):
 def test_a_pedal_drives_the_hunter_and_a_brake_stands_until_enabled_again(linked, bridge_listens):
     vehicle, hunter = linked(bridge_listens=bridge_listens)
     assert vehicle.limits == vehicle_limits("ros2", Config(), "left_turn")
-    with commanded(vehicle, PEDAL):
-        drive(vehicle, hunter, 0.5)
-        wait_until(lambda: report(vehicle).speed_mps > 0.3, "its odometry")
-        vehicle.brake(time.monotonic())
-        wait_until(lambda: hunter.asked_mps == 0.0, "speed 0")
-        wait_until(lambda: hunter.speed_mps < 0.02, "the Hunter to stand")
-        time.sleep(0.3)  # the commands go on, to nobody
-        assert hunter.asked_mps == 0.0
-        drive(vehicle, hunter, 0.5)
-        assert report(vehicle).faults == []
+
+    def drives():
+        return hunter.speed_mps > 0.5 and report(vehicle).speed_mps > 0.3
+
+    command_until(vehicle, PEDAL, drives, "the Hunter to drive, and its odometry")
+    vehicle.brake(time.monotonic())
+    wait_until(lambda: hunter.asked_mps == 0.0, "speed 0")
+    wait_until(lambda: hunter.speed_mps < 0.02, "the Hunter to stand")
+    for _ in range(6):  # the commands go on, to nobody
+        vehicle.command(PEDAL, time.monotonic())
+        time.sleep(0.05)
+    assert hunter.asked_mps == 0.0
+    command_until(vehicle, PEDAL, drives, "the Hunter to drive again")
+    assert report(vehicle).faults == []
     vehicle.close()  # zeros go out until it stands
     assert hunter.speed_mps < 0.1
     assert [twist["linear"]["x"] for twist in hunter.twists[-5:]] == [0.0] * 5
@@ -184,19 +165,16 @@ def test_a_pedal_drives_the_hunter_and_a_brake_stands_until_enabled_again(linked
 
 def test_both_kinds_of_command_below_a_namespace_and_their_tokens(linked):
     vehicle, hunter = linked(CONGESTION, namespace="robot", ackermann_topic="ackermann_cmd")
-    with commanded(vehicle, {"steering": -1.0}, scenario_speed_mps=4.0):
-        drive(vehicle, hunter, 0.9)
-        steering = wait_until(
-            lambda: hunter.drives[-1]["drive"]["speed"] > 0.99 and hunter.drives[-1]["drive"],
-            "the drive",
-        )["steering_angle"]
-        # What hunter_ros2 makes of speed and yaw rate is the inner wheel of the same circle.
-        wait_until(lambda: abs(hunter.inner_rad) > steering, "the wheels")
-        wait_until(
-            lambda: report(vehicle).action["steering"] == pytest.approx(-1.0, abs=0.01),
-            "the odometry's word on the steering",
-        )
-    assert steering > 0  # -1 turns left
+
+    def turns():
+        """At full speed; and so its odometry says."""
+        at_speed = hunter.drives and hunter.drives[-1]["drive"]["speed"] > 0.99
+        steering = report(vehicle).action["steering"]
+        return at_speed and steering == pytest.approx(-1.0, abs=0.01)
+
+    command_until(vehicle, {"steering": -1.0}, turns, "the turn", scenario_speed_mps=4.0)
+    # -1 turns left. What hunter_ros2 makes of speed and yaw rate is the inner wheel of that circle.
+    assert 0 < hunter.drives[-1]["drive"]["steering_angle"] < hunter.inner_rad
     chunks = sorted("/".join(token.split("/")[3:5]) for token in hunter.tokens)
     assert chunks == ["", "MP/robot§ackermann_cmd", "MP/robot§cmd_vel", "MS/robot§odom"]
     vehicle.close()
