@@ -35,6 +35,21 @@ def make_state(step: int, **changes: Any) -> State:
     return State(**{**fields, **changes})
 
 
+def make_command(mode: str = "drive", step: int = 0, action: Sequence[float] = (0.5,)) -> Command:
+    return Command(
+        session="s", episode=0, step=step, mode=mode, action=list(action), policy_id="p",
+        received_ns=0, inference_ns=0, sent_ns=0,
+    )  # fmt: skip
+
+
+HEALTH = Health(
+    vehicle_id="hunter01", vehicle="none", mode="standby", reason="", needs_rearm=False,
+    accepted=0, superseded=0, rejected={}, deadline_misses=0, safe_stops=0, policy_id="p",
+    inference_ms={}, uptime_s=0.0, sent_ns=0, command_ms={"p50": 1.5}, temperature_c=40.0,
+    load_1min=0.5, rss_mb=90.0, rivals=1,
+)  # fmt: skip
+
+
 def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
     """Poll until the condition is true and return its value; fail with `what` otherwise."""
     end_s = time.monotonic() + timeout_s
@@ -54,12 +69,11 @@ class EdgeProcess:
         *arguments: str,
         python: str = sys.executable,
         cwd: Optional[Path] = None,
-        python_flags: Sequence[str] = (),
         stderr: Any = subprocess.PIPE,
         environment: Optional[Dict[str, str]] = None,
     ) -> None:
         self.process = subprocess.Popen(
-            [python, *python_flags, "-m", "edge_runtime", "run", *arguments],
+            [python, "-m", "edge_runtime", "run", *arguments],
             stdout=subprocess.PIPE,
             stderr=stderr,
             text=True,

@@ -49,18 +49,16 @@ def write_policy(
     opset: int = 17,
     ir_version: int = 8,
     loops: int = SLOW_LOOPS,
-    odd_shape: Sequence[int] = (1, 0),
 ) -> str:
     """Write a policy file and return its policy_id; sign it as `path`.sig where a key is given.
 
     kind: "constant" always answers `value`; "mean" answers the mean brightness scaled to
     [-1, 1], a different number for different frames; "nan" is "constant" until the frames are
     brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then takes about a second at
-    SLOW_LOOPS `loops`, and in proportion at others; "odd" likewise, then answers with a tensor of
-    `odd_shape`.
+    SLOW_LOOPS `loops`, and in proportion at others.
     `manifest_changes` replaces fields of the manifest, to write files that must be refused.
     """
-    graph = _graph(kind, value, len(actions), loops, odd_shape)
+    graph = _graph(kind, value, len(actions), loops)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
     fields: Dict[str, Any] = {
@@ -88,10 +86,8 @@ def public_pem(key: Any) -> bytes:
 
 
 # What each kind answers, in ONNX's own text form.
-_CONSTANT = "nothing = Mul(mean, zero) answer = Add(nothing, value)"
 _ANSWERS = {
-    "constant": _CONSTANT,
-    "odd": _CONSTANT,
+    "constant": "nothing = Mul(mean, zero) answer = Add(nothing, value)",
     "mean": "centred = Sub(mean, half_range) answer = Div(centred, half_range)",
     # The root of a negative number is NaN, and NaN times zero stays NaN.
     "nan": """room = Sub(fault_brightness, mean) root = Sqrt(room) nothing = Mul(root, zero)
@@ -106,29 +102,19 @@ _ANSWERS = {
         level = ReduceMean<axes = [0, 1], keepdims = 0>(result)
         nothing = Mul(level, zero) answer = Add(nothing, value)""",
 }
-_ACTION = {
-    # For bright frames a tensor of another shape than the graph says of its output.
-    "odd": """as_said = Mul(column, odd_ones) is_bright = Greater(mean, fault_brightness)
-        action = If(is_bright)<
-            then_branch = other () => (float[] oddly) { oddly = Identity(odd) },
-            else_branch = same () => (float[] said) { said = Identity(as_said) }>""",
-}
 
 
-def _graph(
-    kind: str, value: float, n_actions: int, loops: int, odd_shape: Sequence[int]
-) -> onnx.GraphProto:
+def _graph(kind: str, value: float, n_actions: int, loops: int) -> onnx.GraphProto:
     weights: Dict[str, np.ndarray] = {
         "value": np.array([value], np.float32),
         "zero": np.array([0.0], np.float32),
         "half_range": np.array([127.5], np.float32),
         "fault_brightness": np.array([FAULT_BRIGHTNESS], np.float32),
-        f"{kind}_ones": np.ones((1, n_actions), np.float32),
+        "ones": np.ones((1, n_actions), np.float32),
         "loops": np.array([loops], np.int64),
         "last_axis": np.array([1], np.int64),
         "always": np.array(True),
         "matrix": np.eye(_SLOW_SIZE if kind == "slow" else 1, dtype=np.float32),
-        "odd": np.full(odd_shape, 0.5, np.float32),
     }
     graph = onnx.parser.parse_graph(
         f"""test_{kind} (uint8[batch, 2, 45, 80] frames) => (float[batch, {n_actions}] action) {{
@@ -136,7 +122,7 @@ def _graph(
             mean = ReduceMean<axes = [1, 2, 3], keepdims = 0>(pixels)
             {_ANSWERS[kind]}
             column = Unsqueeze(answer, last_axis)
-            {_ACTION.get(kind, f"action = Mul(column, {kind}_ones)")}
+            action = Mul(column, ones)
         }}"""
     )
     graph.initializer.extend(

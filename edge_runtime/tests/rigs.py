@@ -1,7 +1,5 @@
 """The core of a streamed vehicle in made-up time, and a vehicle that obeys it at once, or not."""
 
-from __future__ import annotations
-
 import math
 
 from edge_runtime.config import CarSettings, Ros2Settings
@@ -92,6 +90,12 @@ class HunterRig(Rig):
             if self.ticks % 5 == 0:
                 self.tell(protocol.SYSTEM_STATUS, self.status)
 
+    def disturb(self, number):
+        """Any frame, and another status from now on."""
+        self.status = OK._replace(mode=number % 4, state=number % 3)
+        can_ids, data = [*protocol.FRAMES, 0x7FF], number.to_bytes(8, "big", signed=True)
+        self.core.hear(can_ids[number % len(can_ids)], data[: number % 50 or 7], self.now_s)
+
     def tell(self, frame, message):
         if isinstance(message, protocol.SystemStatus) and self.counter is not None:
             self.counter = (self.counter + 1) % 256
@@ -115,6 +119,10 @@ class Ros2Rig(Rig):
         super().__init__(Ros2Core(self.settings, similarity_to(CARS[scenario], SPEC)))
         self.angular = None
         self.centre_rad = 0.0
+
+    def disturb(self, number):
+        """Any odometry."""
+        self.core.hear(number, float(number), -(float(number) ** 8), self.now_s)
 
     def exchange(self, motion):
         if motion is not None:

@@ -188,10 +188,9 @@ class AnyHistoryOfAService(AnyHistory):
     armed_at_start = False
 
 
-_SETTINGS = settings(max_examples=60, stateful_step_count=30, deadline=None, derandomize=True)
+patient = settings(max_examples=60, stateful_step_count=30, deadline=None, derandomize=True)
 TestAnyHistory = AnyHistory.TestCase
 TestAnyHistoryWithVehicle = AnyHistoryWithVehicle.TestCase
 TestAnyHistoryOfAService = AnyHistoryOfAService.TestCase
-TestAnyHistory.settings = _SETTINGS
-TestAnyHistoryWithVehicle.settings = _SETTINGS
-TestAnyHistoryOfAService.settings = _SETTINGS
+for case in (TestAnyHistory, TestAnyHistoryWithVehicle, TestAnyHistoryOfAService):
+    case.settings = patient

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import socket
+import sys
 import threading
 import time
 from pathlib import Path
@@ -38,27 +40,20 @@ class Chassis:
     def __init__(self, channel):
         self.bus = can.Bus(interface="virtual", channel=channel)
         self.heard: list = []
-        self.answers = True
         self.status = protocol.SystemStatus(0, protocol.STANDBY, 24.0, 0, 1, 0)
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
+        self._notifier = can.Notifier(self.bus, [self._hear], timeout=0.05)
 
-    def _run(self):
-        while not self._stopping:
-            message = self.bus.recv(0.05)
-            if message is None:
-                continue
-            self.heard.append((message.arbitration_id, bytes(message.data)))
-            told = protocol.decode(*self.heard[-1])
-            if isinstance(told, protocol.ModeCommand):
-                self.status = self.status._replace(mode=told.mode)
-            elif isinstance(told, protocol.BrakeCommand):
-                self.status = self.status._replace(brake=told.locked)
-            elif isinstance(told, protocol.MotionCommand) and self.answers:
-                self.send(protocol.MOTION_STATUS, protocol.MotionStatus(*told))
-                self.status = self.status._replace(counter=(self.status.counter + 1) % 256)
-                self.send(protocol.SYSTEM_STATUS, self.status)
+    def _hear(self, message):
+        self.heard.append((message.arbitration_id, bytes(message.data)))
+        told = protocol.decode(*self.heard[-1])
+        if isinstance(told, protocol.ModeCommand):
+            self.status = self.status._replace(mode=told.mode)
+        elif isinstance(told, protocol.BrakeCommand):
+            self.status = self.status._replace(brake=told.locked)
+        elif isinstance(told, protocol.MotionCommand):
+            self.send(protocol.MOTION_STATUS, protocol.MotionStatus(*told))
+            self.status = self.status._replace(counter=(self.status.counter + 1) % 256)
+            self.send(protocol.SYSTEM_STATUS, self.status)
 
     def send(self, frame, message):
         data = protocol.encode(frame, message)
@@ -67,13 +62,10 @@ class Chassis:
 
     @property
     def speeds(self):
-        return [
-            protocol.decode(*heard).speed_mps for heard in list(self.heard) if heard[0] == 0x111
-        ]
+        return [protocol.decode(*heard).speed_mps for heard in [*self.heard] if heard[0] == 0x111]
 
     def close(self):
-        self._stopping = True
-        self._thread.join(5.0)
+        self._notifier.stop()
         self.bus.shutdown()
 
 
@@ -84,38 +76,25 @@ def channel():
 
 @pytest.fixture
 def chassis(channel):
-    chassis = Chassis(channel)
-    yield chassis
-    chassis.close()
+    with contextlib.closing(Chassis(channel)) as chassis:
+        yield chassis
 
 
 @pytest.fixture
 def vehicle(channel):
-    vehicle = HunterVehicle(BusName("virtual", channel, None), LEFT_TURN, "v2")
-    yield vehicle
-    vehicle.close()
+    bus = BusName("virtual", channel, None)
+    with contextlib.closing(HunterVehicle(bus, LEFT_TURN, "v2")) as vehicle:
+        yield vehicle
 
 
-@pytest.fixture
-def enabled(chassis, vehicle):
-    enable(vehicle)
-    return vehicle
+def drive(chassis, vehicle):
+    """Full throttle at 10 Hz until it moves."""
 
-
-@pytest.fixture
-def driving(chassis, enabled):
-    drive(enabled, lambda: chassis.speeds[-1] > 0.2, "speed")
-    return enabled
-
-
-def drive(vehicle, until, what):
-    """Full throttle at 10 Hz until something holds."""
-
-    def step():
+    def is_quick():
         vehicle.command(PEDAL, time.monotonic())
-        return until()
+        return chassis.speeds[-1] > 0.2
 
-    wait_until(step, what)
+    wait_until(is_quick, "speed")
 
 
 def enable(vehicle):
@@ -123,15 +102,11 @@ def enable(vehicle):
     wait_until(lambda: vehicle.state is State.ENABLED, "the confirmation")
 
 
-def test_the_stream_keeps_the_manuals_period():
-    assert protocol.MOTION_COMMAND.period_s == stream.PERIOD_S
-
-
 def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     time.sleep(0.1)
     assert chassis.heard == []
     enable(vehicle)
-    drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed")
+    drive(chassis, vehicle)
     report = vehicle.feedback(time.monotonic())
     assert report.speed_mps > 0.1
     assert report.scenario_speed_mps == pytest.approx(4 * report.speed_mps)
@@ -142,7 +117,7 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     wait_until(lambda: len(chassis.speeds) > count + 5, "the stream going on")
     assert set(chassis.speeds[count:]) == {0.0}
     enable(vehicle)
-    drive(vehicle, lambda: chassis.speeds[-1] > 0.2, "speed again")
+    drive(chassis, vehicle)
     vehicle.close()
     wait_until(lambda: chassis.heard[-1] == (0x421, b"\x00"), "control given back")
     assert (0x131, b"\x01") in chassis.heard[-3:]
@@ -151,39 +126,21 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     vehicle.close()
 
 
-def test_commands_that_cease_end_in_a_latched_stop(chassis, driving):
-    wait_until(lambda: driving.state is State.STOPPED, "its own stop")
-    assert driving.feedback(time.monotonic()).faults == ["no command for 0.24 s"]
-    wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
-
-
-def test_its_own_stop_does_not_wait_for_the_next_period(chassis, driving, monkeypatch):
-    monkeypatch.setattr(stream, "PERIOD_S", 3.0)
-    time.sleep(0.05)  # one more period of before
-    commanded_s = time.monotonic()
-    driving.command(PEDAL, commanded_s)
-    wait_until(lambda: chassis.speeds[-1] == 0.0, "its own stop")
-    assert time.monotonic() - commanded_s < 1.5
-
-
-def test_a_frame_that_was_held_up_is_followed_at_once_by_one_of_now(driving, monkeypatch):
-    sent: list = []
-    send = driving._bus.send
-
-    def stopped_in_between(message, timeout=None):
-        if not sent and driving.state is State.ENABLED:
-            monkeypatch.setattr(stream, "PERIOD_S", 0.4)
-            time.sleep(0.5)  # the whole process, as far as the frame can tell
-        send(message, timeout=timeout)
-        told = protocol.decode(message.arbitration_id, message.data)
-        sent.append((time.monotonic(), told.speed_mps))
-
-    monkeypatch.setattr(driving._bus, "send", stopped_in_between)
-    wait_until(lambda: len(sent) > 1, "the next frame")
-    (held_s, held_mps), (next_s, next_mps) = sent[:2]
-    assert held_mps > 0.2
-    assert next_mps == 0.0
-    assert next_s - held_s < 0.15
+def test_commands_that_cease_end_in_a_latched_stop_also_before_the_next_period(
+    chassis, vehicle, monkeypatch
+):
+    for period_s in (stream.PERIOD_S, 3.0):
+        enable(vehicle)
+        drive(chassis, vehicle)
+        monkeypatch.setattr(stream, "PERIOD_S", period_s)
+        time.sleep(0.05)  # one more period of before
+        commanded_s = time.monotonic()
+        vehicle.command(PEDAL, commanded_s)
+        wait_until(lambda: vehicle.state is State.STOPPED, "its own stop")
+        wait_until(lambda: chassis.speeds[-1] == 0.0, "a stand")
+        assert time.monotonic() - commanded_s < 1.5
+        if period_s < 3.0:  # in which nothing is heard of the chassis
+            assert vehicle.feedback(time.monotonic()).faults == ["no command for 0.24 s"]
 
 
 def test_a_bus_that_is_full_neither_blocks_nor_kills_the_stream(channel, vehicle):
@@ -209,21 +166,6 @@ def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle)
     assert vehicle.feedback(time.monotonic()).speed_mps == 0.0
     chassis.send(protocol.MOTION_STATUS, protocol.MotionStatus(0.5, 0.0))
     wait_until(lambda: vehicle.feedback(time.monotonic()).speed_mps == 0.5, "what comes now")
-
-
-def test_random_frames_on_the_bus_never_move_it(chassis, enabled):
-    with can.Bus(interface="virtual", channel=chassis.bus.channel_id) as junk:
-        for number in range(2000):
-            message = can.Message(
-                arbitration_id=number * 7919 % 0x800,
-                data=(number * 2654435761 % 2**64).to_bytes(8, "big")[: number % 9],
-                is_extended_id=number % 5 == 0,
-            )
-            junk.send(message, timeout=0.1)
-    assert len(enabled.feedback(time.monotonic()).faults) <= 3
-    assert enabled._stream._thread.is_alive()
-    assert enabled._listener.is_alive()
-    assert set(chassis.speeds) == {0.0}
 
 
 def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(channel):
@@ -262,69 +204,60 @@ def test_names_of_buses(text, name):
     assert parse_bus(text) == name
 
 
-NO_BUS = "write it as INTERFACE:CHANNEL"
-NO_GROUP = "write it as udp_multicast:239"
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        *(
-            (text, NO_BUS)
-            for text in ("", "can0", "socketcan:", ":can0", "slcan:a:fast", "slcan:a:0")
-        ),
-        ("socketcan:can0:500000", "'socketcan:can0:500000'.*ip link.*write socketcan:can0$"),
-        *(
-            (f"udp_multicast:{channel}", NO_GROUP)
-            for channel in (
-                "10.0.0.1", "239.1.2.3:0", "239.1.2.3:70000", "239.1.2:3", "ff15::1", "any",
-                "239.1.2.3:",
-            )
-        ),
+NO_NAMES = {
+    "write it as INTERFACE:CHANNEL": (
+        "", "can0", "socketcan:", ":can0", "slcan:a:fast", "slcan:a:0",
+    ),
+    "'socketcan:can0:500000'.*ip link.*write socketcan:can0": ("socketcan:can0:500000",),
+    "write it as udp_multicast:239": [
+        f"udp_multicast:{channel}"
+        for channel in (
+            "10.0.0.1", "239.1.2.3:0", "239.1.2.3:70000", "239.1.2:3", "ff15::1", "any",
+            "239.1.2.3:",
+        )
     ],
-)  # fmt: skip
-def test_what_is_no_name_of_a_bus_is_refused_in_one_line(text, words):
-    with pytest.raises(UserError, match=words) as refused:
-        parse_bus(text)
-    assert "\n" not in str(refused.value)
+}  # fmt: skip
 
 
-def test_buses_that_cannot_be_opened_are_one_line(caplog):
+@pytest.mark.parametrize("words", NO_NAMES)
+def test_what_is_no_name_of_a_bus_is_refused_in_one_line(words):
+    for text in NO_NAMES[words]:
+        with pytest.raises(UserError, match=f"^.*{words}.*$"):  # a dot is no new line
+            parse_bus(text)
+
+
+def test_buses_that_cannot_be_opened_are_one_line(caplog, monkeypatch):
     for text, words in (
         ("socketcan:can97", "bus socketcan:can97 cannot be opened"),
         ("nosuch:can0", "choose from .*socketcan"),
         ("slcan:/dev/nothing", "/dev/nothing.*manual says what its slcan needs"),
         ("kvaser:0", "bus kvaser:0 cannot be opened"),
     ):
-        with pytest.raises(UserError, match=words) as caught:
+        with pytest.raises(UserError, match=f"^.*{words}.*$"):
             open_bus(parse_bus(text))
-        assert "\n" not in str(caught.value)
     assert caplog.records == []  # a line of a library would be a second one
-
-
-def test_python_can_is_asked_for_where_it_is_missing(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "can", None)
+    monkeypatch.setitem(sys.modules, "can", None)
     with pytest.raises(UserError, match=r"pip install 'phil-edge-runtime\[can\]'"):
         open_bus(parse_bus(DEFAULT_BUS))
 
 
 def test_the_registry_makes_it_for_a_known_scenario_only(channel):
-    bus = f"virtual:{channel}"
-    vehicle = make_vehicle("hunter", Config(bus=bus), "left_turn")
-    assert isinstance(vehicle, HunterVehicle)
-    vehicle.close()
-    assert vehicle.limits == vehicle_limits("hunter", Config(), "left_turn")
+    config = Config(bus=f"virtual:{channel}")
     for make in (make_vehicle, vehicle_limits):
         with pytest.raises(UserError, match="parking"):
-            make("hunter", Config(bus=bus), "parking")
-    config = Config(bus=bus, similarity=SimilaritySettings(scale=0.1, car=CAR))
-    vehicle = make_vehicle("hunter", config, "parking")
-    assert isinstance(vehicle, HunterVehicle)
-    assert vehicle._core.similarity.scale == 0.1
-    vehicle.close()
+            make("hunter", config, "parking")
+    ours = SimilaritySettings(scale=0.1, car=CAR)
+    for scenario, similarity, scale in (("left_turn", None, 0.25), ("parking", ours, 0.1)):
+        config = Config(bus=config.bus, similarity=similarity or SimilaritySettings())
+        with contextlib.closing(make_vehicle("hunter", config, scenario)) as vehicle:
+            assert isinstance(vehicle, HunterVehicle)
+            assert vehicle.limits == vehicle_limits("hunter", config, scenario)
+            assert vehicle._core.similarity.scale == scale
 
 
-def free_udp_port():
+@pytest.fixture
+def port():
+    """A free one for UDP."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("", 0))
         return one.getsockname()[1]
@@ -337,8 +270,8 @@ def sent_packets():
     return sum(int(values[9]) for name, values in fields.items() if name != "lo")
 
 
-def test_frames_reach_the_other_end_and_no_network():
-    name = f"udp_multicast:{GROUP}:{free_udp_port()}"
+def test_frames_reach_the_other_end_and_no_network(port):
+    name = f"udp_multicast:{GROUP}:{port}"
     count = 300
     with open_bus(parse_bus(name)) as near, open_bus(parse_bus(name)) as far:
         before = sent_packets()
@@ -353,9 +286,8 @@ def test_frames_reach_the_other_end_and_no_network():
         assert sent_packets() - before < count / 2
 
 
-def test_what_is_sent_through_a_networks_device_is_not_heard():
+def test_what_is_sent_through_a_networks_device_is_not_heard(port):
     """As a neighbour's frames come: the kernel loops them back from the device they leave by."""
-    port = free_udp_port()
     with open_bus(parse_bus(f"udp_multicast:{GROUP}:{port}")) as far, socket.socket(
         socket.AF_INET, socket.SOCK_DGRAM
     ) as stranger, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import socket
+import socketserver
 import threading
 import time
 from types import SimpleNamespace
 from typing import Any, List
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -15,193 +16,123 @@ from edge_runtime import log, run
 from edge_runtime.config import Config
 from edge_runtime.link import Link, Presence, require_free
 from edge_runtime.run import Waiting
-from edge_runtime.transport import free_endpoint, look, open_session
+from edge_runtime.tests.harness import HEALTH
+from edge_runtime.transport import look, open_session
 from edge_runtime.util import UserError
-from edge_runtime.wire import Health
-
-HEALTH = Health(
-    vehicle_id="hunter01", vehicle="none", mode="standby", reason="", needs_rearm=False,
-    accepted=0, superseded=0, rejected={}, deadline_misses=0, safe_stops=0, policy_id="p",
-    inference_ms={}, uptime_s=0.0, sent_ns=0,
-)  # fmt: skip
 
 
-class FakeSession:
-    """Notes declarations; `routers` are those that are connected."""
-
-    def __init__(self, fails: bool = False) -> None:
-        self.routers: List[str] = []
-        self.sent = 0
-        self.events: List[str] = []
-        self.info = SimpleNamespace(routers_zid=lambda: list(self.routers))
-        self._fails = fails
-
-    def liveliness(self) -> Any:
-        return self
-
-    def get(self, *_: Any, **__: Any) -> list:
-        return []
-
-    def declare_token(self, key: str) -> Any:
-        self.events.append(f"declare {key}")
-        return SimpleNamespace(undeclare=self._undeclare)
-
-    def declare_publisher(self, key: str, **_: Any) -> Any:
-        return SimpleNamespace(undeclare=self._undeclare, put=self._put)
-
-    def close(self) -> None:
-        self.events.append("close")
-
-    def _put(self, payload: bytes) -> None:
-        self.sent += 1
-
-    def _undeclare(self) -> None:
-        self.events.append("undeclare")
-        if self._fails:
-            raise OSError("gone")
+@pytest.fixture
+def session() -> Any:
+    """Nobody else is there; `routers_zid` gives the routers that are connected."""
+    session = MagicMock()
+    session.liveliness().get.return_value = []
+    session.info.routers_zid.return_value = []
+    return session
 
 
-def make_presence(session: Any, give_way: Any = None, open_client: Any = None) -> Presence:
-    client: Any = open_client or Router().open
-    return Presence(session, "k", client, give_way or (lambda: None))
+def declared(session: Any) -> List[str]:
+    """The tokens in order, and "" where one was taken back."""
+    calls = [(name, args) for name, args, _ in session.mock_calls if "declare" in name]
+    return [args[0] if args else "" for _, args in calls]
 
 
-def test_the_tokens_are_declared_again_for_each_router_that_comes():
-    session: Any = FakeSession()
-    presence = make_presence(session)
+def test_the_tokens_are_declared_again_for_each_router_that_comes(session):
+    presence = Presence(session, "k", lambda: session, lambda: None)
     claims = [presence.claim]
     for routers in ([], ["b", "a"], ["a", "b"], [], ["c"], ["c"]):
-        session.routers = routers
+        session.info.routers_zid.return_value = routers
         if presence.refresh():
             claims.append(presence.claim)
     assert claims == sorted(set(claims))  # each is younger than the one before
-    expected = [["declare k", f"declare k/{claim}"] for claim in claims]
-    gone = ["undeclare", "undeclare"]
-    assert session.events == [*expected[0], *gone, *expected[1], *gone, *expected[2]]
+    first, *later = [["k", f"k/{claim}"] for claim in claims]
+    assert declared(session) == [*first, *(key for keys in later for key in ["", "", *keys])]
     presence.undeclare()
-    assert session.events[-2:] == gone
+    assert declared(session)[-2:] == ["", ""]
 
 
-class Router:
-    """What a client session hears of a router that knows these tokens."""
-
-    def __init__(self) -> None:
-        self.tokens: List[str] = []
-
-    def open(self) -> Any:
-        ok = [SimpleNamespace(ok=SimpleNamespace(key_expr=token)) for token in self.tokens]
-        liveliness = SimpleNamespace(get=lambda selector, timeout: ok)
-        return SimpleNamespace(liveliness=lambda: liveliness, close=lambda: None)
-
-
-def test_the_younger_of_two_gives_way_at_the_second_look():
-    router, calls = Router(), []
-    presence = make_presence(FakeSession(), lambda: calls.append("way"), router.open)
-    router.tokens = [f"k/{presence.claim}", "k/0000000000000001-elder"]
-    presence.look()
-    assert calls == []  # it may be the leftover of a lost connection
-    presence.look()
-    presence.look()
-    assert calls == ["way"]
-    assert presence.rivals == 1
-
-
-def test_the_elder_of_two_goes_on_and_counts():
-    router, calls = Router(), []
-    presence = make_presence(FakeSession(), lambda: calls.append("way"), router.open)
-    for claim in ("f" * 16, "f" * 16, "e" * 16, "f" * 16, "e" * 16, "e" * 16):
-        router.tokens = [f"k/{presence.claim}", f"k/{claim}"]
+@pytest.mark.parametrize(
+    ("claims", "given", "rivals"),
+    [
+        # At first an elder one may be the leftover of a lost connection.
+        (["0000000000000001-elder"] * 3, [0, 1, 1], 1),
+        ([letter * 16 for letter in "ffefee"], [0] * 6, 2),
+    ],
+    ids=["the younger of two gives way at the second look", "the elder goes on and counts"],
+)
+def test_of_two_runtimes(session, claims, given, rivals):
+    give_way = MagicMock()
+    presence = Presence(session, "k", lambda: session, give_way)
+    for claim, times_given in zip(claims, given):
+        keys = [f"k/{presence.claim}", f"k/{claim}"]
+        replies = [SimpleNamespace(ok=SimpleNamespace(key_expr=key)) for key in keys]
+        session.liveliness().get.return_value = replies
         presence.look()
-    assert (calls, presence.rivals) == ([], 2)
+        assert give_way.call_count == times_given
+    assert presence.rivals == rivals
 
 
-def test_nobody_there_is_nobody_else():
-    def fail() -> Any:
-        raise UserError("nobody answers")
-
-    presence = make_presence(FakeSession(), open_client=fail)
+def test_nobody_there_is_nobody_else(session):
+    fail = MagicMock(side_effect=UserError("nobody answers"))
+    presence = Presence(session, "k", fail, fail)
     presence.look()
     presence.look()
     assert presence.rivals == 0
     assert not require_free(fail, "hunter01")
-    assert require_free(Router().open, "hunter01")
+    assert require_free(lambda: session, "hunter01")
 
 
-def make_link(session: Any) -> Link:
-    manifest: Any = None
-    return Link(session, "hunter01", manifest)
+@pytest.fixture
+def link(session) -> Link:
+    return Link(session, "hunter01", MagicMock())
 
 
-def test_a_link_that_gave_way_sends_nothing():
-    session = FakeSession()
-    link = make_link(session)
+def test_a_link_that_gave_way_sends_nothing(session, link):
     link.send("health", HEALTH)
-    assert session.sent == 1
     link.gave_way = True
     link.send("health", HEALTH)
-    assert session.sent == 1
+    assert session.declare_publisher().put.call_count == 1
 
 
-def test_only_a_query_by_its_own_name_re_arms():
-    session: Any = FakeSession()
-    asked: dict = {}
-    session.declare_subscriber = lambda key, handler: None
-    session.declare_queryable = asked.__setitem__
-    calls: List[str] = []
-
-    def rearm() -> str:
-        calls.append("rearm")
-        return ""
-
-    make_link(session).declare(lambda payload: None, lambda: HEALTH, rearm)
+def test_only_a_query_by_its_own_name_re_arms(session, link):
+    rearm = MagicMock(return_value="")
+    link.declare(lambda payload: None, lambda: HEALTH, rearm)
+    asked = dict(call.args for call in session.declare_queryable.call_args_list)
     for selector in ("phil/**", "phil/*/rearm", "phil/hunter01/*", "phil/hunter01/re$*"):
-        asked["phil/hunter01/rearm"](query_of(selector))
-    assert calls == []  # somebody looked at everything that is there
-    asked["phil/hunter01/rearm"](query_of("phil/hunter01/rearm"))
-    assert calls == ["rearm"]
+        asked["phil/hunter01/rearm"](MagicMock(key_expr=selector))
+    assert not rearm.called  # somebody looked at everything that is there
+    asked["phil/hunter01/rearm"](MagicMock(key_expr="phil/hunter01/rearm"))
+    assert rearm.call_count == 1
 
 
-def query_of(selector: str) -> Any:
-    return SimpleNamespace(key_expr=selector, reply=lambda *_, **__: None)
-
-
-def test_the_session_is_closed_even_where_nothing_can_be_undeclared():
-    session = FakeSession(fails=True)
+def test_the_session_is_closed_even_where_nothing_can_be_undeclared(session, link):
+    session.declare_publisher().undeclare.side_effect = OSError("gone")
     with pytest.raises(OSError, match="gone"):
-        make_link(session).close()
-    assert session.events[-1] == "close"
+        link.close()
+    assert session.close.called
 
 
-def test_the_session_is_closed_where_the_link_cannot_be_made(monkeypatch):
-    session, stop = FakeSession(), None
-    policy = SimpleNamespace(manifest=SimpleNamespace(action=[], task=""))
-
-    def fail(*_: Any) -> None:
-        raise OSError("no link")
-
-    monkeypatch.setattr(run, "load_policy", lambda *_: policy)
+def test_the_session_is_closed_where_the_link_cannot_be_made(session, monkeypatch):
+    monkeypatch.setattr(run, "load_policy", MagicMock())
     monkeypatch.setattr(run, "open_session", lambda **_: session)
-    monkeypatch.setattr(run, "Link", fail)
+    monkeypatch.setattr(run, "Link", MagicMock(side_effect=OSError("no link")))
     with pytest.raises(OSError, match="no link"):
-        run._drive(Config(), stop)  # type: ignore[arg-type]
-    assert session.events == ["close"] * 2  # the one that asked for other runtimes, and its own
+        run._drive(Config(), MagicMock())
+    assert session.close.call_count == 2  # the one that asked for other runtimes, and its own
 
 
 @contextlib.contextmanager
 def server(answer):
-    """Accepts on loopback and answers each connection with these bytes, then closes it."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
+    """Answers each connection with these bytes, then closes it."""
 
-        def run():
-            with contextlib.suppress(OSError):
-                while True:
-                    link, _ = listening.accept()
-                    with link:
-                        link.recv(1)
-                        link.sendall(answer)
+    class Answers(socketserver.BaseRequestHandler):
+        def handle(self):
+            self.request.recv(1)
+            self.request.sendall(answer)
 
-        threading.Thread(target=run, daemon=True).start()
-        yield f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+    with socketserver.TCPServer(("127.0.0.1", 0), Answers) as listening:
+        threading.Thread(target=listening.serve_forever, daemon=True).start()
+        yield f"tcp/127.0.0.1:{listening.server_address[1]}"
+        listening.shutdown()
 
 
 def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
@@ -213,42 +144,45 @@ def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
         open_session(listen="tcp/a..b:7447", mode="router")
 
 
-def test_a_port_where_nobody_listens():
-    endpoint = free_endpoint()
-    port = endpoint.rsplit(":", 1)[1]
-    words = f"nobody listens on port {port} of 127.0.0.1 (connection refused)"
-    assert look(endpoint, None) == (False, words)
+TLS_ALERT = b"\x15\x03\x03\x00\x02\x02\x28"  # TLS 1.2, fatal, handshake failure
 
 
-def test_a_server_that_speaks_tls_and_one_that_speaks_something_else():
-    alert = b"\x15\x03\x03\x00\x02\x02\x28"  # TLS 1.2, fatal, handshake failure
-    with server(alert) as endpoint:
-        assert "listens with TLS and wants --tls" in look(endpoint, None)[1]
-    with server(b"SSH-2.0-OpenSSH_9.6\r\n") as endpoint:
-        assert "answers, but not as a simulator" in look(endpoint, None)[1]
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (TLS_ALERT, "listens with TLS and wants --tls"),
+        (b"SSH-2.0-OpenSSH_9.6\r\n", "answers, but not as a simulator"),
+    ],
+)
+def test_a_server_that_speaks_tls_and_one_that_speaks_something_else(answer, words):
+    with server(answer) as endpoint:
+        assert words in look(endpoint, None)[1]
 
 
-def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(monkeypatch):
-    said: List[str] = []
+@pytest.fixture
+def said(monkeypatch) -> List[str]:
+    """Why it waits, of each line in the log."""
+    lines: List[str] = []
+    monkeypatch.setattr(log, "event", lambda level, name, **fields: lines.append(fields["why"]))
+    return lines
+
+
+def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(said):
     heard: List[str] = []
-    monkeypatch.setattr(log, "event", lambda level, name, **fields: said.append(fields["why"]))
     look = Waiting(lambda: bool(heard), lambda: f"because {len(said)}").look
     assert [look(now_s) for now_s in (100.0, 100.1, 104.9)] == [True] * 3
     assert said == ["because 0"]
-    assert look(105.0)
-    assert look(109.9)
+    assert [look(now_s) for now_s in (105.0, 109.9)] == [True] * 2
     assert said == ["because 0", "because 1"]
     heard.append("a state")
     assert not look(110.0)
     assert len(said) == 2
 
 
-def test_a_state_that_comes_during_the_look_is_not_waited_for(monkeypatch):
-    said: List[dict] = []
+def test_a_state_that_comes_during_the_look_is_not_waited_for(said):
     heard: List[str] = []
-    monkeypatch.setattr(log, "event", lambda *_, **fields: said.append(fields))
 
-    def why():
+    def why() -> str:
         heard.append("a state")
         return "too late"
 
@@ -256,11 +190,10 @@ def test_a_state_that_comes_during_the_look_is_not_waited_for(monkeypatch):
     assert said == []
 
 
-def test_one_that_is_linked_has_time_for_its_first_state(monkeypatch):
-    said = threading.Event()
-    monkeypatch.setattr(log, "event", lambda *_, **fields: said.set())
+def test_one_that_is_linked_has_time_for_its_first_state(said):
     one = Waiting(lambda: False, lambda: "why")
     one.next_s = time.monotonic() + 5.0
     one.start()
-    assert not said.wait(0.3)
+    time.sleep(0.3)
+    assert said == []
     one.ended.set()

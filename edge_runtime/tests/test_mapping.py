@@ -1,7 +1,5 @@
 """From the policy's action to a vehicle's speed and wheel angle, within its limits."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -25,35 +23,29 @@ MOST = HUNTER.max_speed_mps
 unit = st.floats(-1, 1)
 
 
-def test_speeds_of_the_left_turn_on_the_hunter_by_hand():
-    assert similarity_to(car_of("left_turn", "hunter"), HUNTER) == LEFT_TURN
-    assert LEFT_TURN.scale == 0.25
-    assert LEFT_TURN.follow_speed(0.0, 4.0, 100.0) == 1.0
-
-
-def test_curvature_by_hand():
+@pytest.mark.parametrize("share", [1.0, 0.7])
+def test_curvature_by_hand(share):
     """Full left (-1): slip atan(tan(0.15) / 2), and a circle of 2.5 m / sin(slip), a quarter."""
-    radius_m = 2.5 / math.sin(math.atan(0.5 * math.tan(0.15)))
-    assert CONGESTION.car.curvature(-1.0) == pytest.approx(1 / radius_m)
-    assert math.tan(CONGESTION.centre_rad(-1.0)) == pytest.approx(0.650 / (0.25 * radius_m))
-    assert CONGESTION.centre_rad(1.0) < 0 == CONGESTION.centre_rad(0.0)
+    radius_m = 2.5 / math.sin(math.atan(0.5 * math.tan(0.15 * share)))
+    assert CONGESTION.car.curvature(-share) == pytest.approx(1 / radius_m)
+    assert math.tan(CONGESTION.centre_rad(-share)) == pytest.approx(0.650 / (0.25 * radius_m))
+    assert CONGESTION.centre_rad(share) < 0 == CONGESTION.centre_rad(0.0)
 
 
 @pytest.mark.parametrize("scenario", CARS)
-@given(steering=st.floats(-1, 1), scale=st.floats(0.01, 2.0))
-def test_steering_there_and_back(scenario, steering, scale):
+@given(steering=unit, scale=st.floats(0.01, 2.0), curvature=st.floats(-1e6, 1e6))
+def test_steering_there_and_back(scenario, steering, scale, curvature):
     similarity = similarity_to(CARS[scenario], HUNTER, scale)
     assert similarity.scale == scale
     centre_rad = similarity.centre_rad(steering)
     assert similarity.steering(centre_rad) == pytest.approx(steering, abs=1e-9)
+    assert math.isfinite(similarity.car.steering(curvature))  # none is too much for the inverse
 
 
-@given(curvature=st.floats(-1e6, 1e6))
-def test_no_curvature_is_too_much_for_the_inverse(curvature):
-    assert math.isfinite(CONGESTION.car.steering(curvature))
-
-
-def test_an_unknown_scenario_is_one_line_that_says_what_to_set():
+def test_a_scenarios_car_on_the_hunter():
+    assert similarity_to(car_of("left_turn", "hunter"), HUNTER) == LEFT_TURN
+    assert LEFT_TURN.scale == 0.25
+    assert LEFT_TURN.follow_speed(0.0, 4.0, 100.0) == 1.0
     with pytest.raises(UserError, match=r"'parking'.*congestion, left_turn.*\[similarity.car\]"):
         car_of("parking", "hunter")
 
@@ -87,14 +79,6 @@ def test_a_vehicle_that_is_held_up_does_not_wind_up():
     assert pedal_to_speed(0.0, -0.5, measured=1.0) == 0.0  # a brake that does not bite
 
 
-@given(st.lists(st.tuples(unit, st.floats(0, 0.1), st.floats(-2, 2)), max_size=40))
-def test_no_pedal_leaves_the_range(steps):
-    speed = 0.0
-    for pedal, step_s, measured in steps:
-        speed = pedal_to_speed(speed, pedal, step_s, measured)
-        assert 0.0 <= speed <= MOST
-
-
 @given(unit)
 def test_pedal_to_acceleration_and_back(pedal):
     acceleration = LEFT_TURN.acceleration_mps2(pedal)
@@ -122,42 +106,31 @@ def test_ackermann_by_hand():
 
 
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
-@given(share=unit)
-def test_inner_to_centre_and_back(spec, share):
+@given(unit)
+def test_all_the_way_from_the_action_to_the_inner_wheel_and_back(spec, share):
     inner = share * spec.max_inner_steering_rad
     centre = spec.centre_rad(inner)
     assert abs(centre) <= abs(inner) + 1e-12
     assert spec.inner_rad(centre) == pytest.approx(inner, abs=1e-9)
     assert abs(spec.inner_rad(3 * share / 2)) <= spec.max_inner_steering_rad + 1e-9  # never too far
-
-
-@pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
-@given(steering=unit)
-def test_all_the_way_from_the_action_to_the_inner_wheel_and_back(spec, steering):
     similarity = similarity_to(CARS["congestion"], spec)
-    inner = spec.inner_rad(similarity.centre_rad(steering))
-    assert similarity.steering(spec.centre_rad(inner)) == pytest.approx(steering, abs=1e-9)
-    assert inner == 0 or (inner < 0) == (steering > 0)  # its action +1 turns right
+    inner = spec.inner_rad(similarity.centre_rad(share))
+    assert similarity.steering(spec.centre_rad(inner)) == pytest.approx(share, abs=1e-9)
+    assert inner == 0 or (inner < 0) == (share > 0)  # its action +1 turns right
 
 
-def test_a_path_of_the_scenario_is_the_same_path_smaller():
-    """The heading that a car and the robot gain on the same share of the way is the same."""
-    angle = 0.15 * 0.7
-    car_rad_per_m = math.sin(math.atan(0.5 * math.tan(angle))) / 2.5
-    centre = CONGESTION.centre_rad(-0.7)
-    robot_rad_per_m = math.tan(centre) / HUNTER.wheelbase_m
-    assert robot_rad_per_m * CONGESTION.scale == pytest.approx(car_rad_per_m)
+PEDALS, SPEEDS_MPS = st.floats(-3, 3), st.floats(-2, 2)
 
 
-@given(st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.1, 0.3)), max_size=40))
+@given(st.lists(st.tuples(PEDALS, PEDALS, st.floats(-0.1, 0.3), SPEEDS_MPS), max_size=40))
 def test_a_set_point_stays_within_the_limits_and_turns_no_faster_than_its_rate(steps):
     set_point = SetPoint(CONGESTION)
     full_rad = HUNTER.inner_rad(CONGESTION.centre_rad(-1.0))
-    for pedal, steering, step_s in steps:
+    for pedal, steering, step_s, measured_mps in steps:
         before_rad = set_point.inner_rad
-        set_point.follow(wish_of({"pedal": pedal, "steering": steering}, None), step_s, 1.0)
-        counted_s = min(max(step_s, 0.0), 0.1)
-        most_rad = HUNTER.max_steering_rate_radps * counted_s
+        wish = wish_of({"pedal": pedal, "steering": steering}, None)
+        set_point.follow(wish, step_s, measured_mps)
+        most_rad = HUNTER.max_steering_rate_radps * min(max(step_s, 0.0), 0.1)
         assert abs(set_point.inner_rad - before_rad) <= most_rad + 1e-12
         assert abs(set_point.inner_rad) <= full_rad + 1e-12
         assert 0.0 <= set_point.speed_mps <= MOST

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import random
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
@@ -32,32 +32,54 @@ def action(name, low=-1.0, high=1.0):
 
 
 def refused(path, match, **options):
-    with pytest.raises(UserError, match=match) as caught:
+    with pytest.raises(UserError, match=f"^.*{match}.*$"):  # a dot is no new line
         load_policy(path, **options)
-    assert "\n" not in str(caught.value)
 
 
-def test_a_signed_policy_drives(make_policy):
-    signed = make_policy("mean")
+@pytest.fixture
+def plain(tmp_path):
+    """Where an unsigned policy file may lie."""
+    return tmp_path / "p.onnx"
+
+
+@pytest.mark.parametrize("actions", [(PEDAL,), (PEDAL, STEERING)])
+def test_a_signed_policy_drives(make_policy, actions):
+    signed = make_policy("mean", actions=actions)
     policy = load_policy(signed.path, signed.public_key)
-    assert policy.trust == module.VERIFIED
-    assert policy.policy_id == signed.policy_id
+    assert (policy.trust, policy.policy_id) == (module.VERIFIED, signed.policy_id)
     for level in (0, 51, 255):
         action = policy.act(np.full((2, 45, 80), level, np.uint8))
         assert action.dtype == np.float32
-        np.testing.assert_allclose(action, [level / 127.5 - 1], atol=1e-6)
+        np.testing.assert_allclose(action, [level / 127.5 - 1] * len(actions), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("public_key", "match"),
+    [
+        (public_pem(Ed25519PrivateKey.generate()), "another key signed it"),
+        (b"not a key", "not a PEM public key"),
+        (public_pem(X25519PrivateKey.generate()), "not an Ed25519 key"),
+        (None, "does not exist"),
+    ],
+)
+def test_another_key_or_none_is_refused(make_policy, public_key, match):
+    signed = make_policy()
+    signed.public_key.unlink()
+    if public_key:
+        signed.public_key.write_bytes(public_key)
+    refused(signed.path, match, public_key=signed.public_key, allow_unsigned=True)
 
 
 @pytest.mark.parametrize("shape", [(1, 0), (2, 1), (1, 2), (), (1,), (0, 1), (1, 1, 1)])
-def test_an_answer_of_another_shape_than_one_row_of_actions_is_none(tmp_path, shape):
-    """Probe pictures cannot find it out: the shape hangs on the picture."""
-    write_policy(tmp_path / "p.onnx", "odd", odd_shape=shape)
-    policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
-    assert policy.act(np.zeros((2, 45, 80), np.uint8)).shape == (1,)
-    white = np.full((2, 45, 80), 255, np.uint8)
+def test_an_answer_of_another_shape_than_one_row_of_actions_is_none(plain, shape):
+    """Probe pictures cannot find it out: the shape may hang on the picture."""
+    write_policy(plain)
+    session = SimpleNamespace(run=lambda *_: [np.full(shape, 0.5, np.float32)])
+    policy = load_policy(plain, allow_unsigned=True)._replace(session=session)
+    frames = np.zeros((2, 45, 80), np.uint8)
     with pytest.raises(UserError, match=re.escape(f"float32 {list(shape)}")):
-        policy.act(white)
-    assert infer(policy, white)[0] is None
+        policy.act(frames)
+    assert infer(policy, frames)[0] is None
 
 
 def test_two_files_that_act_differently_never_share_an_id(tmp_path):
@@ -65,10 +87,7 @@ def test_two_files_that_act_differently_never_share_an_id(tmp_path):
     paths = [tmp_path / name for name in ("good.onnx", "bad.onnx")]
     write_policy(paths[0], "mean")
     model = onnx.load(str(paths[0]))
-    model.graph.node[-1].output[0] = "unused"
-    model.graph.node.append(helper.make_node("Sign", ["mean"], ["sign"]))
-    model.graph.node.append(helper.make_node("Abs", ["sign"], ["throttle"]))
-    model.graph.node.append(helper.make_node("Unsqueeze", ["throttle", "last_axis"], ["action"]))
+    model.graph.node[-1].op_type = "Max"  # of the answer and 1
     onnx.save(model, str(paths[1]))
     good, bad = (load_policy(path, allow_unsigned=True) for path in paths)
     assert bad.act(np.full((2, 45, 80), 9, np.uint8)) == [1.0]
@@ -84,74 +103,24 @@ def test_a_policy_from_before_with_an_id_in_its_manifest_still_drives(scenario):
     assert policy.policy_id == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_the_task_is_scenario_and_actions_and_fits_the_wire(tmp_path):
-    write_policy(tmp_path / "p.onnx", value=0.1, actions=(PEDAL, action("steering", -0.5, 0.25)))
-    manifest = load_policy(tmp_path / "p.onnx", allow_unsigned=True).manifest
+def test_the_task_is_scenario_and_actions_and_fits_the_wire(plain):
+    write_policy(plain, value=0.1, actions=(PEDAL, action("steering", -0.5, 0.25)))
+    manifest = load_policy(plain, allow_unsigned=True).manifest
     assert manifest.task == "left_turn, pedal -1 to 1, steering -0.5 to 0.25"
     assert len(module.task_text("s" * 300, [])) == MAX_TEXT_CHARS
 
 
-def test_two_actions(tmp_path):
-    write_policy(tmp_path / "p.onnx", value=-0.25, actions=(PEDAL, STEERING))
-    policy = load_policy(tmp_path / "p.onnx", allow_unsigned=True)
-    np.testing.assert_allclose(policy.act(np.zeros((2, 45, 80), np.uint8)), [-0.25, -0.25])
-
-
-@settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=30
-)
-@given(position=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
-def test_one_changed_byte_is_refused_whatever_the_flags(make_policy, position, flip):
-    signed = make_policy()
-    data = bytearray(signed.path.read_bytes())
-    data[int(position * len(data))] ^= flip
-    signed.path.write_bytes(bytes(data))
-    for allow_unsigned in (False, True):
-        refused(
-            signed.path, "signature", public_key=signed.public_key, allow_unsigned=allow_unsigned
-        )
-
-
-def test_a_changed_or_short_signature_is_refused(make_policy):
-    signed = make_policy()
-    signature_path = signed.path.with_name(signed.path.name + ".sig")
-    good = signature_path.read_bytes()
-    names = f"{re.escape(str(signature_path))}, public key {re.escape(str(signed.public_key))}"
-    for bad in (bytes([good[0] ^ 1]) + good[1:], good[:-1], good + b"\n", b"", bytes(64)):
-        signature_path.write_bytes(bad)
-        refused(signed.path, names, public_key=signed.public_key, allow_unsigned=True)
-
-
-def test_another_key_is_refused(make_policy, tmp_path):
-    signed = make_policy()
-    other = tmp_path / "other.pub"
-    other.write_bytes(public_pem(Ed25519PrivateKey.generate()))
-    refused(signed.path, "another key signed it", public_key=other, allow_unsigned=True)
-
-
-def test_a_key_that_is_none_is_refused(make_policy, tmp_path):
-    signed = make_policy()
-    key = tmp_path / "bad.pub"
-    key.write_bytes(b"not a key")
-    refused(signed.path, "not a PEM public key", public_key=key)
-    key.write_bytes(public_pem(X25519PrivateKey.generate()))
-    refused(signed.path, "not an Ed25519 key", public_key=key)
-    refused(signed.path, "does not exist", public_key=tmp_path / "absent.pub")
-
-
 def test_trust_without_a_key_or_signature(make_policy, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    signed = make_policy()
-    refused(signed.path, "no public key")
-    assert load_policy(signed.path, allow_unsigned=True).trust == module.UNVERIFIED
-    write_policy(tmp_path / "plain.onnx")
-    refused(tmp_path / "plain.onnx", "not signed")
-    assert load_policy(tmp_path / "plain.onnx", allow_unsigned=True).trust == module.UNSIGNED
-
-
-def test_the_public_key_in_the_working_directory_is_found(make_policy, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    signed = make_policy()
+    signed, plain = make_policy(), tmp_path / "plain.onnx"
+    write_policy(plain)
+    for path, match, trust in (
+        (signed.path, "no public key", module.UNVERIFIED),
+        (plain, "not signed", module.UNSIGNED),
+    ):
+        refused(path, match)
+        assert load_policy(path, allow_unsigned=True).trust == trust
+    # The one in the working directory is found.
     (tmp_path / "keys").mkdir()
     signed.public_key.rename(tmp_path / "keys" / "policy.pub")
     assert load_policy(signed.path).trust == module.VERIFIED
@@ -194,9 +163,9 @@ def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
         ({"actions": (PEDAL, PEDAL)}, "names an action twice: pedal, pedal"),
     ],
 )
-def test_manifest_and_graph_must_agree(tmp_path, options, match):
-    write_policy(tmp_path / "p.onnx", **options)
-    refused(tmp_path / "p.onnx", match, allow_unsigned=True)
+def test_manifest_and_graph_must_agree(plain, options, match):
+    write_policy(plain, **options)
+    refused(plain, match, allow_unsigned=True)
 
 
 def _rename(graph):
@@ -213,35 +182,27 @@ def _rename(graph):
         (lambda g: g.input.append(helper.make_tensor_value_info("more", 1, [1])), "more tensor"),
     ],
 )
-def test_a_graph_of_another_input_is_refused(tmp_path, change, found):
-    write_policy(tmp_path / "p.onnx")
-    model = onnx.load(str(tmp_path / "p.onnx"))
+def test_a_graph_of_another_input_is_refused(plain, change, found):
+    write_policy(plain)
+    model = onnx.load(str(plain))
     change(model.graph)
-    onnx.save(model, str(tmp_path / "p.onnx"))
-    refused(tmp_path / "p.onnx", rf"its input must be frames .*{found}", allow_unsigned=True)
+    onnx.save(model, str(plain))
+    refused(plain, rf"its input must be frames .*{found}", allow_unsigned=True)
 
 
 def _input(graph):
     return graph.input[0].type.tensor_type
 
 
-def test_what_onnxruntime_prints_stays_off_stdout(tmp_path, monkeypatch, capfd):
+def test_what_onnxruntime_prints_stays_off_stdout(plain, monkeypatch, capfd):
     def fail(*_, **__):
         print("EP Error")
         raise ValueError("broken\ngraph")
 
     monkeypatch.setattr("onnxruntime.InferenceSession", fail)
-    write_policy(tmp_path / "p.onnx")
-    refused(tmp_path / "p.onnx", "broken graph", allow_unsigned=True)
+    write_policy(plain)
+    refused(plain, "broken graph", allow_unsigned=True)
     assert capfd.readouterr().out == ""
-
-
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n" + bytes(99)])
-def test_foreign_files_are_refused(tmp_path, content):
-    (tmp_path / "p.onnx").write_bytes(content)
-    refused(tmp_path / "p.onnx", "not a whole ONNX file", allow_unsigned=True)
-    refused(tmp_path / "absent.onnx", "does not exist")
-    refused(tmp_path, "is a directory")
 
 
 @pytest.fixture(scope="module")
@@ -251,12 +212,6 @@ def written(tmp_path_factory):
     return path
 
 
-def test_it_reads_what_the_onnx_package_wrote(written):
-    ir_version, opset, metadata = read_onnx(written.read_bytes())
-    assert (ir_version, opset) == (8, 17)
-    assert module.decode_manifest(metadata[MANIFEST_KEY]).scenario == "left_turn"
-
-
 def refused_or_without_manifest(data: bytes) -> bool:
     try:
         return MANIFEST_KEY not in read_onnx(data)[2]
@@ -264,26 +219,23 @@ def refused_or_without_manifest(data: bytes) -> bool:
         return True
 
 
-def test_every_truncation_is_refused(written):
+def test_what_the_onnx_package_wrote_is_read_and_every_truncation_refused(written):
     """A cut between two fields can leave a whole model, but then the manifest is gone."""
     data = written.read_bytes()
-    assert not refused_or_without_manifest(data)
+    ir_version, opset, metadata = read_onnx(data)
+    assert (ir_version, opset) == (8, 17)
+    assert module.decode_manifest(metadata[MANIFEST_KEY]).scenario == "left_turn"
     for length in range(len(data)):
         assert refused_or_without_manifest(data[:length]), length
 
 
-@given(st.binary(max_size=200))
-def test_foreign_bytes_raise_only_user_errors(data):
-    assert refused_or_without_manifest(data)
-
-
 @settings(deadline=None)
 @given(st.data())
-def test_damaged_bytes_raise_only_user_errors(written, data):
+def test_foreign_and_damaged_bytes_raise_only_user_errors(written, data):
+    assert refused_or_without_manifest(data.draw(st.binary(max_size=200)))
     damaged = bytearray(written.read_bytes())
     damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
-    with contextlib.suppress(UserError):
-        read_onnx(bytes(damaged))
+    refused_or_without_manifest(bytes(damaged))
 
 
 def outside(tensor):
@@ -315,32 +267,28 @@ def constant(**value):
     return helper.make_node("Constant", [], ["c"], **value)
 
 
+ELSEWHERE, SPARSE = "another file", "sparse weights"
 HIDDEN = {
-    "in an initializer": (lambda m: outside(m.graph.initializer[0]), "another file"),
+    "in an initializer": (lambda m: outside(m.graph.initializer[0]), ELSEWHERE),
     "in an initializer that says so and names no file": (
-        lambda m: setattr(m.graph.initializer[0], "data_location", TensorProto.EXTERNAL),
-        "another file",
+        lambda m: setattr(m.graph.initializer[0], "data_location", TensorProto.EXTERNAL), ELSEWHERE,
     ),
-    "in a constant": (
-        lambda m: m.graph.node.append(constant(value=outside(weight()))), "another file",
-    ),
-    "in a nested graph": (
-        lambda m: loop_body(m).initializer.append(outside(weight())), "another file",
-    ),
+    "in a constant": (lambda m: m.graph.node.append(constant(value=outside(weight()))), ELSEWHERE),
+    "in a nested graph": (lambda m: loop_body(m).initializer.append(outside(weight())), ELSEWHERE),
     "in a constant of a nested graph": (
-        lambda m: loop_body(m).node.append(constant(value=outside(weight()))), "another file",
+        lambda m: loop_body(m).node.append(constant(value=outside(weight()))), ELSEWHERE,
     ),
     "in a sparse initializer": (
-        lambda m: m.graph.sparse_initializer.append(sparse_weight()), "sparse weights",
+        lambda m: m.graph.sparse_initializer.append(sparse_weight()), SPARSE,
     ),
     "in a sparse initializer of a nested graph": (
-        lambda m: loop_body(m).sparse_initializer.append(sparse_weight()), "sparse weights",
+        lambda m: loop_body(m).sparse_initializer.append(sparse_weight()), SPARSE,
     ),
     "in a sparse constant": (
-        lambda m: m.graph.node.append(constant(sparse_value=sparse_weight())), "sparse weights",
+        lambda m: m.graph.node.append(constant(sparse_value=sparse_weight())), SPARSE,
     ),
     "in a list of sparse tensors": (
-        lambda m: m.graph.node.append(constant(values=[sparse_weight()])), "sparse weights",
+        lambda m: m.graph.node.append(constant(values=[sparse_weight()])), SPARSE,
     ),
     "in a function of the model": (
         lambda m: m.functions.append(
@@ -365,15 +313,11 @@ HIDDEN = {
 def test_weights_that_may_lie_outside_the_file_are_refused(written, place):
     hide, what = HIDDEN[place]
     model = onnx.load(str(written))
+    model.graph.initializer[0].data_location = TensorProto.DEFAULT  # it says where it is
+    assert read_onnx(model.SerializeToString())[1] == 17
     hide(model)
     with pytest.raises(UserError, match=what):
         read_onnx(model.SerializeToString())
-
-
-def test_weights_that_say_they_are_inside_are_read(written):
-    model = onnx.load(str(written))
-    model.graph.initializer[0].data_location = TensorProto.DEFAULT
-    assert read_onnx(model.SerializeToString())[1] == 17
 
 
 def varint(number: int) -> bytes:
@@ -430,27 +374,16 @@ def changed(data, place, flip):
     return data[:place] + bytes([data[place] ^ flip]) + data[place + 1 :]
 
 
-def test_every_byte_of_a_small_policy_counts(signed):
+def test_every_byte_of_a_small_policy_and_every_bit_of_its_signature_count(signed):
     data, signature, public_key = signed
     assert is_accepted(data, signature, public_key)
     draw = random.Random(1)
     for place in range(len(data)):
         flip = draw.randint(1, 255)
         assert not is_accepted(changed(data, place, flip), signature, public_key), (place, flip)
-
-
-def test_every_bit_of_the_signature_counts(signed):
-    data, signature, public_key = signed
     for place in range(len(signature)):
         for bit in range(8):
             assert not is_accepted(data, changed(signature, place, 1 << bit), public_key), place
-
-
-def test_a_second_form_of_the_same_signature_is_refused(signed):
-    """S plus the group's order solves the same equation; it must not pass as another file."""
-    data, signature, public_key = signed
-    number = int.from_bytes(signature[32:], "little") + GROUP_ORDER
-    assert not is_accepted(data, signature[:32] + number.to_bytes(32, "little"), public_key)
 
 
 def test_bytes_more_less_or_elsewhere_are_refused(signed):
@@ -458,31 +391,25 @@ def test_bytes_more_less_or_elsewhere_are_refused(signed):
     half = len(data) // 2
     for other in (b"", data[:-1], data[1:], data + b"\0", b"\0" + data, data[half:] + data[:half]):
         assert not is_accepted(other, signature, public_key)
-
-
-def test_the_kept_policy_in_all_its_regions():
-    """Two megabytes: every byte at both ends (header, manifest), the weights in between drawn."""
-    data = (POLICIES / "left_turn.onnx").read_bytes()
-    signature = (POLICIES / "left_turn.onnx.sig").read_bytes()
-    public_key = (POLICIES / "policy.pub").read_bytes()
-    assert is_accepted(data, signature, public_key)
-    draw = random.Random(2)
-    stride = len(data) // 50
-    places = {*range(40), *range(len(data) - 40, len(data))}
-    places |= {start + draw.randrange(stride) for start in range(0, len(data) - stride, stride)}
-    for place in sorted(places):
-        assert not is_accepted(changed(data, place, 1 << draw.randrange(8)), signature, public_key)
+    # S plus the group's order solves the same equation; it must not pass as another file.
+    number = int.from_bytes(signature[32:], "little") + GROUP_ORDER
+    second_form = signature[:32] + number.to_bytes(32, "little")
+    for other in (second_form, signature[:-1], signature + b"\n", b"", bytes(64)):
+        assert not is_accepted(data, other, public_key)
 
 
 @pytest.mark.parametrize("region", ["graph", "manifest", "signature"])
-def test_the_check_command_refuses_it(make_policy, region):
+def test_a_changed_file_is_refused_whatever_the_flags_also_by_the_command(make_policy, region):
     signed = make_policy()
-    path = Path(f"{signed.path}.sig") if region == "signature" else signed.path
+    signature = Path(f"{signed.path}.sig")
+    path = signature if region == "signature" else signed.path
     data = path.read_bytes()
     place = {"graph": 12, "manifest": data.find(b"algorithm"), "signature": 40}[region]
     assert place >= 0
     path.write_bytes(changed(data, place, 1))
+    names = f"{re.escape(str(signature))}, public key {re.escape(str(signed.public_key))}"
+    for allow_unsigned in (False, True):
+        refused(signed.path, names, public_key=signed.public_key, allow_unsigned=allow_unsigned)
     result = run_command("check", str(signed.path), "--public-key", str(signed.public_key))
-    assert (result.returncode, result.stdout) == (2, "")
+    assert (result.returncode, result.stdout, result.stderr.count("\n")) == (2, "", 1)
     assert "the file was changed" in result.stderr
-    assert result.stderr.count("\n") == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import struct
@@ -10,6 +11,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -50,11 +52,6 @@ IMAGES = st.builds(
     ros.Image, HEADERS, UINT32, UINT32, TEXTS, st.integers(0, 255), UINT32, st.binary(max_size=100)
 )
 MESSAGES = st.one_of(TWISTS, DRIVES, ODOMETRIES, IMAGES)
-KINDS = [ros.Twist, ros.AckermannDriveStamped, ros.Odometry, ros.Image]
-
-
-def type_name(kind):
-    return kind.__idl_typename__
 
 
 @pytest.mark.parametrize(
@@ -62,7 +59,6 @@ def type_name(kind):
     [
         ("/", "cmd_vel", "cmd_vel"),
         ("/", "/cmd_vel", "cmd_vel"),
-        ("/hunter01", "odom", "hunter01/odom"),
         ("hunter01", "camera/image_raw", "hunter01/camera/image_raw"),
         ("/a/b", "c", "a/b/c"),
         ("/hunter01", "/absolute/odom", "absolute/odom"),
@@ -72,16 +68,14 @@ def test_a_key_is_the_name_without_the_first_slash(namespace, topic, key):
     assert ros2.topic_key(namespace, topic) == key
 
 
-BAD_NAMES = ["", "1a", "a/1", "a-b", "a//b", "a b", "*", "/**", "é", "a" * 201]
-
-
 @pytest.mark.parametrize(
-    ("name", "words"), [*((name, "is not valid") for name in BAD_NAMES), ("/", "names nothing")]
+    "name", ["", "1a", "a/1", "a-b", "a//b", "a b", "*", "/**", "é", "a" * 201]
 )
-def test_what_is_no_topic_is_refused_in_one_line(name, words):
-    with pytest.raises(UserError, match=words) as caught:
+def test_what_is_no_topic_is_refused_in_one_line(name):
+    with pytest.raises(UserError, match=r"^.*is not valid.*$"):  # a dot is no new line
         ros2.topic_key("/hunter01", name)
-    assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match=r"^.*names nothing.*$"):
+        ros2.topic_key("/hunter01", "/")
 
 
 @given(st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True))
@@ -91,10 +85,10 @@ def test_any_vehicle_id_gives_a_valid_namespace(vehicle_id):
     assert [ros2.namespace_of(name) for name in given] == ["/hunter01", "/a_b", "/v7up"]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [ros.Twist, ros.AckermannDriveStamped, ros.Odometry, ros.Image])
 @pytest.mark.parametrize(("role", "reliable"), [(ros.PUBLISHER, 1), (ros.SUBSCRIBER, 0)])
 def test_tokens_are_the_bridges_with_the_second_librarys_hash(role, reliable, kind):
-    name = type_name(kind)
+    name = kind.__idl_typename__
     token = ros.topic_token("a1b2", role, "hunter01/cmd_vel", kind)
     zenoh.KeyExpr(token)  # raises for what Zenoh would not declare
     assert token == (
@@ -103,31 +97,10 @@ def test_tokens_are_the_bridges_with_the_second_librarys_hash(role, reliable, ki
     )
 
 
-TWIST = ros.Twist(ros.Vector3(1.5, 0.0, -0.25), ros.Vector3(0.0, 0.0, 0.5))
-DRIVE = ros.AckermannDriveStamped(
-    ros.Header(ros.Time(7, 9), "abc"), ros.AckermannDrive(0.5, 0.0, 1.25)
-)
-LONGER = ros.AckermannDriveStamped(ros.Header(ros.Time(), "abcd"), DRIVE.drive)
-
-
-@pytest.mark.parametrize(
-    ("message", "by_hand"),
-    [
-        (TWIST, struct.pack("<6d", 1.5, 0.0, -0.25, 0.0, 0.0, 0.5)),
-        # sec, nanosec, 4 bytes with the ending zero, no padding; then five floats.
-        (DRIVE, struct.pack("<iII4s5f", 7, 9, 4, b"abc\0", 0.5, 0.0, 1.25, 0.0, 0.0)),
-        (LONGER, struct.pack("<iII8s5f", 0, 0, 5, b"abcd", 0.5, 0.0, 1.25, 0.0, 0.0)),
-    ],
-    ids=["a twist is six doubles", "a drive", "a drive aligns after its text"],
-)
-def test_bytes_by_hand(message, by_hand):
-    assert ros.encode(message) == b"\x00\x01\x00\x00" + by_hand
-
-
 @settings(deadline=None)
 @given(MESSAGES)
 def test_the_second_library_and_ours_understand_each_other(message):
-    kind, name, fields = type(message), type_name(type(message)), asdict(message)
+    kind, name, fields = type(message), message.__idl_typename__, asdict(message)
     ours, theirs = ros.encode(message), second.serialize(name, fields)
     assert second.deserialize(name, ours) == fields
     assert ros.decode(theirs, kind) == message
@@ -139,23 +112,18 @@ def test_the_second_library_and_ours_understand_each_other(message):
 
 @settings(max_examples=500)
 @given(
-    st.sampled_from([b"", b"\0\0\0\0", b"\0\1\0\0"]),
-    st.binary(max_size=1200),
-    st.sampled_from(KINDS),
+    MESSAGES, st.sampled_from([b"", b"\0\0\0\0", b"\0\1\0\0"]), st.binary(max_size=1200), st.data()
 )
-def test_random_bytes_never_raise_after_a_good_header_neither(header, body, kind):
+def test_random_damaged_and_cut_off_bytes_never_raise(message, header, body, data):
+    kind, payload = type(message), bytearray(ros.encode(message))
     assert isinstance(ros.decode(header + body, kind), (kind, Rejection))
-
-
-@settings(max_examples=300)
-@given(MESSAGES, st.data())
-def test_a_message_that_is_cut_off_or_damaged_never_raises(message, data):
-    payload = bytearray(ros.encode(message))
-    kind = type(message)
     cut = data.draw(st.integers(0, len(payload) - 1))
     assert isinstance(ros.decode(bytes(payload[:cut]), kind), Rejection)
     payload[data.draw(st.integers(0, len(payload) - 1))] ^= data.draw(st.integers(1, 255))
     assert isinstance(ros.decode(bytes(payload), kind), (kind, Rejection))
+
+
+LE = b"\0\1\0\0"  # how a message of little-endian CDR begins
 
 
 @pytest.mark.parametrize(
@@ -164,13 +132,14 @@ def test_a_message_that_is_cut_off_or_damaged_never_raises(message, data):
         (b"", ros.Twist, Reason.MALFORMED),
         (b"\0\1\0", ros.Twist, Reason.MALFORMED),
         (b"\0\7\0\0" + bytes(48), ros.Twist, Reason.SCHEMA),  # XCDR version 2
-        (ros.encode(TWIST), ros.Odometry, Reason.MALFORMED),
+        (ros.encode(ros.Twist()), ros.Odometry, Reason.MALFORMED),
         (ros.encode(ros.Odometry()), ros.Twist, Reason.MALFORMED),
-        (b"\0\1\0\0" + struct.pack("<6d", *[0.0] * 5, float("nan")), ros.Twist, Reason.NOT_FINITE),
-        (b"\0\1\0\0" + struct.pack("<6d", float("inf"), *[0.0] * 5), ros.Twist, Reason.NOT_FINITE),
-        (b"\0\1\0\0" + bytes(ros.MAX_PAYLOAD_BYTES), ros.Image, Reason.OVERSIZED),
-        (b"\0\1\0\0" + struct.pack("<iII", 0, 0, 2**32 - 1), ros.Odometry, Reason.MALFORMED),
-        (b"\0\1\0\0" + struct.pack("<iII2s", 0, 0, 3, b"\xff\xff"), ros.Odometry, Reason.MALFORMED),
+        (LE + struct.pack("<6d", *[0.0] * 5, float("nan")), ros.Twist, Reason.NOT_FINITE),
+        (LE + struct.pack("<6d", float("inf"), *[0.0] * 5), ros.Twist, Reason.NOT_FINITE),
+        (LE + bytes(ros.MAX_PAYLOAD_BYTES), ros.Image, Reason.OVERSIZED),
+        (LE + struct.pack("<iII", 0, 0, 2**32 - 1), ros.Odometry, Reason.MALFORMED),
+        (LE + struct.pack("<iII2s", 0, 0, 3, b"\xff\xff"), ros.Odometry, Reason.MALFORMED),
+        (ros.encode(ros.Image()) + bytes(4), ros.Image, Reason.MALFORMED),
     ],
 )
 def test_what_is_no_message_says_why(payload, kind, reason):
@@ -179,29 +148,19 @@ def test_what_is_no_message_says_why(payload, kind, reason):
     assert rejection.reason == reason
 
 
-def test_a_nan_in_a_covariance_is_not_finite():
+def test_a_rejection_names_the_field():
     odometry = ros.Odometry()
     odometry.twist.covariance[3] = float("nan")
-    assert ros.decode(ros.encode(odometry), ros.Odometry) == Rejection(
-        Reason.NOT_FINITE, "twist.covariance is nan"
-    )
-
-
-def test_an_image_of_the_policy_goes_through_whole():
-    pixels = bytes(range(256)) * 14 + bytes(16)
-    image = ros.Image(ros.Header(), 45, 80, "mono8", 0, 80, pixels)
-    assert second.deserialize(type_name(ros.Image), ros.encode(image))["data"] == pixels
+    found = ros.decode(ros.encode(odometry), ros.Odometry)
+    assert found == Rejection(Reason.NOT_FINITE, "twist.covariance is nan")
 
 
 def test_a_message_that_dds_has_filled_up_is_read():
     """As Cyclone DDS writes it: up to 4 bytes, and how many were added in the header."""
     image = ros.Image(height=1, width=3, step=3, data=b"abc")
     plain = ros.encode(image)
-    padding = -len(plain) % 4
-    assert padding == 1
+    assert -len(plain) % 4 == 1
     assert ros.decode(b"\0\1\0\1" + plain[4:] + b"\0", ros.Image) == image
-    too_much = ros.decode(plain + bytes(4), ros.Image)
-    assert isinstance(too_much, Rejection)
 
 
 def test_threads_do_not_share_a_buffer():
@@ -233,18 +192,18 @@ needs_cyclone = pytest.mark.skipif(
 def through_dds(tmp_path_factory):
     """Compile; the function returns DDS's own bytes and the type's name, None where it refuses."""
     folder = tmp_path_factory.mktemp("cyclone")
+    run = partial(subprocess.run, cwd=folder, timeout=60)
     for command in (
         f"idlc -x final -l c {SOURCE}/ros.idl",
         f"gcc -O1 -I. -o through_dds {SOURCE}/through_dds.c ros.c -lddsc",
     ):
-        subprocess.run(command.split(), cwd=folder, check=True, timeout=60)
+        run(command.split(), check=True)
 
     def go(payload, kind):
         (folder / "in").write_bytes(payload)
-        done = subprocess.run(
-            [str(folder / "through_dds"), kind.__name__, "in", "out"],
-            cwd=folder, env={**os.environ, "CYCLONEDDS_URI": LOOPBACK_ONLY},
-            capture_output=True, text=True, timeout=60, check=False,
+        done = run(
+            ["./through_dds", kind.__name__, "in", "out"], capture_output=True, text=True,
+            env={**os.environ, "CYCLONEDDS_URI": LOOPBACK_ONLY},
         )  # fmt: skip
         if done.returncode == REFUSED:
             return None
@@ -275,75 +234,29 @@ def test_dds_refuses_another_type(through_dds):
     assert through_dds(ros.encode(ros.Twist()), ros.Odometry) is None
 
 
-SLOW_TURN = ros.Twist(ros.Vector3(0.5), ros.Vector3(0.0, 0.0, -0.25))
-
-
-@pytest.fixture
-def sessions():
-    """Ours that listens, and a bridge's in its place: a router that connects, as by `-e`."""
-    endpoint = free_endpoint()
-    ours = open_session(listen=endpoint, mode="router")
-    theirs = open_session(connect=endpoint, mode="router")
-    yield ours, theirs
-    theirs.close()
-    ours.close()
-
-
-def test_what_we_publish_arrives_and_is_announced(sessions):
-    ours, theirs = sessions
-    heard = []
-    listener = theirs.declare_subscriber("hunter01/cmd_vel", lambda s: heard.append(s))
-    tokens, watcher = second.watch_tokens(theirs)
-    with closing(Ros2Node(ours, "/hunter01")) as node:
-        publish = node.publisher("cmd_vel", ros.Twist)
-        wait_until(lambda: len(tokens) == 2, "the tokens of the node and its publisher")
-        zid = str(ours.info.zid())
-        assert f"@/{zid}/@ros2_lv" in tokens
-        assert any(token.startswith(f"@/{zid}/@ros2_lv/MP/hunter01§cmd_vel/") for token in tokens)
-        wait_until(lambda: publish(SLOW_TURN) or heard, "the twist")
-        read = second.deserialize("geometry_msgs/msg/Twist", heard[0].payload.to_bytes())
-        assert read == asdict(SLOW_TURN)
-        assert node.sent["hunter01/cmd_vel"] >= 1
-    wait_until(lambda: not tokens, "the tokens to go with the node")
-    listener.undeclare()
-    watcher.undeclare()
-
-
-def test_a_late_bridge_learns_of_us_too(sessions):
-    ours, theirs = sessions
-    with closing(Ros2Node(ours, "/")) as node:
-        node.subscribe("odom", ros.Odometry, lambda _: None)
-        tokens, watcher = second.watch_tokens(theirs)
-        wait_until(lambda: any("/MS/odom/" in token for token in tokens), "the earlier token")
-        watcher.undeclare()
-
-
-def test_we_hear_the_second_library_and_count_what_is_none(sessions):
-    ours, theirs = sessions
-    heard: list[ros.Odometry] = []
+def test_we_hear_the_second_library_and_count_what_is_none():
     odometry = ros.Odometry(ros.Header(ros.Time(5, 6), "odom"), "base_link")
     odometry.twist.twist.linear.x = 0.75
     good = second.serialize("nav_msgs/msg/Odometry", asdict(odometry))
-    with closing(Ros2Node(ours, "/hunter01")) as node:
+    heard: list[ros.Odometry] = []
+    # Theirs is in a bridge's place: a router that connects, as by `-e`.
+    endpoint = free_endpoint()
+    with open_session(listen=endpoint, mode="router") as ours, open_session(
+        connect=endpoint, mode="router"
+    ) as theirs, closing(Ros2Node(ours, "/hunter01")) as node:
         node.subscribe("odom", ros.Odometry, heard.append)
         wait_until(lambda: theirs.put("hunter01/odom", good) or heard, "the odometry")
         assert heard[0] == odometry
         huge = bytes(ros.MAX_PAYLOAD_BYTES + 1)
-        for payload in (b"", b"\0\7\0\0", huge, ros.encode(SLOW_TURN)):
+        for payload in (b"", b"\0\7\0\0", huge, ros.encode(ros.Twist())):
             # Zenoh may drop what it cannot send at once.
             theirs.put("hunter01/odom", payload, congestion_control=zenoh.CongestionControl.BLOCK)
         wait_until(lambda: sum(node.rejected.values()) >= 4, "the rejections")
         assert node.rejected == {"malformed": 2, "schema": 1, "oversized": 1}
 
 
-def test_without_pycdr2_one_line_says_what_to_install():
-    code = (
-        "import sys; sys.modules['pycdr2'] = None\n"
-        "from edge_runtime.util import UserError\n"
-        "import edge_runtime.vehicles\n"
-        "try: import edge_runtime.vehicles.ros2.node\n"
-        "except UserError as error: print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    (line,) = done.stdout.splitlines()
-    assert "pip install pycdr2" in line
+def test_without_pycdr2_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycdr2", None)
+    monkeypatch.delitem(sys.modules, ros.__name__)
+    with pytest.raises(UserError, match="pip install pycdr2"):
+        importlib.import_module(ros.__name__)

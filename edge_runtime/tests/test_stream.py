@@ -1,5 +1,6 @@
 """The stream's thread: periods, a command that gets too old, a wake, a process that was held up."""
 
+import contextlib
 import math
 import time
 
@@ -15,24 +16,23 @@ from edge_runtime.vehicles.stream import Stream
 
 @pytest.fixture
 def started():
-    """Makes a stream that notes when it sent; ended with the test."""
-    streams = []
+    """Starts streams that note when they sent; ended with the test."""
+    with contextlib.ExitStack() as ends:
 
-    def make(late_at_s=lambda: math.inf, during=lambda: None):
-        sent = []
+        def make(late_at_s=lambda: math.inf, during=lambda: None):
+            sent = []
 
-        def send():
-            sent.append(time.monotonic())
-            during()
-            return True
+            def send():
+                sent.append(time.monotonic())
+                during()
+                return True
 
-        streams.append(Stream("test", send, late_at_s))
-        streams[-1].start()
-        return streams[-1], sent
+            running = Stream("test", send, late_at_s)
+            ends.callback(running.stop)
+            running.start()
+            return running, sent
 
-    yield make
-    for each in streams:
-        each.stop()
+        yield make
 
 
 def once(pause_s):
@@ -49,20 +49,14 @@ def test_it_sends_fifty_times_a_second(started):
     assert set(running.gaps_ms()) >= {"gap_p50_ms", "gap_p99_ms", "gap_max_ms"}
 
 
-def test_a_stop_does_not_wait_for_the_period(started, monkeypatch):
-    monkeypatch.setattr(stream, "PERIOD_S", 60.0)
-    running, sent = started()
-    wait_until(lambda: sent, "the first")
-    running.wake()
-    wait_until(lambda: len(sent) == 2, "one more, woken")
-
-
-def test_a_command_that_gets_too_old_does_not_wait_for_the_period(started, monkeypatch):
+def test_a_stop_and_a_command_that_gets_too_old_do_not_wait_for_the_period(started, monkeypatch):
     monkeypatch.setattr(stream, "PERIOD_S", 60.0)
     late_s = time.monotonic() + 0.3
-    _, sent = started(late_at_s=lambda: late_s if time.monotonic() < late_s else math.inf)
+    running, sent = started(lambda: late_s if time.monotonic() < late_s else math.inf)
     wait_until(lambda: len(sent) == 2, "one more, at the command's end")
     assert sent[1] >= late_s
+    running.wake()
+    wait_until(lambda: len(sent) == 3, "one more, woken")
 
 
 def test_what_was_held_up_is_followed_at_once(started, monkeypatch):
@@ -94,11 +88,12 @@ accelerations = st.floats(-5.0, 5.0)
 periods = st.floats(0.005, 0.1)
 
 
-def test_before_the_first_it_stands():
+def test_before_the_first_it_stands_and_two_in_one_moment_are_no_acceleration():
     speeds = Speeds()
     assert (speeds.speed_mps, speeds.stands, speeds.acceleration_mps2()) == (0.0, True, 0.0)
-    speeds.note(3.0, 0.0)
-    assert not speeds.stands
+    for speed_mps in (3.0, 4.0):
+        speeds.note(speed_mps, 0.0)
+        assert (speeds.stands, speeds.acceleration_mps2()) == (False, 0.0)
 
 
 @given(accelerations, periods, st.integers(2, 60), st.floats(-1.0, 1.0))
@@ -120,10 +115,3 @@ def test_what_is_older_than_a_control_period_counts_no_more(earlier, period_s):
     assert speeds.acceleration_mps2() == 0.0
     speeds.note(1.1, later_s + 0.1)
     assert speeds.acceleration_mps2() == pytest.approx(1.0)
-
-
-def test_two_reports_in_one_moment_are_no_acceleration():
-    speeds = Speeds()
-    speeds.note(1.0, 5.0)
-    speeds.note(2.0, 5.0)
-    assert speeds.acceleration_mps2() == 0.0

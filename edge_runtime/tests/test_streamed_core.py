@@ -1,11 +1,11 @@
 """What holds for every streamed vehicle, in made-up time: enabling, commands, stops, the table."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 import edge_runtime
 from edge_runtime.tests.harness import render_table
@@ -25,23 +25,17 @@ def rig(make):
     return make()
 
 
-def test_nothing_leaves_before_enable(rig):
-    rig.core.brake(rig.now_s)
-    rig.step(100, PEDAL)
-    assert rig.sent == []
-    assert not rig.core.close(rig.now_s)
-    assert rig.core.state is State.DISABLED
-
-
-def test_a_new_core_knows_nothing(rig):
-    core = rig.core
+def test_a_new_core_knows_and_sends_nothing(rig):
+    core, report = rig.core, rig.core.report(0.0)
     assert (core.state, core.cause, core.words) == (State.DISABLED, None, "")
-    report = core.report(0.0)
     assert (report.faults, report.speed_mps, report.battery_v) == ([], 0.0, None)
     assert report.action == {"pedal": -1.0, "steering": 0.0}
     assert report.self_braking
-    assert core.standing(0.0) == [rig.silence]
-    assert core.late_at_s == math.inf
+    assert (core.standing(0.0), core.late_at_s) == ([rig.silence], math.inf)
+    core.brake(rig.now_s)
+    rig.step(100, PEDAL)
+    assert not core.close(rig.now_s)
+    assert (rig.sent, core.state) == ([], State.DISABLED)
 
 
 def test_a_vehicle_that_stands_has_its_brake_on_unless_it_is_asked_to_go(rig):
@@ -55,18 +49,15 @@ def test_a_vehicle_that_stands_has_its_brake_on_unless_it_is_asked_to_go(rig):
     assert rig.report.action["pedal"] == -1.0
 
 
-def test_to_enable_it_again_gives_it_the_whole_time_again(rig):
+def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig):
+    count = len(rig.driving().asked)
+    rig.enabled()
+    assert set(rig.speeds(count)) == {0.0}  # until the next command
     rig.talks = False
     for _ in range(2):
         rig.core.enable(rig.now_s)
         rig.step(45)
     assert rig.core.state is State.ENABLING
-
-
-def test_to_enable_it_while_it_drives_makes_it_stand_until_the_next_command(rig):
-    count = len(rig.driving().asked)
-    rig.enabled()
-    assert set(rig.speeds(count)) == {0.0}
 
 
 def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
@@ -121,18 +112,6 @@ def test_a_policy_without_a_pedal_has_the_scenarios_speed_and_its_own_steering(m
     assert rig.inner_rad < -0.05
 
 
-def test_a_brake_is_speed_zero_at_once_and_latches(rig):
-    rig.driving().core.brake(rig.now_s)
-    assert rig.report.commanded_speed_mps == 0.0  # before the next tick, too
-    count = len(rig.asked)
-    rig.step(100, PEDAL)
-    assert set(rig.speeds(count)) == {0.0}
-    assert rig.words == []  # our own wish is no fault
-    assert rig.report.self_braking
-    rig.enabled().step(20, PEDAL)
-    assert rig.speed_mps > 0
-
-
 def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch(rig):
     rig.driving().core.brake(rig.now_s, latch=False)
     count = len(rig.asked)
@@ -143,17 +122,14 @@ def test_the_stop_at_an_episodes_end_needs_no_repetition_and_does_not_latch(rig)
     assert rig.speed_mps > 0
 
 
-def test_without_a_fresh_command_it_stops_within_the_promise_and_latches(rig):
+def test_without_a_fresh_command_it_stops_within_the_promise(rig):
     last_s = rig.driving().core._wished_s
     assert rig.core.late_at_s == last_s + 0.24 < last_s + 0.25  # the stream ticks then, too
     count = len(rig.asked)
     rig.step(100)
-    assert rig.core.late_at_s == float("inf")
+    assert rig.core.late_at_s == math.inf
     stopped_s = next(time_s for time_s, speed_mps in rig.asked[count:] if speed_mps == 0)
     assert 0.2 < stopped_s - last_s <= 0.25 + 0.02
-    assert rig.words == ["no command for 0.24 s"]
-    rig.step(50, PEDAL)
-    assert rig.speed_mps == 0
 
 
 NAN, INF = float("nan"), float("inf")
@@ -191,6 +167,7 @@ def command_no_more(rig):
 
 def brake(rig):
     rig.core.brake(rig.now_s)
+    assert rig.report.commanded_speed_mps == 0.0  # before the next tick, too
     return ""
 
 
@@ -233,45 +210,21 @@ def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):
     assert rig.words == []
 
 
-# The rules that the table was written from, in other words.
-
-OURS = {Event.ENABLE: State.ENABLING, Event.CLOSE: State.DISABLED}
-STOP_ENABLING = {
-    Event.BRAKE, Event.NOT_CONFIRMED, Event.REMOTE, Event.ESTOP, Event.BUS, Event.FOREIGN
-}  # fmt: skip
-STOP_DRIVING = set(Event) - set(OURS) - {Event.CONFIRMED, Event.NOT_CONFIRMED}
-
-
-def expected(state, event):
-    if event in OURS:
-        return OURS[event]
-    if state is State.ENABLING and event is Event.CONFIRMED:
-        return State.ENABLED
-    stops = {State.ENABLING: STOP_ENABLING, State.ENABLED: STOP_DRIVING}
-    return State.STOPPED if event in stops.get(state, ()) else state
-
-
 def after(state, event, leads_to=LEADS_TO):
     return leads_to[event].get(state, state)
 
 
-def test_every_pair_of_state_and_event():
-    pairs = [(state, event) for state in State for event in Event]
-    assert {pair: expected(*pair) for pair in pairs} == {pair: after(*pair) for pair in pairs}
-
-
 @pytest.mark.parametrize("leads_to", [LEADS_TO, ROS2_LEADS_TO])
-def test_every_event_names_states_only_where_it_changes_something(leads_to):
-    assert set(leads_to) == set(Event)
-    for leads in leads_to.values():
-        assert all(before is not after for before, after in leads.items())
-    into_enabled = {event for event in Event if State.ENABLED in leads_to[event].values()}
-    out_of_stopped = {event for event in Event if State.STOPPED in leads_to[event]}
-    assert into_enabled == {Event.CONFIRMED}
+def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop(leads_to):
+    ways = {(event, *way) for event in Event for way in leads_to[event].items()}
+    assert all(before is not then for _, before, then in ways)
+    assert {event for event, _, then in ways if then is State.ENABLED} == {Event.CONFIRMED}
+    out_of_stopped = {event for event, before, _ in ways if before is State.STOPPED}
     assert out_of_stopped == {Event.ENABLE, Event.CLOSE}
 
 
 def test_the_readme_shows_the_table():
+    """Written out a second time, every pair of state and event."""
     readme = Path(edge_runtime.__file__).with_name("README.md").read_text(encoding="utf-8")
     assert render_table(Event, State, after) in readme
 
@@ -292,3 +245,48 @@ def test_the_core_goes_where_the_table_says(rig, state, event):
         assert core._wish is None
     elif leads_to is state:
         assert core._wish is core_wish
+
+
+WILD = st.floats(allow_nan=False, allow_infinity=False)
+HAPPENINGS = st.one_of(
+    st.tuples(st.just("tick"), st.integers(1, 20)),
+    st.tuples(st.just("command"), WILD | st.floats(0, 1), WILD, st.none() | WILD),
+    st.tuples(st.just("enable")),
+    st.tuples(st.just("brake"), st.booleans()),
+    st.tuples(st.just("talks"), st.booleans()),
+    st.tuples(st.just("disturb"), st.integers(-(2**63), 2**63 - 1)),
+)
+
+
+@pytest.mark.parametrize("make_rig", [HunterRig, Ros2Rig])
+@example([("enable",), ("tick", 6), ("command", 6e307, 0.0, None), ("tick", 1)])  # inf * 0 s
+@settings(deadline=None)
+@given(st.lists(HAPPENINGS, max_size=60))
+def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(make_rig, happenings):
+    rig, commanded_s, may_move = make_rig("congestion"), -1e9, False
+    for what, *values in happenings:
+        if what == "tick":
+            for _ in range(*values):
+                count = len(rig.asked)
+                rig.step()
+                for speed_mps in filter(None, rig.speeds(count)):
+                    assert may_move
+                    assert rig.core.state is State.ENABLED
+                    assert 0.0 < speed_mps <= SPEC.max_speed_mps
+                    assert rig.now_s - commanded_s <= 0.25 + STREAM_S
+        elif what == "command":
+            pedal, steering, scenario_speed_mps = values
+            rig.core.command({"pedal": pedal, "steering": steering}, rig.now_s, scenario_speed_mps)
+            commanded_s = rig.now_s
+        elif what == "enable":
+            rig.core.enable(rig.now_s)
+            may_move = True
+        elif what == "brake":
+            rig.core.brake(rig.now_s, *values)
+            may_move = may_move and not values[0]
+        elif what == "talks":
+            (rig.talks,) = values
+        else:
+            rig.disturb(*values)
+        assert abs(rig.inner_rad) <= SPEC.max_inner_steering_rad
+        assert all(-1.0 <= value <= 1.0 for value in rig.report.action.values())

@@ -1,4 +1,4 @@
-"""What the runner makes of a driver that raises or hangs: a fault, and nothing worse."""
+"""The runner of a driver that raises or hangs, the watch over what it reports, and the mock."""
 
 from __future__ import annotations
 
@@ -10,26 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_runtime.tests.harness import wait_until
-from edge_runtime.vehicles.base import (
-    DEVIATES_S,
-    LYING,
-    SILENCE_S,
-    SILENT,
-    STUCK,
-    VehicleReport,
-    VehicleRunner,
-    VehicleWatch,
-)
-from edge_runtime.vehicles.mock import MockVehicle
-from edge_runtime.wire import Command
-
-
-def make_command(mode="drive", step=0, action=(0.5,)):
-    return Command(
-        session="s", episode=0, step=step, mode=mode, action=list(action), policy_id="p",
-        received_ns=0, inference_ns=0, sent_ns=0,
-    )  # fmt: skip
+from edge_runtime.config import Config, SimilaritySettings
+from edge_runtime.tests.harness import make_command, wait_until
+from edge_runtime.tests.rigs import CAR, PEDAL
+from edge_runtime.util import UserError
+from edge_runtime.vehicles import base, make_vehicle, vehicle_limits
+from edge_runtime.vehicles.base import LYING, SILENT, STUCK, VehicleRunner, VehicleWatch
+from edge_runtime.vehicles.mapping import CARS
+from edge_runtime.vehicles.mock import MockParameters, MockVehicle
 
 
 class BrokenVehicle(MockVehicle):
@@ -114,25 +102,25 @@ def test_a_driver_that_raises_is_silent_and_its_thread_lives_on(vehicle, runner)
     wait_until(lambda: len(runner.heard) > count, "feedback again")
 
 
-def test_a_driver_that_takes_no_command_is_at_fault_until_it_takes_one(vehicle, runner):
-    vehicle.broken = "command"
-    runner.command(make_command())  # raises nothing here
-    wait_until(lambda: runner.faults, "the fault")
-    wait_until(lambda: runner.heard and runner.heard[-1].faults == [SILENT], "it in the feedback")
-    vehicle.broken = ""
-    runner.command(make_command("safe_stop", step=1))
-    wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
-    assert vehicle.asked == ["command", "brake"]
-
-
-@pytest.mark.parametrize("action", [[], [0.5, 0.5]])
-def test_a_command_without_just_the_policys_actions_is_a_fault(vehicle, runner, action):
-    runner.command(make_command(action=action))
+@pytest.mark.parametrize(
+    ("broken", "action", "asked"),
+    [("command", [0.5], ["command", "brake"]), ("", [], ["brake"]), ("", [0.5, 0.5], ["brake"])],
+    ids=["the driver raises", "no action", "more than the policy's actions"],
+)
+def test_a_command_that_cannot_be_taken_is_a_fault_until_one_is(
+    vehicle, runner, broken, action, asked
+):
+    vehicle.broken = broken
+    runner.command(make_command(action=action))  # raises nothing here
     wait_until(lambda: runner.faults, "the fault")
     assert runner.fault(time.monotonic())
+    if broken:
+        wait_until(lambda: runner.heard and runner.heard[-1].faults == [SILENT], "the feedback")
+    vehicle.broken = ""
+    # A stop is one whatever stands beside it.
     runner.command(make_command("safe_stop", step=1, action=action))
     wait_until(lambda: not runner.fault(time.monotonic()), "an end of the fault")
-    assert vehicle.asked == ["brake"]  # a stop is one whatever stands beside it
+    assert vehicle.asked == asked
 
 
 def test_a_driver_that_hangs_holds_nobody_and_takes_the_newest_command_later(vehicle, runner):
@@ -157,14 +145,15 @@ def test_a_driver_that_hangs_or_raises_does_not_hold_the_end(vehicle, runner):
 
 
 def test_a_drivers_words_are_a_fault_until_it_is_enabled_again(vehicle, runner):
-    vehicle.says = ["the remote control drives"]
-    vehicle.stands = ["the remote control drives"]
-    wait_until(lambda: runner.fault(time.monotonic()) == "the remote control drives", "the fault")
+    words, long = "the remote control drives", "x" * 1000
+    vehicle.says = [words, long]
+    vehicle.stands = [words]
+    wait_until(lambda: words in runner.fault(time.monotonic()), "the fault")
     wait_until(lambda: runner.standing_fault(time.monotonic()), "its cause")
     vehicle.stands = []
     wait_until(lambda: not runner.standing_fault(time.monotonic()), "the end of its cause")
-    assert runner.fault(time.monotonic()) == "the remote control drives"
-    assert runner.heard[-1].faults == ["the remote control drives"]
+    assert words in runner.fault(time.monotonic())
+    assert runner.heard[-1].faults == [words, long[:256]]  # as long as the wire takes them
     vehicle.says = []
     runner.enable()
     assert runner.fault(time.monotonic()) == ""  # at once: the vehicle shall have its chance
@@ -203,16 +192,11 @@ def test_a_vehicle_that_is_not_armed_is_not_enabled(vehicle):
     runner.close()
 
 
-def test_words_that_are_too_long_for_the_wire_are_cut(vehicle, runner):
-    vehicle.says = ["x" * 1000]
-    wait_until(lambda: runner.heard and runner.heard[-1].faults == ["x" * 256], "feedback")
-
-
 TICK_S = 0.05
 
 
 def report(pedal=0.0, speed_mps=1.0, self_braking=False):
-    return VehicleReport({"pedal": pedal}, speed_mps, self_braking, [])
+    return base.VehicleReport({"pedal": pedal}, speed_mps, self_braking, [])
 
 
 def watched(seconds=1.0, asked=0.0, **reported):
@@ -227,66 +211,52 @@ def watched(seconds=1.0, asked=0.0, **reported):
 
 
 @pytest.mark.parametrize(
-    "drive",
-    [{"asked": 0.3, "pedal": 0.3}, {"asked": 0.6, "pedal": -1.0, "self_braking": True}],
-    ids=["it obeys", "it brakes by itself and obeys nobody"],
+    ("asked", "reported", "newest", "fault"),
+    [
+        (0.3, {"pedal": 0.3}, {}, ""),
+        (0.6, {"pedal": -1.0, "self_braking": True}, {}, ""),  # and obeys nobody
+        (0.0, {}, {"speed_mps": 9.0}, LYING),
+        (0.0, {}, {"speed_mps": math.nan}, LYING),
+        (0.0, {}, {"pedal": 1.1}, LYING),
+        (0.0, {}, {"pedal": math.inf}, LYING),
+    ],
 )
-def test_nothing_is_wrong_with_a_vehicle_that_obeys_or_brakes_by_itself(drive):
-    watch, now_s = watched(**drive)
-    assert watch.fault(now_s) == ""
-
-
-def test_a_vehicle_that_was_not_begun_owes_nothing():
-    assert VehicleWatch().fault(1e9) == ""
+def test_what_a_vehicle_may_report(asked, reported, newest, fault):
+    watch, now_s = watched(asked=asked, **reported)
+    watch.report(report(**{**reported, **newest}), now_s + TICK_S)
+    assert watch.fault(now_s + TICK_S) == fault
 
 
 def test_silence_after_two_periods_also_before_the_first_report():
     watch = VehicleWatch()
+    assert watch.fault(1e9) == ""  # what was not begun owes nothing
     watch.begin(10.0)
-    assert watch.fault(10.0 + SILENCE_S) == ""
-    assert watch.fault(10.001 + SILENCE_S) == SILENT
+    assert watch.fault(10.0 + base.SILENCE_S) == ""
+    assert watch.fault(10.001 + base.SILENCE_S) == SILENT
     watch.report(report(), 10.3)
     assert watch.fault(10.3) == ""
-    assert watch.silent_at_s == pytest.approx(10.3 + SILENCE_S)
+    assert watch.silent_at_s == pytest.approx(10.3 + base.SILENCE_S)
 
 
 def test_an_actuator_outside_of_all_that_was_asked_is_stuck_only_after_a_while():
     watch, now_s = watched(asked=0.6, pedal=0.6)
     watch.report(report(pedal=-1.0), now_s + TICK_S)
-    assert watch.fault(now_s + TICK_S + DEVIATES_S) == ""
-    assert watch.fault(now_s + TICK_S + DEVIATES_S + 0.001) == STUCK
+    assert watch.fault(now_s + TICK_S + base.DEVIATES_S) == ""
+    assert watch.fault(now_s + TICK_S + base.DEVIATES_S + 0.001) == STUCK
     watch.report(report(pedal=0.6), now_s + 2 * TICK_S)
     assert watch.fault(now_s + 2 * TICK_S) == ""
 
 
-def test_an_actuator_on_its_way_between_two_commands_is_not_stuck():
-    watch, now_s = watched(asked=-1.0, pedal=-1.0)
-    watch.command({"pedal": 1.0}, now_s)
-    for tick in range(1, 6):
-        watch.report(report(pedal=-1.0 + tick * 0.4), now_s + tick * TICK_S)
-        assert watch.fault(now_s + tick * TICK_S) == ""
-
-
-@pytest.mark.parametrize(
-    "impossible", [{"speed_mps": 9.0}, {"speed_mps": math.nan}, {"pedal": 1.1}, {"pedal": math.inf}]
-)
-def test_what_cannot_be_is_a_lie(impossible):
-    watch, now_s = watched()
-    watch.report(report(**impossible), now_s + TICK_S)
-    assert watch.fault(now_s + TICK_S) == LYING
-
-
 def test_a_leap_is_a_lie_until_that_speed_could_be_real():
     watch, now_s = watched(speed_mps=1.0)
-    watch.report(report(speed_mps=5.0), now_s + 0.2)  # 0.5 m/s and 15 m/s2 for 0.2 s: up to 4.5
-    assert watch.fault(now_s + 0.2) == LYING
-    watch.report(report(speed_mps=5.0), now_s + 0.3)  # up to 6.0
-    assert watch.fault(now_s + 0.3) == ""
+    for after_s, words in ((0.2, LYING), (0.3, "")):  # 0.5 m/s and 15 m/s2: up to 4.5, then 6.0
+        watch.report(report(speed_mps=5.0), now_s + after_s)
+        assert watch.fault(now_s + after_s) == words
 
 
 @settings(deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=1, max_size=30))
-def test_the_mock_is_never_accused(pedals):
+def test_the_mock_stays_within_its_limits_and_is_never_accused(pedals):
     """Whatever a policy asks at the control rate, reported at the feedback's."""
     vehicle, watch = MockVehicle(), VehicleWatch()
     vehicle.enable(0.0)
@@ -297,5 +267,110 @@ def test_the_mock_is_never_accused(pedals):
             if offset_s == 0.0:
                 vehicle.command({"pedal": pedal}, now_s)
                 watch.command({"pedal": pedal, "steering": 0.0}, now_s)
-            watch.report(vehicle.feedback(now_s), now_s)
+            report = vehicle.feedback(now_s)
+            assert -1.0 - 1e-9 <= report.action["pedal"] <= 1.0 + 1e-9
+            assert 0.0 <= report.speed_mps <= MockParameters().max_speed_mps
+            watch.report(report, now_s)
             assert watch.fault(now_s) == ""
+
+
+# The mock.
+
+
+def enabled(**parameters):
+    vehicle = MockVehicle(MockParameters(**parameters))
+    vehicle.enable(0.0)
+    return vehicle
+
+
+def test_lag_and_rate_limit_by_hand():
+    """From full brake to full throttle in one time constant; and the speed, 5 ms by 5 ms."""
+    vehicle = enabled(dead_time_s=0.0, time_constant_s=0.1, slew_per_s=1e9)
+    vehicle.command({"pedal": 1.0, "steering": 1.0}, 0.0)
+    after = vehicle.feedback(0.1)
+    assert after.action["pedal"] == pytest.approx(1 - 2 * math.exp(-1))
+    assert after.action["steering"] == pytest.approx(1 - math.exp(-1))
+    pedals = [1 - 2 * math.exp(-0.05 * step) for step in range(1, 21)]
+    assert after.speed_mps == pytest.approx(sum(max(0.0, 3.0 * pedal) for pedal in pedals) * 0.005)
+    vehicle = enabled(dead_time_s=0.0, time_constant_s=1e-9, slew_per_s=2.0)
+    vehicle.command(PEDAL, 0.0)
+    assert vehicle.feedback(0.1).action["pedal"] == pytest.approx(-1.0 + 0.2)
+
+
+@pytest.mark.parametrize("scenario", [*CARS, "another"])
+def test_it_is_no_quicker_than_the_policys_car(scenario):
+    car = CARS.get(scenario, CARS["left_turn"])
+    vehicle = make_vehicle("mock", Config(), scenario)
+    vehicle.enable(0.0)
+    speeds = []
+    for tick in range(400):
+        vehicle.command({"pedal": 1.0 if tick < 300 else -1.0}, tick * 0.1)
+        speeds.append(vehicle.feedback(tick * 0.1).speed_mps)
+    assert max(speeds) == car.max_speed_mps
+    changes = [(after - before) / 0.1 for before, after in zip(speeds, speeds[1:])]
+    assert max(changes) == pytest.approx(car.throttle_mps2, rel=0.01)
+    assert min(changes) == pytest.approx(-car.brake_mps2, rel=0.01)
+
+
+def test_a_car_of_the_settings_is_its_car():
+    config = Config(similarity=SimilaritySettings(car=CAR))
+    vehicle = make_vehicle("mock", config, "left_turn")
+    vehicle.enable(0.0)
+    for tick in range(100):
+        vehicle.command(PEDAL, tick * 0.1)
+    assert vehicle.feedback(10.0).speed_mps == 0.5
+
+
+def test_it_follows_commands_and_brakes_by_itself_without_them():
+    vehicle = enabled()
+    for step in range(20):
+        vehicle.command({"pedal": 1.0, "steering": 0.5}, step * 0.1)
+    driving = vehicle.feedback(1.95)
+    assert not driving.self_braking
+    assert driving.speed_mps > 5.0
+    assert driving.action["steering"] == pytest.approx(0.5, abs=1e-3)
+    for after_s, brakes in ((0.2, False), (0.21, True)):
+        assert vehicle.feedback(1.9 + after_s).self_braking == brakes
+    stopped = vehicle.feedback(10.0)
+    assert stopped.speed_mps == 0.0
+    assert stopped.action == pytest.approx({"pedal": -1.0, "steering": 0.5}, abs=1e-3)
+
+
+def test_the_dead_time_passes_before_anything_moves_and_a_brake_overtakes_it():
+    for brakes in (False, True):
+        vehicle = enabled(dead_time_s=0.1)
+        vehicle.command(PEDAL, 0.0)
+        if brakes:
+            vehicle.brake(0.05)
+        assert vehicle.feedback(0.09).action["pedal"] == -1.0
+        assert (vehicle.feedback(0.19).action["pedal"] > -1.0) != brakes
+        assert vehicle.feedback(1e6).speed_mps == 0.0  # a long gap is no long computation
+
+
+def test_the_registry():
+    assert isinstance(make_vehicle("mock", Config(), ""), MockVehicle)
+    assert vehicle_limits("none", Config(), "") == {}
+    assert vehicle_limits("mock", Config(), "") == MockVehicle.limits
+    for make in (make_vehicle, vehicle_limits):
+        with pytest.raises(UserError, match=r"choose from .*mock, hunter"):
+            make("tank", Config(), "")
+    with pytest.raises(ValueError, match="lacks an action"):
+        enabled().command({}, 0.1, 6.0)
+
+
+def test_it_moves_only_enabled_and_a_stop_latches_but_at_an_episodes_end():
+    vehicle = MockVehicle()
+
+    def moves_on_command(at_s):
+        vehicle.command(PEDAL, at_s)
+        return vehicle.feedback(at_s + 0.2).speed_mps > 0.0
+
+    assert not moves_on_command(0.0)
+    vehicle.enable(0.2)
+    vehicle.brake(0.2)
+    assert not moves_on_command(0.3)
+    vehicle.enable(0.5)
+    assert moves_on_command(0.5)
+    vehicle.brake(0.7, latch=False)
+    assert vehicle.feedback(5.0).speed_mps == 0.0
+    assert moves_on_command(5.0)
