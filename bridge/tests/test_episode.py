@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 
 import pytest
 
-from bridge.environments import EpisodeRunner, make_environment, task_of
+from bridge.environments import EpisodeRunner, make_environment, scenario_of, task_of
 from bridge.tests.harness import (
     TOY,
     BridgeProcess,
@@ -20,8 +19,7 @@ from bridge.tests.harness import (
 from bridge.virtual_link import NO_COMMAND, Decision
 from edge_runtime.policy import load_policy
 from edge_runtime.tests.policies import PEDAL, STEERING, write_policy
-from edge_runtime.transport import free_endpoint, open_session
-from edge_runtime.wire import Command, decode_command
+from edge_runtime.transport import free_endpoint
 
 
 class ScriptedClock:
@@ -60,7 +58,7 @@ def run(environment, clock, **options):
     return runner, runner.run(0, seed=3)
 
 
-def test_the_steering_is_held_and_the_car_stands(environment):
+def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):
     clock = ScriptedClock()
     runner, result = run(environment, clock)
     held = [action[0] for action in result.actions[clock.drive : clock.brake_until]]
@@ -74,11 +72,6 @@ def test_the_steering_is_held_and_the_car_stands(environment):
     assert event.stopped_after_s is not None
     assert event.stopped_after_s <= 1.6
     assert event.resumed_after_s == pytest.approx(2.2)
-
-
-def test_after_the_safe_stop_it_drives_on(environment):
-    clock = ScriptedClock()
-    _, result = run(environment, clock)
     assert result.actions[clock.brake_until] == pytest.approx([-0.02])
     assert clock.states[clock.brake_until + 10].speed_mps > 1.0
 
@@ -108,51 +101,31 @@ def policy_of(folder, scenario, *actions):
     return path
 
 
-@contextlib.contextmanager
-def heard_commands(endpoint):
-    """A router that counts modes and reasons of the commands that it passes on."""
-    heard: Counter[tuple[str, str]] = Counter()
-
-    def hear(sample):
-        command = decode_command(sample.payload.to_bytes())
-        assert isinstance(command, Command)
-        heard[command.mode, command.reason] += 1
-
-    with contextlib.closing(open_session(listen=endpoint, mode="router")) as session:
-        subscriber = session.declare_subscriber("phil/hunter01/command", hear)
-        yield heard
-        subscriber.undeclare()
-
-
-@pytest.mark.parametrize("clock", ["lockstep", "realtime"])
-def test_the_policy_of_another_scenario_is_refused_by_both_ends(tmp_path, clock):
-    policy = policy_of(tmp_path, "left_turn", PEDAL)
-    endpoint, out = free_endpoint(), tmp_path / "never.json"
-    options = ("--env", "congestion", "--connect", endpoint, "--clock", clock, "--out", str(out))
-    with (
-        heard_commands(endpoint) as heard,
-        start_edge(endpoint, policy) as edge,
-        BridgeProcess("simulate", *options) as run,
-    ):
-        refused(run, out, "left_turn, pedal -1 to 1", "congestion, steering -1 to 1")
-        assert edge.end() == 0
-    assert "was=standby now=safe_stop reason=other_task" in edge.log
-    assert {mode for mode, _ in heard} == {"safe_stop"}
-    assert heard["safe_stop", "other_task"] >= 1
-
-
-def test_it_is_refused_through_a_relay(tmp_path):
-    policy = policy_of(tmp_path, "left_turn", PEDAL)
-    near, far, out = free_endpoint(), free_endpoint(), tmp_path / "never.json"
-    link = ("--listen", near, "--connect", far, "--latency", "50ms")
-    with BridgeProcess("relay", *link) as relay, start_edge(near, policy) as edge:
-        assert relay.process.stdout is not None
-        assert relay.process.stdout.readline().startswith("ready")
-        with start_simulate(far, out, "congestion", "--clock", "realtime") as run:
+@pytest.mark.parametrize(
+    ("clock", "relayed"), [("lockstep", False), ("realtime", False), ("realtime", True)]
+)
+def test_the_policy_of_another_scenario_is_refused_by_both_ends(tmp_path, clock, relayed):
+    policy, out = policy_of(tmp_path, "left_turn", PEDAL), tmp_path / "never.json"
+    endpoint = near = free_endpoint()
+    with contextlib.ExitStack() as opened:
+        if relayed:
+            near = free_endpoint()
+            link = ("--listen", near, "--connect", endpoint, "--latency", "50ms")
+            relay = opened.enter_context(BridgeProcess("relay", *link))
+            assert relay.process.stdout is not None
+            assert relay.process.stdout.readline().startswith("ready")
+        edge = opened.enter_context(start_edge(near, policy))
+        with start_simulate(endpoint, out, "congestion", "--clock", clock) as run:
             refused(run, out, "left_turn, pedal -1 to 1", "congestion, steering -1 to 1")
         assert edge.end() == 0
-    assert "reason=other_task" in edge.log
+    assert "was=standby now=safe_stop reason=other_task" in edge.log
     assert "now=drive" not in edge.log
+
+
+def test_a_scenario_is_found_by_word_and_by_id():
+    for word, name in (("left_turn", "phil/LeftTurn-v0"), ("congestion", "phil/Congestion-v0")):
+        assert scenario_of(word) == scenario_of(name) == word
+        make_environment(name).close()
 
 
 @pytest.mark.parametrize(
