@@ -59,12 +59,6 @@ def log_of(reached, episodes=2):
     return log
 
 
-def begun():
-    log = TrackingLog()
-    log.begin()
-    return log
-
-
 def held(time_s):
     return asked_at(min(int(time_s / T_S), STEPS - 1)) if time_s >= 0 else -1.0
 
@@ -78,6 +72,12 @@ def follower(dead_s, constant_s):
         value += (target - value) * (1 - math.exp(-step_s / constant_s))
         values.append(value)
     return lambda time_s: values[round(time_s / step_s)]
+
+
+def begun():
+    log = TrackingLog()
+    log.begin()
+    return log
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.06, 0.155, 0.4])
@@ -125,11 +125,8 @@ def test_what_was_not_measured_is_none():
     nothing = TrackingLog().report(["pedal"])
     assert nothing["action_error"] == {"pedal": none}
     assert nothing["lag_ms"] == {"speed": None, "pedal": None}
-
-
-def test_who_is_asked_nothing_new_shows_no_lag():
     log = begun()
-    for step in range(50):
+    for step in range(50):  # A vehicle that is asked nothing new shows no lag.
         log.command(make_command(step, action=[0.5], sent_ns=ns(step * T_S)))
         log.feedback(make_feedback(step, action=[0.5], sent_ns=ns(step * T_S + 0.02)))
     assert log.report(["pedal"])["lag_ms"]["pedal"] is None
@@ -145,23 +142,16 @@ def test_a_vehicle_that_brakes_by_itself_or_between_episodes_makes_no_error():
     report = log.report(["pedal"])
     assert report["action_error"]["pedal"]["max"] == 0.0
     assert report["faults"] == {"low battery": 1}
-
-
-def test_stamps_of_a_clock_that_was_stepped_do_no_harm():
+    for number in range(100):  # The words of faults are counted and bounded.
+        log.feedback(make_feedback(0, faults=[f"fault {number}", "fault 0"]))
+    faults = log.report([])["faults"]
+    assert (len(faults), faults["fault 0"]) == (32, 101)
     log = begun()
-    for step in range(20):
+    for step in range(20):  # Stamps of a clock that was stepped do no harm.
         stamp = ns(step * T_S if step < 10 else -50 + step * T_S)
         log.command(make_command(step, action=[asked_at(step)], sent_ns=stamp))
         log.feedback(make_feedback(step, action=[asked_at(step)], sent_ns=stamp + 1))
     assert log.report(["pedal"])["action_error"]["pedal"]["max"] == 0.0
-
-
-def test_the_words_of_faults_are_counted_and_bounded():
-    log = begun()
-    for number in range(100):
-        log.feedback(make_feedback(0, faults=[f"fault {number}", "fault 0"]))
-    faults = log.report([])["faults"]
-    assert (len(faults), faults["fault 0"]) == (32, 101)
 
 
 DEAD_S = 0.03
@@ -253,34 +243,33 @@ def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
     assert rig.clock.moving_starts == 1
 
 
-class Stranger:
-    """Hears the vehicle's feedback, and sends it again, with more that nobody can believe."""
+@contextlib.contextmanager
+def stranger(endpoint):
+    """Hears the vehicle's feedback, and sends it again, with more that nobody can believe.
 
-    def __init__(self, endpoint):
-        self.heard = []
-        self._key = "phil/hunter01/feedback"
-        self._session = connect_client(endpoint, PATIENCE_S)
-        self._subscriber = self._session.declare_subscriber(self._key, self._hear)
+    A call says whether the vehicle has got as far as a step of the first episode.
+    """
+    key, heard = "phil/hunter01/feedback", []
 
-    def _hear(self, sample):
+    def hear(sample):
         payload = sample.payload.to_bytes()
         feedback: Any = decode_feedback(payload)
-        of_mock = isinstance(feedback, Feedback) and feedback.vehicle == "mock"
-        if not of_mock or payload in self.heard:
+        if not isinstance(feedback, Feedback) or feedback.vehicle != "mock" or payload in heard:
             return
-        self.heard.append(payload)
+        heard.append(payload)
         if feedback.session:
             other = make_feedback(0, session="stranger", sent_ns=feedback.sent_ns + 1)
-            for bad in (payload, encode(other), b"\xff", self.heard[0]):
-                self._session.put(self._key, bad)
+            for bad in (payload, encode(other), b"\xff", heard[0]):
+                session.put(key, bad)
 
-    def is_at(self, episode, step):
-        feedback: Any = decode_feedback(self.heard[-1]) if self.heard else make_feedback(-1)
-        return (feedback.episode, feedback.step) >= (episode, step)
+    def is_at(step):
+        feedback: Any = decode_feedback(heard[-1]) if heard else make_feedback(-1)
+        return (feedback.episode, feedback.step) >= (0, step)
 
-    def close(self):
-        self._subscriber.undeclare()
-        self._session.close()
+    with contextlib.closing(connect_client(endpoint, PATIENCE_S)) as session:
+        subscriber = session.declare_subscriber(key, hear)
+        yield is_at
+        subscriber.undeclare()
 
 
 def test_the_car_does_what_the_vehicle_did_whatever_a_stranger_says(tmp_path):
@@ -290,9 +279,9 @@ def test_the_car_does_what_the_vehicle_did_whatever_a_stranger_says(tmp_path):
     with (
         start_simulate(endpoint, out, SHORT_TOY, *options) as run,
         start_edge(endpoint, policy, "--vehicle", "mock") as edge,
-        contextlib.closing(Stranger(endpoint)) as stranger,
+        stranger(endpoint) as is_at,
     ):
-        wait_until(lambda: stranger.is_at(0, 12), "the middle of the episode")
+        wait_until(lambda: is_at(12), "the middle of the episode")
         edge.process.kill()
         assert run.wait() == 0, run.errors
     report = read(out)
