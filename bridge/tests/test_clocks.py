@@ -1,19 +1,33 @@
-"""The timer thread: what goes wrong on it is heard."""
+"""The clocks: in lock-step, in real time, and with a vehicle in the loop."""
 
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
+from typing import Any
 
 import pytest
 
-from bridge.clocks import DelayLine, LockStepClock, RealTimeClock
-from bridge.inbound import CommandCheck
+from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
+from bridge.inbound import NO_FEEDBACK, CommandCheck, FeedbackCheck
 from bridge.network import parse_spec
-from bridge.tests.harness import decoded, make_command
+from bridge.ports import connect_client
+from bridge.tests.harness import (
+    SHORT_TOY,
+    decoded,
+    make_command,
+    make_feedback,
+    make_policy,
+    read,
+    start_edge,
+    start_simulate,
+)
 from bridge.virtual_link import NO_COMMAND
-from edge_runtime.tests.harness import make_state, wait_until
-from edge_runtime.wire import encode
+from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
+from edge_runtime.transport import free_endpoint
+from edge_runtime.util import UserError
+from edge_runtime.wire import CONTROL_PERIOD_S, Feedback, decode_feedback, encode
 
 
 def test_what_an_action_raises_reaches_the_caller():
@@ -190,3 +204,153 @@ def test_in_real_time_all_is_delayed_duplicated_and_lost_from_the_episodes_start
         assert rig.published == [step for step in range(7) for _ in range(2)]
         assert 6 <= rig.check.rejected["stale"] <= 7
         assert len(rig.clock.latencies_ms) == 7
+
+
+DEAD_S = 0.03
+
+
+class VehicleRig:
+    """A clock with a vehicle that reports the step it was sent last, ``dead_s`` after each."""
+
+    def __init__(self, spec="none", dead_s=DEAD_S):
+        self.dead_s, self.silent_from = dead_s, 99
+        self.check = FeedbackCheck("here", action_size=1)
+        commands = CommandCheck("here", action_size=1)
+        self.clock = VehicleClock(self.publish, commands, parse_spec(spec), self.check)
+
+    def publish(self, payload):
+        step = decoded(payload).step
+        self.clock.receive(encode(make_command(step)))
+        if step >= self.silent_from:
+            return
+        if self.dead_s:
+            threading.Timer(self.dead_s, self.report, [step]).start()
+        else:
+            self.report(step)
+
+    def report(self, step, **changes):
+        self.clock.receive_feedback(encode(make_feedback(step, sent_ns=step + 5, **changes)))
+
+    def drive(self, steps):
+        self.clock.begin(0, seed=0)
+        return [self.clock.exchange(make_state(n, session="here")) for n in range(steps)]
+
+
+@contextlib.contextmanager
+def rig_of(spec="none", **options):
+    rig = VehicleRig(spec, **options)
+    with contextlib.closing(rig.clock):
+        yield rig
+
+
+def test_each_tick_ends_with_what_the_vehicle_did_in_it():
+    with rig_of() as rig:
+        began_s = time.monotonic()
+        decisions = rig.drive(4)
+        assert time.monotonic() - began_s >= 4 * CONTROL_PERIOD_S
+    assert [decision.feedback.step for decision in decisions] == [0, 1, 2, 3]
+    assert [decision.brake_reason for decision in decisions] == [""] * 4
+    assert all(0 < age_ms < 200 for age_ms in rig.clock.feedback_ages_ms)
+    assert rig.check.rejected == {}
+
+
+def test_a_vehicle_that_falls_silent_is_braked_for():
+    # At once: on a busy machine a timer comes late, which would be silence, too.
+    with rig_of(dead_s=0.0) as rig:
+        rig.silent_from = 2
+        decisions = rig.drive(6)
+    assert [decision.brake_reason for decision in decisions[:2]] == ["", ""]
+    assert (decisions[5].brake_reason, decisions[5].feedback) == (NO_FEEDBACK, None)
+
+
+def test_an_injected_delay_holds_feedback_back_as_well():
+    with rig_of("down.delay=150ms") as rig:
+        decisions = rig.drive(5)
+    known = [decision.feedback.step for decision in decisions if decision.feedback]
+    assert 0 <= max(known) <= 3
+    assert min(rig.clock.feedback_ages_ms) >= 150
+
+
+def test_without_any_vehicle_it_says_what_to_do():
+    with rig_of() as rig:
+        with pytest.raises(UserError, match="no feedback from a vehicle of robot-1"):
+            rig.clock.wait_for_vehicle(0.05, "robot-1")
+        rig.report(-1, session="another", episode=-1)
+        rig.clock.wait_for_vehicle(PATIENCE_S, "robot-1")
+
+
+def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
+    monkeypatch.setattr("bridge.clocks.STANDSTILL_WAIT_S", 0.3)
+    with rig_of() as rig:
+        rig.clock.begin(0, seed=0)
+        rig.report(-1, speed_mps=1.0, session="", episode=-1)
+        wait_until(lambda: rig.check.heard is not None, "the feedback")
+        threading.Timer(0.1, rig.report, [0], {"speed_mps": 0.0, "session": ""}).start()
+        rig.check.sent(0, 5)
+        rig.clock.wait_for_standstill()
+        assert rig.clock.moving_starts == 0
+        rig.report(1, speed_mps=0.5)
+        wait_until(lambda: rig.check.heard == make_feedback(1, speed_mps=0.5, sent_ns=6), "it")
+        rig.clock.wait_for_standstill()
+    assert rig.clock.moving_starts == 1
+
+
+@contextlib.contextmanager
+def stranger(endpoint):
+    """Hears the vehicle's feedback, and sends it again, with more that nobody can believe.
+
+    A call says whether the vehicle has got as far as a step of the first episode.
+    """
+    key, heard = "phil/hunter01/feedback", []
+
+    def hear(sample):
+        payload = sample.payload.to_bytes()
+        feedback: Any = decode_feedback(payload)
+        if not isinstance(feedback, Feedback) or feedback.vehicle != "mock" or payload in heard:
+            return
+        heard.append(payload)
+        if feedback.session:
+            other = make_feedback(0, session="stranger", sent_ns=feedback.sent_ns + 1)
+            for bad in (payload, encode(other), b"\xff", heard[0]):
+                session.put(key, bad)
+
+    def is_at(step):
+        feedback: Any = decode_feedback(heard[-1]) if heard else make_feedback(-1)
+        return (feedback.episode, feedback.step) >= (0, step)
+
+    with contextlib.closing(connect_client(endpoint, PATIENCE_S)) as session:
+        subscriber = session.declare_subscriber(key, hear)
+        yield is_at
+        subscriber.undeclare()
+
+
+def test_the_car_does_what_the_vehicle_did_whatever_a_stranger_says(tmp_path):
+    policy, endpoint = make_policy(tmp_path, "constant", 0.3), free_endpoint()
+    out = tmp_path / "report.json"
+    options = ("--clock", "realtime", "--loop", "vehicle")
+    with (
+        start_simulate(endpoint, out, SHORT_TOY, *options) as run,
+        start_edge(endpoint, policy, "--vehicle", "mock") as edge,
+        stranger(endpoint) as is_at,
+    ):
+        wait_until(lambda: is_at(12), "the middle of the episode")
+        edge.process.kill()
+        assert run.wait() == 0, run.errors
+    report = read(out)
+    assert (report["loop"], report["clock"], report["standing"]) == ("vehicle", "realtime", True)
+    vehicle = report["vehicle"]
+    assert (vehicle["name"], vehicle["moving_starts"], vehicle["faults"]) == ("mock", 0, {})
+    # Its actuators take their time: the pedal comes off the brake, and ends where it was asked.
+    pedals = [action[0] for action in report["per_episode"][0]["actions"]]
+    assert pedals[0] < 0.3
+    assert pedals[10] == pytest.approx(0.3, abs=0.02)
+    assert vehicle["action_error"]["pedal"]["max"] > 0.1
+    # A vehicle that takes pedals has no speed set-point.
+    assert vehicle["speed_error_mps"] == {"rmse": None, "max": None}
+    rejected = report["rejected_by_simulator"]
+    assert set(rejected) >= {f"feedback_{r}" for r in ("malformed", "foreign_session", "stale")}
+    assert rejected["feedback_malformed"] >= 10
+    # Nobody reports after a kill: the car brakes, and the report says why.
+    last = report["safe_stop_events"][-1]
+    assert (last["episode"], last["reason"]) == (0, NO_FEEDBACK)
+    assert pedals[-1] == -1.0
