@@ -71,8 +71,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     several = "which vehicle, where the recording holds several"
     add_options(parser, "--vehicle-id", default=None, help=several)
     apart = "how far two actions may be apart, of a range of -1 to 1"
-    limit = {"type": not_negative_number, "default": DEFAULT_TOLERANCE, "help": apart}
-    parser.add_argument("--tolerance", metavar="X", **limit)
+    parser.add_argument(
+        "--tolerance", metavar="X", type=not_negative_number, default=DEFAULT_TOLERANCE, help=apart
+    )
 
 
 def run(arguments: Any) -> int:
