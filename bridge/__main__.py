@@ -7,27 +7,12 @@ import sys
 from edge_runtime.cli import ArgumentParser, dispatch, examples, run_cli
 
 COMMANDS = {
-    "simulate": (
-        "bridge.simulate",
-        "serve an environment to an edge runtime over Zenoh, and report",
-    ),
-    "router": (
-        "bridge.relay:ROUTER",
-        "connect several simulators, edge runtimes and viewers with one another",
-    ),
-    "relay": (
-        "bridge.relay:RELAY",
-        "put an injected network between a simulator and an edge runtime",
-    ),
+    "simulate": ("bridge.simulate", "serve an environment to an edge runtime, and report"),
+    "router": ("bridge.relay:ROUTER", "connect simulators, edge runtimes and viewers"),
+    "relay": ("bridge.relay:RELAY", "inject a network between simulator and edge runtime"),
     "record": ("bridge.record:RECORD", "write everything on the wire to an MCAP recording"),
-    "replay": (
-        "bridge.replay",
-        "run recorded states through a policy or runtime, and compare its commands",
-    ),
-    "repair": (
-        "bridge.record:REPAIR",
-        "save what is whole of a recording that was cut off or damaged",
-    ),
+    "replay": ("bridge.replay", "run recorded states through a policy or runtime, and compare"),
+    "repair": ("bridge.record:REPAIR", "save what is whole of a cut-off or damaged recording"),
     "ros2": ("bridge.ros2", "show the wire to ROS 2, through a zenoh-bridge-ros2dds"),
     "view": ("bridge.rerun.wire_view", "show the wire in rerun, live or in a file"),
 }

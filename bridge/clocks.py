@@ -38,8 +38,7 @@ from edge_runtime.safety import Event
 from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command, Feedback, Reason, State, encode
 
-Publish = Callable[[bytes], None]
-"""Sends an encoded state over the wire; must not block."""
+Publish = Callable[[bytes], None]  # Sends an encoded state over the wire; must not block
 WALL_CLOCK_REASONS = (Event.SILENT.value, Event.TOO_LONG.value)
 """Why an edge runtime that lives in wall time stops; the virtual link has its own for silence."""
 

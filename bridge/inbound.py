@@ -103,8 +103,7 @@ class CommandCheck:
         return command.episode == ended_episode and command.step > answered_step
 
 
-ACTION_RANGE = "action_range"
-"""Rejection reason: no actuator is beyond its end."""
+ACTION_RANGE = "action_range"  # Rejection reason: no actuator is beyond its end
 ROUNDING = 1e-3
 NOT_COMMANDED = ""
 """Session of a vehicle that has not taken a command since its edge runtime was started."""
@@ -135,10 +134,7 @@ class FeedbackCheck:
         self._sent = (episode, step)
 
     def read(self, payload: bytes, now_s: float) -> Feedback | None:
-        """Return the feedback if it is this vehicle's newest; None otherwise.
-
-        ``now_s``: monotonic time.
-        """
+        """Return the feedback if it is this vehicle's newest, else None; ``now_s``: monotonic."""
         feedback = decode_feedback(payload)
         if isinstance(feedback, Rejection):
             self.rejected[feedback.reason.value] += 1
@@ -174,8 +170,7 @@ class FeedbackCheck:
 
 NO_FEEDBACK = "no_feedback"
 """Brake reason: nothing was heard from the vehicle for 2 T, so the car brakes in its place."""
-SELF_BRAKING = "self_braking"
-"""Brake reason: the vehicle says that it brakes by itself."""
+SELF_BRAKING = "self_braking"  # Brake reason: the vehicle says that it brakes by itself
 
 
 @dataclass(frozen=True)
@@ -243,8 +238,7 @@ class EdgeCounts:
         """States that the edge rejected, by reason, without zeros."""
         self.unreadable: Counter[str] = Counter()
         """Health messages that could not be read, as ``health_REASON``."""
-        self.changes = 0
-        """How often another edge runtime took over, or the same was started again."""
+        self.changes = 0  # How often another edge runtime took over, or the same was started again
         self.newest: Health | None = None
         self._lock = threading.Lock()
 

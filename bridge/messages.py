@@ -25,12 +25,10 @@ class Heard(NamedTuple):
 
     key: str
     topic: str
-    payload: bytes
-    """Of a token: 1 byte, 1 where it has come, 0 where it has gone."""
+    payload: bytes  # Of a token: 1 byte, 1 where it has come, 0 where it has gone
     arrived_ns: int
     """This process's clock: the wall's at the start, then monotonic, so that it never goes back."""
-    size: int
-    """Bytes on the wire; a payload over the contract's limit is not kept."""
+    size: int  # Bytes on the wire; a payload over the contract's limit is not kept
 
 
 Point = list[float]
@@ -74,10 +72,8 @@ class Scene(SeenScene, frozen=True, kw_only=True):
     sim_time_s: float
     round_trip_ms: float | None = None
     """Of the newest command: from its state sent until it acts, injected delays included."""
-    answered_step: int | None = None
-    """The state, of this episode, that ``round_trip_ms`` is of."""
-    rejected: dict[str, int] = {}
-    """What the simulator did not believe so far, by reason."""
+    answered_step: int | None = None  # The state, of this episode, that ``round_trip_ms`` is of
+    rejected: dict[str, int] = {}  # What the simulator did not believe so far, by reason
 
 
 class Stamps(NamedTuple):
@@ -132,8 +128,7 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
 """Topic -> decoder; for what is not valid it returns a ``Rejection``, for a scene None."""
 
 
-BURST = 2.0
-"""Two at once, so that the jitter of a stream at just the pace costs no message."""
+BURST = 2.0  # Two at once, so that the jitter of a stream at just the pace costs no message
 
 
 class Pace:

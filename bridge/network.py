@@ -22,8 +22,7 @@ import numpy as np
 
 from edge_runtime.util import UserError
 
-DIRECTIONS = ("up", "down")
-"""State to edge runtime, and command to simulator."""
+DIRECTIONS = ("up", "down")  # State to edge runtime, and command to simulator
 TAILS = ("normal", "lognormal", "pareto")
 ORDERS = ("free", "kept")
 
@@ -33,8 +32,7 @@ class Kind(NamedTuple):
 
     read: Callable[[str], Any]
     write: Callable[[Any], str]
-    limit: str = ""
-    """What a message about a wrong value says besides the example."""
+    limit: str = ""  # What a message about a wrong value says besides the example
 
 
 def _measure(units: Mapping[str, float], most: float, least: float = 0.0) -> Kind:
@@ -74,10 +72,8 @@ class Outage:
     """
 
     length_s: float
-    start_s: float
-    """When the (first) window begins."""
-    period_s: float | None = None
-    """From one window's begin to the next; None: there is only one."""
+    start_s: float  # When the (first) window begins
+    period_s: float | None = None  # From one window's begin to the next; None: there is only one
 
     def covers(self, now_s: float) -> bool:
         """Whether a message sent at ``now_s`` falls into a window (its end is outside)."""
@@ -131,8 +127,7 @@ class DirectionSpec:
     Messages are treated one by one, as datagrams are, unless ``order`` is kept.
     """
 
-    delay_ms: float = _setting(0.0, "delay", MS, "50ms")
-    """Mean time under way."""
+    delay_ms: float = _setting(0.0, "delay", MS, "50ms")  # Mean time under way
     jitter_ms: float = _setting(0.0, "jitter", MS, "10ms")
     """Standard deviation of the time under way; what falls below zero becomes zero."""
     loss_percent: float = _setting(0.0, "loss", PERCENT, "1%")

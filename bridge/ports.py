@@ -38,13 +38,10 @@ from edge_runtime.util import UserError
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, MAX_PAYLOAD_BYTES, check_vehicle_id, key
 
 ANY_VEHICLE = "*"
-POLL_S = 0.1
-"""How soon a listener sees that the simulator has gone."""
+POLL_S = 0.1  # How soon a listener sees that the simulator has gone
 RETRY_S = 0.2
-TOKEN_S = 1.0
-"""A simulator that is there has this time to say so, however short the wait asked for."""
-QUEUE_MESSAGES = 2000
-"""About a minute of real time, all topics together."""
+TOKEN_S = 1.0  # A simulator that is there has this time to say so, however short the wait asked for
+QUEUE_MESSAGES = 2000  # About a minute of real time, all topics together
 EDGE_POLL_S = 0.1
 QUERY_S = 1.0
 PayloadHandler = Callable[[bytes], None]
@@ -295,50 +292,21 @@ def writable(path: str) -> str:
 
 ENDPOINT = {"metavar": "PROTOCOL/HOST:PORT", "type": check_endpoint}
 _SECONDS = {"metavar": "SECONDS", "type": seconds}
+_VEHICLE = {"metavar": "ID", "type": check_vehicle_id}
+_TLS, _WAIT = "ca.pem, cert.pem, key.pem of this party", "how long to wait for"
+_SIMULATOR = "where the simulator or the router listens"
+_UNTIL = "stop after this many seconds (otherwise when no simulator is left)"
+_NETWORK = "injected network: " + GRAMMAR.replace("%", "%%")
 OPTIONS: dict[str, dict[str, Any]] = {
     "--listen": {**ENDPOINT, "help": "where the edge runtime and viewers connect to"},
-    "--connect": {
-        **ENDPOINT,
-        "default": DEFAULT_ENDPOINT,
-        "help": "where the simulator or the router listens",
-    },
-    "--tls": {
-        "metavar": "DIR",
-        "help": "ca.pem, cert.pem, key.pem of this party (python -m deploy certs);"
-        " endpoint tls/...",
-    },
-    "--vehicle-id": {
-        "metavar": "ID",
-        "type": check_vehicle_id,
-        "default": DEFAULT_VEHICLE_ID,
-        "help": "the vehicle",
-    },
-    "--wait-s": {
-        **_SECONDS,
-        "default": 10.0,
-        "help": "how long to wait for a simulator, in seconds",
-    },
-    "--duration-s": {
-        **_SECONDS,
-        "help": "stop after this many seconds (otherwise when no simulator is left)",
-    },
-    "--wait-edge-s": {
-        **_SECONDS,
-        "default": 30.0,
-        "help": "how long to wait for an edge runtime, in seconds",
-    },
-    "--latency": {
-        "metavar": "SPEC",
-        "type": parse_spec,
-        "default": "none",
-        "help": "injected network: " + GRAMMAR.replace("%", "%%"),
-    },
-    "--seed": {
-        "metavar": "N",
-        "type": not_negative,
-        "default": 0,
-        "help": "of delays and losses",
-    },
+    "--connect": {**ENDPOINT, "default": DEFAULT_ENDPOINT, "help": _SIMULATOR},
+    "--tls": {"metavar": "DIR", "help": f"{_TLS} (python -m deploy certs); endpoint tls/..."},
+    "--vehicle-id": {**_VEHICLE, "default": DEFAULT_VEHICLE_ID, "help": "the vehicle"},
+    "--wait-s": {**_SECONDS, "default": 10.0, "help": f"{_WAIT} a simulator, in seconds"},
+    "--duration-s": {**_SECONDS, "help": _UNTIL},
+    "--wait-edge-s": {**_SECONDS, "default": 30.0, "help": f"{_WAIT} an edge runtime, in seconds"},
+    "--latency": {"metavar": "SPEC", "type": parse_spec, "default": "none", "help": _NETWORK},
+    "--seed": {"metavar": "N", "type": not_negative, "default": 0, "help": "of delays and losses"},
     "--out": {"metavar": "R.json", "type": writable, "help": "write the report to this file"},
 }
 """The options that several commands have; their types raise UserError for a bad value."""

@@ -58,10 +58,8 @@ from edge_runtime.files import (
 from edge_runtime.tls import tls_for
 from edge_runtime.util import UserError, counted, open_regular
 
-FLUSH_S = 0.5
-"""A kill loses at most this much, and what waits in the queue."""
-NOT_WRITTEN = 1
-"""Exit status where the disk did not take the recording to its end."""
+FLUSH_S = 0.5  # A kill loses at most this much, and what waits in the queue
+NOT_WRITTEN = 1  # Exit status where the disk did not take the recording to its end
 CHUNK_BYTES = 1 << 20
 MAX_PENDING_BYTES = 4 << 20
 NEVER_OVER = "choose another name: no recording is lost"
@@ -76,23 +74,13 @@ def _new(path: str) -> str:
 
 
 def _add_record_arguments(parser: Any) -> None:
-    parser.add_argument(
-        "--out",
-        metavar="F.mcap",
-        type=_new,
-        required=True,
-        help="the recording; it must not exist yet",
-    )
+    out = "the recording; it must not exist yet"
+    parser.add_argument("--out", metavar="F.mcap", type=_new, required=True, help=out)
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
     help_text = "record this vehicle only (otherwise all)"
     add_options(parser, "--vehicle-id", default=None, help=help_text)
-    parser.add_argument(
-        "--linger-s",
-        metavar="SECONDS",
-        type=seconds,
-        default=2.0,
-        help="how long to go on without any simulator: it may come back, in seconds",
-    )
+    linger = "how long to go on without any simulator: it may come back, in seconds"
+    parser.add_argument("--linger-s", metavar="SECONDS", type=seconds, default=2.0, help=linger)
 
 
 def _run_record(arguments: Any) -> int:
@@ -111,11 +99,8 @@ def _run_record(arguments: Any) -> int:
                 _listen(listener, writer, arguments)
             writer.finish(listener.dropped)
         except OSError as error:
-            print(
-                f"error: recording {path} stopped: {error.strerror}; it holds what was written"
-                f" before: python -m bridge repair {path}",
-                file=sys.stderr,
-            )
+            stopped = f"error: recording {path} stopped: {error.strerror}; it holds what was"
+            print(f"{stopped} written before: python -m bridge repair {path}", file=sys.stderr)
             return NOT_WRITTEN
     if listener.dropped:
         dropped = counted(listener.dropped, "message")
@@ -275,10 +260,7 @@ class FlushedFile:
         return self.flushed_bytes + len(self._pending)
 
     def flush(self) -> None:
-        """Hand everything to the operating system, which keeps it when this process is killed.
-
-        Raises OSError (a full disk, for one); the file is then as it was after the last flush.
-        """
+        """Hand all to the operating system; OSError (a full disk) leaves the file as it was."""
         data = memoryview(bytes(self._pending))
         self._pending.clear()
         written = 0
@@ -299,8 +281,7 @@ class FlushedFile:
 
 Field: Any = descriptor_pb2.FieldDescriptorProto
 TIMESTAMP = "google.protobuf.Timestamp"
-Time = Annotated[dict[str, int], TIMESTAMP]
-"""As `_stamp` makes it."""
+Time = Annotated[dict[str, int], TIMESTAMP]  # As `_stamp` makes it
 Fixed32 = Annotated[int, Field.TYPE_FIXED32]
 Data = Annotated[bytes, Field.TYPE_BYTES]
 _SCALARS = {
@@ -355,24 +336,18 @@ class Schema(NamedTuple):
 
 @functools.cache
 def describe(kind: type[msgspec.Struct]) -> Schema:
-    """Mirror a struct: one of the two above by Foxglove's name, one of the wire as ``phil.<name>``.
-
-    Plain bytes and types that protobuf does not have are left out.
-    """
+    """Mirror a struct as a protobuf message, without plain bytes and what protobuf lacks."""
     package = "foxglove" if kind in (RawImage, Log) else "phil"
     stamp = descriptor_pb2.FileDescriptorProto()
     timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
+    name = f"{package}.{kind.__name__}"
     file = descriptor_pb2.FileDescriptorProto(
-        name=f"{package}/{kind.__name__}.proto",
-        package=package,
-        syntax="proto3",
-        dependency=[stamp.name],
+        name=f"{name}.proto", package=package, syntax="proto3", dependency=[stamp.name]
     )
     _add_struct(file.message_type.add(), kind, package)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(stamp)
     pool.Add(file)
-    name = f"{package}.{kind.__name__}"
     make = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
     files = descriptor_pb2.FileDescriptorSet(file=[stamp, file])
     return Schema(name, make, files.SerializeToString())
@@ -418,23 +393,14 @@ def _add_map_entry(message: Any, name: str, inner: tuple[Any, ...]) -> str:
     return entry_name
 
 
-KEPT = ".damaged"
-"""Ends the name under which a damaged recording is kept beside the repaired one."""
+KEPT = ".damaged"  # Ends the name under which a damaged recording is kept beside the repaired one
 
 
 def _add_repair_arguments(parser: Any) -> None:
-    parser.add_argument(
-        "recording",
-        metavar="F.mcap",
-        help="the recording; where more than a torn end is left out of it, the file as it was is"
-        f" kept as F.mcap{KEPT}",
-    )
-    parser.add_argument(
-        "--out",
-        metavar="G.mcap",
-        type=_new,
-        help="write here instead of over the recording itself; it must not exist yet",
-    )
+    text = "the recording; where more than a torn end is left out of it, the file as it was is"
+    parser.add_argument("recording", metavar="F.mcap", help=f"{text} kept as F.mcap{KEPT}")
+    out = "write here instead of over the recording itself; it must not exist yet"
+    parser.add_argument("--out", metavar="G.mcap", type=_new, help=out)
 
 
 def _run_repair(arguments: Any) -> int:
@@ -456,14 +422,14 @@ def _run_repair(arguments: Any) -> int:
         if not messages:
             raise UserError(f"{source} holds no whole message; there is nothing to repair")
         if arguments.out is None and not recording.trouble():
-            whole, more = "is whole", ""
-            if not recording.has_checksums:
-                whole = "can be read to its end"
-                more = (
-                    ". It has no checksum over all of it, so a change in its index would not show;"
-                    " --out G.mcap writes it with one"
+            if recording.has_checksums:
+                print(f"{source} is whole: {found}; nothing done")
+            else:
+                print(
+                    f"{source} can be read to its end: {found}; nothing done. It has no checksum"
+                    " over all of it, so a change in its index would not show; --out G.mcap writes"
+                    " it with one"
                 )
-            print(f"{source} {whole}: {found}; nothing done{more}")
             return 0
         kept = _write(data, recording, arguments.out)
     left_out = recording.missing() and f"; left out: {recording.missing()}"
@@ -497,20 +463,19 @@ def _rewrite(recording: Recording) -> tuple[bytes, int]:
     """Copy every message into a new recording, held in memory."""
     stream = io.BytesIO()
     writer = start_mcap(stream)
-    schemas: dict[int, int] = {0: 0}
+    schemas: dict[int, int] = {}
     channels: dict[int, int] = {}
     messages = 0
     for channel, schema, message in recording.messages():
         if schema is not None and schema.id not in schemas:
             schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
         if channel.id not in channels:
-            channels[channel.id] = writer.register_channel(
-                channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0)
-            )
-        times = {"log_time": message.log_time, "publish_time": message.publish_time}
+            kind = (channel.message_encoding, schemas.get(channel.schema_id, 0))
+            channels[channel.id] = writer.register_channel(channel.topic, *kind)
         writer.add_message(
-            channels[channel.id], data=message.data, sequence=message.sequence, **times
-        )
+            channels[channel.id], message.log_time, message.data, message.publish_time,
+            message.sequence,
+        )  # fmt: skip
         messages += 1
     if recording.metadata:
         writer.add_metadata(METADATA, recording.metadata)

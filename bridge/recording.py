@@ -38,8 +38,7 @@ WIRE_ENCODING = "msgpack"
 METADATA = "phil"
 MAX_RECORD_BYTES = 64 << 20
 """A torn length must not ask for more memory than any record of ours needs."""
-MAX_CHUNK_BYTES = 8 << 20
-"""Unpacked; ours hold little more than 1 MiB."""
+MAX_CHUNK_BYTES = 8 << 20  # Unpacked; ours hold little more than 1 MiB
 MAX_WORK = 200
 """Bytes read and unpacked for each byte of the file, above one chunk. The recording of a car that
 stands still for an hour comes to 100: every picture in it is the same."""
@@ -78,15 +77,11 @@ class Condition:
 
     cut_off: bool = False
     """The file ends without its index, between two records or within one: its writer was killed."""
-    damaged_places: int = 0
-    """Broken parts before the end; all that is whole between them is read."""
+    damaged_places: int = 0  # Broken parts before the end; all that is whole between them is read
     damaged_bytes: int = 0
-    torn_bytes: int = 0
-    """Of the record within which the file stops."""
-    nameless_messages: int = 0
-    """Whole ones whose topic stood in a broken part alone."""
-    is_altered: bool = False
-    """The checksum over the data is wrong, though nothing in it is broken."""
+    torn_bytes: int = 0  # Of the record within which the file stops
+    nameless_messages: int = 0  # Whole ones whose topic stood in a broken part alone
+    is_altered: bool = False  # The checksum over the data is wrong, though nothing in it is broken
     has_checksums: bool = False
     """Over all of the data and over the index: nothing could change without being noticed."""
 
@@ -170,10 +165,7 @@ class Recording(Condition):
 
 
 class Records(Condition):
-    """The records of a file of ``size`` bytes; its condition is known after ``walk``.
-
-    ``name`` is for the errors, where the stream does not know it.
-    """
+    """The records of a file of ``size`` bytes; its condition is known after ``walk``."""
 
     def __init__(self, stream: IO[bytes], size: int, name: str = "") -> None:
         super().__init__()
@@ -302,10 +294,7 @@ class Records(Condition):
         return crc
 
     def _spend(self, count: int, at: int) -> None:
-        """Count bytes to be read or unpacked, up to that place of the file.
-
-        UserError where they are out of proportion: damage does not do that.
-        """
+        """Count bytes read or unpacked up to a place; UserError for more than damage explains."""
         self._spent_bytes += count
         if self._spent_bytes > MAX_CHUNK_BYTES + MAX_WORK * at:
             raise UserError(

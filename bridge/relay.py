@@ -34,8 +34,7 @@ DOWN = ("command", "feedback", "health")
 """The topics that pass the model towards the simulator; the other way goes the state."""
 REARM = "rearm"
 QUERIES = ("status", REARM)
-QUERY_S = 2.0
-"""As long as the operator's commands wait for an answer."""
+QUERY_S = 2.0  # As long as the operator's commands wait for an answer
 LAG_WINDOW = 100_000
 COUNTS = ("received", "bytes", "lost", "duplicated", "delivered")
 
@@ -102,10 +101,7 @@ def open_relay(
 
 
 class Relay:
-    """Carries one vehicle's topics between two Zenoh sessions.
-
-    Zenoh calls the handlers on its own threads; they only push into delay lines and ask on.
-    """
+    """Carries one vehicle's topics between two Zenoh sessions, on Zenoh's own threads."""
 
     def __init__(
         self,
@@ -213,10 +209,7 @@ class RelayTraffic:
         self._down_line.close()
 
     def report(self) -> dict[str, Any]:
-        """Return the counts of each topic, and how late the timers were.
-
-        A message that is still under way is among the received only.
-        """
+        """Return the counts of each topic, and how late the timers were."""
         with self._lock:
             lags_ms = [lag_s * 1e3 for lag_s in self._lags_s or (0.0,)]
             counts = {name: dict(counted) for name, counted in self._counts.items()}
@@ -266,16 +259,11 @@ def _add_router_arguments(parser: Any) -> None:
     help_text = f"where all others connect to; may be repeated (default: {DEFAULT_ENDPOINT})"
     add_options(parser, "--listen", action="append", help=help_text)
     add_options(parser, "--tls")
-    help_text = (
-        "a vehicle whose parties have rights here, with --tls; may be repeated"
-        f" (default: {DEFAULT_VEHICLE_ID})"
-    )
-    add_options(parser, "--vehicle-id", action="append", default=None, help=help_text)
-    parser.add_argument(
-        "--config",
-        metavar="FILE.json5",
-        help="all settings from a file of `python -m deploy router`, and no other option",
-    )
+    vehicle = "a vehicle whose parties have rights here, with --tls; may be repeated"
+    vehicle += f" (default: {DEFAULT_VEHICLE_ID})"
+    add_options(parser, "--vehicle-id", action="append", default=None, help=vehicle)
+    config = "all settings from a file of `python -m deploy router`, and no other option"
+    parser.add_argument("--config", metavar="FILE.json5", help=config)
 
 
 def _run_router(arguments: Any) -> int:

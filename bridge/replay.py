@@ -35,19 +35,15 @@ from edge_runtime.wire import SAFE_STOP, Command, Health, State, decode_command,
 
 RUNTIME_ENDED = "runtime_ended"
 """Reason of the farewell of a runtime that is ended; no decision about a state."""
-JUST_AFTER_S = 1e-6
-"""A watchdog wakes at its deadline or later, never before."""
+JUST_AFTER_S = 1e-6  # A watchdog wakes at its deadline or later, never before
 CLOCK_STEP_S = 1.0
 """Where the two clocks come apart by more than this, the runtime's has been stepped."""
-RESTART_S = 0.5
-"""Uptimes that disagree by more than this belong to two runtimes."""
+RESTART_S = 0.5  # Uptimes that disagree by more than this belong to two runtimes
 
-Key = tuple[str, int, int]
-"""Session, episode, step."""
+Key = tuple[str, int, int]  # Session, episode, step
 DEFAULT_TOLERANCE = 1e-5
 """Two processors round differently; a graph of the same weights stays far below this."""
-DIFFERENT = 1
-"""Exit status where at least one command differs."""
+DIFFERENT = 1  # Exit status where at least one command differs
 SHOWN_DIFFERENCES = 10
 EXAMPLE = examples(
     "python -m bridge replay hil_tests/recordings/left_turn.mcap \\\n"
@@ -60,34 +56,23 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("recording", metavar="F.mcap", help="what bridge record has written")
     through = parser.add_mutually_exclusive_group(required=True)
-    through.add_argument(
-        "--policy", metavar="POLICY.onnx", help="replay in process, with the recording's times"
-    )
-    help_text = "replay in real time to an edge runtime that connects here"
-    add_options(through, "--listen", help=help_text)
-    help_text = "replay in real time to an edge runtime behind this router"
-    add_options(through, "--connect", default=None, help=help_text)
+    in_process = "replay in process, with the recording's times"
+    live = "replay in real time to an edge runtime"
+    through.add_argument("--policy", metavar="POLICY.onnx", help=in_process)
+    add_options(through, "--listen", help=f"{live} that connects here")
+    add_options(through, "--connect", default=None, help=f"{live} behind this router")
     add_options(parser, "--tls", "--wait-edge-s", "--out")
     add_public_key(parser)
+    unsigned = "also take a policy whose origin cannot be verified"
+    parser.add_argument("--allow-unsigned", action="store_true", help=unsigned)
+    config = "with --policy: the settings of the edge runtime that was recorded, where a vehicle's"
+    config += " model or scale was not the default"
+    parser.add_argument("--config", metavar="FILE.toml", help=config)
+    several = "which vehicle, where the recording holds several"
+    add_options(parser, "--vehicle-id", default=None, help=several)
+    apart = "how far two actions may be apart, of a range of -1 to 1"
     parser.add_argument(
-        "--allow-unsigned",
-        action="store_true",
-        help="also take a policy whose origin cannot be verified",
-    )
-    parser.add_argument(
-        "--config",
-        metavar="FILE.toml",
-        help="with --policy: the settings of the edge runtime that was recorded, where a vehicle's"
-        " model or scale was not the default",
-    )
-    help_text = "which vehicle, where the recording holds several"
-    add_options(parser, "--vehicle-id", default=None, help=help_text)
-    parser.add_argument(
-        "--tolerance",
-        metavar="X",
-        type=not_negative_number,
-        default=DEFAULT_TOLERANCE,
-        help="how far two actions may be apart, of a range of -1 to 1",
+        "--tolerance", metavar="X", type=not_negative_number, default=DEFAULT_TOLERANCE, help=apart
     )
 
 
@@ -120,9 +105,8 @@ def run(arguments: Any) -> int:
     )
     for row in report["first_differences"][:3]:
         recorded, ours = _text(row["recorded"]), _text(row["replayed"])
-        print(
-            f"  episode {row['episode']} step {row['step']}: recorded {recorded}; replayed {ours}"
-        )
+        place = f"episode {row['episode']} step {row['step']}"
+        print(f"  {place}: recorded {recorded}; replayed {ours}")
     return DIFFERENT if report["different"] else 0
 
 
@@ -170,12 +154,9 @@ class Exchange:
 
     arrived_s: float
     """When the state reached the runtime, seconds since the recording's first message."""
-    begun_s: float
-    """When the policy began with it."""
-    finished_s: float
-    """When the policy's answer, or the verdict that it took too long, was there."""
-    last_s: float
-    """When the last answer was heard, repetitions included."""
+    begun_s: float  # When the policy began with it
+    finished_s: float  # When the policy's answer, or the verdict that it took too long, was there
+    last_s: float  # When the last answer was heard, repetitions included
     answers: list[Answer] = field(default_factory=list)
 
 

@@ -85,8 +85,7 @@ class SafeStopEvent:
     """One unbroken stretch of braking; its fields are those of the report."""
 
     episode: int
-    step: int
-    """The first tick in which the vehicle braked."""
+    step: int  # The first tick in which the vehicle braked
     reason: str
     """``no_command`` if the simulator braked by itself, else the edge runtime's reason; with a
     vehicle in the loop also ``no_feedback`` and ``self_braking``."""
@@ -243,8 +242,7 @@ class Series:
     asked: Numbers
     reached_s: Numbers
     reached: Numbers
-    held: bool
-    """What was asked for holds until the next; otherwise it is interpolated."""
+    held: bool  # What was asked for holds until the next; otherwise it is interpolated
 
     def errors(self, delay_s: float = 0.0) -> Numbers:
         """Reached minus what was asked for ``delay_s`` before."""

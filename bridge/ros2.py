@@ -43,8 +43,7 @@ LONGEST_GAP_S = 0.5
 """After a longer silence its speed meanwhile is unknown: only so much is made up."""
 ERROR_PER_METRE = 0.1
 """Guessed, not measured: a standard deviation of 10 % of the way, and 0.1 rad a metre."""
-UNKNOWN = 1e6
-"""A variance for what a car on a plane does not know: height, roll and pitch."""
+UNKNOWN = 1e6  # A variance for what a car on a plane does not know: height, roll and pitch
 
 CAMERA_FRAME, ODOMETRY_FRAME, BASE_FRAME = "camera", "odom", "base_link"
 _, HEIGHT, WIDTH = FRAMES_SHAPE
@@ -74,26 +73,17 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_options(parser, "--connect", "--tls", "--wait-s", "--duration-s")
     add_options(parser, "--vehicle-id", help="the vehicle to show")
     side = parser.add_mutually_exclusive_group()
-    side.add_argument(
-        "--ros2-listen",
-        metavar="PROTOCOL/HOST:PORT",
-        help=f"where a zenoh-bridge-ros2dds connects to (default: {DEFAULT_ROS2_ENDPOINT})",
-    )
-    side.add_argument(
-        "--ros2-connect",
-        metavar="PROTOCOL/HOST:PORT",
-        help="where a zenoh-bridge-ros2dds listens; it may come later",
-    )
-    parser.add_argument(
-        "--namespace", metavar="NS", help="ROS namespace of the topics (default: /VEHICLE_ID)"
-    )
-    parser.add_argument(
-        "--max-rate-hz",
-        metavar="HZ",
-        type=number("a rate above 0 and up to 1000 Hz", lambda rate_hz: 0.0 < rate_hz <= 1000.0),
-        default=MAX_RATE_HZ,
-        help="most messages a second on each topic; more are left out",
-    )
+    where = "where a zenoh-bridge-ros2dds"
+    for name, text in (
+        ("--ros2-listen", f"{where} connects to (default: {DEFAULT_ROS2_ENDPOINT})"),
+        ("--ros2-connect", f"{where} listens; it may come later"),
+    ):
+        side.add_argument(name, metavar="PROTOCOL/HOST:PORT", help=text)
+    namespace = "ROS namespace of the topics (default: /VEHICLE_ID)"
+    parser.add_argument("--namespace", metavar="NS", help=namespace)
+    rate = number("a rate above 0 and up to 1000 Hz", lambda rate_hz: 0.0 < rate_hz <= 1000.0)
+    most = "most messages a second on each topic; more are left out"
+    parser.add_argument("--max-rate-hz", metavar="HZ", type=rate, default=MAX_RATE_HZ, help=most)
     add_options(parser, "--out", help="write the counts to this file at the end")
 
 
@@ -132,10 +122,7 @@ def run(arguments: Any) -> int:
 
 
 class Outlet:
-    """Publishes what it is given; used by one thread.
-
-    `rejected` counts what our wire brought and could not be read or shown, by topic and reason.
-    """
+    """Publishes what it is given; ``rejected`` counts what it could not, by topic and reason."""
 
     def __init__(self, node: Ros2Node, policies: Policies, max_rate_hz: float) -> None:
         self.rejected: Counter[str] = Counter()
@@ -214,10 +201,7 @@ class Policies:
         self.newest: Policy | None = None
 
     def find(self, policy_id: str) -> Policy | None:
-        """Return the policy of that id; None until the edge says, and for an unknown scenario.
-
-        Waits for the edge's answer once for each new policy, and seldom where none comes.
-        """
+        """Return the policy of that id; None until the edge says, and for an unknown scenario."""
         if policy_id not in self._known and self._clock_s() >= self._ask_again_s:
             self._ask_again_s = self._clock_s() + RETRY_S
             with contextlib.suppress(UserError):  # the edge has just gone: asked again later
@@ -249,10 +233,7 @@ class Policy(NamedTuple):
         return dict(zip(self.action_names, values, strict=False)).get(name)
 
     def curvature(self, values: Sequence[float], scale: float = 1.0) -> float | None:
-        """Return the path's curvature (1/m) at that steering; None where there is none.
-
-        ``scale``: metres of the vehicle for one of the scenario.
-        """
+        """Return the path's curvature (1/m); ``scale``: vehicle metres for one of the scenario."""
         steering = self.action(values, "steering")
         return None if steering is None else self.car.curvature(steering) / scale
 
@@ -354,8 +335,7 @@ class DeadReckoning:
         if self._time_ns is not None and time_ns > self._time_ns:
             step_s = min((time_ns - self._time_ns) * 1e-9, LONGEST_GAP_S)
             self._move(
-                0.5 * (speed_mps + self._speed_mps) * step_s,
-                0.5 * (curvature + self._curvature),
+                0.5 * (speed_mps + self._speed_mps) * step_s, 0.5 * (curvature + self._curvature)
             )
         self._time_ns = time_ns
         self._speed_mps, self._curvature = speed_mps, curvature

@@ -47,37 +47,19 @@ EXAMPLE = examples(
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    words = ", ".join(SCENARIOS)
-    parser.add_argument(
-        "--env", metavar="ENV", required=True, help=f"scenario ({words}), gymnasium id or module:id"
-    )
-    parser.add_argument(
-        "--condition",
-        choices=CONDITIONS,
-        default=NOMINAL,
-        help="scene; " + "; ".join(f"{name}: {meaning}" for name, meaning in CONDITIONS.items()),
-    )
-    parser.add_argument(
-        "--episodes", metavar="N", type=positive, default=1, help="episodes to drive"
-    )
-    parser.add_argument(
-        "--clock",
-        choices=sorted(CLOCKS),
-        default=LOCKSTEP,
-        help="lockstep waits for each command; realtime waits for nobody",
-    )
-    parser.add_argument(
-        "--loop",
-        choices=LOOPS,
-        default=POLICY,
-        help="the car does what the policy commands, or (realtime only) what the vehicle behind "
-        "the edge runtime reports to have done",
-    )
-    parser.add_argument(
-        "--standing",
-        action="store_true",
-        help="the car starts every episode at rest, as with --loop vehicle it always does",
-    )
+    add = parser.add_argument
+    env = f"scenario ({', '.join(SCENARIOS)}), gymnasium id or module:id"
+    scene = "scene; " + "; ".join(f"{name}: {meaning}" for name, meaning in CONDITIONS.items())
+    clock = "lockstep waits for each command; realtime waits for nobody"
+    loop = "the car does what the policy commands, or (realtime only) what the vehicle behind"
+    loop += " the edge runtime reports to have done"
+    standing = "the car starts every episode at rest, as with --loop vehicle it always does"
+    add("--env", metavar="ENV", required=True, help=env)
+    add("--condition", choices=CONDITIONS, default=NOMINAL, help=scene)
+    add("--episodes", metavar="N", type=positive, default=1, help="episodes to drive")
+    add("--clock", choices=sorted(CLOCKS), default=LOCKSTEP, help=clock)
+    add("--loop", choices=LOOPS, default=POLICY, help=loop)
+    add("--standing", action="store_true", help=standing)
     where = parser.add_mutually_exclusive_group()
     add_options(where, "--listen", default=DEFAULT_ENDPOINT)
     help_text = "share a router with other vehicles instead of listening"
@@ -209,10 +191,7 @@ def _refuse_another_task(asked: Namespace, runner: EpisodeRunner, theirs: str, o
 
 
 class EpisodeBar:
-    """Shows the episodes done and what the vehicle does at the moment.
-
-    Where nobody watches a terminal, it prints a line an episode instead.
-    """
+    """Shows the episodes done and what the vehicle does; without a terminal, a line an episode."""
 
     def __init__(self, progress: Progress, episodes: int) -> None:
         self._progress = progress

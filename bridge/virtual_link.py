@@ -36,27 +36,22 @@ from edge_runtime.safety import (
 from edge_runtime.wire import CONTROL_PERIOD_S, SAFE_STOP, Command
 
 SILENCE_LIMIT_S = 2 * CONTROL_PERIOD_S
-COMMAND_WINDOW_S = 0.025
-"""A command that arrives within this time after the tick still acts in it."""
+COMMAND_WINDOW_S = 0.025  # A command that arrives within this time after the tick still acts in it
 ROUNDING_S = 1e-9
 """Sums such as 0.3 + 0.01 + 0.015 miss 0.325 by less than this; no real delay is as short."""
 
 NO_COMMAND = "no_command"
 """Brake reason: the vehicle brakes by itself because nothing arrived for 2 T."""
-UNKNOWN_SAFE_STOP = "safe_stop"
-"""Brake reason when a safe_stop command gives none of its own."""
+UNKNOWN_SAFE_STOP = "safe_stop"  # Brake reason when a safe_stop command gives none of its own
 
 
 @dataclass(frozen=True)
 class Decision:
     """What the vehicle does in one tick."""
 
-    command: Command | None
-    """The newest command, held; None before the first of the episode."""
-    fresh: bool
-    """It arrived since the decision before this one."""
-    brake_reason: str
-    """Why the vehicle brakes; empty while it obeys the command."""
+    command: Command | None  # The newest command, held; None before the first of the episode
+    fresh: bool  # It arrived since the decision before this one
+    brake_reason: str  # Why the vehicle brakes; empty while it obeys the command
     undriven_s: float
     """Time since the newest ``drive`` command arrived (since the episode began, if none has)."""
     command_age_s: float | None = None
@@ -142,8 +137,7 @@ class Arrival(Generic[Message]):
 @dataclass(frozen=True)
 class _Answer:
     command: Command
-    sent_s: float
-    """Virtual time of the state's tick."""
+    sent_s: float  # Virtual time of the state's tick
     computing_s: float
 
 

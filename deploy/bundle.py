@@ -44,8 +44,7 @@ from edge_runtime.util import UserError, read_bytes
 NAME = "install.pyz"
 DEFAULT_OUT = "build/bundles"
 UNITS = Path(__file__).parent / "systemd"
-HOLD = "../../state/hold"
-"""Seen from a release's folder: what the installer locks while it judges."""
+HOLD = "../../state/hold"  # Seen from a release's folder: what the installer locks while it judges
 _OF_THE_BUNDLE = ("policy", "tls", "public_key", "allow_unsigned", "hold")
 _DIGITS = 8
 _FIRST_DAY = (1980, 1, 1, 0, 0, 0)
@@ -70,8 +69,7 @@ TARGETS = {
 }
 _MANYLINUX = (5, 12, 17, 24, 26, 27, 28, 31)
 """The minor versions of glibc 2 that wheels are tagged with, up to the boards' own."""
-_PATCH = 2
-"""pip takes 3.9 for 3.9.0, which cryptography shuns; Debian bullseye has 3.9.2."""
+_PATCH = 2  # pip takes 3.9 for 3.9.0, which cryptography shuns; Debian bullseye has 3.9.2.
 _LINE = re.compile(r"([A-Za-z0-9._-]+)==([A-Za-z0-9._+!-]+) --hash=sha256:([0-9a-f]{64})")
 _SETUPTOOLS = 75  # as edge_runtime/pyproject.toml asks
 _EPOCH_S = 315532800
@@ -170,10 +168,7 @@ def make_bundle(inputs: Inputs, target: Target, out: Path) -> Made:
 
 
 def check_inputs(inputs: Inputs) -> tuple[Ed25519PrivateKey, Policy, Config, str]:
-    """All but the wheels: the key, the policy, the settings, and the file that says them.
-
-    Raises UserError for what `make_bundle` would refuse.
-    """
+    """The key, the policy, the settings and their text; UserError for what no bundle may hold."""
     key = tls.read_signing_key(inputs.key)
     if inputs.policy.is_file() and not Path(f"{inputs.policy}.sig").exists():
         # Here, because load_policy would name a flag that no bundle has.

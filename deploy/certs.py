@@ -44,12 +44,10 @@ CA_DAYS = 3650
 CLOCK_SLACK = datetime.timedelta(days=1)
 """A certificate is valid from a day ago: boards' clocks are behind until they are set."""
 LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
-MAX_NAME_CHARS = 64
-"""The longest common name of a certificate (RFC 5280)."""
+MAX_NAME_CHARS = 64  # The longest common name of a certificate (RFC 5280)
 SESSIONS_PER_VEHICLE = 4
 """Edge runtime, simulator, an operator's command, and the edge runtime's look at its start."""
-SPARE_SESSIONS = 1000
-"""Viewers; Zenoh's own default."""
+SPARE_SESSIONS = 1000  # Viewers; Zenoh's own default
 MAX_MESSAGE_BYTES = 256 * 1024
 """Four times what an edge runtime reads. Larger ones end at the router; Zenoh itself says 1 GiB."""
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
@@ -129,10 +127,7 @@ def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_certs(arguments: argparse.Namespace) -> int:
-    """Make what is missing of the authority and of the parties' folders.
-
-    Raises UserError, with nothing written, where nothing is missing.
-    """
+    """Make what is missing of the authority and the parties; UserError where nothing is."""
     out, days = Path(arguments.out), arguments.days
     hosts = list(dict.fromkeys(map(_host, [*LOOPBACK_HOSTS, *arguments.host])))
     roles = _missing(out, arguments.vehicle_id or [DEFAULT_VEHICLE_ID])

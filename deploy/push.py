@@ -29,8 +29,7 @@ SSH, SCP = ("ssh", *_UNATTENDED), ("scp", "-q", "-p", *_UNATTENDED)
 _HOST = re.compile(r"([A-Za-z0-9_][A-Za-z0-9_.-]*@)?[A-Za-z0-9\[][A-Za-z0-9_.:\]-]*")
 _TRUST, _BUNDLE = "trust.pub", "bundle.tar"
 """Names over there, whatever the files are called here: a bundle may be called `install.pyz`."""
-_SSH_FAILED = 255
-"""ssh's own status; any other is that of the command over there."""
+_SSH_FAILED = 255  # ssh's own status; any other is that of the command over there
 
 
 class Step(NamedTuple):

@@ -157,10 +157,7 @@ class Contender:
         self._episode += 1
 
     def rouse(self) -> float:
-        """Send states until the first answer, and say when that came (perf_counter).
-
-        A process that is ready may not be known here yet.
-        """
+        """Send states until the first answer comes; when that came (perf_counter, s)."""
         self.arrivals.clear()
 
         def is_answered() -> bool:

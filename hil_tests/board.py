@@ -43,8 +43,7 @@ from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 
-Keep = Callable[[dict[str, Any]], None]
-"""Given a report, for JSON, each time when it has grown."""
+Keep = Callable[[dict[str, Any]], None]  # Given a report, for JSON, each time when it has grown
 
 BOARDS = ("aarch64", "python38")
 CACHE, WHEELS = ROOT / "build/board", ROOT / DEFAULT_FOLDER
@@ -99,10 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prove each board, print its report, write the file.
-
-    Raises UserError where this machine cannot, or a step failed.
-    """
+    """Prove each board; UserError where this machine cannot, or a step failed."""
     if arguments.out is not None:
         check_writable(arguments.out)
     for board in arguments.boards:
@@ -294,10 +290,7 @@ class Board:
 
 
 def make_image() -> None:
-    """A disk with Debian on it, its kernel, and the key that opens it; minutes, once.
-
-    Raises UserError where debootstrap failed, for instance without a network.
-    """
+    """A disk with Debian, its kernel and a key; minutes, once. UserError without a network."""
     CACHE.mkdir(parents=True, exist_ok=True)
     # In a mount namespace of its own: what it mounts is gone with it, whatever happens.
     apart = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-e", "-c"]
@@ -310,10 +303,7 @@ def make_image() -> None:
 
 
 def prove_aarch64(cuts: int, keep: Keep) -> None:
-    """Install, drive, upgrade, spoil, hang and cut off an emulated board.
-
-    Raises UserError where a step failed that must not.
-    """
+    """Install, drive, upgrade, spoil, hang and cut off an emulated board; UserError if it fails."""
     if not (CACHE / "disk").exists():
         make_image()
     with tempfile.TemporaryDirectory(prefix="phil-board-") as place:
@@ -439,10 +429,7 @@ def _install_faulty(board: Board, bundle: Path) -> dict[str, Any]:
 
 
 def _cut(board: Board, lights: list[Path], cuts: int) -> Iterator[dict[str, Any]]:
-    """Cut the power at random moments of an upgrade; look, and let the same command complete it.
-
-    Yields what came of the cuts so far.
-    """
+    """Cut the power at random moments of upgrades; complete each. Yields what came of them."""
     choice = random.Random(1)
     begun_s = time.monotonic()
     board.must(f"install {lights[0].name}")

@@ -28,8 +28,7 @@ from trainer.util import ProgressBar, cores
 PART_EPISODES, LOOP_EPISODES = 50, 5
 """Of a network, in virtual time; of a loop, in real time: short, so that all rigs end at about the
 same time."""
-LONGEST_EPISODE_S = 60.0
-"""With the wait for a stand before it; the scenarios time out after 30 s."""
+LONGEST_EPISODE_S = 60.0  # With the wait for a stand before it; the scenarios time out after 30 s
 SHOWN_WRONG = 5
 
 
@@ -118,10 +117,7 @@ def _choose(arguments: argparse.Namespace) -> tuple[list[sweep.Axis], list[str] 
 
 
 def _task(arguments: argparse.Namespace, changes: dict[str, float] | None = None) -> sweep.Task:
-    """UserError where the policy does not load.
-
-    The edge runtime checks signatures where it matters; here the loop is measured.
-    """
+    """UserError where the policy does not load; its signature is the edge runtime's to check."""
     policy = Path(arguments.policy or f"results/policies/{arguments.scenario}.onnx")
     loaded = load_policy(str(policy), arguments.public_key, allow_unsigned=True)
     return sweep.Task(

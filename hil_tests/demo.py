@@ -21,8 +21,7 @@ MARKER = ".phil-demo"
 LATENCY = "50ms+-10ms"
 VEHICLE = "demo01"
 RUNS = 20
-GOOD_SUCCESS = 0.8
-"""What the drives without latency should reach."""
+GOOD_SUCCESS = 0.8  # What the drives without latency should reach
 FIRST_SEED = 0
 RECORDED_RUNS = 2
 TRAINING_STEPS = 1500

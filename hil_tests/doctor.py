@@ -29,21 +29,17 @@ from edge_runtime.util import UserError
 
 BASICS = "basics"
 INSTALL = "make install"
-NOT_READY = 1
-"""Exit status where a basic is missing."""
-TIMEOUT_S = 60.0
-"""For a program that a probe starts."""
+NOT_READY = 1  # Exit status where a basic is missing
+TIMEOUT_S = 60.0  # For a program that a probe starts
 ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "requirements" / "workstation.txt"
 OLDEST = (3, 11)
 DISK_GB = 2
 """A training run with its checkpoint takes some 0.5 GB, recordings and pictures come on top."""
-MEMORY_GB = 2
-"""A full replay buffer and torch take 1.2 GB."""
+MEMORY_GB = 2  # A full replay buffer and torch take 1.2 GB.
 ARRIVAL_S = 5.0
 LOOPBACK = "127.0.0.1"
-_CAN_DEVICE = "280"
-"""ARPHRD_CAN of linux/if_arp.h."""
+_CAN_DEVICE = "280"  # ARPHRD_CAN of linux/if_arp.h.
 _KERNEL = """
 import os, sys, torch
 from trainer.learner.kernel import load
@@ -103,11 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
         found.append(examine(check))
         print(lines(found[-1]), flush=True)
     print(f"\n{summary(found)}")
-    return 0 if basics_work(found) else NOT_READY
-
-
-class MissingError(Exception):
-    """The machine has it not; the text says what was tried and what came of it."""
+    return NOT_READY if lacking(found, BASICS) else 0
 
 
 class Check(NamedTuple):
@@ -140,17 +132,12 @@ def examine(check: Check) -> Finding:
         ok, detail = True, check.probe()
     except ModuleNotFoundError as error:  # the thing itself was not tried
         detail, remedy = f"Python finds no module {error.name}", INSTALL
-    except (MissingError, UserError) as error:
+    except UserError as error:
         detail = str(error)
     # A broken library may raise anything at all, and the checks after it are still wanted.
     except Exception as error:
         detail = f"{type(error).__name__}: {error}"
     return Finding(check, ok, " ".join(detail.split()), remedy)
-
-
-def basics_work(found: list[Finding]) -> bool:
-    """Whether nothing basic is missing."""
-    return all(finding.ok for finding in found if finding.check.group == BASICS)
 
 
 def lines(finding: Finding) -> str:
@@ -162,22 +149,24 @@ def lines(finding: Finding) -> str:
     return ("\n" + 11 * " ").join((f"  missing  {said}", *needs))
 
 
+def lacking(found: list[Finding], group: str | None = None) -> list[str]:
+    """The names of what is missing, of all groups or one."""
+    return [one.check.name for one in found if not one.ok and group in (None, one.check.group)]
+
+
 def summary(found: list[Finding]) -> str:
     """The last line."""
-    missing = [finding.check for finding in found if not finding.ok]
-    if not basics_work(found):
-        names = ", ".join(check.name for check in missing if check.group == BASICS)
-        return f"The basics do not work here: {names}."
+    if basic := lacking(found, BASICS):
+        return f"The basics do not work here: {', '.join(basic)}."
     basics = "The basics work. " if any(one.check.group == BASICS for one in found) else ""
-    if not missing:
+    if not (names := lacking(found)):
         return f"{basics}Nothing is missing."
-    names = ", ".join(check.name for check in missing)
-    return f"{basics}Missing{' besides' if basics else ''}: {names}."
+    return f"{basics}Missing{' besides' if basics else ''}: {', '.join(names)}."
 
 
 def _python() -> str:
     if sys.version_info[:2] < OLDEST:
-        raise MissingError(f"this is Python {platform.python_version()}")
+        raise UserError(f"this is Python {platform.python_version()}")
     return f"{platform.python_version()}, {sys.executable}"
 
 
@@ -187,7 +176,7 @@ def _packages() -> str:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [re.split(r"[^\w.-]", line)[0] for line in project["dependencies"]]
     if absent := [name for name in wanted if _installed(name) is None]:
-        raise MissingError(f"not installed: {', '.join(absent)}")
+        raise UserError(f"not installed: {', '.join(absent)}")
     return f"all {len(wanted)} that pyproject.toml asks for"
 
 
@@ -198,7 +187,7 @@ def _versions() -> str:
     other = {n: version for n, version in found.items() if version.split("+")[0] != locked[n]}
     if other:
         each = (f"{name} {version} (locked: {locked[name]})" for name, version in other.items())
-        raise MissingError(f"other versions: {', '.join(each)}")
+        raise UserError(f"other versions: {', '.join(each)}")
     return f"{len(found)} packages as in {LOCK.name}"
 
 
@@ -221,7 +210,7 @@ def _loopback() -> str:
     ):
         client.put("phil/doctor", b"doctor")
         if not came.wait(ARRIVAL_S):
-            raise MissingError(f"no message within {ARRIVAL_S:.0f} s over {endpoint}")
+            raise UserError(f"no message within {ARRIVAL_S:.0f} s over {endpoint}")
     return f"a message went over {endpoint}"
 
 
@@ -240,7 +229,7 @@ def _memory() -> str:
 def _enough(size: int, wanted_gb: int, what: str) -> str:
     said = f"{size / 1e9:.1f} GB {what}"
     if size < wanted_gb * 10**9:
-        raise MissingError(f"{said}; {wanted_gb} are wanted")
+        raise UserError(f"{said}; {wanted_gb} are wanted")
     return said
 
 
@@ -248,7 +237,7 @@ def _chromium() -> str:
     from trainer.util import CHROMIUM, find_chromium
 
     if (path := find_chromium()) is None:
-        raise MissingError(f"none of {', '.join(CHROMIUM)} is installed")
+        raise UserError(f"none of {', '.join(CHROMIUM)} is installed")
     return program_says(path, "--version")
 
 
@@ -281,7 +270,7 @@ def _can_over_udp() -> str:
         sender.send(can.Message(arbitration_id=0x111, data=b"doctor", is_extended_id=False))
         heard = receiver.recv(ARRIVAL_S)
     if heard is None or bytes(heard.data) != b"doctor":
-        raise MissingError("a frame did not arrive on loopback")
+        raise UserError("a frame did not arrive on loopback")
     return "a frame went through UDP multicast on loopback"
 
 
@@ -290,7 +279,7 @@ def _can_interface() -> str:
     kinds = {path.parent.name: path.read_text() for path in Path("/sys/class/net").glob("*/type")}
     found = sorted(name for name, kind in kinds.items() if kind.strip() == _CAN_DEVICE)
     if not found:
-        raise MissingError("there is no CAN interface")
+        raise UserError("there is no CAN interface")
     return ", ".join(found)
 
 
@@ -313,43 +302,36 @@ def _board(name: str) -> str:
     from hil_tests.board import why_not
 
     if reason := why_not(name):
-        raise MissingError(reason)
+        raise UserError(reason)
     return f"hil_tests board --boards {name} can run"
 
 
 def python_says(script: str) -> str:
-    """What a script prints, in a process of its own.
-
-    Raises ModuleNotFoundError where it imports what is not installed, MissingError where it fails
-    in another way.
-    """
+    """What a script prints, in its own process; ModuleNotFoundError, or UserError if it fails."""
     try:
         return program_says(sys.executable, "-c", script)
-    except MissingError as error:
+    except UserError as error:
         said = str(error).partition(": ")[2]
         if said.startswith("ModuleNotFoundError"):
             raise ModuleNotFoundError(name=said.split("'")[1]) from None
-        raise MissingError(said) from None
+        raise UserError(said) from None
 
 
 def program_says(*command: str) -> str:
-    """The first line that a program prints, or where it is if it prints none.
-
-    Raises MissingError where it is not there, fails, or does not end.
-    """
+    """The first line that a program prints, else where it is; UserError where it fails."""
     name = Path(command[0]).name
     if (path := shutil.which(command[0])) is None:
-        raise MissingError(f"{name} is not installed")
+        raise UserError(f"{name} is not installed")
     quiet = {**os.environ, "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S, env=quiet
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise MissingError(f"{name}: {error}") from None
+        raise UserError(f"{name}: {error}") from None
     if done.returncode != 0:
         said = (done.stderr or done.stdout).strip() or f"exit status {done.returncode}"
-        raise MissingError(f"{name}: {said.splitlines()[-1]}")
+        raise UserError(f"{name}: {said.splitlines()[-1]}")
     return done.stdout.partition("\n")[0] or path
 
 

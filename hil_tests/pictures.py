@@ -37,8 +37,7 @@ from hil_tests.report import write_figures, write_png
 from trainer.drivers import load_driver, make_environment
 from trainer.training.metrics import read_metrics
 
-MOMENTS = {"left_turn": ("8", "3.4"), "congestion": ("3", "5.0")}
-"""Scenario -> seed and time, s."""
+MOMENTS = {"left_turn": ("8", "3.4"), "congestion": ("3", "5.0")}  # Scenario -> seed and time, s
 FILM_POLICY, FILM_SEED = "constant:0.3", "40"
 """Always the same throttle, and a drive in which it would meet a car, once: the guide brakes, hands
 the wheel back when the car stands, and the next gap is wide enough."""
@@ -52,8 +51,7 @@ NETWORK = ("--clock", "realtime", "--latency", "50ms+-10ms,outage=0.4s@3s", "--e
            "--seed", "8")  # fmt: skip
 LOOP_TIME_S = 8.0
 TRUST = ("--policy", str(POLICY), "--public-key", str(PUBLIC_KEY))
-SOME_MISSING = 1
-"""Exit status where a picture could not be made here."""
+SOME_MISSING = 1  # Exit status where a picture could not be made here
 Make = Callable[[Path, Path], None]
 """Writes a picture, given its path and a directory for what is made on the way."""
 

@@ -28,8 +28,7 @@ from edge_runtime.util import UserError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 POLICY = Path("results/policies/left_turn.onnx")
-PUBLIC_KEY = POLICY.with_name("policy.pub")
-"""The policy that ships, and what it is verified with."""
+PUBLIC_KEY = POLICY.with_name("policy.pub")  # The policy that ships, and what it is verified with
 PATIENCE_S = 30.0
 STOP_TIMEOUT_S = 10.0
 POLL_S = 0.002

@@ -63,8 +63,7 @@ def fault_verdict(row: Found) -> str:
     return "MISSED: " + ", ".join(faults) if faults else met
 
 
-Cells = Mapping[str, Callable[[Found], str]]
-"""What is said of something, and how it is read."""
+Cells = Mapping[str, Callable[[Found], str]]  # What is said of something, and how it is read
 _OF_A_ROW: Cells = {
     "episodes": lambda row: str(row["episodes"]),
     "success (95 %)": lambda row: share(row["success"]),

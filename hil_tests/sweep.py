@@ -32,14 +32,12 @@ from trainer.experiments.data import Estimate, mean_estimate, success_estimate
 from trainer.experiments.plan import digest
 from trainer.util import ProgressBar
 
-LOOPS = POLICY, VEHICLE = ("policy", "vehicle")
-"""What may be in the loop."""
+LOOPS = POLICY, VEHICLE = ("policy", "vehicle")  # What may be in the loop
 VEHICLE_ID = "campaign01"
 MODEL = "hunter-2.0"
 PART_LIMIT_S = 900.0
 ATTEMPTS = 6
-FORMAT = 3
-"""Raise it where the same part begins to mean another drive: kept results become void."""
+FORMAT = 3  # Raise it where the same part begins to mean another drive: kept results become void
 
 
 @dataclass(frozen=True)
@@ -49,14 +47,11 @@ class Axis:
     name: str
     title: str
     unit: str
-    values: tuple[float, ...]
-    """Ascending."""
+    values: tuple[float, ...]  # Ascending
     pattern: str
     """The specification of a point, which is its name in the report; ``{}`` is the value."""
-    base: str
-    """The specification at value 0, and what the line is measured on."""
-    limit: str
-    """How the budget's sentence names the limit; ``{}`` is the value with its unit."""
+    base: str  # The specification at value 0, and what the line is measured on
+    limit: str  # How the budget's sentence names the limit; ``{}`` is the value with its unit
 
     def spec(self, value: float) -> str:
         """The specification at a value."""
@@ -109,17 +104,12 @@ DEAD_TIMES_MS = (0, 50, 100, 200, 300, 400, 500, 600, 800)
 TIME_CONSTANTS_MS = (20, 50, 100, 200, 300, 500, 750, 1000)
 LAGS = [Lag(dead, constant) for dead in DEAD_TIMES_MS for constant in TIME_CONSTANTS_MS]
 
-Found = Mapping[str, Any]
-"""A part of a report's JSON."""
-Rows = Mapping[str, Found]
-"""The report's rows by their specification."""
+Found = Mapping[str, Any]  # A part of a report's JSON
+Rows = Mapping[str, Found]  # The report's rows by their specification
 
 
 def limit_of(axis: Axis, rows: Rows, target: float) -> float | None:
-    """The largest tested value up to which success is at the target at every tested value.
-
-    Success is the point estimate; nothing is interpolated. None where even 0 is below the target.
-    """
+    """The largest value up to which every tested one is at the target; None: not even 0 is."""
     limit: float | None = None
     for value in axis.values:
         if rows[axis.spec(value)]["success"]["value"] < target:
@@ -289,11 +279,7 @@ def run_rig(task: Task, part: Part, limit_s: float, *options: str, hunter: bool 
 
 
 def simulate(endpoint: str, out: Path, limit_s: float, *options: str) -> dict[str, Any]:
-    """Run ``bridge simulate`` beside an edge runtime; its report, with the command.
-
-    ``wall_s`` of the report includes the simulator's start. Raises UserError where it failed, or
-    did not end (CommandTimeoutError).
-    """
+    """Run ``bridge simulate`` (``wall_s``: with its start); UserError where it fails or hangs."""
     words, began_s = ("bridge", "simulate", *options), time.monotonic()
     with Process(*words, "--listen", endpoint, "--out", str(out)) as simulator:
         simulator.succeed(limit_s)
@@ -378,11 +364,7 @@ def worth_keeping(report: Found) -> dict[str, Any]:
 
 
 def make_row(spec: str, parts: Sequence[Found]) -> dict[str, Any]:
-    """Join what was driven over the wire at one point, each part `worth_keeping`.
-
-    Latencies are from state sent to command received: the median of the parts' p50 and the
-    largest p99.
-    """
+    """Join the parts of one point; latencies: the median of their p50, the largest p99."""
     episodes = [episode for part in parts for episode in part["episodes"]]
     outcomes = Counter(episode["outcome"] for episode in episodes)
     count = len(episodes)
@@ -408,10 +390,7 @@ def make_row(spec: str, parts: Sequence[Found]) -> dict[str, Any]:
 
 
 def join_vehicles(parts: Sequence[Found]) -> dict[str, Any]:
-    """One report of a vehicle for several: errors pooled, lags and ages the median of the parts.
-
-    The largest stands for ``max`` and ``p99``.
-    """
+    """One report for several: errors pooled, the median else, the largest for max and p99."""
     first, samples = parts[0], [part["samples"] for part in parts]
     return {
         **{name: first[name] for name in ("name", "scale")},

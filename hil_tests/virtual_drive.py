@@ -46,8 +46,7 @@ class Driven(NamedTuple):
     outcome: str
     distance_m: float
     time_s: float
-    stops: int
-    """How often the driver stopped the vehicle."""
+    stops: int  # How often the driver stopped the vehicle
 
 
 class VirtualDrive:

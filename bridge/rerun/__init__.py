@@ -38,20 +38,16 @@ POLICY: Colour = (40, 120, 230)
 HUMAN: Colour = (60, 170, 90)
 RETURNING: Colour = (185, 140, 255)
 """The person has let go, and the action is on its way back to the policy's."""
-APPLIED: Colour = (235, 140, 40)
-"""What the car was told, whoever decided it."""
+APPLIED: Colour = (235, 140, 40)  # What the car was told, whoever decided it
 BY_NAME = MappingProxyType(
     {"policy": POLICY, "human": HUMAN, "returning": RETURNING, "applied": APPLIED}
 )
 
 LOOPBACK = "127.0.0.1"
-START_S = 30.0
-"""How long it may take until it listens."""
+START_S = 30.0  # How long it may take until it listens
 LOOK_S = 0.05
-FLUSH_S = 5.0
-"""How long it may take to receive what was drawn."""
-END_S = 1.0
-"""How long a viewer that takes no more may take to end."""
+FLUSH_S = 5.0  # How long it may take to receive what was drawn
+END_S = 1.0  # How long a viewer that takes no more may take to end
 GRPC_PORT = 9876
 WEB_PORT = 9090
 SPAWN, SERVE = "spawn", "serve"
@@ -200,10 +196,7 @@ def _shown(recording: rr.RecordingStream, kind: str, blueprint: rrb.Blueprint) -
 
 
 class Viewer:
-    """A viewer that listens at ``ports``, started with these options of rerun's command.
-
-    ViewerGone: it ends at once, or does not listen in time.
-    """
+    """A viewer that listens at ``ports``; ViewerGone where it ends at once or listens too late."""
 
     def __init__(self, options: Sequence[str], ports: Sequence[int]) -> None:
         command = [sys.executable, "-m", "rerun_cli", "--bind", LOOPBACK, *options]

@@ -25,10 +25,8 @@ GLASS = (30, 34, 40)
 BLUE, ORANGE, GREEN, RED = (40, 120, 230), (235, 140, 40), (60, 170, 90), (220, 50, 50)
 PURPLE, GREY = (150, 80, 200), (120, 124, 130)
 GROUND = [222, 229, 216]
-MARGIN_M = (10.0, 5.0)
-"""Ground shown beyond path and cars: along x, along y."""
-NEAR_M = 20.0
-"""From the path; whoever is farther away comes into the picture when it matters."""
+MARGIN_M = (10.0, 5.0)  # Ground shown beyond path and cars: along x, along y
+NEAR_M = 20.0  # From the path; whoever is farther away comes into the picture when it matters
 ALL_OF_IT = rrb.TimeRange(
     start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
 )
@@ -144,8 +142,7 @@ class Plot(NamedTuple):
 
     origin: str
     title: str
-    limits: tuple[float, float] | None = None
-    """Of the y axis; None: as the values need."""
+    limits: tuple[float, float] | None = None  # Of the y axis; None: as the values need
 
 
 def plot_view(plot: Plot, shown: rrb.TimeRange = ALL_OF_IT) -> rrb.TimeSeriesView:

@@ -142,12 +142,10 @@ def make_blueprint(scene: Scene | None) -> rrb.Blueprint:
 
 SILENT = "no command"
 NOTHING_WRONG = "-"
-REMEMBERED_STATES = 64
-"""States whose sending time is kept, for the latency of their commands."""
+REMEMBERED_STATES = 64  # States whose sending time is kept, for the latency of their commands
 EGO = {"drive": POLICY, "safe_stop": draw.RED, SILENT: (160, 30, 120)}
 """Colour of the ego car by what it is told."""
-ALL = "all"
-"""The sum over the reasons, which has a line from the start."""
+ALL = "all"  # The sum over the reasons, which has a line from the start
 SIDES = {"edge": draw.ORANGE, "simulator": draw.BLUE}
 """The side that rejects, and the colour of all that it has rejected."""
 
@@ -337,10 +335,8 @@ class Moment(NamedTuple):
     """One place on all timelines."""
 
     episode: int
-    episode_time_s: float
-    """Simulated time within the episode."""
-    total_step: int
-    """Episodes end to end, as ``sim_time_s``."""
+    episode_time_s: float  # Simulated time within the episode
+    total_step: int  # Episodes end to end, as ``sim_time_s``
     sim_time_s: float
 
 

@@ -76,10 +76,7 @@ def wait_until_driving(edge: EdgeProcess) -> None:
 
 
 def wait_until_driving_steadily(log: Path, steady_s: float = 0.4) -> None:
-    """Wait until the edge runtime, whose stderr is ``log``, has driven that long without a stop.
-
-    On a busy machine it may stop for a reason of its own, at any time.
-    """
+    """Wait until the edge runtime, whose stderr is ``log``, has driven that long without a stop."""
 
     def steady() -> bool:
         before = log.read_text()
@@ -125,9 +122,7 @@ def simulate_undisturbed(
 ) -> dict[str, Any]:
     """Run ``simulate`` again where the machine itself stood still for over 2 T in the middle.
 
-    Both ends live in wall time, so a test machine that pauses causes a rightful safe stop. In lock
-    step the report counts those; in real time the reasons are the edge runtime's, and what a test
-    injects shows as ``no_command``.
+    In real time such a stop has a reason of the edge runtime's; an injected one is ``no_command``.
     """
     for _ in range(attempts):
         report = simulate(folder, endpoint, env, options)
@@ -166,33 +161,19 @@ def rerun(*arguments: str) -> str:
 def make_command(step: int, **changes: Any) -> Command:
     """Make a valid command of session ``here``, episode 0; ``changes`` replace its fields."""
     fields: dict[str, Any] = {
-        "session": "here",
-        "episode": 0,
-        "step": step,
-        "mode": "drive",
-        "action": [0.5],
-        "policy_id": "p",
-        "received_ns": 1,
-        "inference_ns": 1,
-        "sent_ns": 1,
-    }
+        "session": "here", "episode": 0, "step": step, "mode": "drive", "action": [0.5],
+        "policy_id": "p", "received_ns": 1, "inference_ns": 1, "sent_ns": 1,
+    }  # fmt: skip
     return Command(**{**fields, **changes})
 
 
 def make_feedback(step: int, **changes: Any) -> Feedback:
     """Make a valid feedback of a vehicle that obeys ``make_command(step)``, stamped at its tick."""
     fields: dict[str, Any] = {
-        "vehicle": "robot",
-        "session": "here",
-        "episode": 0,
-        "step": step,
-        "mode": "drive",
-        "action": [0.5],
-        "speed_mps": 1.0,
-        "self_braking": False,
-        "faults": [],
+        "vehicle": "robot", "session": "here", "episode": 0, "step": step, "mode": "drive",
+        "action": [0.5], "speed_mps": 1.0, "self_braking": False, "faults": [],
         "sent_ns": 1_000_000_000 + step * 100_000_000,
-    }
+    }  # fmt: skip
     return Feedback(**{**fields, **changes})
 
 

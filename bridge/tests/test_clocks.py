@@ -1,19 +1,33 @@
-"""The timer thread: what goes wrong on it is heard."""
+"""The clocks: in lock-step, in real time, and with a vehicle in the loop."""
 
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
+from typing import Any
 
 import pytest
 
-from bridge.clocks import DelayLine, LockStepClock, RealTimeClock
-from bridge.inbound import CommandCheck
+from bridge.clocks import DelayLine, LockStepClock, RealTimeClock, VehicleClock
+from bridge.inbound import NO_FEEDBACK, CommandCheck, FeedbackCheck
 from bridge.network import parse_spec
-from bridge.tests.harness import decoded, make_command
+from bridge.ports import connect_client
+from bridge.tests.harness import (
+    SHORT_TOY,
+    decoded,
+    make_command,
+    make_feedback,
+    make_policy,
+    read,
+    start_edge,
+    start_simulate,
+)
 from bridge.virtual_link import NO_COMMAND
-from edge_runtime.tests.harness import make_state, wait_until
-from edge_runtime.wire import encode
+from edge_runtime.tests.harness import PATIENCE_S, make_state, wait_until
+from edge_runtime.transport import free_endpoint
+from edge_runtime.util import UserError
+from edge_runtime.wire import CONTROL_PERIOD_S, Feedback, decode_feedback, encode
 
 
 def test_what_an_action_raises_reaches_the_caller():
@@ -136,23 +150,18 @@ def test_an_outage_brakes_and_ends_with_the_fifth_fresh_state():
     assert [bool(reason) for reason in found] == [11 <= step < 19 for step in range(20)]
     assert set(found[11:15]) == {NO_COMMAND}
     assert set(found[15:19]) == {"no_fresh_state"}
-
-
-def test_one_lost_state_is_no_silence_and_two_are():
     one, two = (reasons(Rig(f"up.outage={length}s@0.95s").drive(20)) for length in (0.1, 0.2))
-    assert not any(one)
+    assert not any(one)  # One lost state is no silence.
     assert [reason for reason in two if reason] == [NO_COMMAND, *["no_fresh_state"] * 4]
 
 
 def test_a_machine_that_stalls_is_counted_apart_from_the_network():
-    rig = Rig()
+    rig, late = Rig(), Rig("outage=0.5s@1s")
     rig.drive(3)
     rig.answer = lambda step: make_command(step, mode="safe_stop", reason="no_fresh_state")
-    rig.exchange(3)
-    assert rig.clock.wall_clock_stalls == 1
-    late = Rig("outage=0.5s@1s")
+    assert reasons(rig.exchange(3)) == ["no_fresh_state"]
     late.drive(20)
-    assert late.clock.wall_clock_stalls == 0
+    assert (rig.clock.wall_clock_stalls, late.clock.wall_clock_stalls) == (1, 0)
 
 
 @pytest.mark.parametrize("spec", ["up.loss=100%", "down.loss=100%"])
@@ -173,11 +182,6 @@ def test_a_silent_edge_costs_2_periods_of_wall_time_once_then_one_a_step():
     assert reasons(rig.exchange(5)) == [""]
 
 
-def test_a_safe_stop_command_brakes_with_its_reason():
-    stop = make_command(0, mode="safe_stop", reason="inference_too_slow")
-    assert Rig(answer=lambda step: stop).drive(1)[0].brake_reason == "inference_too_slow"
-
-
 def test_only_faults_are_counted_among_what_comes_unasked():
     rig = Rig()
     rig.drive(3)
@@ -188,26 +192,165 @@ def test_only_faults_are_counted_among_what_comes_unasked():
     assert dict(rig.check.rejected) == {"foreign_session": 1, "malformed": 1}
 
 
-STEPS = 7
-
-
-def drive_in_real_time(spec):
-    """Each state is answered on the delay line's thread."""
+@pytest.mark.parametrize("spec", ["5ms,duplicate=100%", "up.outage=1000s@0.25s"])
+def test_in_real_time_all_is_delayed_duplicated_and_lost_from_the_episodes_start(spec):
     rig = Rig(spec, make_command, RealTimeClock)
     with contextlib.closing(rig.clock):
-        rig.drive(STEPS)
-    return rig
+        rig.drive(7)
+    if "outage" in spec:
+        assert rig.published[0] == 0
+        assert 6 not in rig.published
+    else:  # The last command's copy may come after the last tick.
+        assert rig.published == [step for step in range(7) for _ in range(2)]
+        assert 6 <= rig.check.rejected["stale"] <= 7
+        assert len(rig.clock.latencies_ms) == 7
 
 
-def test_duplicates_come_out_twice_on_both_ways():
-    rig = drive_in_real_time("5ms,duplicate=100%")
-    # The last command's copy may come after the last tick.
-    assert rig.published == [step for step in range(STEPS) for _ in range(2)]
-    assert STEPS - 1 <= rig.check.rejected["stale"] <= STEPS
-    assert len(rig.clock.latencies_ms) == STEPS
+DEAD_S = 0.03
 
 
-def test_an_outage_is_timed_from_the_episodes_start():
-    rig = drive_in_real_time("up.outage=1000s@0.25s")
-    assert rig.published[0] == 0
-    assert STEPS - 1 not in rig.published
+class VehicleRig:
+    """A clock with a vehicle that reports the step it was sent last, ``dead_s`` after each."""
+
+    def __init__(self, spec="none", dead_s=DEAD_S):
+        self.dead_s, self.silent_from = dead_s, 99
+        self.check = FeedbackCheck("here", action_size=1)
+        commands = CommandCheck("here", action_size=1)
+        self.clock = VehicleClock(self.publish, commands, parse_spec(spec), self.check)
+
+    def publish(self, payload):
+        step = decoded(payload).step
+        self.clock.receive(encode(make_command(step)))
+        if step >= self.silent_from:
+            return
+        if self.dead_s:
+            threading.Timer(self.dead_s, self.report, [step]).start()
+        else:
+            self.report(step)
+
+    def report(self, step, **changes):
+        self.clock.receive_feedback(encode(make_feedback(step, sent_ns=step + 5, **changes)))
+
+    def drive(self, steps):
+        self.clock.begin(0, seed=0)
+        return [self.clock.exchange(make_state(n, session="here")) for n in range(steps)]
+
+
+@contextlib.contextmanager
+def rig_of(spec="none", **options):
+    rig = VehicleRig(spec, **options)
+    with contextlib.closing(rig.clock):
+        yield rig
+
+
+def test_each_tick_ends_with_what_the_vehicle_did_in_it():
+    with rig_of() as rig:
+        began_s = time.monotonic()
+        decisions = rig.drive(4)
+        assert time.monotonic() - began_s >= 4 * CONTROL_PERIOD_S
+    assert [decision.feedback.step for decision in decisions] == [0, 1, 2, 3]
+    assert [decision.brake_reason for decision in decisions] == [""] * 4
+    assert all(0 < age_ms < 200 for age_ms in rig.clock.feedback_ages_ms)
+    assert rig.check.rejected == {}
+
+
+def test_a_vehicle_that_falls_silent_is_braked_for():
+    # At once: on a busy machine a timer comes late, which would be silence, too.
+    with rig_of(dead_s=0.0) as rig:
+        rig.silent_from = 2
+        decisions = rig.drive(6)
+    assert [decision.brake_reason for decision in decisions[:2]] == ["", ""]
+    assert (decisions[5].brake_reason, decisions[5].feedback) == (NO_FEEDBACK, None)
+
+
+def test_an_injected_delay_holds_feedback_back_as_well():
+    with rig_of("down.delay=150ms") as rig:
+        decisions = rig.drive(5)
+    known = [decision.feedback.step for decision in decisions if decision.feedback]
+    assert 0 <= max(known) <= 3
+    assert min(rig.clock.feedback_ages_ms) >= 150
+
+
+def test_without_any_vehicle_it_says_what_to_do():
+    with rig_of() as rig:
+        with pytest.raises(UserError, match="no feedback from a vehicle of robot-1"):
+            rig.clock.wait_for_vehicle(0.05, "robot-1")
+        rig.report(-1, session="another", episode=-1)
+        rig.clock.wait_for_vehicle(PATIENCE_S, "robot-1")
+
+
+def test_an_episode_waits_until_the_vehicle_stands(monkeypatch):
+    monkeypatch.setattr("bridge.clocks.STANDSTILL_WAIT_S", 0.3)
+    with rig_of() as rig:
+        rig.clock.begin(0, seed=0)
+        rig.report(-1, speed_mps=1.0, session="", episode=-1)
+        wait_until(lambda: rig.check.heard is not None, "the feedback")
+        threading.Timer(0.1, rig.report, [0], {"speed_mps": 0.0, "session": ""}).start()
+        rig.check.sent(0, 5)
+        rig.clock.wait_for_standstill()
+        assert rig.clock.moving_starts == 0
+        rig.report(1, speed_mps=0.5)
+        wait_until(lambda: rig.check.heard == make_feedback(1, speed_mps=0.5, sent_ns=6), "it")
+        rig.clock.wait_for_standstill()
+    assert rig.clock.moving_starts == 1
+
+
+@contextlib.contextmanager
+def stranger(endpoint):
+    """Hears the vehicle's feedback, and sends it again, with more that nobody can believe.
+
+    A call says whether the vehicle has got as far as a step of the first episode.
+    """
+    key, heard = "phil/hunter01/feedback", []
+
+    def hear(sample):
+        payload = sample.payload.to_bytes()
+        feedback: Any = decode_feedback(payload)
+        if not isinstance(feedback, Feedback) or feedback.vehicle != "mock" or payload in heard:
+            return
+        heard.append(payload)
+        if feedback.session:
+            other = make_feedback(0, session="stranger", sent_ns=feedback.sent_ns + 1)
+            for bad in (payload, encode(other), b"\xff", heard[0]):
+                session.put(key, bad)
+
+    def is_at(step):
+        feedback: Any = decode_feedback(heard[-1]) if heard else make_feedback(-1)
+        return (feedback.episode, feedback.step) >= (0, step)
+
+    with contextlib.closing(connect_client(endpoint, PATIENCE_S)) as session:
+        subscriber = session.declare_subscriber(key, hear)
+        yield is_at
+        subscriber.undeclare()
+
+
+def test_the_car_does_what_the_vehicle_did_whatever_a_stranger_says(tmp_path):
+    policy, endpoint = make_policy(tmp_path, "constant", 0.3), free_endpoint()
+    out = tmp_path / "report.json"
+    options = ("--clock", "realtime", "--loop", "vehicle")
+    with (
+        start_simulate(endpoint, out, SHORT_TOY, *options) as run,
+        start_edge(endpoint, policy, "--vehicle", "mock") as edge,
+        stranger(endpoint) as is_at,
+    ):
+        wait_until(lambda: is_at(12), "the middle of the episode")
+        edge.process.kill()
+        assert run.wait() == 0, run.errors
+    report = read(out)
+    assert (report["loop"], report["clock"], report["standing"]) == ("vehicle", "realtime", True)
+    vehicle = report["vehicle"]
+    assert (vehicle["name"], vehicle["moving_starts"], vehicle["faults"]) == ("mock", 0, {})
+    # Its actuators take their time: the pedal comes off the brake, and ends where it was asked.
+    pedals = [action[0] for action in report["per_episode"][0]["actions"]]
+    assert pedals[0] < 0.3
+    assert pedals[10] == pytest.approx(0.3, abs=0.02)
+    assert vehicle["action_error"]["pedal"]["max"] > 0.1
+    # A vehicle that takes pedals has no speed set-point.
+    assert vehicle["speed_error_mps"] == {"rmse": None, "max": None}
+    rejected = report["rejected_by_simulator"]
+    assert set(rejected) >= {f"feedback_{r}" for r in ("malformed", "foreign_session", "stale")}
+    assert rejected["feedback_malformed"] >= 10
+    # Nobody reports after a kill: the car brakes, and the report says why.
+    last = report["safe_stop_events"][-1]
+    assert (last["episode"], last["reason"]) == (0, NO_FEEDBACK)
+    assert pedals[-1] == -1.0

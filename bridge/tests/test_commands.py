@@ -6,6 +6,7 @@ import shlex
 
 import pytest
 
+from bridge.ports import open_port
 from bridge.tests.harness import LEFT_TURN, TOY
 from edge_runtime.transport import free_endpoint
 
@@ -25,6 +26,8 @@ ROWS = [
     ("simulate --env TOY --listen here", "endpoint"),
     ("simulate --env TOY --connect here", "endpoint"),
     ("simulate --env TOY --connect FREE --wait-edge-s 0", "nobody answers"),
+    ("simulate --env TOY --listen FREE --wait-edge-s 0", "python -m edge_runtime run"),
+    ("simulate --env TOY --listen BUSY --out r.json", "in use"),
     ("simulate --env TOY --connect FREE --listen FREE", "not allowed"),
     ("simulate --env TOY --out /dev/null/r.json", "Not a directory"),
     ("simulate --env TOY --clock sundial", "sundial"),
@@ -60,12 +63,15 @@ ROWS = [
     ("ros2 --connect FREE --namespace ''", "empty value after --namespace"),
     ("ros2 --connect FREE --ros2-listen tls/127.0.0.1:7448", "plain text"),
     ("ros2 --connect FREE --ros2-listen nowhere", "endpoint 'nowhere'"),
+    ("ros2 --connect FREE --ros2-listen BUSY", "is in use"),
+    ("ros2 --connect FREE --ros2-listen BUSY", "--ros2-listen"),
     ("ros2 --connect FREE --ros2-listen tcp/a:1 --ros2-connect tcp/a:1", "not allowed with"),
     ("ros2 --connect FREE --max-rate-hz 0", "is not a rate"),
     ("ros2 --connect FREE --max-rate-hz nan", "is not a rate"),
     ("ros2 --connect FREE --out /dev/null/a.json", "Not a directory"),
     ("ros2 --connect FREE --tls nowhere", "plain text despite --tls"),
     ("view --connect FREE --save never.rrd --wait-s 0", "nobody answers"),
+    ("view --connect BUSY --save never.rrd --wait-s 0.2", "--vehicle-id"),
     ("view --connect FREE", "no display"),
     ("view --save /dev/null/a.rrd", "Not a directory"),
     ("view --connect FREE --save a.rrd --vehicle-id a/b", "vehicle id"),
@@ -77,14 +83,25 @@ ROWS = [
 ]
 
 
+@pytest.fixture
+def busy():
+    """Where a simulator of another vehicle listens."""
+    endpoint = free_endpoint()
+    with open_port(endpoint, "other"):
+        yield endpoint
+
+
 @pytest.mark.parametrize(("command", "part"), ROWS)
-def test_bad_input_is_one_line_and_status_2(command, part, refusal, monkeypatch, tmp_path):
+def test_bad_input_is_one_line_and_status_2(command, part, refusal, busy, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (tmp_path / "there.mcap").write_bytes(b"mine")
-    words = {"TOY": lambda: TOY, "FREE": free_endpoint, "LEFT_TURN": lambda: str(LEFT_TURN)}
-    arguments = [words[word]() if word in words else word for word in shlex.split(command)]
+    words = {"TOY": TOY, "BUSY": busy, "LEFT_TURN": str(LEFT_TURN)}
+    arguments = [
+        free_endpoint() if word == "FREE" else words.get(word, word)
+        for word in shlex.split(command)
+    ]
     assert part in refusal(*arguments)
     assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]
     assert (tmp_path / "there.mcap").read_bytes() == b"mine"

@@ -25,10 +25,10 @@ from bridge.virtual_link import NO_COMMAND, CommandHold
 from edge_runtime.wire import Health, encode
 
 
-def checking(newest_step=5):
+def checking():
     check = CommandCheck("here", action_size=1)
     check.begin(0)
-    check.sent(newest_step)
+    check.sent(5)
     return check
 
 
@@ -55,27 +55,19 @@ BOTH = [
 )  # fmt: skip
 def test_a_command_that_answers_nothing_is_counted_by_reason(changes, reason):
     bad = changes if isinstance(changes, bytes) else encode(make_command(**{"step": 5} | changes))
-    check = checking()
+    check, good = checking(), make_command(5, policy_id="abc")
     assert check.read(bad) is None
-    assert dict(check.rejected) == {reason: 1}
-
-
-def test_a_good_command_passes_and_names_the_policy():
-    check = checking()
-    command = make_command(5, policy_id="abc")
-    assert check.read(encode(command)) == command
-    assert (check.policy_ids, dict(check.rejected)) == (["abc"], {})
+    assert check.read(encode(good)) == good
+    assert (check.policy_ids, dict(check.rejected)) == (["abc"], {reason: 1})
 
 
 def test_an_earlier_episode_is_stale_but_an_overtaken_answer_is_no_fault():
-    check = checking(newest_step=5)
+    check = checking()
     check.end(final_step=6, answered_step=4)
     check.begin(1)
-    assert check.read(encode(make_command(5))) is None
-    assert check.read(encode(make_command(6))) is None
-    assert dict(check.rejected) == {}
-    assert check.read(encode(make_command(3))) is None
-    assert dict(check.rejected) == {"stale": 1}
+    for step, rejected in ((5, {}), (6, {}), (3, {"stale": 1})):
+        assert check.read(encode(make_command(step))) is None
+        assert dict(check.rejected) == rejected
 
 
 def test_the_newest_command_is_held_for_2_periods_and_no_longer():
@@ -86,19 +78,13 @@ def test_the_newest_command_is_held_for_2_periods_and_no_longer():
     assert (held.brake_reason, held.fresh, held.command) == ("", False, make_command(0))
     assert (braking.brake_reason, braking.command_age_s) == (NO_COMMAND, None)  # It obeys none.
     assert braking.undriven_s == pytest.approx(0.21)
-
-
-def test_a_command_is_as_old_as_the_state_that_it_answers():
-    hold = CommandHold(now_s=0.0)
-    assert hold.decide(0.025).command_age_s is None
-    hold.admit(make_command(0), now_s=0.06, sent_s=0.0)
-    ages_s = [hold.decide(now_s).command_age_s for now_s in (0.125, 0.225)]
-    assert ages_s == pytest.approx([0.125, 0.225])
-
-
-def test_without_any_command_it_brakes_after_2_periods():
+    # Without any command it brakes as late.
     hold = CommandHold(now_s=5.0)
     assert [hold.decide(now_s).brake_reason for now_s in (5.2, 5.201)] == ["", NO_COMMAND]
+    # A command is as old as the state that it answers.
+    hold.admit(make_command(0), now_s=5.26, sent_s=5.2)
+    ages_s = [hold.decide(now_s).command_age_s for now_s in (5.325, 5.425)]
+    assert ages_s == pytest.approx([0.125, 0.225])
 
 
 def test_a_repeated_drive_command_is_no_heartbeat_but_a_repeated_safe_stop_is():
@@ -135,14 +121,8 @@ def test_one_stretch_of_braking_is_one_event():
     assert (first.episode, first.step, first.reason) == (7, 1, NO_COMMAND)
     assert (first.brake_after_s, first.stopped_after_s, first.resumed_after_s) == (0.25, 0.2, 0.3)
     assert (second.step, second.stopped_after_s, second.resumed_after_s) == (5, None, None)
-
-
-def test_a_new_episode_closes_the_event_of_the_last():
-    log = SafeStopLog(period_s=0.1)
-    (braking,) = decisions("x")
-    log.observe(0, 9, braking, 1.0)
-    log.observe(1, 0, braking, 1.0)
-    assert [(one.episode, one.resumed_after_s) for one in log.events] == [(0, None), (1, None)]
+    log.observe(8, 0, braking[-1], 1.0)  # A new episode closes the event of the last.
+    assert [(one.episode, one.resumed_after_s) for one in log.events[1:]] == [(7, None), (8, None)]
 
 
 @pytest.mark.parametrize(
@@ -188,10 +168,10 @@ HEARD = CommandHold(now_s=0.0).decide(0.0)
 STOPPED = CommandHold(now_s=0.0).decide(0.0, edge_silence_s=0.3)
 
 
-def decide(feedback, after_s=0.05, heard=HEARD, episode=0):
+def decide(feedback, after_s=0.05, heard=HEARD, received_s=1.0):
     hold = FeedbackHold(now_s=0.0)
-    hold.admit(feedback, received_s=1.0, now_s=1.0)
-    return hold.decide(heard, episode, now_s=1.0 + after_s)
+    hold.admit(feedback, received_s=received_s, now_s=1.0)
+    return hold.decide(heard, 0, now_s=1.0 + after_s)
 
 
 def test_feedback_holds_for_2_periods_and_no_longer():
@@ -200,13 +180,16 @@ def test_feedback_holds_for_2_periods_and_no_longer():
     assert held.feedback_age_s == pytest.approx(0.2)
     silent = decide(make_feedback(3), after_s=0.21)
     assert (silent.brake_reason, silent.feedback) == (NO_FEEDBACK, None)
-
-
-def test_a_delay_on_the_way_makes_feedback_older_and_the_vehicle_not_silent():
-    hold = FeedbackHold(now_s=0.0)
-    hold.admit(make_feedback(3), received_s=1.0, now_s=1.3)
-    decision = hold.decide(HEARD, 0, now_s=1.35)
-    assert (decision.brake_reason, decision.feedback_age_s) == ("", pytest.approx(0.35))
+    # A delay on the way makes feedback older, and the vehicle not silent.
+    delayed = decide(make_feedback(3), received_s=0.7)
+    assert (delayed.brake_reason, delayed.feedback_age_s) == ("", pytest.approx(0.35))
+    # A command that nobody obeys has no age.
+    hold = CommandHold(now_s=0.0)
+    hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
+    heard, stopped = hold.decide(0.05), make_feedback(3, mode="safe_stop")
+    assert decide(make_feedback(3), heard=heard).command_age_s == heard.command_age_s
+    assert decide(stopped, heard=heard).command_age_s is None
+    assert decide(make_feedback(3), after_s=1.0, heard=heard).command_age_s is None
 
 
 @pytest.mark.parametrize(
@@ -274,15 +257,6 @@ def test_a_steered_car_brakes_when_its_vehicle_does():
     assert isinstance(silent, VehicleDecision)
 
 
-def test_a_command_that_nobody_obeys_has_no_age():
-    hold = CommandHold(now_s=0.0)
-    hold.admit(make_command(3), now_s=0.0, sent_s=0.0)
-    heard, stopped = hold.decide(0.05), make_feedback(3, mode="safe_stop")
-    assert decide(make_feedback(3), heard=heard).command_age_s == heard.command_age_s
-    assert decide(stopped, heard=heard).command_age_s is None
-    assert decide(make_feedback(3), after_s=1.0, heard=heard).command_age_s is None
-
-
 def health(sent_ns, uptime_s, vehicle="none", needs_rearm=False, **rejected):
     return Health(
         vehicle_id="v", vehicle=vehicle, mode="drive", reason="", needs_rearm=needs_rearm,
@@ -316,10 +290,12 @@ def test_the_status_answer_counts_as_a_message_and_junk_does_not():
     counts = EdgeCounts()
     counts.observe_message(encode(health(1, 1.0)))
     status = {**msgspec.to_builtins(health(2, 2.0, stale=1)), "version": "1", "manifest": {}}
-    counts.observe_status(msgspec.json.encode(status))
-    counts.observe_status(b"junk")
-    counts.observe_message(b"junk")
+    for answer in (msgspec.json.encode(status), b"junk"):
+        counts.observe_status(answer)
+    for payload in (b"junk", bytes(70_000)):
+        counts.observe_message(payload)
     assert counts.rejected == {"stale": 1}
+    assert counts.unreadable == {"health_malformed": 1, "health_oversized": 1}
 
 
 def test_the_report_joins_both_sides():
@@ -328,11 +304,3 @@ def test_the_report_joins_both_sides():
         "rejected_by_edge": {"stale": 2},
         "rejected_by_simulator": {"stale": 1, "schema": 3},
     }
-
-
-def test_health_that_cannot_be_read_is_counted_by_reason():
-    counts = EdgeCounts()
-    for payload in (b"junk", bytes(70_000), encode(health(1, 1.0))):
-        counts.observe_message(payload)
-    assert counts.unreadable == {"health_malformed": 1, "health_oversized": 1}
-    assert counts.rejected == {}

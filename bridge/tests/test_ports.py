@@ -35,11 +35,11 @@ WILD = ("phil/*/{}", "phil/**", "phil/v$*/{}", "*/v1/{}", "**/{}")
 def sessions():
     """The simulator's router, and somebody else's client."""
     endpoint = free_endpoint()
-    router = open_session(listen=endpoint, mode="router")
-    client = open_session(connect=endpoint, mode="client")
-    yield endpoint, router, client
-    client.close()
-    router.close()
+    with (
+        contextlib.closing(open_session(listen=endpoint, mode="router")) as router,
+        contextlib.closing(open_session(connect=endpoint, mode="client")) as client,
+    ):
+        yield endpoint, router, client
 
 
 def put_wildly(session, topic):
@@ -94,16 +94,12 @@ with sigterm_as_interrupt():
 
 
 def test_a_signal_that_another_thread_takes_ends_the_wait():
-    command = [sys.executable, "-c", _ANOTHER_THREAD_TAKES_IT]
+    command = ["timeout", "20", sys.executable, "-c", _ANOTHER_THREAD_TAKES_IT]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "ready\n"
-            process.terminate()
-            output, _ = process.communicate(timeout=20)
-        finally:
-            process.kill()
-    assert output == "told\n"
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.terminate()  # `timeout` passes it on.
+        assert process.stdout.read() == "told\n"
     assert process.returncode == 0
 
 
@@ -177,6 +173,7 @@ def test_two_unmodified_ends_drive_through_a_relay(tmp_path):
         relay.process.terminate()
         assert relay.wait() == 0, relay.errors
     counts = read(out)
+    json.dumps(counts, allow_nan=False)
     states, commands, _, health = counts["topics"].values()
     assert report["latency_ms"]["p50"] > 75
     assert report["latency_spec"] == "none"
@@ -186,4 +183,3 @@ def test_two_unmodified_ends_drive_through_a_relay(tmp_path):
     assert counts["queries"]["status"] >= 2  # The simulator's, before and after the drive.
     assert counts["latency_spec"] == "delay=40ms,jitter=5ms,loss=10%,duplicate=10%"
     assert "delivered: state" in relay.output
-    json.dumps(counts, allow_nan=False)

@@ -10,8 +10,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import time
 import zlib
 from pathlib import Path
@@ -22,8 +20,6 @@ import numpy as np
 import pytest
 import zenoh
 import zstandard
-from hypothesis import given
-from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Chunk, Header, Message
@@ -65,20 +61,20 @@ def heard(topic: str, payload: bytes, arrived_ns: int = 1) -> Heard:
     return Heard(f"phil/v/{topic}", topic, payload, arrived_ns, len(payload))
 
 
+def told(stored: Stored) -> tuple[str, int, bytes]:
+    return stored.channel.topic, stored.message.log_time, stored.message.data
+
+
+def told_in(path: Path) -> list[tuple[str, int, bytes]]:
+    return list(map(told, Recording(path).messages()))
+
+
 @contextlib.contextmanager
 def writing(path: Path, dropped: int = 0):
     """A recording that is finished at the end of the block."""
     with contextlib.closing(RecordingWriter(path)) as writer:
         yield writer
         writer.finish(dropped)
-
-
-def told_in(path: Path) -> list[tuple[str, int, bytes]]:
-    return [told(stored) for stored in Recording(path).messages()]
-
-
-def told(stored: Stored) -> tuple[str, int, bytes]:
-    return stored.channel.topic, stored.message.log_time, stored.message.data
 
 
 def test_the_picture_is_what_the_policy_saw(tmp_path):
@@ -101,8 +97,7 @@ def test_what_cannot_be_read_is_kept_and_what_is_too_large_is_not(tmp_path):
         writer.write(heard("alive", b"\x01"))
     recording = Recording(tmp_path / "a.mcap")
     found = [(topic, data) for topic, _, data in map(told, recording.messages())]
-    assert ("phil/v/state", b"junk") in found
-    assert ("phil/v/alive", b'{"here": true}') in found
+    assert {("phil/v/state", b"junk"), ("phil/v/alive", b'{"here": true}')} <= set(found)
     events = [data for topic, data in found if topic == "view/v/events"]
     assert b"unreadable" in events[0]
     assert b"65537 bytes" in events[1]
@@ -132,12 +127,6 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     policy = load_policy(make_policy(tmp_path), allow_unsigned=True)
     assert ("here", 0, 1) in drive.exchanges
     replay_in_process(drive, policy, Config())
-
-
-def test_an_empty_file_is_no_recording(tmp_path):
-    (tmp_path / "empty.mcap").touch()
-    with pytest.raises(UserError, match="no MCAP recording"):
-        list(Recording(tmp_path / "empty.mcap").messages())
 
 
 def start_record(endpoint: str, path: Path, *options: str) -> BridgeProcess:
@@ -207,11 +196,13 @@ def record_and_kill(folder: Path) -> tuple[Path, float]:
         start_record(endpoint, recording) as run,
         start_edge(endpoint, make_policy(folder)),
     ):
-        wait_until(lambda: recording.exists() and len(states_in(recording)) > 10, "a second")
-        assert bridge_status(["repair", str(recording)]) == 2  # Not while it grows.
+        wait_until(lambda: len(states_in(recording)) > 10, "a second")
+        for options in ([], ["--out", str(folder / "other.mcap")]):  # Not while it grows.
+            assert bridge_status(["repair", str(recording), *options]) == 2
         run.process.send_signal(signal.SIGKILL)
         killed_ns = time.time_ns()
         run.process.wait()
+    assert not (folder / "other.mcap").exists()
     return recording, (killed_ns - states_in(recording)[-1][0]) * 1e-9
 
 
@@ -231,18 +222,16 @@ def test_a_kill_loses_at_most_the_last_second_and_repair_gives_the_index_back(tm
         ):
             count += 1
     assert count == len(states)
-    assert "is being written" in capsys.readouterr().err
+    assert capsys.readouterr().err.count("is being written") >= 2
     assert bridge_status(["repair", str(recording)]) == 0
-    with recording.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-        assert summary is not None
-        assert len(states_in(recording)) == len(states)
+    assert chunks(recording)
+    assert len(states_in(recording)) == len(states)
     assert bridge_status(["repair", str(recording)]) == 0
     assert "is whole" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("keep", [0.2, 0.5, 0.9, 0.999])
-def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
+def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep, repair):
     recording, _ = drive
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(recording.read_bytes()[: int(recording.stat().st_size * keep)])
@@ -251,6 +240,9 @@ def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep):
     read_again = Recording(torn)
     collections.deque(read_again.messages(), maxlen=0)
     assert read_again.cut_off
+    said = repair(torn)
+    assert "a torn end of" in said or keep > 0.99  # Only the index is torn.
+    assert states_in(torn) == part
 
 
 def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
@@ -326,18 +318,6 @@ def test_a_simulator_that_comes_back_is_recorded_into_the_same_file(tmp_path):
     assert len(sessions) == 2
 
 
-HELD_OPEN = """
-import sys
-from pathlib import Path
-from bridge.record import FlushedFile
-file = FlushedFile(Path(sys.argv[1]))
-file.write(sys.stdin.buffer.read(int(sys.argv[2])))
-file.flush()
-print("ready", flush=True)
-sys.stdin.read()
-"""
-
-
 @pytest.fixture
 def copy(tmp_path):
     path = tmp_path / "drive.mcap"
@@ -364,30 +344,17 @@ def repair(capsys):
     return repaired
 
 
-def damage_contents(path, number):
-    flip_chunk(path, number)
-
-
-def damage_length(path, number):
-    flip(path, chunks(path)[number].chunk_start_offset + 1, 8)
-
-
-def damage_opcode(path, number):
-    flip(path, chunks(path)[number].chunk_start_offset, 1)
-
-
-def zero_the_chunk(path, number):
-    """As a disk does: neither the record nor its length is left."""
-    index = chunks(path)[number]
-    start, end = index.chunk_start_offset, index.chunk_start_offset + index.chunk_length
-    data = path.read_bytes()
-    path.write_bytes(data[:start] + bytes(end - start) + data[end:])
-
-
 @pytest.mark.parametrize("number", [0, 3, 29], ids=["first", "middle", "last"])
-@pytest.mark.parametrize("damage", [damage_contents, damage_length, damage_opcode, zero_the_chunk])
+@pytest.mark.parametrize("damage", ["contents", "length", "opcode", "all zero, as a disk does"])
 def test_only_the_broken_chunk_is_lost(copy, damage, number):
-    damage(copy, number)
+    index = chunks(copy)[number]
+    start, size = index.chunk_start_offset, index.chunk_length
+    if damage.startswith("all"):  # Neither the record nor its length is left.
+        data = copy.read_bytes()
+        copy.write_bytes(data[:start] + bytes(size) + data[start + size :])
+    else:
+        place = {"contents": (size // 2, 4), "length": (1, 8), "opcode": (0, 1)}[damage]
+        flip(copy, start + place[0], place[1])
     recording = Recording(copy)
     assert [told(stored) for stored in recording.messages()] == without_chunk(number)
     assert (recording.damaged_places, recording.cut_off) == (1, False)
@@ -452,14 +419,6 @@ def test_of_a_cut_file_with_a_broken_first_chunk_the_nameless_messages_are_count
     assert "the file as it was" in out
 
 
-def test_a_damaged_file_is_not_kept_over_an_earlier_one(copy, refusal):
-    flip_chunk(copy, 3)
-    damaged, kept = copy.read_bytes(), copy.with_name("drive.mcap.damaged")
-    kept.write_text("mine")
-    assert "drive.mcap.damaged exists" in refusal("repair", copy)
-    assert (kept.read_text(), copy.read_bytes()) == ("mine", damaged)
-
-
 def test_a_file_without_a_checksum_over_all_of_it_is_not_called_whole(copy, tmp_path, repair):
     """As other programs write them. --out writes it with one."""
     data, out = bytearray(copy.read_bytes()), tmp_path / "out.mcap"
@@ -486,63 +445,40 @@ def test_a_change_outside_of_the_chunks_is_said_and_mended(copy, tmp_path, repai
     assert "is whole" in repair(whole)
 
 
-def test_a_repair_that_was_killed_can_be_done_again(copy, repair):
-    flip_chunk(copy, 3)
-    copy.with_name("drive.mcap.damaged").hardlink_to(copy)
-    repair(copy)
-    assert told_in(copy) == without_chunk(3)
-
-
 def test_through_a_link_the_file_is_repaired_and_kept_where_it_is(copy, tmp_path, repair):
     flip_chunk(copy, 3)
+    copy.with_name("drive.mcap.damaged").hardlink_to(copy)  # As a repair that was killed leaves it.
     link = tmp_path / "elsewhere" / "link.mcap"
     link.parent.mkdir()
     link.symlink_to(copy)
     repair(link)
     assert link.is_symlink()
+    assert told_in(copy) == without_chunk(3)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "drive.mcap", "drive.mcap.damaged", "elsewhere",
     ]  # fmt: skip
 
 
-def test_out_writes_a_new_file_only(copy, tmp_path, refusal, repair):
+def test_no_file_is_overwritten(copy, tmp_path, refusal, repair):
     flip_chunk(copy, 3)
-    damaged, out = copy.read_bytes(), tmp_path / "ok.mcap"
+    damaged, out, kept = copy.read_bytes(), tmp_path / "ok.mcap", tmp_path / "drive.mcap.damaged"
     repair(copy, "--out", out)
-    assert copy.read_bytes() == damaged
     whole = out.read_bytes()
     line = refusal("repair", copy, "--out", out)
     assert "exists; choose another name: no recording is lost" in line
-    assert out.read_bytes() == whole
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["drive.mcap", "ok.mcap"]
+    kept.write_text("mine")
+    assert "drive.mcap.damaged exists" in refusal("repair", copy)
+    found = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert found == {"drive.mcap": damaged, "ok.mcap": whole, kept.name: b"mine"}
 
 
-def test_what_is_being_written_is_not_repaired_and_a_kill_frees_it(tmp_path, refusal, repair):
-    path, data = tmp_path / "growing.mcap", LEFT_TURN.read_bytes()[:100_000]
-    command = [sys.executable, "-c", HELD_OPEN, str(path), str(len(data))]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
-        assert writer.stdin is not None
-        assert writer.stdout is not None
-        writer.stdin.write(data)
-        writer.stdin.flush()
-        assert writer.stdout.readline() == b"ready\n"
-        for options in ([], ["--out", tmp_path / "other.mcap"]):
-            assert "is being written" in refusal("repair", path, *options)
-        assert path.read_bytes() == data
-        writer.kill()
-        writer.wait()
-    assert "a torn end of" in repair(path)
-    assert [place.name for place in tmp_path.iterdir()] == ["growing.mcap"]
-
-
-def test_a_pipe_is_no_recording_and_nobody_waits_for_it(tmp_path, refusal):
-    pipe = tmp_path / "pipe"
+def test_what_is_no_recording_is_refused_and_nobody_waits_for_a_pipe(tmp_path, refusal):
+    pipe, empty = tmp_path / "pipe", tmp_path / "empty.mcap"
     os.mkfifo(pipe)
-    for command, option, out in (("repair", "--out", "out.mcap"), ("view", "--save", "out.rrd")):
-        assert "no regular file" in refusal(command, pipe, option, tmp_path / out)
-
-
-OVERWRITTEN = 10
+    empty.touch()
+    for path, says in ((pipe, "no regular file"), (empty, "no MCAP recording")):
+        assert says in refusal("repair", path, "--out", tmp_path / "out.mcap")
+        assert says in refusal("view", path, "--save", tmp_path / "out.rrd")
 
 
 @pytest.fixture(scope="module")
@@ -561,35 +497,21 @@ def is_whole(path) -> bool:
     """Whether `repair` would say so."""
     recording = Recording(path)
     try:
-        for _ in recording.messages():
-            pass
+        collections.deque(recording.messages(), maxlen=0)
     except UserError:
         return False
     return not recording.trouble() and recording.has_checksums
 
 
-def overwritten(small, at: int, new: bytes) -> bool:
-    """Whether a recording with those bytes at that place is no longer whole, or the same."""
-    data = small.read_bytes()
-    changed = data[:at] + new + data[at + len(new) :]
-    path = small.with_name("changed.mcap")
-    path.write_bytes(changed)
-    return changed == data or not is_whole(path)
-
-
-def test_ten_bytes_overwritten_at_any_place_are_noticed(small):
+def test_bytes_overwritten_at_any_place_are_noticed(small):
     assert is_whole(small)
-    data = small.read_bytes()
-    for at in range(0, len(data) - OVERWRITTEN + 1, 5):
-        flipped = bytes(byte ^ 0xFF for byte in data[at : at + OVERWRITTEN])
-        assert overwritten(small, at, flipped), at
-        assert overwritten(small, at, bytes(OVERWRITTEN)), at
-
-
-@given(place=st.floats(0, 1), new=st.binary(min_size=1, max_size=OVERWRITTEN))
-def test_any_bytes_overwritten_are_noticed(small, place, new):
-    at = round(place * (small.stat().st_size - len(new)))
-    assert overwritten(small, at, new)
+    data, path = small.read_bytes(), small.with_name("changed.mcap")
+    for at in range(0, len(data) - 9, 5):
+        flipped = bytes(byte ^ 0xFF for byte in data[at : at + 10])
+        for new in (flipped, bytes(10), flipped[: at % 9 + 1]):
+            changed = data[:at] + new + data[at + len(new) :]
+            path.write_bytes(changed)
+            assert changed == data or not is_whole(path), (at, new)
 
 
 MIB = 1 << 20
@@ -617,46 +539,44 @@ def crafted(path, *chunks: tuple[bytes, int], filling: bytes = b""):
     return path
 
 
-class Counted:
-    """How many bytes are unpacked."""
+@pytest.fixture
+def unpacked(monkeypatch):
+    """The sizes of the chunks that are unpacked."""
+    sizes, breakup = [], records.breakup_chunk
 
-    def __init__(self, monkeypatch) -> None:
-        self.unpacked = 0
-        self._breakup = records.breakup_chunk
-        monkeypatch.setattr(records, "breakup_chunk", self)
+    def count(chunk, validate_crc):
+        sizes.append(chunk.uncompressed_size)
+        return breakup(chunk, validate_crc)
 
-    def __call__(self, chunk, validate_crc):
-        self.unpacked += chunk.uncompressed_size
-        return self._breakup(chunk, validate_crc)
+    monkeypatch.setattr(records, "breakup_chunk", count)
+    return sizes
 
 
-@pytest.mark.parametrize(("announced", "tells_size"), [(1024, True), (1, True), (1024, False)])
+@pytest.mark.parametrize(
+    ("mib", "announced_mib", "tells_size", "count", "most_mib"),
+    [(1024, 1024, True, 40, 0), (1024, 1, True, 40, 0), (1024, 1024, False, 40, 0),
+     (64, 1, False, 1, 1)],
+)  # fmt: skip
 def test_a_chunk_that_unpacks_to_too_much_is_passed_over(
-    tmp_path, monkeypatch, announced, tells_size
+    tmp_path, unpacked, mib, announced_mib, tells_size, count, most_mib
 ):
-    """Whether the chunk says so itself, or its data alone do."""
-    counted = Counted(monkeypatch)
-    bomb = zeros(1024, tells_size)
-    path = crafted(tmp_path / "bomb.mcap", *[(bomb, announced * MIB)] * 40)
+    """Whether the chunk says so itself, or its data alone do, or neither."""
+    bomb = zeros(mib, tells_size)
+    path = crafted(tmp_path / "bomb.mcap", *[(bomb, announced_mib * MIB)] * count)
     recording = Recording(path)
     assert list(recording.messages()) == []
     assert recording.damaged_bytes == path.stat().st_size - len(MCAP0_MAGIC) - HEADER_BYTES
-    assert counted.unpacked == 0
+    assert sum(unpacked) <= most_mib * MIB
 
 
-def test_data_that_do_not_say_their_size_are_unpacked_as_far_as_the_chunk_says(tmp_path):
-    recording = Recording(crafted(tmp_path / "bomb.mcap", (zeros(64, False), MIB)))
-    assert list(recording.messages()) == []
-    assert recording.damaged_places == 1
-
-
-def test_chunks_that_unpack_to_too_much_together_are_refused(tmp_path, monkeypatch, refusal):
-    counted = Counted(monkeypatch)
+def test_chunks_that_unpack_to_too_much_together_are_refused(
+    tmp_path, monkeypatch, unpacked, refusal
+):
     monkeypatch.setattr(records, "MAX_CHUNK_BYTES", MIB)
     path = crafted(tmp_path / "bomb.mcap", *[(zeros(1), MIB)] * 100)
     for command in (["repair"], ["view", "--save", str(tmp_path / "a.rrd")]):
         assert "bomb.mcap is refused" in refusal(*command, path)
-    assert counted.unpacked <= 4 * MIB
+    assert sum(unpacked) <= 4 * MIB
     assert [file.name for file in tmp_path.iterdir()] == ["bomb.mcap"]
 
 

@@ -1,16 +1,20 @@
-"""What ``bridge simulate`` says to a person: a line an episode, and the last line."""
+"""What is said of a drive: a line an episode, the last line, a vehicle's errors and its lag."""
 
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from bridge.report import (
+    LAG_STEP_S,
     EpisodeResult,
     SafeStopEvent,
+    TrackingLog,
     episode_line,
     make_report,
     markdown_table,
@@ -20,6 +24,8 @@ from bridge.report import (
 from bridge.tests.harness import (
     SHORT_TOY,
     SLOW_TOY,
+    make_command,
+    make_feedback,
     make_policy,
     start_edge,
     start_simulate,
@@ -51,16 +57,10 @@ def test_every_outcome_is_named_and_every_reason():
         "6 episodes: 2 goal (33%), 3 timeout (50%), 1 collision (17%); latency p50 1.0 ms,"
         " p99 1.0 ms; 3 safe stops (2 no_command, 1 vehicle_fault); 0 rejected messages"
     )
-
-
-def test_a_stop_is_told_as_a_stop_and_not_as_missed_deadlines():
     line = summary_line(report_of(["timeout"], ["no_command"], {"stale": 2}))
     assert "0 goal (0%), 1 timeout (100%)" in line
     assert "1 safe stop (1 no_command); 2 rejected messages (2 stale)" in line
-    assert "38" not in line
-
-
-def test_a_line_an_episode():
+    assert "38" not in line  # A stop is told as a stop, and not as missed deadlines.
     assert episode_line(2, 5, RESULT, []) == "episode 2 of 5: goal after 12.3 s"
     stop = SafeStopEvent(1, 3, "no\x1bcommand", 0.2)
     assert episode_line(2, 5, RESULT, [stop]).endswith("; 1 safe stop (1 no\\x1bcommand)")
@@ -99,9 +99,7 @@ def test_without_a_terminal_each_episode_is_told_as_it_ends(tmp_path):
         assert run.process.poll() is None  # It comes while the others are still driven.
         assert run.wait() == 0
     lines = [first, *run.errors.splitlines()]
-    for number, line in enumerate(lines, start=1):
-        assert line.startswith(f"episode {number} of 3: ")
-    assert len(lines) == 3
+    assert [line[:16] for line in lines] == [f"episode {number} of 3: " for number in (1, 2, 3)]
     (last,) = run.output.splitlines()
     assert last.startswith("3 episodes: ")
 
@@ -124,3 +122,126 @@ def test_a_car_that_waits_for_its_rearm_says_so_at_both_ends_with_the_command(tm
         assert edge_main(shlex.split(rearm)[3:]) == 0
         wait_until_driving_steadily(log)
         assert log.read_text().count("waits_for_rearm") == 1
+
+
+T_S, REPORT_S = 0.1, 0.05
+STEPS = 120
+
+
+def asked_at(step):
+    """A pedal that wanders like a policy's, float in [-1, 1]."""
+    return float(np.clip(0.7 * math.sin(0.31 * step) + 0.5 * math.sin(0.113 * step), -1, 1))
+
+
+def ns(time_s):
+    return round((5.0 + time_s) * 1e9)
+
+
+def log_of(reached, episodes=2):
+    """The log of a vehicle that has reached ``reached(t)`` at t, in each of the episodes."""
+    log = TrackingLog()
+    for zero_s in (0.0, 100.0)[:episodes]:
+        log.begin()
+        for step in range(STEPS):
+            asked = {"action": [asked_at(step)], "sent_ns": ns(zero_s + step * T_S)}
+            log.command(make_command(step, **asked))
+        for time_s in np.arange(0.013, STEPS * T_S, REPORT_S):
+            stamp = ns(zero_s + time_s)
+            log.feedback(make_feedback(0, action=[reached(time_s)], sent_ns=stamp))
+        log.end()
+    return log
+
+
+def held(time_s):
+    return asked_at(min(int(time_s / T_S), STEPS - 1)) if time_s >= 0 else -1.0
+
+
+def follower(dead_s, constant_s):
+    """What a first-order actuator behind a dead time has reached at each time."""
+    step_s = 0.001
+    value, values = -1.0, []
+    for index in range(int(STEPS * T_S / step_s) + 100):
+        target = held(index * step_s - dead_s)
+        value += (target - value) * (1 - math.exp(-step_s / constant_s))
+        values.append(value)
+    return lambda time_s: values[round(time_s / step_s)]
+
+
+def begun():
+    log = TrackingLog()
+    log.begin()
+    return log
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.06, 0.155, 0.4])
+def test_a_delay_is_found(delay_s):
+    report = log_of(lambda time_s: held(time_s - delay_s)).report(["pedal"])
+    # Asked and reached are steps here: all delays between two reports are as good.
+    assert report["lag_ms"]["pedal"] == pytest.approx(delay_s * 1e3, abs=REPORT_S / 2 * 1e3)
+
+
+@pytest.mark.parametrize(("dead_s", "constant_s"), [(0.02, 0.05), (0.1, 0.1), (0.2, 0.3)])
+def test_a_lag_lies_between_the_dead_time_and_its_sum_with_the_time_constant(dead_s, constant_s):
+    lag_s = log_of(follower(dead_s, constant_s)).report(["pedal"])["lag_ms"]["pedal"] / 1e3
+    half_s = REPORT_S / 2
+    assert dead_s + 0.5 * constant_s - half_s < lag_s < dead_s + constant_s + half_s
+
+
+def test_an_error_is_what_was_asked_then_with_the_lag_in_it():
+    for off in (0.0, 0.25):
+        report = log_of(lambda time_s, off=off: held(time_s) - off).report(["pedal"])
+        assert report["action_error"]["pedal"] == pytest.approx({"rmse": off, "max": off})
+
+
+def test_a_speed_is_compared_with_its_set_point_at_the_same_moment():
+    log = begun()
+    for number in range(200):
+        time_s = number * REPORT_S
+        asked, reached = (1 + math.sin(2 * (time_s - lag_s)) for lag_s in (0.0, 0.2))
+        log.feedback(
+            make_feedback(
+                0, sent_ns=ns(time_s), speed_mps=reached, commanded_speed_mps=asked,
+                scenario_speed_mps=4 * reached,
+            )
+        )  # fmt: skip
+    report = log.report([])
+    assert report["lag_ms"] == {"speed": pytest.approx(200, abs=1e3 * LAG_STEP_S)}
+    assert report["speed_error_mps"]["max"] == pytest.approx(2 * math.sin(0.2), abs=0.01)
+    assert report["scale"] == pytest.approx(0.25)
+
+
+def test_what_was_not_measured_is_none():
+    none = {"rmse": None, "max": None}
+    report = log_of(lambda time_s: 0.5).report(["pedal"])
+    assert report["speed_error_mps"] == none
+    assert (report["lag_ms"]["speed"], report["scale"]) == (None, None)
+    nothing = TrackingLog().report(["pedal"])
+    assert nothing["action_error"] == {"pedal": none}
+    assert nothing["lag_ms"] == {"speed": None, "pedal": None}
+    log = begun()
+    for step in range(50):  # A vehicle that is asked nothing new shows no lag.
+        log.command(make_command(step, action=[0.5], sent_ns=ns(step * T_S)))
+        log.feedback(make_feedback(step, action=[0.5], sent_ns=ns(step * T_S + 0.02)))
+    assert log.report(["pedal"])["lag_ms"]["pedal"] is None
+
+
+def test_a_vehicle_that_brakes_by_itself_or_between_episodes_makes_no_error():
+    log = log_of(held, episodes=1)
+    log.feedback(make_feedback(0, action=[-1.0], sent_ns=ns(50.0), faults=["unheard"]))
+    log.begin()
+    log.command(make_command(0, action=[0.5], sent_ns=ns(60.0)))
+    braking = {"self_braking": True, "faults": ["low battery"]}
+    log.feedback(make_feedback(0, action=[-1.0], sent_ns=ns(60.1), **braking))
+    report = log.report(["pedal"])
+    assert report["action_error"]["pedal"]["max"] == 0.0
+    assert report["faults"] == {"low battery": 1}
+    for number in range(100):  # The words of faults are counted and bounded.
+        log.feedback(make_feedback(0, faults=[f"fault {number}", "fault 0"]))
+    faults = log.report([])["faults"]
+    assert (len(faults), faults["fault 0"]) == (32, 101)
+    log = begun()
+    for step in range(20):  # Stamps of a clock that was stepped do no harm.
+        stamp = ns(step * T_S if step < 10 else -50 + step * T_S)
+        log.command(make_command(step, action=[asked_at(step)], sent_ns=stamp))
+        log.feedback(make_feedback(step, action=[asked_at(step)], sent_ns=stamp + 1))
+    assert log.report(["pedal"])["action_error"]["pedal"]["max"] == 0.0

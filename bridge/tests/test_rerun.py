@@ -1,15 +1,17 @@
-"""What both views share: geometry, timelines, pace, and where a recording goes."""
+"""The views in rerun: geometry, pace, where a recording goes, and `bridge view` beside a drive."""
 
 from __future__ import annotations
 
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 
+import msgspec
 import pytest
 import rerun as rr
 import rerun.blueprint as rrb
@@ -18,11 +20,35 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 import bridge.rerun
-from bridge.messages import Pace, SeenCar, SeenScene, read_scene
+from bridge.__main__ import main
+from bridge.messages import (
+    Pace,
+    Scene,
+    SeenCar,
+    SeenScene,
+    Stamps,
+    decode_scene,
+    encode_scene,
+    read_scene,
+)
 from bridge.rerun import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.draw import outline, view_bounds
-from bridge.rerun.wire_view import Timeline
+from bridge.rerun.wire_view import Timeline, WireLog
+from bridge.tests.harness import (
+    LEFT_TURN,
+    SLOW_TOY,
+    BridgeProcess,
+    flip_chunk,
+    make_command,
+    make_policy,
+    rerun,
+    start_edge,
+    start_simulate,
+)
+from bridge.tests.toy import ToyEnv
 from bridge.tests.viewers import NO_GPU, in_place, listens
+from edge_runtime.tests.harness import make_state, wait_until
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
 
 
@@ -35,6 +61,13 @@ def test_a_car_that_heads_down_the_picture_is_long_in_y():
     assert x_range[0] < 4.0 < 6.0 < x_range[1]
     assert y_range[0] < 0.0 < 4.0 < y_range[1]
 
+    def bounds(x):
+        car = SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
+        return view_bounds(SeenScene(path=[[0.0, 0.0], [10.0, 0.0]], vehicles=[car]))
+
+    assert bounds(-60.0) == bounds(5.0)  # One far from the path does not shrink the picture.
+    assert bounds(-15.0)[0][0] == pytest.approx(bounds(5.0)[0][0] - 15.0)
+
 
 def test_episodes_stand_end_to_end():
     timeline = Timeline()
@@ -44,15 +77,6 @@ def test_episodes_stand_end_to_end():
     assert timeline.place(0, 5).total_step == 5
     late = timeline.place(1, 2)
     assert (late.episode_time_s, late.sim_time_s) == (0.2, 1.0)
-
-
-def test_a_car_far_from_the_path_does_not_shrink_the_picture():
-    def bounds(x):
-        car = SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
-        return view_bounds(SeenScene(path=[[0.0, 0.0], [10.0, 0.0]], vehicles=[car]))
-
-    assert bounds(-60.0) == bounds(5.0)
-    assert bounds(-15.0)[0][0] == pytest.approx(bounds(5.0)[0][0] - 15.0)
 
 
 def test_a_scene_is_read_without_what_is_not_drawn():
@@ -88,9 +112,6 @@ def test_what_comes_faster_is_thinned_out_and_a_pause_brings_no_burst():
     pace = Pace(0.1)
     assert sum(pace.due(0.01 * n) for n in range(1000)) == pytest.approx(100, abs=2)
     assert sum(pace.due(60.0 + 0.01 * n) for n in range(100)) == pytest.approx(10, abs=2)
-
-
-def test_an_interval_of_zero_takes_all():
     pace = Pace(0.0)
     assert all(pace.due(now_s) for now_s in [0.0, 0.0, 5.0, 5.0, 4.0])
 
@@ -112,34 +133,20 @@ def test_sigterm_finishes_the_file(tmp_path):
     assert "/speed" in found
 
 
-def test_a_link_to_a_file_stays_and_the_file_is_written(tmp_path):
-    target, link = tmp_path / "kept.rrd", tmp_path / "link.rrd"
+def test_a_link_to_a_file_stays_and_the_folder_of_a_file_is_made(tmp_path):
+    target, link, new = tmp_path / "kept.rrd", tmp_path / "link.rrd", tmp_path / "a" / "b.rrd"
     link.symlink_to(target)
-    with opened("save", link):
-        pass
-    assert link.is_symlink()
-    assert target.stat().st_size > 0
-
-
-def test_the_folder_of_a_file_is_made(tmp_path):
-    path = tmp_path / "runs" / "today" / "drive.rrd"
-    check_sink(Sink("save", str(path)))
-    assert not path.parent.exists()
-    with opened("save", path):
-        pass
-    assert path.stat().st_size > 0
-
-
-def test_a_command_with_another_use_for_sigterm_keeps_it(tmp_path):
-    def quit_softly(*_):
-        pass
-
-    before = signal.signal(signal.SIGTERM, quit_softly)
+    check_sink(Sink("save", str(new)))
+    assert not new.parent.exists()
+    before = signal.signal(signal.SIGTERM, quit_softly := lambda *_: None)
     try:
-        with opened("save", tmp_path / "a.rrd"):
+        with opened("save", link), opened("save", new):
+            # A command with another use for SIGTERM keeps it.
             assert signal.getsignal(signal.SIGTERM) is quit_softly
     finally:
         signal.signal(signal.SIGTERM, before)
+    assert link.is_symlink()
+    assert min(target.stat().st_size, new.stat().st_size) > 0
 
 
 def test_a_sink_is_named_by_a_word():
@@ -153,12 +160,11 @@ def test_a_sink_is_named_by_a_word():
 def show(kind, for_s=0.0):
     with opened(kind) as recording:
         end_s = time.monotonic() + for_s
-        while not for_s or time.monotonic() < end_s:
+        while True:
             recording.log("speed", rr.Scalars(3.0))
             flush(recording)
-            if not for_s:
-                break
-        return recording
+            if time.monotonic() >= end_s:
+                return
 
 
 @pytest.mark.parametrize("kind", ["starts slowly", "works"])
@@ -209,3 +215,151 @@ def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
     code = "import sys\n" + "".join(f"import bridge.{name}\n" for name in taken)
     code += "assert not {'zenoh', 'rerun', 'gymnasium'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def verify(recording):
+    """Fail unless rerun itself can read the recording; return what it holds."""
+    rerun("rrd", "verify", str(recording))
+    return rerun("rrd", "stats", str(recording))
+
+
+def start_view(endpoint, path, *options):
+    return BridgeProcess("view", "--save", str(path), "--connect", endpoint, *options)
+
+
+def test_a_view_records_the_drive_and_ends_with_the_simulator(tmp_path):
+    endpoint, recording = free_endpoint(), tmp_path / "drive.rrd"
+    policy = make_policy(tmp_path, "constant")
+    with (
+        start_view(endpoint, recording) as view,
+        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY) as run,
+    ):
+        wait_until(lambda: list(tmp_path.glob(".drive.rrd*")), "the recording to begin")
+        with start_edge(endpoint, policy):
+            assert run.wait() == 0, run.errors
+        assert view.wait(20) == 0, view.errors
+    found = verify(recording)
+    entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
+    assert [entity for entity in entities if entity not in found] == []
+
+
+@pytest.mark.parametrize("told", ["the view is interrupted", "the simulator is killed"])
+def test_a_view_that_ends_early_keeps_what_it_recorded(told, tmp_path):
+    endpoint, recording = free_endpoint(), tmp_path / "cut.rrd"
+    with (
+        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY) as run,
+        start_view(endpoint, recording) as view,
+    ):
+        wait_until(lambda: list(tmp_path.glob(".cut.rrd*")), "the recording to begin")
+        time.sleep(0.3)
+        assert not recording.exists()
+        if told == "the view is interrupted":
+            view.process.send_signal(signal.SIGTERM)
+        else:
+            run.process.kill()
+        assert view.wait(20) == 0, view.errors
+    verify(recording)
+    assert list(tmp_path.glob(".cut*")) == []
+
+
+def test_a_late_viewer_does_not_call_it_silence(monkeypatch):
+    log = WireLog(rr.RecordingStream("test"))
+    events = []
+    monkeypatch.setattr(log, "_event", lambda text, *_: events.append(text))
+    log.write_state(make_state(50), 10**18)
+    assert events == []
+    log.write_state(make_state(53), 10**18 + 3 * 10**8)
+    assert events == ["no command: the simulator brakes by itself"]
+
+
+def test_a_recording_is_shown_without_a_drive(tmp_path, capsys):
+    out = tmp_path / "left_turn.rrd"
+    assert main(["view", str(LEFT_TURN), "--save", str(out)]) == 0
+    found = verify(out)
+    entities = ("frames/now", "road/ego/body", "road/roads", "action/asked", "latency/uplink",
+                "latency/inference", "mode/reason", "rejected/edge/all")  # fmt: skip
+    assert [entity for entity in entities if entity not in found] == []
+    assert capsys.readouterr().out == f"wrote {out}\n"
+
+
+def test_a_damaged_recording_is_shown_without_what_is_broken(tmp_path, capsys):
+    damaged, out = tmp_path / "drive.mcap", tmp_path / "drive.rrd"
+    shutil.copy(LEFT_TURN, damaged)
+    flip_chunk(damaged, 3)
+    assert main(["view", str(damaged), "--save", str(out)]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is damaged (1 damaged place of" in line
+    assert "road/ego/body" in verify(out)
+
+
+@pytest.fixture
+def kept(monkeypatch):
+    """The numbers that a log draws, by entity."""
+    numbers: dict[str, list[float]] = {}
+    monkeypatch.setattr(
+        WireLog, "_scalar", lambda _, path, value: numbers.setdefault(path, []).append(value)
+    )
+    return numbers
+
+
+def make_scene(**fields):
+    return Scene(episode=0, step=9, sim_time_s=0.9, **fields)
+
+
+def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(kept):
+    log = WireLog(rr.RecordingStream("test"))
+    ms = 10**6
+    for step in (3, 4):
+        sent_ns = 10**18 + step * 100 * ms
+        log.write_state(make_state(step, sent_ns=sent_ns), sent_ns)
+        received_ns = sent_ns + (20 + step) * ms
+        command = make_command(
+            step, received_ns=received_ns, inference_ns=2 * ms, sent_ns=received_ns + 3 * ms
+        )
+        log.write_command(command, received_ns)
+        repeated = msgspec.structs.replace(command, sent_ns=command.sent_ns + 100 * ms)
+        log.write_command(repeated, received_ns + 100 * ms)
+    # The newest command is that of step 4, but the round trip that is told is still step 3's.
+    for _ in range(2):
+        log.write_scene(make_scene(round_trip_ms=60.0, answered_step=3), 10**18)
+    assert kept["latency/uplink"] == pytest.approx([23.0, 23.0, 24.0, 24.0])
+    assert kept["latency/round_trip"] == [60.0, 60.0]
+    assert kept["latency/downlink"] == pytest.approx([60.0 - 26.0])
+
+
+def test_rejections_are_counted_by_side_and_reason(kept):
+    log = WireLog(rr.RecordingStream("test"))
+    for count in (0, 2, 5):
+        log.write_scene(make_scene(rejected={"stale": count}), 10**18)
+    assert kept == {
+        "rejected/simulator/all": [0, 2, 5],
+        "rejected/simulator/stale": [0, 2, 5],  # From zero, so that the line shows the step.
+    }
+
+
+def test_live_pictures_are_at_most_ten_a_second(monkeypatch):
+    drawn = []
+
+    def draw(*_, **__):
+        drawn.append(1)
+        return rr.Clear(recursive=False)
+
+    monkeypatch.setattr(rr, "Image", draw)
+    for interval_s, expected in ((0.1, 2 * 11), (0.0, 2 * 101)):
+        drawn.clear()
+        log = WireLog(rr.RecordingStream("test"), interval_s)
+        for step in range(101):  # A lock-step drive at ten times real time.
+            log.write_state(make_state(step), 10**18 + step * 10**7)
+        assert len(drawn) == pytest.approx(expected, abs=2)
+
+
+def test_a_scene_survives_the_wire_with_numpy_numbers_inside_and_what_is_none_is_none():
+    environment = ToyEnv()
+    environment.reset(seed=1)
+    stamps = Stamps(episode=2, step=3, sim_time_s=0.3, rejected={"stale": 2})
+    scene = decode_scene(encode_scene(environment.scene(), stamps))
+    assert scene is not None
+    assert (scene.episode, scene.step, scene.vehicles[0].ego) == (2, 3, True)
+    assert scene.path == [[0.0, 0.0], [14.0, 0.0]]
+    for payload in (b"", b"\xc1", b"\x80", bytes(70_000)):
+        assert decode_scene(payload) is None

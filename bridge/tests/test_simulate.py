@@ -1,4 +1,4 @@
-"""``python -m bridge simulate`` against real edge runtimes, each in a process of its own."""
+"""``python -m bridge simulate`` against real edge runtimes, and its episodes by themselves."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import time
 import numpy as np
 import pytest
 
-from bridge.environments import make_environment, scenario_of
+from bridge.environments import EpisodeRunner, make_environment, scenario_of, task_of
 from bridge.tests.harness import (
     SHORT_TOY,
     SLOW_TOY,
     TOY,
     BridgeProcess,
     drive_in_process,
+    make_command,
     make_policy,
     read,
     refused,
@@ -26,6 +27,9 @@ from bridge.tests.harness import (
     wait_until_driving,
     wait_until_driving_steadily,
 )
+from bridge.virtual_link import NO_COMMAND, Decision
+from edge_runtime.policy import load_policy
+from edge_runtime.tests.policies import PEDAL, STEERING, write_policy
 from edge_runtime.transport import free_endpoint, open_session
 
 CONTRACT_KEYS = {
@@ -34,6 +38,13 @@ CONTRACT_KEYS = {
     *("lateral_acceleration_mps2", "longitudinal_acceleration_mps2"),
     *("latency_ms", "deadline_misses", "safe_stops", "rejected"),
 }
+
+
+def drove_as_in_process(report, policy):
+    for row in report["per_episode"]:
+        outcome, actions = drive_in_process(policy, row["seed"])
+        assert row["outcome"] == outcome
+        np.testing.assert_allclose(row["actions"], actions, atol=1e-5)
 
 
 def test_lock_step_over_the_wire_is_the_same_drive_as_in_process(tmp_path):
@@ -46,22 +57,9 @@ def test_lock_step_over_the_wire_is_the_same_drive_as_in_process(tmp_path):
     assert report["rejected"] == {}
     assert report["safe_stops"] == report["deadline_misses"] == report["missed_ticks"] == 0
     assert report["command_age_ms"]["max"] == 0.0  # Virtual time, and no delay in it.
-    for row in report["per_episode"]:
-        outcome, actions = drive_in_process(policy, row["seed"])
-        assert row["outcome"] == outcome
-        np.testing.assert_allclose(row["actions"], actions, atol=1e-5)
+    drove_as_in_process(report, policy)
     assert [row["seed"] for row in report["per_episode"]] == [40, 41, 42]
     assert again["per_episode"] == report["per_episode"]
-
-
-def test_virtual_latency_repeats_itself_over_the_wire(tmp_path):
-    policy, endpoint = make_policy(tmp_path), free_endpoint()
-    options = ["--episodes", "2", "--latency", "60ms+-30ms,loss=10%"]
-    with start_edge(endpoint, policy):
-        first, again = (simulate_undisturbed(tmp_path, endpoint, TOY, options) for _ in range(2))
-    assert first["per_episode"] == again["per_episode"]
-    assert first["latency_ms"]["p50"] > 100
-    assert first["latency_spec"] == "delay=60ms,jitter=30ms,loss=10%"
 
 
 def test_real_time_with_latency(tmp_path):
@@ -73,15 +71,15 @@ def test_real_time_with_latency(tmp_path):
         took_s = time.monotonic() - started_s
     assert report["per_episode"][0]["outcome"] == "goal"
     assert took_s > report["episode_time_s"]["mean"] - 0.2
+    assert report["latency_spec"] == "delay=40ms,jitter=2ms"
     assert 70 < report["latency_ms"]["p50"] < 200
     # On the wire for 80 ms, so it acts in the next tick at the earliest, held from tick to tick.
     assert 80 < report["command_age_ms"]["p50"] < 250
 
 
-@pytest.mark.parametrize("clock", ["lockstep", "realtime"])
-def test_no_state_reaches_the_edge_so_the_simulator_brakes(tmp_path, clock):
+def test_no_state_reaches_the_edge_so_the_simulator_brakes(tmp_path):
     policy, endpoint = make_policy(tmp_path, "constant"), free_endpoint()
-    options = ["--clock", clock, "--latency", "up.loss=100%"]
+    options = ["--clock", "realtime", "--latency", "up.loss=100%"]
     with start_edge(endpoint, policy):
         report = simulate(tmp_path, endpoint, SHORT_TOY, options)
     (event,) = report["safe_stop_events"]
@@ -121,50 +119,11 @@ def test_a_killed_edge_is_braked_for_and_a_new_one_drives_on(tmp_path, clock):
     assert row["actions"][resumed] == pytest.approx([0.2])
 
 
-def test_two_simulators_cannot_share_a_port(tmp_path, refusal):
-    endpoint, out = free_endpoint(), tmp_path / "never.json"
-    with contextlib.closing(open_session(listen=endpoint, mode="router")):
-        line = refusal("simulate", "--env", TOY, "--listen", endpoint, "--out", out)
-    assert "in use" in line
-    assert not out.exists()
-
-
-def test_nobody_comes_and_one_line_says_what_to_start(tmp_path):
-    out = tmp_path / "never.json"
-    with start_simulate(free_endpoint(), out, TOY, "--wait-edge-s", "0.3") as run:
-        refused(run, out, "python -m edge_runtime run")
-
-
 def test_a_number_that_is_not_finite_is_one_line_and_status_2(tmp_path):
     policy, endpoint, out = make_policy(tmp_path), free_endpoint(), tmp_path / "never.json"
     env = "bridge.tests.toy:BridgeToyNan-v0"
     with start_edge(endpoint, policy), start_simulate(endpoint, out, env) as run:
         refused(run, out, "reward is nan")
-
-
-def test_what_the_edge_rejects_is_in_the_report(tmp_path):
-    policy, endpoint = make_policy(tmp_path), free_endpoint()
-    options = ["--latency", "up.delay=100ms,up.jitter=80ms,up.duplicate=50%"]
-    with start_edge(endpoint, policy):
-        report = simulate(tmp_path, endpoint, TOY, options)
-    assert report["rejected_by_edge"]["stale"] > 0
-    assert report["rejected_by_edge"]["duplicate"] > 0
-    assert report["rejected"]["stale"] >= report["rejected_by_edge"]["stale"]
-
-
-@pytest.mark.parametrize(
-    ("name", "word"),
-    [
-        ("left_turn", "left_turn"),
-        ("phil/LeftTurn-v0", "left_turn"),
-        ("congestion", "congestion"),
-        ("phil/Congestion-v0", "congestion"),
-    ],
-)
-def test_a_scenario_is_found_by_word_and_by_id(name, word):
-    environment = make_environment(name)
-    assert scenario_of(name) == word
-    environment.close()
 
 
 def test_an_interrupted_run_writes_no_report(tmp_path):
@@ -182,44 +141,26 @@ def test_an_interrupted_run_writes_no_report(tmp_path):
     assert list(tmp_path.glob("*half*")) == []
 
 
-PAIRS = {"car-a": ("mean", 0.0, 40), "car-b": ("constant", 0.25, 60)}
-"""Vehicle id -> kind and value of its policy, and its seed."""
-
-
-def drive_all(folder, endpoint):
-    """Drive every pair at once; return the reports by vehicle id."""
-    runs = {}
-    with contextlib.ExitStack() as stack:
-        for vehicle_id, (kind, value, seed) in PAIRS.items():
-            policy = make_policy(folder, kind, value)
-            out = folder / f"{vehicle_id}.json"
-            options = ("--connect", endpoint, "--vehicle-id", vehicle_id)
-            arguments = ("simulate", "--env", TOY, "--seed", str(seed), "--out", str(out))
-            run = stack.enter_context(BridgeProcess(*arguments, "--episodes", "2", *options))
-            stack.enter_context(start_edge(endpoint, policy, "--vehicle-id", vehicle_id))
-            runs[vehicle_id] = (run, policy, out)
-        for run, _, _ in runs.values():
-            assert run.wait() == 0, run.errors
-    return {vehicle_id: (read(out), policy) for vehicle_id, (_, policy, out) in runs.items()}
-
-
 def test_two_vehicles_on_one_router_each_drive_as_if_alone(tmp_path):
-    endpoint = free_endpoint()
-    router = open_session(listen=endpoint, mode="router")
-    try:
+    policies = make_policy(tmp_path, "mean", 0.0), make_policy(tmp_path, "constant", 0.25)
+    endpoint, outs = free_endpoint(), [tmp_path / "car-0.json", tmp_path / "car-1.json"]
+    with contextlib.closing(open_session(listen=endpoint, mode="router")):
         for _ in range(3):  # A busy machine may pause a process for over 2 T.
-            reports = drive_all(tmp_path, endpoint)
-            if not any(r["safe_stops"] or r["rejected"] for r, _ in reports.values()):
+            with contextlib.ExitStack() as opened:
+                runs = []
+                for policy, out in zip(policies, outs, strict=True):
+                    where = ("--connect", endpoint, "--vehicle-id", out.stem)
+                    drive = ("simulate", "--env", TOY, "--episodes", "2", "--out", str(out))
+                    runs.append(opened.enter_context(BridgeProcess(*drive, *where)))
+                    opened.enter_context(start_edge(endpoint, policy, *where[2:]))
+                assert [run.wait() for run in runs] == [0, 0]
+            reports = list(map(read, outs))
+            if not any(report["safe_stops"] or report["rejected"] for report in reports):
                 break
-    finally:
-        router.close()
-    assert len({report["policy_id"] for report, _ in reports.values()}) == 2
-    for report, policy in reports.values():
+    assert len({report["policy_id"] for report in reports}) == 2
+    for report, policy in zip(reports, policies, strict=True):
         assert report["rejected"] == {}
-        for row in report["per_episode"]:
-            outcome, actions = drive_in_process(policy, row["seed"])
-            assert row["outcome"] == outcome
-            np.testing.assert_allclose(row["actions"], actions, atol=1e-5)
+        drove_as_in_process(report, policy)
 
 
 MODULE = """
@@ -275,3 +216,155 @@ def test_an_installed_environment_is_served_by_its_id(site, tmp_path):
     (row,) = report["per_episode"]
     assert (row["steps"], row["outcome"]) == (20, "ended")
     assert row["reward"] == pytest.approx(20 * 0.3, rel=1e-6)
+
+
+class ScriptedClock:
+    """Drives for a while with one steering, brakes, and drives again."""
+
+    latencies_ms: tuple = ()
+    drive, brake_until = 10, 32
+
+    def begin(self, episode, seed):
+        self.states = []
+
+    def exchange(self, state):
+        self.states.append(state)
+        braking = self.drive <= state.step < self.brake_until
+        reason = NO_COMMAND if braking else ""
+        steering = 0.04 if state.step < self.drive else -0.02
+        command = make_command(state.step, action=[steering])
+        return Decision(command, fresh=True, brake_reason=reason, undriven_s=0.0)
+
+    def newest_answer(self):
+        return None
+
+    def finish(self, state):
+        self.states.append(state)
+
+
+@pytest.fixture
+def environment():
+    environment = make_environment("congestion")
+    yield environment
+    environment.close()
+
+
+def run(environment, clock, **options):
+    runner = EpisodeRunner(environment, clock, "here", lambda *_: None, lambda *_: None, **options)
+    return runner, runner.run(0, seed=3)
+
+
+def test_the_steering_is_held_and_the_car_stands_and_drives_on(environment):
+    clock = ScriptedClock()
+    runner, result = run(environment, clock)
+    held = [action[0] for action in result.actions[clock.drive : clock.brake_until]]
+    assert held == pytest.approx([0.04] * len(held))
+    speeds = [state.speed_mps for state in clock.states]
+    assert speeds[clock.drive] > 3.5
+    # At 4 m/s2 from at most 6 m/s.
+    assert speeds[clock.drive + 16] == 0.0
+    (event,) = runner.safe_stops.events
+    assert event.reason == NO_COMMAND
+    assert event.stopped_after_s is not None
+    assert event.stopped_after_s <= 1.6
+    assert event.resumed_after_s == pytest.approx(2.2)
+    assert result.actions[clock.brake_until] == pytest.approx([-0.02])
+    assert clock.states[clock.brake_until + 10].speed_mps > 1.0
+
+
+def test_a_new_episode_starts_with_the_brake_released(environment):
+    clock = ScriptedClock()
+    clock.brake_until = 10_000
+    run(environment, clock)
+    clock.drive = 10_000
+    run(environment, clock)
+    assert clock.states[10].speed_mps > 3.5
+
+
+@pytest.mark.parametrize(("options", "speed_mps"), [({}, 5.0), ({"standing": True}, 0.0)])
+def test_an_episode_starts_from_a_stand_where_that_is_asked_for(environment, options, speed_mps):
+    clock = ScriptedClock()
+    run(environment, clock, **options)
+    assert clock.states[0].speed_mps == pytest.approx(speed_mps, abs=1.0)
+
+
+HALF_PEDAL = type(PEDAL)(name="pedal", meaning="m", unit="u", low=-1.0, high=0.5)
+
+
+def policy_of(folder, scenario, *actions):
+    path = folder / f"{scenario}-{len(actions)}.onnx"
+    write_policy(path, actions=actions, manifest_changes={"scenario": scenario})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("clock", "relayed"), [("lockstep", False), ("realtime", False), ("realtime", True)]
+)
+def test_the_policy_of_another_scenario_is_refused_by_both_ends(tmp_path, clock, relayed):
+    policy, out = policy_of(tmp_path, "left_turn", PEDAL), tmp_path / "never.json"
+    endpoint = near = free_endpoint()
+    with contextlib.ExitStack() as opened:
+        if relayed:
+            near = free_endpoint()
+            link = ("--listen", near, "--connect", endpoint, "--latency", "50ms")
+            relay = opened.enter_context(BridgeProcess("relay", *link))
+            assert relay.process.stdout is not None
+            assert relay.process.stdout.readline().startswith("ready")
+        edge = opened.enter_context(start_edge(near, policy))
+        with start_simulate(endpoint, out, "congestion", "--clock", clock) as run:
+            refused(run, out, "left_turn, pedal -1 to 1", "congestion, steering -1 to 1")
+        assert edge.end() == 0
+    assert "was=standby now=safe_stop reason=other_task" in edge.log
+    assert "now=drive" not in edge.log
+
+
+def test_a_scenario_is_found_by_word_and_by_id():
+    for word, name in (("left_turn", "phil/LeftTurn-v0"), ("congestion", "phil/Congestion-v0")):
+        assert scenario_of(word) == scenario_of(name) == word
+        make_environment(name).close()
+
+
+@pytest.mark.parametrize(
+    ("env", "scenario", "actions", "same"),
+    [
+        ("left_turn", "left_turn", (PEDAL,), True),
+        ("phil/Congestion-v0", "congestion", (STEERING,), True),
+        ("left_turn", "congestion", (PEDAL,), False),
+        ("left_turn", "left_turn", (STEERING,), False),
+        ("left_turn", "left_turn", (HALF_PEDAL,), False),
+        ("left_turn", "left_turn", (PEDAL, STEERING), False),
+        (TOY, "left_turn", (PEDAL,), True),
+        (TOY, "anything", (STEERING,), True),
+        (TOY, "left_turn", (HALF_PEDAL,), False),
+        (TOY, "left_turn", (PEDAL, STEERING), False),
+    ],
+)
+def test_what_is_known_of_both_is_compared(tmp_path, env, scenario, actions, same):
+    policy = policy_of(tmp_path, scenario, *actions)
+    manifest = load_policy(policy, allow_unsigned=True).manifest
+    environment = make_environment(env)
+    assert (task_of(environment, env, manifest) == manifest.task) is same
+    known = env != TOY  # The toy tells neither scenario nor names, so its states say nothing.
+    assert bool(task_of(environment, env)) is known
+    environment.close()
+
+
+def test_a_foreign_environment_refuses_another_number_of_actions(tmp_path):
+    policy = policy_of(tmp_path, "left_turn", PEDAL, STEERING)
+    endpoint, out = free_endpoint(), tmp_path / "never.json"
+    with start_edge(endpoint, policy), start_simulate(endpoint, out, TOY) as run:
+        refused(run, out, "('left_turn, pedal -1 to 1')", "steering")
+
+
+def test_another_runtime_in_the_middle_of_a_drive_ends_it(tmp_path):
+    own, other = (
+        policy_of(tmp_path, "left_turn", PEDAL), policy_of(tmp_path, "congestion", STEERING),
+    )  # fmt: skip
+    endpoint, out = free_endpoint(), tmp_path / "never.json"
+    options = ("--clock", "realtime", "--episodes", "20")
+    with start_simulate(endpoint, out, "left_turn", *options) as run:
+        with start_edge(endpoint, own) as edge:
+            wait_until_driving(edge)
+            edge.process.kill()
+        with start_edge(endpoint, other):
+            refused(run, out, "another task", "left_turn, pedal -1 to 1")

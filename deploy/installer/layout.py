@@ -40,8 +40,7 @@ SITE, CONTENTS, LAUNCHER = "site-packages", "contents.json", "bin/phil-edge"
 WHEELS, TLS = "wheels/", "tls/"
 POLICY, PUBLIC_KEY, CONFIG = "policy.onnx", "policy.pub", "config.toml"
 _MAKING = ".making-"
-_HOLD_LIMIT_S = 2.0
-"""A runtime that asks whether it may send has the lock for microseconds."""
+_HOLD_LIMIT_S = 2.0  # A runtime that asks whether it may send has the lock for microseconds
 _NOT_COMPILED = re.compile(f"/{SITE}/(.*/)?tests/")
 """numpy's own tests are a quarter of all files, and nobody imports them here."""
 _LAUNCH = """\

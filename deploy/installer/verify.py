@@ -195,10 +195,7 @@ def parse_manifest(data: bytes) -> Manifest:
 
 
 def check_fits(target: Target) -> None:
-    """Raise UserError unless Python, processor and C library are what the wheels need.
-
-    Wheels for another computer would fail late and strangely.
-    """
+    """Raise UserError unless Python, processor and C library are what the wheels need."""
     python = f"{sys.version_info[0]}.{sys.version_info[1]}"
     if python != target.python:
         raise UserError(

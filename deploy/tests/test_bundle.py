@@ -1,17 +1,22 @@
-"""What goes into a bundle and what may not, that it is the same again, and its wheels."""
+"""What goes into a bundle, that it is the same again, its wheels, and which bundle is believed."""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
+import random
 import stat
+import subprocess
 import tarfile
 import zipfile
-from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from deploy import bundle
+from deploy import bundle as bundle_module
 from deploy.__main__ import main
 from deploy.bundle import (
     DEFAULT_FOLDER,
@@ -19,6 +24,8 @@ from deploy.bundle import (
     TARGETS,
     Inputs,
     Pin,
+    _pack,
+    _sign,
     build_edge_wheel,
     build_installer,
     gather,
@@ -26,7 +33,17 @@ from deploy.bundle import (
     make_bundle,
     read_lock,
 )
-from deploy.installer.layout import unpack_wheel
+from deploy.installer.__main__ import trusted_key
+from deploy.installer.layout import Layout, unpack_wheel
+from deploy.installer.verify import (
+    MANIFEST,
+    Manifest,
+    parse_manifest,
+    read_bundle,
+    read_public_key,
+    ssh_key,
+    to_json,
+)
 from deploy.installer.verify import UserError as InstallerError
 from deploy.tests.boards import HERE
 from edge_runtime.config import load_config
@@ -134,14 +151,20 @@ def test_settings_that_do_not_hold_are_refused(workshop, tmp_path, text, match):
         workshop.make(config=config)
 
 
-def test_a_policy_of_somebody_else_or_unsigned_is_refused(workshop, tmp_path):
-    other = workshop.inputs(0.2)
-    with pytest.raises(UserError, match="does not fit the policy file and public key"):
-        workshop.make(0.1, public_key=other.public_key)
-    unsigned = tmp_path / "unsigned.onnx"
+def test_a_bundle_of_somebody_elses_policy_or_key_or_a_long_name_is_refused(workshop, tmp_path):
+    other, unsigned = workshop.inputs(0.2), tmp_path / "unsigned.onnx"
     unsigned.write_bytes(other.policy.read_bytes())
-    with pytest.raises(UserError, match=r"is not signed(?!.*--allow-unsigned)"):  # no bundle has it
-        workshop.make(policy=unsigned)
+    long = tmp_path / f"{'a' * 190}-1-py3-none-any.whl"
+    long.write_bytes(workshop.host.read_bytes())
+    for changes, match in (
+        ({"public_key": other.public_key}, "does not fit the policy file and public key"),
+        ({"policy": unsigned}, r"is not signed(?!.*--allow-unsigned)"),  # no bundle has it
+        ({"key": tmp_path / "missing.key"}, "not exist"),
+        ({"key": workshop.public_key}, "private"),
+        ({"wheels": [workshop.edge_wheel, long]}, "too long for a bundle"),
+    ):
+        with pytest.raises(UserError, match=match):
+            workshop.make(0.1, **changes)
 
 
 @pytest.mark.parametrize("name", ["edge-other", "simulator-hunter01", "ca"])
@@ -149,12 +172,6 @@ def test_the_certificates_must_be_this_vehicles(workshop, party, tmp_path, name)
     (tmp_path / "c.toml").write_text('connect = "tls/10.0.0.1:7447"\n')
     with pytest.raises(UserError):
         workshop.make(tls=party / name, config=tmp_path / "c.toml")
-
-
-def test_without_a_private_key_nothing_is_signed(workshop, tmp_path):
-    for key, match in ((tmp_path / "missing.key", "not exist"), (workshop.public_key, "private")):
-        with pytest.raises(UserError, match=match):
-            workshop.make(key=key)
 
 
 @pytest.mark.parametrize(
@@ -169,21 +186,13 @@ def test_a_mistake_is_one_line_before_anything_is_downloaded(
 ):
     monkeypatch.chdir(tmp_path)
     if "--wheels" not in arguments:
-        monkeypatch.setattr(bundle, "gather", lambda *_: pytest.fail("downloads"))
+        monkeypatch.setattr(bundle_module, "gather", lambda *_: pytest.fail("downloads"))
     inputs = workshop.inputs()
     good = ["--policy", inputs.policy, "--public-key", inputs.public_key, "--key", inputs.key]
     status = exit_status(main, ["bundle", *map(str, good), *arguments.split()])
     said = capsys.readouterr().err.strip().splitlines()
     assert (status, len(said)) == (2, 1)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_name_that_no_archive_takes_is_said(workshop, tmp_path):
-    long = tmp_path / f"{'a' * 190}-1-py3-none-any.whl"
-    long.write_bytes(workshop.host.read_bytes())
-    inputs = workshop.inputs(wheels=[workshop.edge_wheel, long])
-    with pytest.raises(UserError, match="too long for a bundle"):
-        make_bundle(inputs, HERE, tmp_path / "out")
 
 
 def test_a_bundle_that_is_interrupted_leaves_no_key_behind(workshop, tmp_path, monkeypatch):
@@ -204,17 +213,17 @@ def wheel(*members: str) -> bytes:
     return packed.getvalue()
 
 
-def unpacked(folder: Path) -> set[str]:
-    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
-
-
-def test_packages_come_out_and_scripts_stay_in(tmp_path):
+def test_packages_come_out_scripts_stay_in_and_no_two_wheels_hold_the_same_file(tmp_path):
     data = wheel(
         "a/__init__.py", "a-1.dist-info/RECORD", "a-1.data/purelib/b.py", "a-1.data/platlib/c/d.so",
         "a-1.data/scripts/tool", "a-1.data/headers/a.h", "a-1.data/data/share/x",
     )  # fmt: skip
     unpack_wheel(data, "a-1.whl", tmp_path)
-    assert unpacked(tmp_path) == {"a/__init__.py", "a-1.dist-info/RECORD", "b.py", "c/d.so"}
+    found = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert found == {"a/__init__.py", "a-1.dist-info/RECORD", "b.py", "c/d.so"}
+    for clash in ("b.py", "b.py/x.py", "b-1.data/purelib/b.py"):
+        with pytest.raises(InstallerError, match="another wheel"):
+            unpack_wheel(wheel(clash), "b-1.whl", tmp_path)
 
 
 LEAVES = ("../x.py", "/x.py", "a/../../x.py", "a\\..\\x.py", "a-1.data/purelib/../../x.py")
@@ -233,24 +242,15 @@ def test_what_is_no_wheel_or_leaves_the_folder_is_refused(tmp_path, data, match)
     assert not (tmp_path / "x.py").exists()
 
 
-def test_two_wheels_may_not_hold_the_same_file(tmp_path):
-    unpack_wheel(wheel("a.py"), "a-1.whl", tmp_path)
-    for clash in ("a.py", "a.py/b.py", "b-1.data/purelib/a.py"):
-        with pytest.raises(InstallerError, match="another wheel"):
-            unpack_wheel(wheel(clash), "b-1.whl", tmp_path)
-
-
 @pytest.mark.parametrize("target", TARGETS.values(), ids=lambda target: target.name)
-def test_every_target_is_locked_by_hash(target):
+def test_every_target_is_locked_by_hash_and_the_twin_has_the_boards_versions(target):
     pins = read_lock(lock_path(target))
     names = {pin.name for pin in pins}
     assert {"numpy", "onnxruntime", "eclipse-zenoh", "msgspec", "cryptography", "tomli"} <= names
     assert len(names) == len(pins)
-
-
-def test_the_twin_has_the_boards_versions():
-    board, twin = (read_lock(lock_path(TARGETS[n])) for n in ("jetpack5", "linux-x86_64"))
-    assert [pin[:2] for pin in board] == [pin[:2] for pin in twin]
+    if target.name == "jetpack5":
+        twin = read_lock(lock_path(TARGETS["linux-x86_64"]))
+        assert [pin[:2] for pin in pins] == [pin[:2] for pin in twin]
 
 
 @pytest.mark.parametrize("line", ["numpy", "numpy>=1", "numpy==1.0", "numpy==1 --hash=sha256:ab"])
@@ -262,7 +262,7 @@ def test_a_lock_without_version_or_hash_is_refused(tmp_path, line):
 
 
 def test_a_full_folder_needs_no_network(tmp_path, monkeypatch):
-    monkeypatch.setattr(bundle, "pip", lambda *_: pytest.fail("pip was asked"))
+    monkeypatch.setattr(bundle_module, "pip", lambda *_: pytest.fail("pip was asked"))
     (tmp_path / "a-1-py3-none-any.whl").write_bytes(b"")
     (tmp_path / "other-1-py3-none-any.whl").write_bytes(b"other")
     lock = tmp_path / "lock.txt"
@@ -280,3 +280,150 @@ def test_a_wheel_with_another_hash_is_not_taken(tmp_path, monkeypatch):
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     with pytest.raises(UserError, match="pip download: ERROR: No matching distribution"):
         gather(HERE, lock, tmp_path)
+
+
+FILES = {"config.toml": b"a = 1\n", "empty": b"", "wheels/a-1.whl": bytes(range(256)) * 5}
+KEY = Ed25519PrivateKey.from_private_bytes(bytes(32))
+MADE = Manifest("0.1.0-a-b", HERE, "hunter01", "p" * 64)
+CONTENTS = {**FILES, MANIFEST: to_json(MADE)}
+
+
+def pem_of(key) -> bytes:
+    return key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+
+
+PUBLIC = pem_of(KEY)
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    path = tmp_path / "bundle.tar"
+    write(path, _pack(CONTENTS))
+    return path
+
+
+def write(path, data: bytes, key: Ed25519PrivateKey = KEY) -> None:
+    """A bundle of these bytes, and the key's signature of them."""
+    path.write_bytes(data)
+    path.with_name(f"{path.name}.sig").write_bytes(_sign(data, key))
+
+
+def refused(path, match: str = "is refused", key: bytes = PUBLIC) -> None:
+    with pytest.raises(InstallerError, match=match):
+        read_bundle(str(path), key)
+
+
+def test_what_was_put_in_comes_out_and_others_read_it_too(bundle, tmp_path):
+    opened = read_bundle(str(bundle), PUBLIC)
+    assert (opened.manifest, opened.files) == (MADE, CONTENTS)
+    subprocess.run(["tar", "--extract", "--file", bundle], cwd=tmp_path, check=True)
+    assert all((tmp_path / name).read_bytes() == data for name, data in CONTENTS.items())
+
+
+def changed(path):
+    """100 seeded places of a file, one byte of it changed at a time."""
+    whole, choice = path.read_bytes(), random.Random(7)
+    for place in choice.sample(range(len(whole)), 100):
+        data = bytearray(whole)
+        data[place] ^= choice.randrange(1, 256)
+        path.write_bytes(data)
+        yield
+    path.write_bytes(whole)
+
+
+def test_any_one_byte_changed_is_found(bundle):
+    """`python -m hil_tests board` tries it with the installer on a board."""
+    for _ in changed(bundle):
+        refused(bundle, "is refused: its signature is not of the key")
+    # A signature is text: a few changes, as of a line's end, leave what it says as it was.
+    taken = 0
+    for _ in changed(bundle.with_name("bundle.tar.sig")):
+        with contextlib.suppress(InstallerError):
+            assert read_bundle(str(bundle), PUBLIC).files == CONTENTS
+            taken += 1
+    assert taken < 10
+
+
+@pytest.mark.parametrize("size", [0, 1, 511, 512, 2000, -1, -512, -1024])
+def test_a_part_of_it_or_more_is_refused(bundle, size):
+    whole = bundle.read_bytes()
+    for data in (whole[:size], whole + bytes(abs(size) + 1)):
+        bundle.write_bytes(data)
+        refused(bundle)
+
+
+def test_another_key_a_signature_for_something_else_and_none_are_refused(bundle, monkeypatch):
+    data = bundle.read_bytes()
+    write(bundle, data, Ed25519PrivateKey.generate())
+    refused(bundle, "signature is not of the key")
+    monkeypatch.setattr(bundle_module, "NAMESPACE", "file")
+    write(bundle, data)
+    refused(bundle, "signature is not of the key")
+    bundle.with_name("bundle.tar.sig").unlink()
+    refused(bundle, r"signature .*bundle\.tar\.sig cannot be read")
+
+
+def tar_of(*kinds: bytes) -> bytes:
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w") as tar:
+        for kind in kinds:
+            member = tarfile.TarInfo("a")
+            member.type, member.linkname = kind, "config.toml"
+            tar.addfile(member)
+    return packed.getvalue()
+
+
+NAMES = ("/etc/passwd", "../x", "a/../../x", "a//b", "", ".hidden", "a/.", "a\nb", "a b")
+KINDS = (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.DIRTYPE, tarfile.FIFOTYPE)
+STRANGE = {
+    **{f"name {name!r}": _pack({**CONTENTS, name: b"x"}) for name in NAMES},
+    **{f"kind {kind!r}": tar_of(kind) for kind in KINDS},
+    "file twice": tar_of(tarfile.REGTYPE, tarfile.REGTYPE),
+}
+NO_BUNDLE = {"empty": b"", "no tar": b"no tar", "no manifest": _pack(FILES)}
+
+
+@pytest.mark.parametrize("what", [*STRANGE, *NO_BUNDLE])
+def test_what_is_signed_and_no_bundle_is_refused(bundle, what):
+    write(bundle, {**STRANGE, **NO_BUNDLE}[what])
+    refused(bundle, "holds what no bundle holds" if what in STRANGE else "is refused")
+
+
+@pytest.mark.parametrize(
+    ("raw", "match"),
+    [
+        *((raw, "manifest is not valid") for raw in (b"", b"[]", b"{}")),
+        *((to_json(MADE._replace(version=v)), "manifest is not valid") for v in ("../x", "")),
+        (to_json(MADE).replace(b'"format":1', b'"format":2'), "format is 2"),
+    ],
+)
+def test_a_signed_manifest_that_makes_no_sense_is_refused(raw, match):
+    with pytest.raises(InstallerError, match=match):
+        parse_manifest(raw)
+
+
+@pytest.mark.parametrize("name", ["missing.tar", ".", "pipe", "/dev/zero"])
+def test_what_cannot_be_read_is_one_line(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InstallerError, match=r"cannot be read|is not a file"):
+        trusted_key(Layout(str(tmp_path)), str(tmp_path / name))
+    refused(tmp_path / name, r"cannot be read|is not a file")
+
+
+def test_an_ssh_keygen_that_cannot_verify_is_said(bundle, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    refused(bundle, "ssh-keygen cannot be run")
+    (tmp_path / "ssh-keygen").write_text("#!/bin/sh\necho unknown option -- Y >&2; exit 1\n")
+    (tmp_path / "ssh-keygen").chmod(0o755)
+    refused(bundle, "OpenSSH 8.2")
+
+
+def test_a_key_is_the_same_however_its_lines_end_and_what_is_none_is_said(tmp_path):
+    path, pem = tmp_path / "key.pub", pem_of(ec.generate_private_key(ec.SECP256R1()))
+    path.write_bytes(PUBLIC.replace(b"\n", b"\r\n"))
+    assert ssh_key(read_public_key(str(path))) == ssh_key(PUBLIC)
+    assert ssh_key(PUBLIC) != ssh_key(pem_of(Ed25519PrivateKey.generate()))
+    for wrong in (b"", b"\xff\xfe", pem, pem[:-30], pem.replace(b"PUBLIC", b"PRIVATE")):
+        path.write_bytes(wrong)
+        with pytest.raises(InstallerError, match="public key is not"):
+            read_public_key(str(path))

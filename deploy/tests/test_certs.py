@@ -58,20 +58,16 @@ def test_each_party_has_what_it_needs_and_no_more(made):
     for name in PARTIES:
         assert {p.name for p in (made / name).iterdir()} == {"ca.pem", "cert.pem", "key.pem"}
         assert load_tls(made / name).name == name
+        usage = extension(made / name, x509.ExtendedKeyUsage)
+        assert ExtendedKeyUsageOID.CLIENT_AUTH in usage
+        is_server = name in ("router", "simulator-hunter01")
+        assert (ExtendedKeyUsageOID.SERVER_AUTH in usage) is is_server
     for key in [*made.glob("*/key.pem"), made / "ca/ca.key.pem"]:
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
         assert stat.S_IMODE(key.parent.stat().st_mode) == 0o700
 
 
-def test_only_listeners_have_a_servers_certificate(made):
-    for name in PARTIES:
-        usage = extension(made / name, x509.ExtendedKeyUsage)
-        assert ExtendedKeyUsageOID.CLIENT_AUTH in usage
-        is_server = name in ("router", "simulator-hunter01")
-        assert (ExtendedKeyUsageOID.SERVER_AUTH in usage) is is_server
-
-
-def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
+def test_what_is_missing_is_made_and_nothing_before_it_changes(tmp_path, capsys):
     folder = tmp_path / "certs"
     assert make(folder, "--vehicle-id", "one") == 0
     before = contents(folder)
@@ -84,6 +80,17 @@ def test_a_second_vehicle_joins_and_nothing_before_it_changes(tmp_path):
     assert set(names.get_values_for_type(x509.DNSName)) == {"localhost", "bench.local"}
     addresses = {str(a) for a in names.get_values_for_type(x509.IPAddress)}
     assert addresses == {"127.0.0.1", "::1", "10.0.0.7"}
+    (folder / "edge-one").rename(tmp_path / "old")
+    assert make(folder, "--vehicle-id", "one") == 0
+    assert f"kept as it is: {folder / 'router'}" in capsys.readouterr().out
+    again = contents(folder)
+    assert {path for path in after if again[path] != after[path]} <= {
+        Path("edge-one/cert.pem"), Path("edge-one/key.pem"),
+    }  # fmt: skip
+    assert contents(tmp_path / "old") != contents(folder / "edge-one")
+    (folder / "ca/ca.key.pem").unlink()
+    assert make(folder, "--vehicle-id", "new") == 2
+    assert "ca.key.pem" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -106,26 +113,6 @@ def test_bad_input_is_one_line_and_nothing_is_written(made, options, word, capsy
     (line,) = capsys.readouterr().err.splitlines()
     assert word in line
     assert contents(made) == before
-
-
-def test_one_folder_moved_away_is_made_new_and_the_others_are_kept(tmp_path, capsys):
-    folder = tmp_path / "certs"
-    assert make(folder) == 0
-    (folder / "edge-hunter01").rename(tmp_path / "old")
-    before = contents(folder)
-    assert make(folder) == 0
-    assert f"kept as it is: {folder / 'router'}" in capsys.readouterr().out
-    after = contents(folder)
-    assert {path: after[path] for path in before} == before
-    assert {path.parts[0] for path in set(after) - set(before)} == {"edge-hunter01"}
-    assert contents(tmp_path / "old") != contents(folder / "edge-hunter01")
-
-
-def test_an_authority_without_its_key_is_refused(made, tmp_path, capsys):
-    shutil.copytree(made, tmp_path / "certs")
-    (tmp_path / "certs/ca/ca.key.pem").unlink()
-    assert make(tmp_path / "certs", "--vehicle-id", "new") == 2
-    assert "ca.key.pem" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["ca.pem", "cert.pem", "key.pem"])

@@ -47,11 +47,10 @@ PROGRAMS = ["ssh"] * 2 + ["scp"] * 4 + ["ssh"] * 2
 def far(tmp_path, monkeypatch):
     """A far computer: its home is a folder here. Its log says what was asked of it."""
     home, programs = tmp_path / "home", tmp_path / "programs"
-    for folder in (home, programs):
-        folder.mkdir()
-    log = tmp_path / "log"
-    log.touch()
-    names = {"python": sys.executable, "log": str(log), "home": str(home)}
+    home.mkdir()
+    programs.mkdir()
+    (tmp_path / "log").touch()
+    names = {"python": sys.executable, "log": str(tmp_path / "log"), "home": str(home)}
     for name, text in (("ssh", SSH), ("scp", SCP)):
         (programs / name).write_text(text.format(**names))
         (programs / name).chmod(0o755)
@@ -59,14 +58,20 @@ def far(tmp_path, monkeypatch):
     return tmp_path
 
 
-def push(board, workshop, *arguments: object) -> int:
-    options = ["--trust", workshop.public_key, "--root", board.root, "--no-sudo"]
-    return exit_status(main, ["push", *map(str, [*arguments, *options])])
+@pytest.fixture
+def push(far, board, workshop):
+    """Push to the board of this computer; the exit status."""
+
+    def pushed(*arguments: object) -> int:
+        options = ["--trust", workshop.public_key, "--root", board.root, "--no-sudo"]
+        return exit_status(main, ["push", *map(str, [*arguments, *options])])
+
+    return pushed
 
 
-def test_a_push_installs_and_leaves_nothing_behind(far, board, workshop, capfd):
+def test_a_push_installs_and_leaves_nothing_behind(far, board, push, workshop, capfd):
     made = workshop.make(0.1)
-    assert push(board, workshop, "phil@board", made.path, "--service", "none") == 0
+    assert push("phil@board", made.path, "--service", "none") == 0
     assert f"current: {made.manifest.version}" in capfd.readouterr().out
     assert board.status()["current"] == made.manifest.version
     assert list((far / "home").iterdir()) == []
@@ -75,18 +80,18 @@ def test_a_push_installs_and_leaves_nothing_behind(far, board, workshop, capfd):
 
 
 @pytest.mark.parametrize("name", ["install.pyz", "trust.pub", "-q.tar", "two words;id.tar"])
-def test_a_bundle_may_have_any_name(far, board, workshop, tmp_path, name):
+def test_a_bundle_may_have_any_name(board, push, workshop, tmp_path, name):
     made = workshop.make(0.1)
     bundle = tmp_path / name
     bundle.write_bytes(made.path.read_bytes())
     Path(f"{bundle}.sig").write_bytes(Path(f"{made.path}.sig").read_bytes())
-    assert push(board, workshop, "board", bundle, "--service", "none") == 0
+    assert push("board", bundle, "--service", "none") == 0
     assert board.status()["current"] == made.manifest.version
 
 
-def test_a_dry_run_says_each_step_and_does_none(far, board, workshop, capsys):
+def test_a_dry_run_says_each_step_and_does_none(far, board, push, workshop, capsys):
     made = workshop.make(0.1)
-    assert push(board, workshop, "board", made.path, "--dry-run") == 0
+    assert push("board", made.path, "--dry-run") == 0
     said = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in said[::2]] == ["#"] * len(PROGRAMS)
     assert [line.split()[0] for line in said[1::2]] == PROGRAMS
@@ -96,13 +101,15 @@ def test_a_dry_run_says_each_step_and_does_none(far, board, workshop, capsys):
     assert not board.root.exists()
 
 
-def test_an_installer_that_refuses_is_told_and_cleaned_up(far, board, workshop, tmp_path, capfd):
+def test_an_installer_that_refuses_is_told_and_cleaned_up(
+    far, board, push, workshop, tmp_path, capfd
+):
     """The board trusts somebody else's key already."""
     _, other = write_key_pair(tmp_path / "other")
     made = workshop.make(0.1)
     board.root.mkdir()
     (board.root / "trusted.pub").write_bytes(other.read_bytes())
-    assert push(board, workshop, "board", made.path, "--service", "none") == 2
+    assert push("board", made.path, "--service", "none") == 2
     assert "trusts another key" in capfd.readouterr().err
     assert list((far / "home").iterdir()) == []
     assert [p.name for p in board.root.iterdir()] == ["trusted.pub"]
@@ -117,12 +124,12 @@ def test_an_installer_that_refuses_is_told_and_cleaned_up(far, board, workshop, 
     ],
 )
 def test_a_push_that_fails_ends_at_once_and_leaves_nothing_behind(
-    far, board, workshop, monkeypatch, capfd, host, machine, says, lines
+    far, board, push, workshop, monkeypatch, capfd, host, machine, says, lines
 ):
     """What has come so far may hold the vehicle's private key."""
     made = make_bundle(workshop.inputs(), HERE._replace(machine=machine), far / "bundles")
     monkeypatch.chdir(made.path.parent)
-    assert push(board, workshop, host, made.path.name) == 2
+    assert push(host, made.path.name) == 2
     assert says in capfd.readouterr().err
     assert len((far / "log").read_text().splitlines()) == lines
     assert list((far / "home").iterdir()) == []
@@ -130,20 +137,18 @@ def test_a_push_that_fails_ends_at_once_and_leaves_nothing_behind(
 
 
 @pytest.mark.parametrize("host", ["-oProxyCommand=touch x", "a b", "", "a;b", "$(id)", "user@"])
-def test_a_host_that_would_be_an_option_or_a_command_is_refused(far, board, workshop, host, capsys):
-    made = workshop.make(0.1)
-    assert push(board, workshop, *(["--"] if host[:1] == "-" else []), host, made.path) == 2
+def test_a_host_that_would_be_an_option_or_a_command_is_refused(far, push, workshop, host):
+    assert push(*(["--"] if host[:1] == "-" else []), host, workshop.make(0.1).path) == 2
     assert not (far / "log").read_text()
 
 
-def test_a_bundle_that_the_board_would_refuse_is_not_sent(far, board, workshop, capsys):
-    made = workshop.make(0.1)
-    changed = far / "changed.tar"
+def test_a_bundle_that_the_board_would_refuse_is_not_sent(far, push, workshop, capsys):
+    made, changed = workshop.make(0.1), far / "changed.tar"
     data = bytearray(made.path.read_bytes())
     data[-2000] ^= 1
     changed.write_bytes(data)
     Path(f"{changed}.sig").write_bytes(Path(f"{made.path}.sig").read_bytes())
-    assert push(board, workshop, "board", changed) == 2
+    assert push("board", changed) == 2
     assert "is refused" in capsys.readouterr().err
-    assert push(board, workshop, "board", Path("missing.tar")) == 2
+    assert push("board", Path("missing.tar")) == 2
     assert not (far / "log").read_text()

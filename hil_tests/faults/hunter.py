@@ -93,10 +93,7 @@ def stuck(rig: Rig, number: int) -> Try:
 def _when_over(
     rig: Rig, expect: Expect, on_s: float, known_s: float, stop: CommandSeen, stands_s: float
 ) -> Try:
-    """Switch the fault off, look whether it stays as it is, and re-arm until it moves in fact.
-
-    The recovery lasts to the first drive command.
-    """
+    """Switch the fault off, look whether the stop holds, and re-arm until the vehicle moves."""
     rig.chassis.switch(expect.name, False)
     time.sleep(QUIET_S)
     quiet_s = time.monotonic()

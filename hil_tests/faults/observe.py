@@ -27,8 +27,7 @@ REACTION_LIMIT_S = 2 * CONTROL_PERIOD_S + 0.05
 RECOVERY_LIMIT_S = 1.0
 """From the end of the fault to the first drive command, with no vehicle attached."""
 
-Place = tuple[str, int, int]
-"""Session, episode and step of a state."""
+Place = tuple[str, int, int]  # Session, episode and step of a state
 _POLL_S = 0.1
 
 
@@ -202,8 +201,7 @@ class CanMonitor(can.Listener):
 
     def __init__(self, bus: str, can_ids: tuple[int, ...]) -> None:
         self.heard: list[Heard] = []
-        self.strange: list[Heard] = []
-        """Frames that are not the Hunter's: nobody should send any."""
+        self.strange: list[Heard] = []  # Frames that are not the Hunter's: nobody should send any
         self._can_ids = frozenset(can_ids)
         self._bus = open_bus(parse_bus(bus))
         self._notifier = can.Notifier(self._bus, [self], timeout=_POLL_S)

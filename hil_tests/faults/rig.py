@@ -48,8 +48,7 @@ _TOLD = re.compile(r"chassis t=([\d.]+) control=(\w+) .*motion=(\w+)")
 _SWITCHED = re.compile(r"fault t=([\d.]+) (\w+)=(\w+)")
 _SETTLED_S, _SETTLED_COMMANDS = 0.35, 3
 _REARM_EVERY_S = 2.0
-_HEALTH_S = 0.6
-"""Longer than a period of the health message."""
+_HEALTH_S = 0.6  # Longer than a period of the health message
 _CHUNK_BYTES = 65536
 _STATE_BYTES = 20
 """More than a keep-alive and less than a state, also where Zenoh hands it over in shared memory
@@ -94,8 +93,7 @@ class Rig:
         connect = None if sender else self._simulator_endpoint
         self.probe = Probe(self._hub, connect, VEHICLE_ID, self.timeline)
         self._closing.callback(self.probe.close)
-        self.edge_endpoint = self._hub
-        """Where the edge runtime connects."""
+        self.edge_endpoint = self._hub  # Where the edge runtime connects
         if between == "link":
             self.link = Link(self._hub)
             self._closing.callback(self.link.close)
@@ -143,10 +141,7 @@ class Rig:
     def wait_until_driving(
         self, timeout_s: float = 30.0, ready: Callable[[], bool] = lambda: True
     ) -> None:
-        """Until drive commands come steadily, the simulated vehicle's brake is off, and ``ready``.
-
-        A vehicle is re-armed until then.
-        """
+        """Until it drives steadily, its brake off, and is ``ready``; a vehicle is re-armed."""
         rearmed_s = time.monotonic()
 
         def driving() -> bool:
@@ -404,10 +399,7 @@ def free_bus() -> str:
 
 
 class Link:
-    """A TCP link that can be cut, stalled and restored, carried by threads.
-
-    It listens at ``endpoint`` and passes everything on to ``target``, both ``tcp/HOST:PORT``.
-    """
+    """A TCP link from ``endpoint`` to ``target`` that can be cut, stalled and restored."""
 
     def __init__(self, target: str) -> None:
         self.endpoint = free_endpoint()

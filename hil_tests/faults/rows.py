@@ -67,15 +67,12 @@ class Row:
     run: DoFault
     reaction_limit_s: float | None = REACTION_LIMIT_S
     recovery_limit_s: float | None = RECOVERY_LIMIT_S
-    rig: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the Rig."""
-    policy: str = "given"
-    """``given``, or one of `run.POLICIES`."""
+    rig: Mapping[str, Any] = field(default_factory=dict)  # Options of the Rig
+    policy: str = "given"  # ``given``, or one of `run.POLICIES`.
     flows: bool = False
     """Whether the simulator's states go on through the fault: where they do not, the machine stood
     still, and the try is done again (and counted as disturbed)."""
-    alone: bool = False
-    """Whether it needs the machine for itself."""
+    alone: bool = False  # Whether it needs the machine for itself
     new_rig_each_try: bool = False
     by_arrival: bool = False
     """Whether the age of an answer is taken by the probe's clock (the edge's is stepped)."""
@@ -165,8 +162,7 @@ FULL_AT_BYTES = 60_000
 """The recorder writes about 1 kB for each state: the picture of noise compresses badly."""
 RECORDED_S = 2.5
 MOST_LOST_S = 1.0
-_CANNOT_WRITE = 1
-"""Exit status of a recorder that cannot write."""
+_CANNOT_WRITE = 1  # Exit status of a recorder that cannot write
 _FEWEST_STATES = 5
 _EXPECT_OWN = "simulator brakes by itself: no_command"
 _EXPECT_BOTH = "both ends stop, each by itself"

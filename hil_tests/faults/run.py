@@ -57,8 +57,7 @@ class Outcome:
     tries: list[Try] = field(default_factory=list)
     unsafe: list[str] = field(default_factory=list)
     crashes: list[str] = field(default_factory=list)
-    disturbed: int = 0
-    """Tries in which the machine itself stood still, done again."""
+    disturbed: int = 0  # Tries in which the machine itself stood still, done again
     failures: list[str] = field(default_factory=list)
     """Tries that came to no end: nothing was seen of what should have come."""
 
@@ -109,10 +108,7 @@ def run_faults(
 
 
 def choose_rows(names: Sequence[str] | None) -> list[Row]:
-    """The rows of these names or patterns, in the table's order; all for None.
-
-    Raises UserError for a name that the table does not hold, or a pattern that fits none.
-    """
+    """The rows of these names or patterns, in the table's order; UserError where one fits none."""
     known = [row.name for row in ROWS]
     chosen: set[str] = set()
     for name in ["*"] if names is None else names:
@@ -125,10 +121,7 @@ def choose_rows(names: Sequence[str] | None) -> list[Row]:
 def run_row(
     row: Row, trust: Sequence[str], work: Path, tries: int, on_try: Callable[[str], None]
 ) -> Outcome:
-    """All tries of a row; a rig in which a try came to no end is replaced.
-
-    ``trust`` are the options of its edge runtimes; rigs have their directories in ``work``.
-    """
+    """All tries of a row, each rig in a directory in ``work``; one that hangs is replaced."""
     outcome, number = Outcome(), 0
     while number < tries:
         with Rig(trust, Path(tempfile.mkdtemp(dir=work)), **row.rig) as rig:

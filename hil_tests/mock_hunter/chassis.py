@@ -143,8 +143,7 @@ class Chassis(NamedTuple):
     control: Control = Control.STANDBY
     condition: Condition = Condition.OK
     brake_locked: bool = True
-    commanded_s: float = float("-inf")
-    """When the newest 0x111 came, or CAN control was taken."""
+    commanded_s: float = float("-inf")  # When the newest 0x111 came, or CAN control was taken
     causes: frozenset[str] = frozenset()
     errors: frozenset[str] = frozenset()
 

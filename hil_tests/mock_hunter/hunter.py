@@ -34,11 +34,9 @@ _MANUAL = "AgileX user manual (HARDWARE_FACTS.md)"
 STANDS_MPS = 0.005
 """Slower than this it stands: half of what one count in 0x221 could show is 0.0005."""
 FAST_S = 0.02
-SLOW_EVERY = 5
-"""Frames of 100 ms go with every fifth of those of 20 ms."""
+SLOW_EVERY = 5  # Frames of 100 ms go with every fifth of those of 20 ms
 STEP_S = 0.005
-_LONGEST_GAP_S = 10.0
-"""After a longer pause of the process it has long come to its rest."""
+_LONGEST_GAP_S = 10.0  # After a longer pause of the process it has long come to its rest
 _MODES = {
     Control.STANDBY: codec.STANDBY,
     Control.CAN: codec.CAN_CONTROL,
@@ -68,25 +66,20 @@ class Parameters:
     """Geometry and actuators of one model; SOURCES says how far to trust each number."""
 
     max_speed_mps: float
-    max_inner_rad: float
-    """Of the inner front wheel."""
+    max_inner_rad: float  # Of the inner front wheel
     wheelbase_m: float
     track_m: float
     command_timeout_s: float = 0.5
-    dead_time_s: float = 0.03
-    """From a command on the bus to the first movement of an actuator."""
+    dead_time_s: float = 0.03  # From a command on the bus to the first movement of an actuator
     speed_time_constant_s: float = 0.1
     acceleration_mps2: float = 2.0
     braking_mps2: float = 3.0
     """Of the speed controller, and of the brake: the chassis stops a moving car with either."""
-    steering_rate_radps: float = 1.0
-    """Of the inner wheel."""
-    motor_revolutions_per_m: float = 20.0
-    """Of path of a rear wheel."""
+    steering_rate_radps: float = 1.0  # Of the inner wheel
+    motor_revolutions_per_m: float = 20.0  # Of path of a rear wheel
     steer_revolutions_per_rad: float = 20.0
     """Of the steering motor, for each radian of the inner wheel."""
-    pulses_per_revolution: float = 100.0
-    """Of a motor's encoder."""
+    pulses_per_revolution: float = 100.0  # Of a motor's encoder
 
 
 MODELS: dict[str, Parameters] = {
@@ -112,10 +105,7 @@ them with ``--set``."""
 
 
 def make_parameters(model: str, changes: Mapping[str, float] | None = None) -> Parameters:
-    """A model's row with some numbers replaced.
-
-    Raises UserError for an unknown name, or a number that is not positive (a dead time may be 0).
-    """
+    """A model's row with some numbers replaced; UserError for a number that cannot be."""
     for name, value in (changes or {}).items():
         if name not in SOURCES:
             raise UserError(f"no parameter {name!r}; choose from {', '.join(SOURCES)}")
@@ -212,8 +202,7 @@ class MockHunter:
         self.chassis = Chassis()
         self.body = Body()
         self.faults: set[str] = set()
-        self.next_s = now_s
-        """When `due` must be called next."""
+        self.next_s = now_s  # When `due` must be called next
         self._parameters, self._profile = parameters, profile
         self._now_s = now_s
         self._under_way: deque[tuple[float, Setpoint]] = deque()

@@ -25,8 +25,7 @@ from edge_runtime.vehicles.hunter.protocol import DEFAULT_PROFILE, PROFILES
 from hil_tests.mock_hunter.chassis import FAULTS, check_fault
 from hil_tests.mock_hunter.hunter import MODELS, SOURCES, MockHunter, make_parameters, read_changes
 
-Switch = tuple[str, bool]
-"""A fault's name, and whether it is switched on."""
+Switch = tuple[str, bool]  # A fault's name, and whether it is switched on
 _WORDS = {"on": True, "off": False}
 
 

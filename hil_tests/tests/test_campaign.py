@@ -33,56 +33,45 @@ def rows_of(axis, *success):
 
 
 @pytest.mark.parametrize(
-    ("success", "limit"),
-    [
-        ((1.0, 0.99, 0.98, 0.97), 100),
-        ((1.0, 0.97, 1.0, 1.0), 0),  # What holds further out does not count: one may land between.
-        ((0.97, 1.0, 1.0, 1.0), None),
-        ((1.0, 1.0, 1.0, 1.0), 150),
-    ],
-)
-def test_the_limit_is_the_largest_value_up_to_which_all_hold(success, limit):
-    assert sweep.limit_of(DELAY, rows_of(DELAY, *success), 0.98) == limit
-
-
-@pytest.mark.parametrize(
-    ("success", "sentence"),
+    ("success", "limits", "sentence"),
     [
         (
-            {DELAY: (1.0, 1.0, 0.9, 0.9), LOSS: (1.0, 1.0)},
+            {DELAY: (1.0, 1.0, 0.9, 0.9), LOSS: (1.0, 1.0)}, (50, 10),
             "a policy holds at least 98% success up to 50 ms of delay and "
             "10 % of loss (the most that was tested), one at a time.",
         ),
-        ({DELAY: (0.9, 1.0, 1.0, 1.0)}, "a policy is below 98% success even on a perfect network."),
+        # What holds further out does not count: one may land between.
+        ({DELAY: (1.0, 0.97, 1.0, 1.0)}, (0,),
+         "a policy holds at least 98% success up to none of delay, one at a time."),
+        ({DELAY: (0.9, 1.0, 1.0, 1.0)}, (None,),
+         "a policy is below 98% success even on a perfect network."),
         # An axis whose own base fails takes nothing from the others.
         (
-            {LOSS: (1.0, 0.9), JITTER: (0.9, 1.0)},
+            {LOSS: (1.0, 0.9), JITTER: (0.9, 1.0)}, (0, None),
             "a policy holds at least 98% success up to none of loss, one at a time; "
             "on delay=1ms alone it is below that, so no jitter has a budget.",
         ),
     ],
-)
-def test_the_budgets_sentence(success, sentence):
+)  # fmt: skip
+def test_the_budget_is_the_largest_value_up_to_which_all_hold(success, limits, sentence):
     rows = {
         spec: row for axis, some in success.items() for spec, row in rows_of(axis, *some).items()
     }
     found = sweep.budget(list(success), rows, 0.98, "a policy")
     assert found["sentence"] == sentence
-    assert found["up_to_the_largest_tested"].get("loss") == (
-        None if LOSS not in success else success[LOSS][-1] == 1.0
-    )
+    assert tuple(found["limits"].values()) == limits
+    largest = {axis.name: axis.values[-1] for axis in success}
+    open_ended = {name: found["limits"][name] == most for name, most in largest.items()}
+    assert found["up_to_the_largest_tested"] == open_ended
 
 
-def test_every_axis_begins_without_trouble_and_gets_worse():
+def test_every_axis_gets_worse_and_parts_cover_each_seed_once():
     for axis in sweep.NETWORK_AXES:
         assert list(axis.values) == sorted(set(axis.values))
         assert len(set(axis.specs)) == len(axis.specs)
         assert axis.base == axis.specs[0]
     delays = next(axis.values for axis in sweep.NETWORK_AXES if axis.name == "delay")
     assert {0, 25, 250} <= set(delays)  # 0 to 500 ms there and back
-
-
-def test_parts_cover_each_seed_once():
     parts = sweep.Part("none", 7, 60).split(25)
     assert [part[1:] for part in parts] == [(7, 25), (32, 25), (57, 10)]
 
@@ -105,20 +94,6 @@ def row_of(*reports):
     return sweep.make_row("s", [sweep.worth_keeping(report) for report in reports])
 
 
-def test_a_row_joins_its_parts():
-    row = row_of(report_of(0, ["goal"] * 8, p99=110.0), report_of(8, ["collision"] * 2, p99=130.0))
-    # Wilson's 95 % interval of 8 in 10.
-    assert row["success"] == pytest.approx(
-        {"value": 0.8, "low": 0.49016, "high": 0.94331}, abs=1e-5
-    )
-    assert row["collision_rate"] == 0.2
-    assert row["safe_stops_per_episode"] == 0.2
-    assert row["safe_stop_reasons"] == {"no_feedback": 2}
-    assert row["ticks_without_new_command"] == 0.1
-    assert row["latency_ms"] == {"p50": 1.0, "p99": 130.0}
-    assert row["rejected"] == {"stale": 4}
-
-
 def vehicle_of(samples, rmse, lag_ms):
     return {
         "name": "hunter", "scale": 0.25, "samples": samples,
@@ -132,7 +107,18 @@ def vehicle_of(samples, rmse, lag_ms):
     }  # fmt: skip
 
 
-def test_errors_of_several_rigs_are_pooled_by_their_samples():
+def test_a_row_joins_its_parts():
+    row = row_of(report_of(0, ["goal"] * 8, p99=110.0), report_of(8, ["collision"] * 2, p99=130.0))
+    # Wilson's 95 % interval of 8 in 10.
+    assert row["success"] == pytest.approx(
+        {"value": 0.8, "low": 0.49016, "high": 0.94331}, abs=1e-5
+    )
+    assert (row["collision_rate"], row["safe_stops_per_episode"]) == (0.2, 0.2)
+    assert row["safe_stop_reasons"] == {"no_feedback": 2}
+    assert row["ticks_without_new_command"] == 0.1
+    assert row["latency_ms"] == {"p50": 1.0, "p99": 130.0}
+    assert row["rejected"] == {"stale": 4}
+    # Errors of several rigs are pooled by their samples.
     found = sweep.join_vehicles([vehicle_of(100, 0.3, 120.0), vehicle_of(300, 0.1, 140.0)])
     assert found["speed_error_mps"]["rmse"] == pytest.approx((0.25 * 0.09 + 0.75 * 0.01) ** 0.5)
     assert found["speed_error_mps"]["max"] == 0.6
@@ -180,15 +166,10 @@ def test_the_lag_budget_is_the_sum_up_to_which_every_point_holds():
         (none, "below 95% success at the least lag"),
     ):
         assert words in lag_sentence({"lag_budget": budgeted})
-
-
-def test_the_table_shows_lags_that_were_not_told_as_such():
-    rows = {row["spec"]: row for row in (row_at(0, 100, 20, 90), row_at(50, 200, 10, None, 1))}
-    found = {
-        "rows": rows, "runs": 20,
-        "lag_budget": sweep.lag_budget(list(rows.values()), 0.95),
-    }  # fmt: skip
-    text = render_sweep(found)
+    # The table shows lags that were not told as such.
+    two = [row_at(0, 100, 20, 90), row_at(50, 200, 10, None, 1)]
+    shown = {"rows": {row["spec"]: row for row in two}, "lag_budget": sweep.lag_budget(two, 0.95)}
+    text = render_sweep({**shown, "runs": 20})
     assert "| 100 | 100% (90) | - |" in text
     assert "| 200 | - | 50%* (-) |" in text
 
@@ -237,20 +218,18 @@ def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeyp
     assert len(edges) == 2
 
 
-def test_the_markdown_stands_beside_the_json(tmp_path):
-    out = tmp_path / "r.json"
+def test_the_markdown_stands_beside_the_json_or_that_is_said_before_the_work(tmp_path):
+    out, markdown = tmp_path / "r.json", tmp_path / "r.md"
     check_report(out)
     write_report(out, {"passed": True}, ["# Campaign", "", "all", ""])
     assert json.loads(out.read_text()) == {"passed": True}
-    assert (tmp_path / "r.md").read_text() == "# Campaign\n\nall\n"
-
-
-def test_what_could_not_be_written_is_said_before_the_work(tmp_path):
+    assert markdown.read_text() == "# Campaign\n\nall\n"
     with pytest.raises(UserError, match=r"r\.md is for the JSON"):
-        check_report(tmp_path / "r.md")
-    (tmp_path / "r.md").mkdir()
+        check_report(markdown)
+    markdown.unlink()
+    markdown.mkdir()
     with pytest.raises(UserError, match="is a directory"):
-        check_report(tmp_path / "r.json")
+        check_report(out)
 
 
 def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it():
@@ -261,8 +240,7 @@ def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it():
         if not report["safe_stops"]:
             break
     vehicle = report["vehicle"]
-    assert report["loop"] == "vehicle"
-    assert (vehicle["name"], vehicle["moving_starts"]) == ("hunter", 0)
+    assert (report["loop"], vehicle["name"], vehicle["moving_starts"]) == ("vehicle", "hunter", 0)
     assert vehicle["scale"] == pytest.approx(0.25)
     assert vehicle["samples"] > 20
     assert vehicle["speed_error_mps"]["max"] > 0.01
@@ -290,12 +268,10 @@ def test_in_virtual_time_a_drive_repeats_and_its_lag_grows_with_the_actuators():
     )
     assert dead == pytest.approx(lag_ms + 170, abs=30)
     assert slow > lag_ms + 100
-
-
-def test_a_vehicle_that_cannot_follow_is_stopped_by_its_driver():
-    driven, _ = drive_virtually(0, dead_time_s=3.0)
-    assert driven.stops >= 1
-    assert driven.outcome != "goal"
+    # A vehicle that cannot follow is stopped by its driver.
+    lost, _ = drive_virtually(0, dead_time_s=3.0)
+    assert lost.stops >= 1
+    assert lost.outcome != "goal"
 
 
 def test_the_sweep_as_a_command(tmp_path):
@@ -306,10 +282,9 @@ def test_the_sweep_as_a_command(tmp_path):
     assert found["rows"]["dead=50ms,constant=100ms"]["outcomes"] == {"goal": 2}
     (kept,) = (tmp_path / "r_rows").iterdir()
     (row,) = json.loads(kept.read_text())
-    kept.write_text("{")
-    assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 2
-    kept.write_text(json.dumps([{**row, "outcomes": {"kept": 2}}]))
-    assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == 0
+    for text, status in (("{", 2), (json.dumps([{**row, "outcomes": {"kept": 2}}]), 0)):
+        kept.write_text(text)
+        assert run_cli(main, ["vehicle", *options, "--out", str(out)]) == status
     again = json.loads(out.read_text())["sweep"]
     assert again["rows"]["dead=50ms,constant=100ms"]["outcomes"] == {"kept": 2}
     assert "| 100 | 100% (" in (tmp_path / "r.md").read_text()

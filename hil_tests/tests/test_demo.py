@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -13,7 +12,7 @@ from edge_runtime.util import UserError
 from hil_tests import demo
 from hil_tests.__main__ import main
 from hil_tests.demo import Demo
-from hil_tests.processes import Process
+from hil_tests.processes import Process, wait_until
 
 SMALL = (
     "--steps", "100", "--human-episodes", "20", "--human-minutes", "0.001", "--runs", "1",
@@ -37,10 +36,8 @@ def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(
         "left_turn.onnx", "left_turn.onnx.sig", "learning_curve.png", "drive.rrd",
         "in_process.json", "wire.json", "wire_latency.json", "keys", "run", "human",
     }  # fmt: skip
-    reports = [
-        json.loads((tmp_path / "demo" / f"{name}.json").read_text())
-        for name in ("in_process", "wire", "wire_latency")
-    ]
+    names = ("in_process", "wire", "wire_latency")
+    reports = [json.loads((tmp_path / "demo" / f"{name}.json").read_text()) for name in names]
     assert len({report["policy_id"] for report in reports}) == 1
     assert reports[2]["latency_ms"]["p50"] > 80
     for text in ("in process", "over Zenoh", "each way", "safe stops"):
@@ -56,16 +53,12 @@ def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(
     assert (tmp_path / "demo" / "left_turn.onnx").read_bytes() == policy
 
 
-def test_a_policy_without_signature_or_key_is_not_offered(tmp_path):
+def test_a_policy_without_signature_is_not_offered_and_a_failing_command_says_why(tmp_path):
     kept = Demo(tmp_path, runs=1)
     kept.policy.write_bytes(b"x")
     assert not kept.offer_kept()
-
-
-def test_a_background_command_that_fails_says_why(tmp_path):
-    missing = str(tmp_path / "none.onnx")
     with pytest.raises(UserError, match="does not exist"):
-        Process("edge_runtime", "run", "--policy", missing, ready="ready")
+        Process("edge_runtime", "run", "--policy", str(tmp_path / "none.onnx"), ready="ready")
 
 
 CHILD = """
@@ -93,9 +86,7 @@ def test_what_an_interrupted_command_keeps_is_waited_for(tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.DEVNULL,
         start_new_session=True,
     )  # fmt: skip
-    end_s = time.monotonic() + 30.0
-    while not (tmp_path / "ready").exists() and time.monotonic() < end_s:
-        time.sleep(0.02)
+    wait_until((tmp_path / "ready").exists, "the child")
     os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
     assert parent.wait(30) != 0
     assert (tmp_path / "kept").exists()

@@ -38,11 +38,6 @@ def command(**changes):
     return CommandSeen(**{**fields, "reason": "", **changes})
 
 
-def test_an_answer_in_time_to_a_known_state_is_safe():
-    assert unsafe_commands([command()], STATES) == []
-    assert unsafe_commands([command(sent_s=10.0 + REACTION_LIMIT_S)], STATES) == []
-
-
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
@@ -56,9 +51,8 @@ def test_each_way_to_be_unsafe_is_found(changes, why):
     (found,) = unsafe_commands([command(**changes)], STATES)
     assert why in found
     assert unsafe_commands([command(mode="safe_stop", **changes)], STATES) == []
-
-
-def test_a_stepped_clock_is_judged_by_arrival():
+    in_time = [command(), command(sent_s=10.0 + REACTION_LIMIT_S)]
+    assert unsafe_commands(in_time, STATES) == []
     stepped = [command(sent_s=3610.0)]
     assert unsafe_commands(stepped, STATES, by_arrival=True) == []
     assert unsafe_commands(stepped, STATES) != []
@@ -71,9 +65,7 @@ def test_safe_stops_at_the_pace_of_drives_are_no_drive():
     assert stops_between([command(), *stops], 9.9, 10.5) == ["safe stop: no_fresh_state"]
     assert stops_between([command()], 9.9, 10.5) == []
     assert stops_between(stops, 10.5, 11.0) == []
-
-
-def test_gaps_count_the_edges_of_the_window():
+    # Gaps count the edges of the window.
     assert longest_gap_s([1.0, 1.1, 1.5, 9.0], 0.9, 1.6) == pytest.approx(0.4)
     assert longest_gap_s([], 2.0, 5.0) == pytest.approx(3.0)
 
@@ -87,9 +79,7 @@ def test_mutations_repeat_by_seed_and_no_decoder_minds_them():
     reasons = {one.reason for one in read if isinstance(one, wire.Rejection)}
     assert {"malformed", "oversized", "not_finite"} <= {reason.value for reason in reasons}
     assert any(isinstance(one, wire.State) for one in read)  # a flipped bit in a picture is legal
-
-
-def test_the_senders_pictures_never_trip_a_faulty_policy():
+    # The sender's pictures never trip a faulty policy.
     assert np.frombuffer(make_state(1).frames, np.uint8).max() < 200
 
 
@@ -99,16 +89,13 @@ def judged(*tries, **outcome):
 
 def test_a_row_passes_only_within_its_limits():
     assert judged(Try(0.25, 1.0))["passed"]
-    assert judged(Try(0.251, 0.5))["reactions_late"] == 1
-    assert judged(Try(0.2, 1.001))["recoveries_late"] == 1
+    slow, late = judged(Try(0.251, 0.5)), judged(Try(0.2, 1.001))
+    assert (slow["reactions_late"], late["recoveries_late"]) == (1, 1)
     for bad in (
-        judged(Try(0.251, 0.5)),
-        judged(Try(0.2, 1.001)),
-        judged(Try(0.2, 0.5, wrong=["drove on"])),
-        judged(Try(0.2, 0.5), unsafe=["late"]),
-        judged(Try(0.2, 0.5), crashes=["edge"]),
+        slow, late, judged(Try(0.2, 0.5, wrong=["drove on"])),
+        judged(Try(0.2, 0.5), unsafe=["late"]), judged(Try(0.2, 0.5), crashes=["edge"]),
         judged(failures=["try 0: nothing"]),
-    ):
+    ):  # fmt: skip
         assert not bad["passed"]
 
 
@@ -123,15 +110,14 @@ def test_the_table_says_what_was_missed():
     assert "0 crashes and 1 unsafe commands" in table
 
 
-def test_every_row_has_a_name_of_its_own_and_others_are_refused():
+def test_rows_are_chosen_once_by_names_of_their_own_and_in_the_tables_order():
     names = [row.name for row in ROWS]
     assert len(set(names)) == len(names)
     for other in ("meteor", "meteor_*"):
         with pytest.raises(UserError, match=r"no fault 'meteor.*'; choose from .*edge_killed"):
             run_faults(1, [other])
-
-
-def test_patterns_choose_rows_once_and_in_the_tables_order():
+    hunters = {name for name in names if fnmatch.fnmatch(name, "hunter_*")}
+    assert hunters == {f"hunter_{name}" for name in FAULTS}
     chosen = [row.name for row in choose_rows(["vehicle_*", "vehicle_stuck", "edge_killed"])]
     assert chosen == ["edge_killed", "vehicle_silent", "vehicle_stuck", "vehicle_lying"]
 
@@ -164,11 +150,6 @@ def test_off_the_bus_it_stops_does_not_resume_by_itself_and_drives_once_rearmed(
     assert row["figures"]["stands, ms"] > 500.0  # by the chassis's own time-out: it hears nothing
 
 
-def test_every_fault_of_the_mock_has_a_row():
-    names = {row.name for row in ROWS if fnmatch.fnmatch(row.name, "hunter_*")}
-    assert names == {f"hunter_{name}" for name in FAULTS}
-
-
 @pytest.fixture
 def monitor():
     one = CanMonitor(f"virtual:monitor{next(_buses)}", (0x111, 0x221))
@@ -195,18 +176,9 @@ def test_frames_and_speeds_that_should_never_be_are_found(monitor):
     monitor.heard += asked((1.0, bytes.fromhex("06 40 00 00 00 00 00 00")))  # 1.6 m/s
     monitor.strange.append(Heard(1.0, 0x7DF, b""))
     assert hunter._kept_to_its_own(monitor) == ["0x7df was on the bus", "asked for 1.60 m/s"]
-
-
-def test_the_speed_of_a_frame_has_a_sign():
-    assert hunter.speed_mps(Heard(0.0, 0x221, FAST)) == pytest.approx(1.0)
     backwards = bytes.fromhex("FF 6A 00 00 00 00 00 00")
-    assert hunter.speed_mps(Heard(0.0, 0x221, backwards)) == pytest.approx(-0.15)
-
-
-def moved_between(truth, begin_s, end_s):
-    chassis = ChassisProcess.__new__(ChassisProcess)
-    chassis.truth = [Truth(since_s, "can", moves) for since_s, moves in truth]
-    return chassis.moved_between(begin_s, end_s)
+    speeds = [hunter.speed_mps(Heard(0.0, 0x221, data)) for data in (FAST, backwards)]
+    assert speeds == pytest.approx([1.0, -0.15])
 
 
 @pytest.mark.parametrize(
@@ -219,4 +191,6 @@ def moved_between(truth, begin_s, end_s):
     ],
 )
 def test_any_movement_in_between_is_found(truth, moved):
-    assert moved_between(truth, 1.0, 2.0) == moved
+    chassis = ChassisProcess.__new__(ChassisProcess)
+    chassis.truth = [Truth(since_s, "can", moves) for since_s, moves in truth]
+    assert chassis.moved_between(1.0, 2.0) == moved

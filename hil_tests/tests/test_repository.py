@@ -1,9 +1,4 @@
-"""Held by reading every file: imports, READMEs, and the --help of every command.
-
-Who may import whom, that what is imported is asked for, and that nothing from outside, a message or
-a file, is ever run as code. What the READMEs point at is there, and what their pictures are drawn
-from. Every command has ``--help`` with examples, and its own parser takes each of them.
-"""
+"""Held by reading every file: imports, READMEs, and the --help of every command."""
 
 import argparse
 import ast
@@ -93,52 +88,36 @@ def imported(path: Path) -> frozenset[str]:
 
 
 @pytest.mark.parametrize("folder", ARROWS)
-def test_a_folder_imports_only_what_stands_below_it(folder):
+def test_a_folder_imports_only_what_stands_below_it_and_no_heavy_library(folder):
     files = sources(folder)
     assert files
+    heavy = {library for library, folders in ONLY_IN.items() if folder not in folders}
     for path in files:
         neighbours = imported(path) & set(ARROWS) - {folder}
         assert neighbours <= ARROWS[folder], path
+        assert not imported(path) & heavy, path
 
 
 def test_the_edge_runtime_uses_only_libraries_that_a_board_has():
     for path in sources("edge_runtime"):
         foreign = imported(path) - set(sys.stdlib_module_names) - {"edge_runtime"}
-        behind_it = {library for library, door in DOORS.items() if path == door}
-        assert foreign <= EDGE_LIBRARIES | behind_it, path
-
-
-@pytest.mark.parametrize("library", DOORS)
-def test_a_vehicles_library_is_loaded_only_with_the_vehicle(library):
-    code = f"import sys, edge_runtime.run; assert {library!r} not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
-
-
-@pytest.mark.parametrize(("library", "folders"), ONLY_IN.items())
-def test_heavy_libraries_stay_where_they_belong(library, folders):
-    for folder in set(ARROWS) - folders:
-        for path in sources(folder):
-            assert library not in imported(path), path
-
-
-def test_the_check_can_fail(tmp_path):
-    bad = tmp_path / "bad.py"
-    bad.write_text("def f():\n    from trainer import x\n    import torch.nn\n")
-    assert imported(bad) == {"trainer", "torch"}
+        assert foreign <= EDGE_LIBRARIES | {name for name in DOORS if DOORS[name] == path}, path
 
 
 def test_every_library_that_is_imported_is_a_dependency():
     lines = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     asked_for = {re.split(r"[^\w.-]", line)[0].lower() for line in lines}
     modules = {name for part in ARROWS for path in sources(part) for name in imported(path)}
-    foreign = modules - {*ARROWS, *ELSEWHERE} - sys.stdlib_module_names
     installed = packages_distributions()
-    unasked = [
-        module
-        for module in foreign
-        if asked_for.isdisjoint(name.lower() for name in installed.get(module, ()))
-    ]
-    assert sorted(unasked) == []
+    for module in modules - {*ARROWS, *ELSEWHERE} - sys.stdlib_module_names:
+        names = {name.lower() for name in installed.get(module, ())}
+        assert names & asked_for, module
+
+
+@pytest.mark.parametrize("library", DOORS)
+def test_a_vehicles_library_is_loaded_only_with_the_vehicle(library):
+    code = f"import sys, edge_runtime.run; assert {library!r} not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
 def faults(tree: ast.AST) -> list[str]:
@@ -153,47 +132,38 @@ def test_nothing_shipped_runs_what_it_reads(folder):
         assert faults(tree_of(path)) == [], path
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
+def test_the_checks_can_fail(tmp_path):
+    bad = tmp_path / "bad.py"
+    bad.write_text("def f():\n    from trainer import x\n    import torch.nn\n")
+    assert imported(bad) == {"trainer", "torch"}
+    for line in (
         "import pickle", "from marshal import loads", "import cloudpickle as c", "eval(text)",
         "exec(open(p).read())", "torch.load(p)", "torch.load(p, weights_only=False)",
         "torch.load(p, weights_only=flag)", "np.load(p, allow_pickle=True)",
         "numpy.load(p, allow_pickle=flag)", "yaml.load(text)",
         "yaml.load(text, Loader=yaml.FullLoader)", "pandas.read_pickle(p)",
         "subprocess.run(text, shell=True)",
-    ],
-)  # fmt: skip
-def test_the_check_sees_it(line):
-    assert faults(ast.parse(f"def f():\n    {line}\n"))
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
+    ):  # fmt: skip
+        assert faults(ast.parse(f"def f():\n    {line}\n")), line
+    for line in (
         "model.eval()", "re.compile(text)", "torch.compile(model)",
         "torch.load(p, weights_only=True)", "np.load(p)",
         "yaml.load(text, Loader=yaml.SafeLoader)", "subprocess.run([name])",
-    ],
-)  # fmt: skip
-def test_the_check_lets_the_harmless_pass(line):
-    assert not faults(ast.parse(line))
+    ):  # fmt: skip
+        assert not faults(ast.parse(line)), line
 
-
-PACKAGES = ("edge_runtime", "bridge", "trainer", "deploy", "hil_tests")
 
 LEAST_WRITING = {"edge_runtime": 2, "bridge": 6, "trainer": 7, "deploy": 4, "hil_tests": 7}
 """Commands with an --out of those packages."""
 
 
-def find_programs():
-    """Every module with a parser of its own, as ``python -m`` names it."""
-    sources = [path for folder in PACKAGES for path in (ROOT / folder).rglob("*.py")]
-    texts = [path.read_text() for path in sources if "tests" not in path.parts]
-    return sorted({name for text in texts for name in re.findall(r'prog="python -m (\S+)"', text)})
-
-
-PROGRAMS = find_programs()
+PROGRAMS = sorted(
+    name
+    for folder in ARROWS
+    for path in sources(folder)
+    for name in re.findall(r'prog="python -m (\S+)"', path.read_text())
+)
+"""Every module with a parser of its own, as ``python -m`` names it."""
 
 
 class ParsedError(Exception):
@@ -246,7 +216,7 @@ def examples_in(text):
 def test_every_command_shows_examples_that_it_takes(program, only_parse):
     shown = help_of(program, [], only_parse)
     commands = [[name] for name in subcommands_in(shown)]
-    assert bool(commands) == (program in PACKAGES)
+    assert bool(commands) == (program in ARROWS)
     for words in [[], *commands]:
         found = examples_in(help_of(program, words, only_parse))
         assert found, f"python -m {program} {' '.join(words)} --help has no example"
@@ -273,16 +243,6 @@ def test_an_empty_name_of_what_is_written_is_refused(program, least, empty, only
         assert f"{name}: an empty value after --out (see" in only_parse[-1]
 
 
-def test_a_wrong_example_is_found_out(only_parse):
-    parser = ArgumentParser(prog="x", epilog=examples("python -m x --runs \\\n    two # runs"))
-    parser.add_argument("--runs", type=int)
-    (example,) = examples_in(parser.format_help())
-    assert example == ["x", "--runs", "two"]
-    with pytest.raises(SystemExit) as ended:
-        parser.parse_args(example[1:])
-    assert ended.value.code == 2
-
-
 def test_phil_runs_every_folder():
     """As installed: the script lies beside the Python that runs this test."""
     phil = Path(sys.executable).with_name("phil")
@@ -297,7 +257,7 @@ def test_phil_runs_every_folder():
         assert said in ended.stdout + ended.stderr
 
 
-def test_the_installer_shows_examples_that_it_takes():
+def test_the_installer_shows_examples_that_it_takes_and_takes_no_empty_root(capsys):
     parser = installer._parser()
     (commands,) = (
         action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
@@ -306,19 +266,12 @@ def test_the_installer_shows_examples_that_it_takes():
         text = " ".join(one.format_help().split())
         _, _, example = text.partition("example: sudo python3 install.pyz ")
         parser.parse_args(shlex.split(example))
-
-
-@pytest.mark.parametrize("empty", [["--root", ""], ["--root="]], ids=" ".join)
-def test_the_installer_takes_no_empty_root(empty, capsys):
-    """It would be the directory where one stands."""
-    with pytest.raises(SystemExit) as ended:
-        installer.main(["uninstall", *empty])
-    assert ended.value.code == 2
-    assert "an empty value" in capsys.readouterr().err
-
-
-def test_the_installer_takes_a_root_that_ends_with_an_equals_sign():
-    assert installer._parser().parse_args(["uninstall", "--root=/a="]).root == "/a="
+    assert parser.parse_args(["uninstall", "--root=/a="]).root == "/a="
+    for empty in (["--root", ""], ["--root="]):  # It would be the directory where one stands.
+        with pytest.raises(SystemExit) as ended:
+            installer.main(["uninstall", *empty])
+        assert ended.value.code == 2
+        assert "an empty value" in capsys.readouterr().err
 
 
 def test_examples_and_paragraphs_keep_their_lines():
@@ -339,12 +292,8 @@ READMES = sorted(
 )
 
 
-def test_every_folder_has_one():
-    folders = ("edge_runtime", "bridge", "trainer", "hil_tests", "deploy")
-    assert {Path(folder) / "README.md" for folder in folders} <= set(READMES)
-
-
-def test_the_front_page_is_one_page():
+def test_every_folder_has_one_and_the_front_page_is_one_page():
+    assert {Path(folder) / "README.md" for folder in ARROWS} <= set(READMES)
     assert len((ROOT / "README.md").read_bytes()) <= 8192
 
 
@@ -354,21 +303,14 @@ def anchors(text: str) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", each.lower()).strip().replace(" ", "-") for each in headings}
 
 
-@pytest.mark.parametrize("page", ["README.md", *(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))])
-def test_a_link_into_a_page_meets_a_heading(page):
-    for link, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", (ROOT / page).read_text()):
-        target = (ROOT / page).parent / link if link else ROOT / page
-        assert anchor in anchors(target.read_text()), (link, anchor)
-
-
 @pytest.mark.parametrize("readme", READMES, ids=str)
 def test_links_and_kept_files_exist_and_nothing_is_left_to_fill_in(readme):
-    text = (ROOT / readme).read_text()
-    links = re.findall(r"\]\(([^)#:]+)\)", text)
-    kept = re.findall(r"\bresults/[\w./-]+\.(?:onnx|pub|json|csv|md)\b", text)
-    for link in links:
-        assert (ROOT / readme.parent / link).exists(), link
-    for path in kept:
+    text, folder = (ROOT / readme).read_text(), ROOT / readme.parent
+    for link, anchor in re.findall(r"\]\(([^)#:]*)(?:#([^)]+))?\)", text):
+        target = folder / link if link else ROOT / readme
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target.read_text()), (link, anchor)
+    for path in re.findall(r"\bresults/[\w./-]+\.(?:onnx|pub|json|csv|md)\b", text):
         assert (ROOT / path).exists(), path
     assert "<!--" not in text
 
@@ -381,27 +323,19 @@ def test_security_names_every_port_that_speaks_plain_text_beside_tls():
 
 @pytest.mark.parametrize("readme", ["docs/first_day.md", "deploy/README.md"])
 def test_of_two_bundles_the_newest_one_is_pushed(readme, tmp_path):
-    """The command as it stands there, in a shell, with a program that tells its arguments."""
+    """The command's words as a shell reads them."""
     (command,) = re.findall(
         r"^python -m deploy push (?:.*\\\n)*.*$", (ROOT / readme).read_text(), re.M
     )
-    python = tmp_path / "python"
-    python.write_text('#!/bin/sh\nfor each in "$@"; do echo "$each"; done\n')
-    python.chmod(0o755)
     bundles = tmp_path / "build" / "bundles"
     bundles.mkdir(parents=True)
     for number, name in enumerate(("b", "a")):
         path = bundles / f"phil-jetpack5-hunter01-{name}.tar"
         path.touch()
         os.utime(path, (number, number))
-    path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
-    told = subprocess.run(
-        ["sh", "-c", command], cwd=tmp_path, env={"PATH": path}, capture_output=True, text=True,
-        check=True,
-    ).stdout.split()  # fmt: skip
-    assert [word for word in told if word.endswith(".tar")] == [
-        "build/bundles/phil-jetpack5-hunter01-a.tar"
-    ]
+    told = subprocess.check_output(["sh", "-c", f"echo {command}"], cwd=tmp_path, text=True)
+    found = [word for word in told.split() if word.endswith(".tar")]
+    assert found == ["build/bundles/phil-jetpack5-hunter01-a.tar"]
 
 
 def test_the_table_of_targets_is_that_of_the_bundles():
@@ -416,16 +350,11 @@ def test_the_table_of_targets_is_that_of_the_bundles():
 DOCS = ROOT / "docs"
 
 
-def test_the_table_of_pictures_is_that_of_the_command():
-    text = (DOCS / "README.md").read_text()
-    listed = re.findall(r"^\| \[(\S+)\]", text, re.M)
+def test_the_table_of_pictures_is_that_of_the_command_and_every_picture_is_small():
+    listed = re.findall(r"^\| \[(\S+)\]", (DOCS / "README.md").read_text(), re.M)
     assert set(pictures.PICTURES) <= set(listed)
     assert [name for name in listed if not (DOCS / name).is_file()] == []
-
-
-def test_every_picture_is_small():
-    heavy = [path.name for path in DOCS.glob("*.*") if path.stat().st_size > 2_000_000]
-    assert heavy == []
+    assert [path.name for path in DOCS.glob("*.*") if path.stat().st_size > 2_000_000] == []
 
 
 def test_the_guide_in_the_film_brakes_for_the_crash_and_hands_the_wheel_back():
