@@ -1,7 +1,3 @@
-"""Profiles: what they say, and one clear line where they are wrong."""
-
-from __future__ import annotations
-
 from itertools import product
 
 import pytest
@@ -105,42 +101,31 @@ def test_a_wrong_profile_is_one_line(tmp_path, change, complaint):
 class Trembling:
     """A wheel with two pedals whose axes tremble before they are held still; a look is a moment."""
 
-    def __init__(self) -> None:
-        self._coming = {0: [0.0], 1: [-1.0], 2: [-1.0]}
-        self._pressed: set[int] = set()
+    def __init__(self, answers):
+        self._answers, self._pressed = answers, set()
+        self._let_go()
+        self.get_name = lambda: 'A "quoted" wheel'
+        self.get_numaxes, self.get_numbuttons = lambda: 3, lambda: 12
+        self.get_axis = lambda axis: self._coming[axis][0]
+        self.get_button = self._pressed.__contains__
 
-    def look(self) -> None:
+    def _let_go(self):
+        self._coming = {0: [0.0], 1: [-1.0], 2: [-1.0]}
+
+    def look(self):
         for places in self._coming.values():
             if len(places) > 1:
                 places.pop(0)
 
-    def press(self, axis: int, place: float) -> None:
-        self._coming[axis] = [0.5, 0.7, 0.4, 0.6] * 5 + [place]
-
-    def answer(self, line: str, answers) -> None:
+    def answer(self, line):
         """Press what is asked for, and let go when told."""
-        for word, (axis, place) in answers.items():
+        for word, (axis, place) in self._answers.items():
             if word in line:
-                self.press(axis, place)
+                self._coming[axis] = [0.5, 0.7, 0.4, 0.6] * 5 + [place]
         if "let go" in line:
-            self._coming |= {0: [0.0], 1: [-1.0], 2: [-1.0]}
+            self._let_go()
         if "button" in line:
             self._pressed.add(7)
-
-    def get_name(self) -> str:
-        return 'A "quoted" wheel'
-
-    def get_numaxes(self) -> int:
-        return len(self._coming)
-
-    def get_axis(self, axis: int) -> float:
-        return self._coming[axis][0]
-
-    def get_numbuttons(self) -> int:
-        return 12
-
-    def get_button(self, number: int) -> bool:
-        return number in self._pressed
 
 
 ANSWERS = {"LEFT": (0, 0.5), "RIGHT": (0, -0.4), "THROTTLE": (2, 0.9), "BRAKE": (1, 1.0)}
@@ -153,8 +138,8 @@ def ask(monkeypatch):
         monkeypatch.setattr(module, name, value)
 
     def ask(answers):
-        wheel = Trembling()
-        return module.ask(wheel, wheel.look, lambda line: wheel.answer(line, answers))
+        wheel = Trembling(answers)
+        return module.ask(wheel, wheel.look, wheel.answer)
 
     return ask
 
@@ -165,19 +150,18 @@ def test_the_answers_become_a_profile(ask, tmp_path):
     profile = read_profile(path)
     assert (profile.name, profile.match) == ('A "quoted" wheel',) * 2
     assert profile.buttons == {"hold": (7,)}
-    places = {0: 0.5, 1: -1.0, 2: 0.9}
-    assert profile.action("congestion", places) == pytest.approx(-1.0, abs=0.01)
-    assert profile.action("congestion", {0: -0.4}) == pytest.approx(1.0, abs=0.01)
-    assert profile.action("left_turn", places) == pytest.approx(1.0, abs=0.01)
-    assert profile.action("left_turn", {2: -1.0, 1: 1.0}) == pytest.approx(-1.0, abs=0.01)
+    for scenario, places, action in (
+        ("congestion", {0: 0.5, 1: -1.0, 2: 0.9}, -1.0),
+        ("congestion", {0: -0.4}, 1.0),
+        ("left_turn", {0: 0.5, 1: -1.0, 2: 0.9}, 1.0),
+        ("left_turn", {2: -1.0, 1: 1.0}, -1.0),
+    ):
+        assert profile.action(scenario, places) == pytest.approx(action, abs=0.01)
 
 
-def test_left_and_right_on_different_axes_is_refused(ask):
+def test_left_and_right_on_different_axes_is_refused_and_no_answer_ends_it(ask, monkeypatch):
     with pytest.raises(UserError, match="left was axis 0, right axis 2"):
         ask({**ANSWERS, "RIGHT": (2, 0.5)})
-
-
-def test_no_answer_ends_it(ask, monkeypatch):
     monkeypatch.setattr(module, "PATIENCE_S", 0.3)
     with pytest.raises(UserError, match="no profile was written"):
         ask({})
