@@ -10,11 +10,12 @@ from trainer.tests.test_td3 import make_batch, weights_of
 
 @pytest.fixture
 def processor(tmp_path, monkeypatch):
-    """Pretend to have a processor of these flags."""
+    """Pretend to have a processor of these flags; None: there is no list of them."""
 
-    def pretend(text: str) -> None:
+    def pretend(text):
         info = tmp_path / "cpuinfo"
-        info.write_text(text)
+        if text is not None:
+            info.write_text(text)
         monkeypatch.setattr(networks, "CPU_INFO", info)
         networks.multiplies_bfloat16.cache_clear()
 
@@ -30,6 +31,7 @@ def processor(tmp_path, monkeypatch):
         ("flags : fma avx2 avx512f", False),
         ("Features : fp asimd ebf16x", False),
         ("", False),
+        (None, False),
     ],
 )
 def test_the_processors_flags_decide(processor, flags, multiplies):
@@ -37,26 +39,17 @@ def test_the_processors_flags_decide(processor, flags, multiplies):
     assert networks.multiplies_bfloat16("cpu") == multiplies
 
 
-def test_without_a_list_of_flags_there_is_none(processor, monkeypatch, tmp_path):
-    processor("")
-    monkeypatch.setattr(networks, "CPU_INFO", tmp_path / "none")
-    assert not networks.multiplies_bfloat16("cpu")
-
-
-def updated(precisions: tuple[str, ...]) -> list[dict[str, torch.Tensor]]:
-    """The weights after one update, for each precision."""
-    learners = [
-        TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
-        for name in precisions
-    ]
-    for learner in learners:
+def updated():
+    """The weights after one update, in float32 and in bfloat16."""
+    for name in ("float32", "bfloat16"):
+        learner = TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
         learner.update(make_batch())
-    return [weights_of(learner) for learner in learners]
+        yield weights_of(learner)
 
 
 def test_a_processor_without_bfloat16_learns_in_float32(processor):
     processor("flags : fma avx2")
-    single, reduced = updated(("float32", "bfloat16"))
+    single, reduced = updated()
     assert all((single[name] == reduced[name]).all() for name in single)
 
 
@@ -64,7 +57,7 @@ def test_a_processor_without_bfloat16_learns_in_float32(processor):
     not networks.multiplies_bfloat16("cpu"), reason="this processor has no bfloat16"
 )
 def test_a_processor_with_bfloat16_learns_in_it():
-    single, reduced = updated(("float32", "bfloat16"))
+    single, reduced = updated()
     for name in ("actor", "critics"):
         assert not torch.equal(single[name], reduced[name])
 
