@@ -7,7 +7,6 @@ import torch
 
 from deploy.certs import write_key_pair
 from edge_runtime.policy import load_policy, read_onnx
-from edge_runtime.tls import read_signing_key
 from edge_runtime.util import UserError
 from trainer import export as export_module
 from trainer.export import (
@@ -99,6 +98,3 @@ def test_a_wrong_key_leaves_no_file(exported, tmp_path):
     with pytest.raises(UserError, match="not a private key"):
         write_policy(exported, tmp_path / "policy.onnx", key)
     assert not (tmp_path / "policy.onnx").exists()
-    _, public = write_key_pair(tmp_path / "keys")
-    with pytest.raises(UserError):
-        read_signing_key(public)

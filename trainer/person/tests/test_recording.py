@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from bridge import recording as files
-from bridge.tests.test_recording import MIB, crafted, zeros
 from edge_runtime.files import try_to_lock_file
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
@@ -107,13 +105,6 @@ def test_another_file_is_refused(tmp_path, data):
     ):
         with pytest.raises(UserError, match=said):
             list(read_steps(tmp_path / name))
-
-
-def test_a_file_made_to_keep_its_reader_busy_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "MAX_CHUNK_BYTES", MIB)
-    path = crafted(tmp_path / "sitting-0001.mcap", *[(zeros(1), MIB)] * 40)
-    with pytest.raises(UserError, match=r"sitting-0001\.mcap is refused"):
-        list(read_steps(path))
 
 
 @pytest.mark.parametrize(("room", "refused"), [(500, "write"), (0, "close")])
