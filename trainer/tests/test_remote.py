@@ -52,7 +52,8 @@ class Kept:
     """Stands for ``LearningThread``: keeps what would be learned, as the replay's chain would."""
 
     def __init__(self):
-        self.rows, self.current = [], None
+        self.rows: list[tuple] = []
+        self.current: Any = None
 
     def start_episode(self, observation):
         self.current = observation

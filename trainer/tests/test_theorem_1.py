@@ -73,7 +73,7 @@ def intervention_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
     for place in np.ndindex(rewards.shape):
         state, _, following = place
         rewards[place] = equations.shaped_reward(
-            rewards[place], PENALTY, bool(unacceptable[following]), bool(unacceptable[state])
+            float(rewards[place]), PENALTY, bool(unacceptable[following]), bool(unacceptable[state])
         )
     return mdp._replace(rewards=rewards)
 

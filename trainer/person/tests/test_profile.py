@@ -102,7 +102,8 @@ class Trembling:
     """A wheel with two pedals whose axes tremble before they are held still; a look is a moment."""
 
     def __init__(self, answers):
-        self._answers, self._pressed = answers, set()
+        self._answers = answers
+        self._pressed: set[int] = set()
         self._let_go()
         self.get_name = lambda: 'A "quoted" wheel'
         self.get_numaxes, self.get_numbuttons = lambda: 3, lambda: 12
