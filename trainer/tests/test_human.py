@@ -1,19 +1,20 @@
 from dataclasses import replace
-from itertools import repeat
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from edge_runtime.util import UserError
-from trainer.drivers import EXPERTS, load_driver, make_environment
+from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.dagger import HumanTraining
 from trainer.human.guide import HumanGuide
 from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, Brakes, objections
+from trainer.tests.humans import BRAKE, FULL, Brakes, drive
 
 LABELLED = HumanModelConfig(updates_per_episode=1, batch_size=8, label_every_step=True)
 
@@ -122,34 +123,29 @@ def test_what_does_not_fit_together_is_refused(tmp_path):
         load_driver(str(tmp_path), LeftTurnEnv())
 
 
-ANYWHERE = repeat(True)
-
-
-class ScriptedTrigger:
-    def __init__(self, reasons, places=ANYWHERE):
-        self.reasons, self.places = iter(reasons), iter(places)
-
-    def reset(self):
-        pass
-
-    def judge(self, action):
-        return next(self.reasons)
-
-    def may_return(self):
-        return next(self.places)
-
-
 @pytest.mark.parametrize(("scenario", "drives"), [("left_turn", 20), ("congestion", 10)])
 def test_the_trigger_lets_the_expert_drive(scenario, drives):
     """Or the policy would be punished for driving like the human: theorem 1's assumption."""
     env = make_environment(scenario)
-    counted = objections(env, EXPERTS[scenario](env), drives)
-    assert counted == {"drives": drives, "arrived": drives, "objected_of_these": 0}
+    expert, trigger = EXPERTS[scenario](env), TRIGGERS[scenario](EXPERTS[scenario](env))
+
+    def judged(observation):
+        action = expert.act(observation)
+        assert trigger.judge(action) is None
+        return action
+
+    for seed in range(drives):
+        expert.reset()
+        trigger.reset()
+        assert drive(env, judged, seed)[1]["outcome"] == "goal"
 
 
-def watch(reasons, places=ANYWHERE, **hold):
+def watch(reasons, places=(), **hold):
     """What a human does of whom the trigger says so: its steps at the wheel, and those held."""
-    guide = HumanGuide(Brakes(), ScriptedTrigger(reasons, places), **hold)
+    judged, returned = iter(reasons), iter(places)
+    trigger: Any = SimpleNamespace(reset=lambda: None)
+    trigger.judge, trigger.may_return = lambda _: next(judged), lambda: next(returned, True)
+    guide = HumanGuide(Brakes(), trigger, **hold)
     steps = [guide.watch(np.zeros((2, 45, 80), np.uint8), FULL) for _ in reasons]
     taken = [step for step in steps if step]
     assert all(step.action is BRAKE for step in taken)
