@@ -48,11 +48,10 @@ def test_a_policy_file_answers_within_the_domain_as_the_edge_sends_it():
 @pytest.mark.parametrize("action", ["0", "-1", "0.25"])
 def test_one_action_throughout(action):
     driver, policy_id = load_driver(f"constant:{action}", make_environment("congestion"))
-    driver.reset()
-    answers = [driver.act(np.full((2, 45, 80), shade, np.uint8)) for shade in (0, 255)]
     assert policy_id == f"constant:{action}"
-    assert [answer.tolist() for answer in answers] == [[float(action)]] * 2
-    assert answers[0].dtype == np.float32
+    for shade in (0, 255):
+        answer = driver.act(np.full((2, 45, 80), shade, np.uint8))
+        assert (answer.dtype, answer.tolist()) == (np.float32, [float(action)])
 
 
 @pytest.mark.parametrize("action", ["", "fast", "nan", "1.5", "-2", "inf"])

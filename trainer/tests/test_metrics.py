@@ -32,14 +32,18 @@ def test_a_row_that_was_cut_off_is_left_out(kept, tmp_path):
     assert [each["episode"] for each in read_metrics(tmp_path)] == ["0", "1"]
 
 
-def test_what_goes_on_after_a_cut_begins_a_new_row(tmp_path):
+def test_what_goes_on_after_a_cut_begins_a_new_row_and_a_full_disk_is_one_line(tmp_path):
     write(tmp_path, [row(0), row(1), row(2)[:40]])
     writer = MetricsWriter(tmp_path, 2)
     writer.add(metrics_of(2))
-    writer.close()
     rows = read_metrics(tmp_path)
     assert [each["episode"] for each in rows] == ["0", "1", "2"]
     assert rows[2]["distance_m"] == "2.5"
+    with Path("/dev/full").open("w") as writer._file:
+        writer._csv = csv.DictWriter(writer._file, NAMES)
+        with pytest.raises(UserError, match="No space left on device"):
+            writer.add(metrics_of(0))
+        writer.close()
 
 
 def test_a_run_from_before_a_column_is_read_and_goes_on(tmp_path):
@@ -76,16 +80,6 @@ def test_a_curve_needs_no_value_that_a_row_may_go_without(capsys, tmp_path):
     names = ("validation_success", "validation_distance_m", "validation_reward")
     write(tmp_path, [*(row(episode, **dict.fromkeys(names, "")) for episode in (0, 1)), ""])
     assert call(capsys, "plot", str(tmp_path))[0] == 0
-
-
-def test_a_full_disk_is_one_line(tmp_path):
-    writer = MetricsWriter(tmp_path)
-    writer._file.close()
-    with Path("/dev/full").open("w") as writer._file:
-        writer._csv = csv.DictWriter(writer._file, NAMES)
-        with pytest.raises(UserError, match="No space left on device"):
-            writer.add(metrics_of(0))
-        writer.close()
 
 
 def test_a_run_is_summed_up():

@@ -1,3 +1,5 @@
+from collections import Counter
+
 import pytest
 import torch
 
@@ -69,20 +71,18 @@ def test_every_picture_of_an_update_is_embedded_in_its_precision(processor, monk
     embed, reduced = Picture.forward, []
 
     def spy(self, frames):
-        reduced.append((id(self), torch.is_autocast_enabled("cpu")))
-        # Whatever this processor can do.
-        with torch.autocast("cpu", enabled=False):
+        reduced.append((self, torch.is_autocast_enabled("cpu")))
+        with torch.autocast("cpu", enabled=False):  # whatever this processor can do
             return embed(self, frames)
 
     monkeypatch.setattr(Picture, "forward", spy)
     batch = make_batch()
     learner = TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
     learner.update(batch)
-    online = [learner.actor, *learner.critics.pair]
-    targets = [learner.target_actor, *learner.target_critics.pair]
-    used = [*online, *targets, learner.target_critics.first]
-    embedded = [id(network.picture) for network in used]
-    assert sorted(reduced) == sorted((network, name == "bfloat16") for network in embedded)
+    targets = learner.target_critics
+    used = [learner.actor, *learner.critics.pair, learner.target_actor, *targets.pair]
+    wanted = Counter((network.picture, name == "bfloat16") for network in [*used, targets.first])
+    assert Counter(reduced) == wanted
     reduced.clear()
     learner.act(batch.frames[0])
-    assert reduced == [(id(learner.actor.picture), False)]
+    assert reduced == [(learner.actor.picture, False)]

@@ -1,3 +1,4 @@
+import re
 from itertools import product
 
 import pytest
@@ -55,13 +56,10 @@ def test_a_pedal_goes_from_nothing_to_all(released, pressed, dead_zone, share):
     assert 0.0 <= pedal.action(released + share * (pressed - released)) <= 1.0
 
 
-def test_within_the_dead_zone_nothing_happens_and_at_its_edge_nothing_jumps():
-    steering = Steering(0, dead_zone=0.2)
-    assert [steering.action(place) for place in (-0.2, 0.1, 0.2)] == pytest.approx([0.0, 0.0, 0.0])
-    assert steering.action(0.21) == pytest.approx(0.0125)
-
-
-def test_what_is_shipped_is_at_rest_at_rest_and_the_g29s_pedals_and_wheel():
+def test_at_rest_nothing_happens_and_at_the_dead_zones_edge_nothing_jumps():
+    steering, places = Steering(0, dead_zone=0.2), (-0.2, 0.1, 0.2, 0.21)
+    actions = [steering.action(place) for place in places]
+    assert actions == pytest.approx([0.0, 0.0, 0.0, 0.0125])
     g29, pad = (read_profile(SHIPPED / name) for name in ("g29.toml", "gamepad.toml"))
     for profile, scenario in product((g29, pad), ("left_turn", "congestion")):
         assert profile.action(scenario, {}) == 0.0
@@ -71,31 +69,28 @@ def test_what_is_shipped_is_at_rest_at_rest_and_the_g29s_pedals_and_wheel():
 
 
 @pytest.mark.parametrize(
-    ("change", "complaint"),
+    ("found", "wrong", "complaint"),
     [
-        (("axis = 0", "axis = -1"), "steering.axis"),
-        (("axis = 0", 'axis = "x"'), "steering.axis"),
-        (("axis = 0", "axis = 0\nwheel = 1"), "unknown field `wheel`"),
-        (("axis = 0", "axis = 0\nleft = 0.5\ncentre = 0.0\nright = 1.0"), "centre is not between"),
-        (("axis = 1", "axis = 1\nreleased = 1.0"), "not 0.02 apart"),
-        (('name = "mine"', ""), "missing required field `name`"),
-        (("hold = [0]", ""), "buttons.hold is empty"),
-        (("hold = [0]", "hold = [0]\nfly = [1]"), "Invalid enum value 'fly'"),
-        (('name = "mine"', 'name = "mine"\nrest = 0.5'), "rest must be below threshold"),
-        (('name = "mine"', 'name = "mine"\ntake_over = "shouting"'), "shouting"),
-        (("axis = 0", "axis = "), "is no TOML"),
+        ("axis = 0", "axis = -1", "steering.axis"),
+        ("axis = 0", 'axis = "x"', "steering.axis"),
+        ("axis = 0", "axis = 0\nwheel = 1", "unknown field `wheel`"),
+        ("axis = 0", "axis = 0\nleft = 0.5\ncentre = 0.0\nright = 1.0", "centre is not between"),
+        ("axis = 1", "axis = 1\nreleased = 1.0", "not 0.02 apart"),
+        ('name = "mine"', "", "missing required field `name`"),
+        ("hold = [0]", "", "buttons.hold is empty"),
+        ("hold = [0]", "hold = [0]\nfly = [1]", "Invalid enum value 'fly'"),
+        ('name = "mine"', 'name = "mine"\nrest = 0.5', "rest must be below threshold"),
+        ('name = "mine"', 'name = "mine"\ntake_over = "shouting"', "shouting"),
+        ("axis = 0", "axis = ", "is no TOML"),
     ],
 )
-def test_a_wrong_profile_is_one_line(tmp_path, change, complaint):
+def test_a_wrong_profile_is_one_line(tmp_path, found, wrong, complaint):
     path = tmp_path / "wrong.toml"
     path.write_text(GOOD)
     assert read_profile(path).threshold == 0.15
-    path.write_text(GOOD.replace(*change))
-    with pytest.raises(UserError) as error:
+    path.write_text(GOOD.replace(found, wrong))
+    with pytest.raises(UserError, match=f"^.*{path}.*{re.escape(complaint)}.*$"):
         read_profile(path)
-    assert complaint in str(error.value)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 class Trembling:
