@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import structs
 
 from trainer.drivers import make_environment
-from trainer.person.interface import LET_GO, Moving, Reading, View
+from trainer.person.interface import LET_GO, Moving, Reading, View, Wish
 from trainer.person.recording import Recorder, Step
 from trainer.person.session import Sitting
 
@@ -51,7 +51,8 @@ class Discarding(Puppet):
         self._discarded, self._episodes = set(discarded), episodes
 
     def poll(self, now_s: float) -> Reading:
-        seen, wishes = self.views[-1], set()
+        seen = self.views[-1]
+        wishes: set[Wish] = set()
         if seen.message.startswith("episode"):
             wishes |= {"quit"} if seen.episode + 1 == self._episodes else set()
             wishes |= {"discard"} if seen.episode in self._discarded else set()

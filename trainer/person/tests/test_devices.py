@@ -1,6 +1,7 @@
 import time
 from dataclasses import replace
 from itertools import count
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -164,10 +165,14 @@ def opened(monkeypatch):
     pygame.quit()
 
 
+def shown() -> Any:
+    """What is in the window."""
+    return pygame.display.get_surface()
+
+
 def found(colour):
     """Where a colour is seen in the window, as (left, top, right, bottom)."""
-    surface = pygame.display.get_surface()
-    mask = pygame.mask.from_threshold(surface, colour, (12, 12, 12, 255))
+    mask = pygame.mask.from_threshold(shown(), colour, (12, 12, 12, 255))
     boxes = mask.get_bounding_rects()
     assert boxes, "not seen"
     return boxes[0].unionall(boxes[1:])
@@ -195,7 +200,7 @@ def test_a_window_that_is_resized_shows_all_of_it_in_its_shape(opened):
 @pytest.mark.parametrize("control", ["policy", "human", "returning"])
 def test_the_car_has_the_colour_of_who_drives(opened, control):
     opened(1920, 1080).show(replace(first_view(), control=control, human_action=0.0))
-    car = pygame.surfarray.array3d(pygame.display.get_surface().subsurface((0, 0, 736, 400)))
+    car = pygame.surfarray.array3d(shown().subsurface((0, 0, 736, 400)))
     seen = set(map(tuple, car.reshape(-1, 3).tolist()))
     drivers = {rerun.POLICY, rerun.HUMAN, rerun.RETURNING}
     assert seen & drivers == {rerun.BY_NAME[control]}
