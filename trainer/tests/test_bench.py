@@ -20,9 +20,9 @@ TINY = bench.Effort(
 
 
 def test_contenders_take_turns_and_none_is_always_first(monkeypatch):
-    clock = count()
     calls: list[str] = []
     ticks: list[str] = []
+    clock = count()
     monkeypatch.setattr(bench.time, "perf_counter", lambda: float(next(clock)))
     contenders = {name: partial(calls.append, name) for name in "abc"}
     times = bench.take_turns(contenders, 4, 2, ticks.append)
@@ -160,18 +160,16 @@ def test_a_viewer_that_draws_nothing_is_found_out():
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_both_drives_meet_the_same_traffic(scenario):
     env, picture = make_environment(scenario), bench.HighwayPicture(make_environment(scenario))
-    ends: dict[str, list[bool]] = {"ours": [], "highway_env": []}
+    ends: list[list[bool]] = [[], []]
 
-    def ours(action):
-        ends["ours"].append(any(env.step(action)[2:4]))
-        return ends["ours"][-1]
+    def noted(place, ended):
+        ends[place].append(ended)
+        return ended
 
-    def highway_env(action):
-        ends["highway_env"].append(picture.step(action)[1])
-        return ends["highway_env"][-1]
-
-    for drive in (bench.driving(ours, env.reset), bench.driving(highway_env, picture.reset)):
-        for _ in range(150):
-            drive()
-    assert ends["ours"] == ends["highway_env"]
-    assert any(ends["ours"])
+    ours = bench.driving(lambda action: noted(0, any(env.step(action)[2:4])), env.reset)
+    theirs = bench.driving(lambda action: noted(1, picture.step(action)[1]), picture.reset)
+    for _ in range(150):
+        ours()
+        theirs()
+    assert ends[0] == ends[1]
+    assert any(ends[0])

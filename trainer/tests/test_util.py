@@ -12,13 +12,10 @@ from trainer.tests.test_commands import refusal
 
 @pytest.mark.parametrize("command", ["train", "human"])
 def test_a_second_training_in_a_directory_is_refused(command, capsys, tmp_path):
-    run_dir = tmp_path / "run"
-    with util.claimed(run_dir):
-        (run_dir / "metrics.csv").write_text("the first's")
-        err = refusal(capsys, command, "--out", str(run_dir), "--episodes", "1")
-        assert f"{run_dir} is being trained in by process {os.getpid()} on " in err
-    assert [path.name for path in run_dir.iterdir()] == ["metrics.csv"]
-    assert (run_dir / "metrics.csv").read_text() == "the first's"
+    with util.claimed(tmp_path):
+        err = refusal(capsys, command, "--out", str(tmp_path), "--episodes", "1")
+        assert f"{tmp_path} is being trained in by process {os.getpid()} on " in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_directory_that_nothing_came_into_goes_again(tmp_path):
@@ -33,6 +30,9 @@ def test_a_directory_that_nothing_came_into_goes_again(tmp_path):
 
 def test_what_a_killed_process_leaves_keeps_nobody_out(tmp_path):
     lock = tmp_path / util.LOCK_FILE
+    for nameless in (b"", b"\xff", b"[]", b"{}"):
+        lock.write_bytes(nameless)
+        assert util.holder(lock) == "another process"
     lock.write_text('{"pid": 1, "host": "elsewhere", "more": "than we write"}')
     with util.claimed(tmp_path):
         assert util.holder(lock).startswith(f"process {os.getpid()} on ")
@@ -58,12 +58,6 @@ def test_a_lock_whose_file_was_taken_away_is_no_lock(tmp_path, monkeypatch):
     assert not path.exists()
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff", b"[]", b"{}"])
-def test_a_holder_without_a_name_is_another_process(content, tmp_path):
-    (tmp_path / "lock").write_bytes(content)
-    assert util.holder(tmp_path / "lock") == "another process"
-
-
 def test_a_lock_that_cannot_be_had_is_one_line(tmp_path):
     (tmp_path / util.LOCK_FILE).mkdir()
     with pytest.raises(UserError, match="cannot lock"), util.claimed(tmp_path):
@@ -74,7 +68,12 @@ def test_a_lock_that_cannot_be_had_is_one_line(tmp_path):
 @pytest.mark.parametrize("heeded", [True, False])
 def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number, heeded):
     before, asked = [signal.getsignal(each) for each in util.SIGNALS], []
-    with util.quit_on_signals(lambda: asked.append(number) or heeded):
+
+    def ask():
+        asked.append(number)
+        return heeded
+
+    with util.quit_on_signals(ask):
         assert [signal.getsignal(each) for each in util.SIGNALS] != before
         if heeded:
             signal.raise_signal(number)
@@ -105,34 +104,29 @@ def test_what_is_out_of_range_is_told_the_range(name, value, said):
     LearnerConfig(priority_offset=1e-30, gamma=1.0, batch_size=1)
 
 
-def git(directory, *arguments: str) -> str:
-    named = ("-c", "user.name=a", "-c", "user.email=a@b")
-    command = ["git", *named, *arguments]
-    done = subprocess.run(command, cwd=directory, check=True, capture_output=True, text=True)
-    return done.stdout.strip()
-
-
 def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
+    def git(*arguments):
+        command = ["git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments]
+        done = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True)
+        return done.stdout.strip()
+
     code, human = tmp_path / "trainer" / "code.py", tmp_path / "results" / "humans" / "human.pt"
     paper = tmp_path / "results" / "paper"
-    table, unit = paper / "README.md", paper / "left_turn.jsonl"
-    for path in (code, human, table, unit):
+    written = [paper / "README.md", paper / "left_turn.jsonl"]
+    for path in (code, human, *written):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("as committed")
-    git(tmp_path, "init", "-q")
-    git(tmp_path, "add", "-A")
-    git(tmp_path, "commit", "-qm", "all")
-    commit = git(tmp_path, "rev-parse", "HEAD")
-    table.write_text("a run has written")
-    unit.write_text("another one")
-    (unit.parent / "fig7.png").write_text("new")
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-qm", "all")
+    commit = git("rev-parse", "HEAD")
+    for path in (*written, paper / "fig7.png"):
+        path.write_text("a run has written")
     assert util.revision_of(code.parent) == commit
     for path in (human, code):
         path.write_text("changed")
         assert util.revision_of(code.parent) == f"{commit}-dirty"
         path.write_text("as committed")
-
-
-def test_outside_of_a_repository_it_is_unknown_and_a_process_keeps_the_one_it_began_with(tmp_path):
-    assert util.revision_of(tmp_path) == "unknown"
+    # Outside of a repository it is unknown, and a process keeps the one that it began with.
+    assert util.revision_of(tmp_path.parent) == "unknown"
     assert util.source_revision() is util.source_revision()
