@@ -51,30 +51,16 @@ EXAMPLE = examples(
     "python -m trainer bench --threads 2 --out b.json",
 )
 OURS, FLOAT32, SB3, HIGHWAY = "ours", "ours_float32", "stable_baselines3", "highway_env_grayscale"
-PEERS = {
-    FLOAT32: "the same in float32",
-    SB3: "Stable-Baselines3 TD3",
-    HIGHWAY: "highway-env grayscale",
-}
-SB3_BAR = 4.0
-"""At least as many times Stable-Baselines3's updates."""
-ENVIRONMENT_BARS = {"left_turn": 10.0, "congestion": 8.0}
-"""At least as many times highway-env's steps."""
+PEERS = {FLOAT32: "the same in float32", SB3: "Stable-Baselines3 TD3",
+         HIGHWAY: "highway-env grayscale"}  # fmt: skip
+BARS = {"learner": (SB3, 4.0), "left_turn": (HIGHWAY, 10.0), "congestion": (HIGHWAY, 8.0)}
+"""Ours is to be at least so many times as fast as this peer."""
 TRANSITIONS = 1000
 """In each learner's buffer, not the paper's 100,000: drawing from a full one costs no more."""
 PARTS = ("environment", "acting", "storing", "learning", "waiting")
-HUMAN_SHARE = 0.2
-"""About what a guided run's buffer holds; the Q advantage is computed for these only."""
-FEATURES = 1792
-GREY_WEIGHTS = [0.2989, 0.5870, 0.1140]
-"""Red, green and blue in the grey value, as in highway-env's documentation."""
-FILE_WIDTH = 120
-Work = Callable[[], object]
-"""A contender's piece of work: an update, or a step."""
-Times = dict[str, list[float]]
-"""Contender -> seconds of a piece of its work, round by round."""
-Tick = Callable[[str], None]
-"""Told what was done, once a round."""
+Work = Callable[[], object]  # a contender's piece of work: an update, or a step
+Times = dict[str, list[float]]  # contender -> seconds of a piece of its work, round by round
+Tick = Callable[[str], None]  # told what was done, once a round
 
 
 @dataclass(frozen=True)
@@ -93,9 +79,7 @@ class Effort:
         return self.rounds * (1 + len(SCENARIOS)) + self.training_episodes
 
 
-FULL = Effort()
-QUICK = Effort(rounds=4, updates_per_round=3, training_episodes=3)
-"""A look, not a measurement."""
+FULL, QUICK = Effort(), Effort(rounds=4, updates_per_round=3, training_episodes=3)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -129,9 +113,7 @@ def measure(effort: Effort, tick: Tick) -> dict[str, Any]:
         "torch": torch.__version__,
         "source_revision": source_revision(),
         "learner_ms_per_update": learner["ms_per_update"],
-        "environment_steps_per_s": {
-            name: figures["steps_per_s"] for name, figures in environment.items()
-        },
+        "environment_steps_per_s": {name: it["steps_per_s"] for name, it in environment.items()},
         "train_s_per_10k_steps": training["s_per_10k_steps"],
         "learner": learner,
         "environment": environment,
@@ -139,9 +121,7 @@ def measure(effort: Effort, tick: Tick) -> dict[str, Any]:
     }
 
 
-def take_turns(
-    contenders: Mapping[str, Work], rounds: int, pieces: int, tick: Tick = lambda done: None
-) -> Times:
+def take_turns(contenders: Mapping[str, Work], rounds: int, pieces: int, tick: Tick) -> Times:
     """So many pieces of each contender's work a round, after one round that is not counted.
 
     The one that begins a round ends the next: none is always measured first.
@@ -195,9 +175,7 @@ def measure_learner(effort: Effort, tick: Tick) -> dict[str, Any]:
 
 
 def figures(times: Times, name: str, of: Callable[[float], float]) -> dict[str, Any]:
-    """A figure ``of`` the median time of ours and of each peer, and how many times as long each
-    peer takes.
-    """
+    """A figure ``of`` the median times, and how many times as long as ours each peer takes."""
     medians = {each: float(np.median(times[each])) for each in times}
     ours = medians.pop(OURS)
     peers = {peer: {name: of(its), "ratio": its / ours} for peer, its in medians.items()}
@@ -205,12 +183,7 @@ def figures(times: Times, name: str, of: Callable[[float], float]) -> dict[str, 
 
 
 def driving(step: Callable[[NDArray[np.float32]], bool], reset: Callable[..., Any]) -> Work:
-    """A step under an action at random, and so on episode after episode.
-
-    Args:
-        step: takes an action [1] and says whether the episode ended.
-        reset: starts the episode with ``seed``.
-    """
+    """Random actions, episode after episode: ``step`` takes one, [1], and says whether it ended."""
     random, seeds = np.random.default_rng(0), count()  # All contenders drive the same episodes.
     reset(seed=next(seeds))
 
@@ -240,7 +213,7 @@ def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
     episodes: list[EpisodeMetrics] = []
     with tempfile.TemporaryDirectory() as directory:
         run = TrainingRun(config, Path(directory))
-        try:
+        with contextlib.closing(run.learning):
             while run.learning.added < learner.warmup_steps:
                 run.advance()
             began_s = time.perf_counter()
@@ -248,8 +221,6 @@ def measure_training(effort: Effort, tick: Tick) -> dict[str, Any]:
                 episodes.append(run.advance())
                 tick("training")
             whole_s = time.perf_counter() - began_s
-        finally:
-            run.learning.close()
     return training_figures(episodes, whole_s)
 
 
@@ -271,8 +242,7 @@ def show(report: dict[str, Any]) -> None:
         table.add_column(name, no_wrap=number, justify="right" if number else "left")
     for row in rows(report):
         table.add_row(*row)
-    # A file has no width; rich would fold its lines at 80.
-    width = None if sys.stdout.isatty() else FILE_WIDTH
+    width = None if sys.stdout.isatty() else 120  # a file has none; rich would fold at 80
     Console(markup=False, highlight=False, width=width).print(table)
 
 
@@ -280,22 +250,19 @@ def rows(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     """The lines of what was measured: ours beside each peer's, and whether the bar is met."""
     learner, seconds = report["learner"], report["training"]["s_per_10k_steps"]
     what = f"PHIL-TD3 update, batch {learner['batch_size']}, ms"
-    measured = [(what, learner, "ms_per_update", {SB3: SB3_BAR})]
-    for scenario, found in report["environment"].items():
-        bars = {HIGHWAY: ENVIRONMENT_BARS[scenario]}
-        measured.append((f"{scenario} with observation, steps/s", found, "steps_per_s", bars))
-    for text, found, key, bars in measured:
-        ours = f"{found[key]:.1f}"
-        for name, peer in found["peers"].items():
-            ratio, bar = peer["ratio"], ""
-            if name in bars:
-                bar = f"≥ {bars[name]:g}  {'met' if ratio >= bars[name] else 'MISSED'}"
-            yield text, ours, f"{peer[key]:.1f}  {PEERS[name]}", f"{ratio:.2f}", bar
-        for name in bars.keys() - found["peers"]:
-            yield text, ours, f"{PEERS[name]} is not installed", "", ""
+    measured = [("learner", what, learner, "ms_per_update")]
+    for name, found in report["environment"].items():
+        measured.append((name, f"{name} with observation, steps/s", found, "steps_per_s"))
+    for name, text, found, key in measured:
+        (rival, least), ours = BARS[name], f"{found[key]:.1f}"
+        for peer, its in found["peers"].items():
+            verdict = "met" if its["ratio"] >= least else "MISSED"
+            bar = f"≥ {least:g}  {verdict}" if peer == rival else ""
+            yield text, ours, f"{its[key]:.1f}  {PEERS[peer]}", f"{its['ratio']:.2f}", bar
+        if rival not in found["peers"]:
+            yield text, ours, f"{PEERS[rival]} is not installed", "", ""
     yield "training, s per 10,000 steps", f"{seconds['total']:.1f}"
-    for name in PARTS:
-        yield f"  of it {name}", f"{seconds[name]:.1f}"
+    yield from ((f"  of it {name}", f"{seconds[name]:.1f}") for name in PARTS)
 
 
 class Experience(NamedTuple):
@@ -304,7 +271,7 @@ class Experience(NamedTuple):
     frames: NDArray[np.uint8]  # [n + 1, 2, 45, 80]
     actions: NDArray[np.float32]  # [n, 1]
     rewards: NDArray[np.float32]  # [n]
-    human: NDArray[np.bool_]  # [n]
+    human: NDArray[np.bool_]  # [n]; in a fifth of the steps, about as in a guided run
 
 
 def gather(size: int, seed: int = 0) -> Experience:
@@ -314,7 +281,7 @@ def gather(size: int, seed: int = 0) -> Experience:
         frames=real_observations("left_turn", size + 1, seed),
         actions=random.uniform(-1, 1, (size, 1)).astype(np.float32),
         rewards=random.normal(size=size).astype(np.float32),
-        human=random.random(size) < HUMAN_SHARE,
+        human=random.random(size) < 0.2,
     )
 
 
@@ -322,9 +289,7 @@ def filled(experience: Experience) -> ReplayBuffer:
     """A buffer of ours that holds all of it."""
     replay = ReplayBuffer(len(experience.actions))
     replay.start_episode(experience.frames[0])
-    for action, reward, frames, human in zip(
-        experience.actions, experience.rewards, experience.frames[1:], experience.human, strict=True
-    ):
+    for action, reward, human, frames in zip(*experience[1:], experience.frames[1:], strict=True):
         replay.add(action, float(reward), frames, False, bool(human))
     return replay
 
@@ -333,10 +298,7 @@ def make_sb3_model(experience: Experience) -> Any:
     """Stable-Baselines3's TD3 with the networks of tables A2 and A3, its replay filled.
 
     It does less than the paper asks for: both critics share one features extractor, the replay is
-    uniform, and there is no Q advantage and no behaviour cloning.
-
-    Raises:
-        ImportError: it is not installed.
+    uniform, and there is no Q advantage and no behaviour cloning. ImportError: it isn't installed.
     """
     from stable_baselines3 import TD3
     from stable_baselines3.common.logger import Logger
@@ -346,28 +308,20 @@ def make_sb3_model(experience: Experience) -> Any:
         """The paper's two convolutions; the library normalises the pictures before."""
 
         def __init__(self, space: gymnasium.Space[Any]) -> None:
-            super().__init__(space, FEATURES)
+            super().__init__(space, features_dim=1792)
             first, second = nn.Conv2d(2, 6, 6), nn.Conv2d(6, 16, 6)
             pooled = [first, nn.ReLU(), nn.MaxPool2d(2), second, nn.ReLU(), nn.MaxPool2d(2)]
             self.layers = nn.Sequential(*pooled, nn.Flatten())
 
         def forward(self, images: torch.Tensor) -> torch.Tensor:
-            """Features [batch, 1792] of float images [batch, 2, 45, 80] in [0, 1]."""
             return self.layers(images)
 
     size = len(experience.actions)
     model = TD3(
-        "CnnPolicy",
-        gymnasium.make(SCENARIOS["left_turn"]),
-        learning_rate=2e-4,
-        gamma=0.95,
-        tau=1e-3,
-        buffer_size=size,
-        policy_delay=1,
+        "CnnPolicy", gymnasium.make(SCENARIOS["left_turn"]), learning_rate=2e-4, gamma=0.95,
+        tau=1e-3, buffer_size=size, policy_delay=1, device="cpu", seed=0,
         policy_kwargs={"features_extractor_class": Trunk, "net_arch": [256, 128, 64]},
-        device="cpu",
-        seed=0,
-    )
+    )  # fmt: skip
     model.set_logger(Logger(folder=None, output_formats=[]))
     assert model.replay_buffer is not None
     for i in range(size):
@@ -380,9 +334,8 @@ def make_sb3_model(experience: Experience) -> Any:
 class HighwayPicture:
     """A scenario of ours whose frames highway-env's GrayscaleObservation draws.
 
-    All else is the scenario's: cars and their motion, reward, frames, the ground in view. Left
-    out, in highway-env's favour: its own traffic step, and a new viewer at each reset. The
-    environment has no wrappers, and must not be used elsewhere.
+    All else is the scenario's. Left out, in highway-env's favour: its own traffic step, and a new
+    viewer at each reset. The environment has no wrappers, and must not be used elsewhere.
     """
 
     action_type = observation_type = None
@@ -392,20 +345,16 @@ class HighwayPicture:
         self.env = env
         env._frame = lambda ego, cars: 0
         self.config = {
-            "scaling": 1.0 / env.rasteriser.metres_per_pixel,
-            "centering_position": [0.5, 0.5],
-            "render_agent": True,
-            "simulation_frequency": 10,
-            # Into a surface in memory, and nothing copied to a screen.
-            "offscreen_rendering": True,
-        }
+            "scaling": 1.0 / env.rasteriser.metres_per_pixel, "centering_position": [0.5, 0.5],
+            "render_agent": True, "simulation_frequency": 10, "offscreen_rendering": True,
+        }  # fmt: skip
         env.reset(seed=0)
         # SDL's "dummy" driver exists on every machine and needs no screen; but highway-env's
         # viewer takes it for a wish not to draw at all.
         with patch.dict(os.environ, {"SDL_VIDEODRIVER": "dummy"}):
-            self._drawn = GrayscaleObservation(
-                self, observation_shape=(COLUMNS, ROWS), stack_size=2, weights=GREY_WEIGHTS
-            )
+            grey = [0.2989, 0.5870, 0.1140]  # of red, green and blue, as its documentation has it
+            shape = (COLUMNS, ROWS)
+            self._drawn = GrayscaleObservation(self, shape, stack_size=2, weights=grey)
         self._drawn.viewer.enabled = True
 
     def reset(self, *, seed: int) -> NDArray[np.uint8]:
@@ -422,21 +371,15 @@ class HighwayPicture:
     def observe(self) -> NDArray[np.uint8]:
         """Draw what our rasteriser looks at."""
         view = self.env.rasteriser
-        middle_m = 0.5 * view.metres_per_pixel * np.array([COLUMNS, ROWS])
-        position = np.array(self.env.view_corner_m) + middle_m
-        self._drawn.observer_vehicle = SimpleNamespace(position=position)
-        observation: NDArray[np.uint8] = self._drawn.observe()
-        return observation
+        middle_m = self.env.view_corner_m + view.metres_per_pixel * np.array([COLUMNS, ROWS]) / 2
+        self._drawn.observer_vehicle = SimpleNamespace(position=middle_m)
+        return self._drawn.observe()
 
     @property
     def road(self) -> Any:
         """Our road, with the ego car among the others: ours stands outside ``road.vehicles``."""
-        return SimpleNamespace(
-            network=self.env.road.network,
-            vehicles=[*self.env.traffic, self.env.ego],
-            objects=[],
-            record_history=False,
-        )
+        cars, network = [*self.env.traffic, self.env.ego], self.env.road.network
+        return SimpleNamespace(network=network, vehicles=cars, objects=[], record_history=False)
 
 
 def check_varies(picture: HighwayPicture) -> None:
@@ -446,10 +389,9 @@ def check_varies(picture: HighwayPicture) -> None:
         RuntimeError: they are all alike. A viewer of highway-env 1.12 that is not enabled draws
             nothing, without a warning, and would look fast.
     """
-    first, ended = picture.reset(seed=0), False
-    moves = False
+    first, moves, ended = picture.reset(seed=0), False, False
     while not ended:
-        observation, ended = picture.step(np.zeros(picture.env.action_space.shape, np.float32))
+        observation, ended = picture.step(np.zeros(1, np.float32))
         moves = moves or not np.array_equal(observation[-1], first[-1])
     if not (moves and first.min() < first.max()):
         raise RuntimeError("highway-env draws the same picture all over: the figures are void")

@@ -1,9 +1,6 @@
-"""Pedals, a driver that knows only one of them, whole episodes, and whether a human objects."""
+"""Pedals, a driver that knows only one of them, and whole episodes."""
 
 import numpy as np
-
-from bridge.report import GOAL
-from trainer.drivers import EXPERTS, TRIGGERS
 
 FULL, NOTHING, BRAKE = (np.array([pedal], np.float32) for pedal in (1.0, 0.0, -1.0))
 
@@ -38,23 +35,3 @@ def drive(env, driver, seed=0):
     """The rewards of an episode, and its last info."""
     _, rewards, infos = zip(*episode(env, driver, seed), strict=True)
     return list(rewards), infos[-1]
-
-
-def objections(env, driver, drives):
-    """Drives with the seeds 0, 1, ...; how many arrived, and to how many of those it objected."""
-    trigger = TRIGGERS[env.scenario](EXPERTS[env.scenario](env))
-    arrived = objected = 0
-    for seed in range(drives):
-        driver.reset()
-        trigger.reset()
-        reasons: set[str | None] = set()
-
-        def judged(observation, reasons=reasons):
-            action = driver.act(observation)
-            reasons.add(trigger.judge(action))
-            return action
-
-        _, info = drive(env, judged, seed)
-        arrived += info["outcome"] == GOAL
-        objected += info["outcome"] == GOAL and reasons != {None}
-    return {"drives": drives, "arrived": arrived, "objected_of_these": objected}

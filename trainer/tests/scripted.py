@@ -1,6 +1,5 @@
 """A training run on a scripted road, with a scripted human and a learner that only listens."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,7 +7,6 @@ import numpy as np
 from gymnasium import spaces
 
 from trainer.human.guide import Intervention
-from trainer.human.left_turn import Reason
 from trainer.learner.config import LearnerConfig
 from trainer.learner.td3 import Losses
 from trainer.training.config import RunConfig
@@ -17,13 +15,9 @@ from trainer.training.run import TrainingRun
 POLICY, HUMAN = 0.25, -0.5
 BATCH = 4
 LEARNER = LearnerConfig(
-    batch_size=BATCH,
-    replay_capacity=100,
-    warmup_steps=1,
-    exploration_initial=0.0,
-    exploration_final=0.0,
-    intervention_penalty=-7.0,
-)
+    batch_size=BATCH, replay_capacity=100, warmup_steps=1, exploration_initial=0.0,
+    exploration_final=0.0, intervention_penalty=-7.0,
+)  # fmt: skip
 CONFIG = RunConfig(episodes=1, evaluate_every_steps=0, checkpoint_every=1000, learner=LEARNER)
 
 
@@ -36,51 +30,44 @@ class ScriptedEnv:
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     brake_action = np.array([0.0], np.float32)
 
-    def __init__(self, length: int, outcome: str) -> None:
-        self.length, self.outcome = length, outcome
-        self.steps = 0
-        self.actions: list[float] = []
-        self.braking = False
-        self.braked: list[bool] = []
+    def __init__(self, length, outcome):
+        self.length, self.outcome, self.steps = length, outcome, 0
+        self.actions, self.braked, self.braking = [], [], False
 
-    def press_brake(self, pressed: bool) -> None:
+    def press_brake(self, pressed):
         self.braking = pressed
 
-    def reset(self, *, seed: int | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed=None):
         self.steps = 0
         return self._observation(), {"distance_m": 0.0}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action):
         self.steps += 1
         self.actions.append(float(action[0]))
         self.braked.append(self.braking)
-        info: dict[str, Any] = {
-            "distance_m": float(self.steps),
-            "lateral_acceleration_mps2": 0.0,
-            "longitudinal_acceleration_mps2": 0.0,
-        }
+        accelerations = ("lateral_acceleration_mps2", "longitudinal_acceleration_mps2")
+        info = {"distance_m": float(self.steps), **dict.fromkeys(accelerations, 0.0)}
         ended, timeout = self.steps == self.length, self.outcome == "timeout"
         if ended:
             info["outcome"] = self.outcome
-        terminated, truncated = ended and not timeout, ended and timeout
-        return self._observation(), float(self.steps), terminated, truncated, info
+        ends = ended and not timeout, ended and timeout
+        return self._observation(), float(self.steps), *ends, info
 
-    def _observation(self) -> np.ndarray:
+    def _observation(self):
         return np.full((2, 45, 80), self.steps, np.uint8)
 
 
 class ScriptedGuide:
     """Acts at the given steps of each episode, counted from one."""
 
-    def __init__(self, run: Any, human_steps: tuple[int, ...], reason: Reason) -> None:
+    def __init__(self, run, human_steps, reason):
         self.run, self.human_steps, self.reason = run, human_steps, reason
-        self.asked: list[int] = []
-        self.resets = 0
+        self.asked, self.resets = [], 0
 
-    def reset(self) -> None:
+    def reset(self):
         self.resets += 1
 
-    def watch(self, observation: np.ndarray, action: np.ndarray) -> Intervention | None:
+    def watch(self, observation, action):
         self.asked.append(self.run.episode)
         step = self.run.env.steps + 1
         if step not in self.human_steps:
@@ -89,22 +76,15 @@ class ScriptedGuide:
         return Intervention(np.array([HUMAN], np.float32), self.reason, first)
 
 
-def scripted_run(
-    run_dir: Path,
-    config: RunConfig,
-    length: int = 1,
-    outcome: str = "goal",
-    human_steps: tuple[int, ...] = (),
-    reason: Reason = "collision",
-) -> Any:
+def scripted_run(run_dir, config, length=1, outcome="goal", human_steps=(), reason="collision"):
     """A run that also keeps what it ``stored``, the ``betas`` and the priorities it was given
     (``learned``) and wrote back (``written``); each of the last two as (indices, priorities).
     """
     run: Any = TrainingRun(config, run_dir)
     run.env = ScriptedEnv(length, outcome)
     run.guide = ScriptedGuide(run, human_steps, reason)
-    run.stored, run.betas, run.learned, run.written = [], [], [], []
-    run.guidance_stored = []
+    for kept in ("stored", "betas", "learned", "written", "guidance_stored"):
+        setattr(run, kept, [])
     replay, learner = run.learning.replay, run.learning.learner
     add, write = replay.add, replay.update_priorities
 

@@ -1,11 +1,5 @@
-"""The bench measures what it says, its peers do the same work, its arithmetic is right.
-
-No test asks how fast.
-"""
-
 import json
 import os
-from dataclasses import replace
 from functools import partial
 from itertools import count
 from types import SimpleNamespace
@@ -15,60 +9,34 @@ import numpy as np
 import pytest
 
 from trainer import bench
-from trainer.bench import (
-    FLOAT32,
-    HIGHWAY,
-    OURS,
-    PARTS,
-    QUICK,
-    SB3,
-    HighwayPicture,
-    check_varies,
-    driving,
-    figures,
-    filled,
-    gather,
-    make_sb3_model,
-    rows,
-    take_turns,
-    training_figures,
-    whole_update,
-)
 from trainer.drivers import make_environment
 from trainer.learner.td3 import Losses
 from trainer.scenarios import SCENARIOS
-from trainer.tests.test_commands import call, refusal
+from trainer.tests.test_commands import call
 
-TINY = replace(
-    QUICK, batch_size=4, rounds=2, updates_per_round=1, steps_per_round=10, training_episodes=1
+TINY = bench.Effort(
+    batch_size=4, rounds=2, updates_per_round=1, steps_per_round=10, training_episodes=1
 )
 
 
 def test_contenders_take_turns_and_none_is_always_first(monkeypatch):
-    clock = count()
     calls: list[str] = []
     ticks: list[str] = []
+    clock = count()
     monkeypatch.setattr(bench.time, "perf_counter", lambda: float(next(clock)))
     contenders = {name: partial(calls.append, name) for name in "abc"}
-    times = take_turns(contenders, 4, 2, ticks.append)
+    times = bench.take_turns(contenders, 4, 2, ticks.append)
     assert "".join(calls[::2]) == "abc" + "abc" + "bca" + "cab" + "abc"
     assert times == {name: [0.5] * 4 for name in "abc"}
     assert len(ticks) == 4
 
 
-def test_figures_are_of_medians():
-    assert figures({OURS: [1.0, 2.0, 9.0], SB3: [4.0, 6.0, 7.0]}, "ms", float) == {
-        "ms": 2.0,
-        "peers": {SB3: {"ms": 6.0, "ratio": 3.0}},
-    }
-
-
 def test_training_figures_scale_to_10000_steps():
-    parts_s = dict(zip(PARTS, (0.1, 0.2, 0.3, 6.0, 0.0), strict=True))
-    named = {f"{name}_s": value for name, value in parts_s.items()}
-    episodes: list[Any] = [SimpleNamespace(steps=steps, **named) for steps in (100, 300)]
-    found = training_figures(episodes, 16.0)
-    wanted = zip(("total", *PARTS), (400.0, 5.0, 10.0, 15.0, 300.0, 0.0), strict=True)
+    names = [f"{name}_s" for name in bench.PARTS]
+    parts_s = dict(zip(names, (0.1, 0.2, 0.3, 6.0, 0.0), strict=True))
+    episodes: list[Any] = [SimpleNamespace(steps=steps, **parts_s) for steps in (100, 300)]
+    found = bench.training_figures(episodes, 16.0)
+    wanted = zip(("total", *bench.PARTS), (400.0, 5.0, 10.0, 15.0, 300.0, 0.0), strict=True)
     assert found["steps"] == 400
     assert found["s_per_10k_steps"] == pytest.approx(dict(wanted))
 
@@ -80,15 +48,13 @@ def test_an_update_draws_learns_and_sets_the_new_priorities():
         seen.append(batch.indices)
         return Losses(0.0, 0.0, 0.0, 0.0, np.full(len(batch.indices), 7.0))
 
-    experience = gather(50)
-    buffer, learner = filled(experience), SimpleNamespace(update=learn)
-    update = whole_update(learner, buffer, batch_size=8)  # type: ignore[arg-type]
+    buffer, learner = bench.filled(bench.gather(50)), SimpleNamespace(update=learn)
+    update = bench.whole_update(learner, buffer, batch_size=8)  # type: ignore[arg-type]
     for _ in range(3):
         update()
     assert [len(indices) for indices in seen] == [8, 8, 8]
-    drawn = np.concatenate(seen)
-    assert (buffer._priorities[drawn] == 7.0).all()
-    assert 0 < experience.human.sum() < 50
+    assert (buffer._priorities[np.concatenate(seen)] == 7.0).all()
+    assert 0 < buffer.human_count < 50
 
 
 @pytest.mark.parametrize(("has", "precision"), [(True, "bfloat16"), (False, "float32")])
@@ -98,7 +64,7 @@ def test_an_effective_precision_of_float32_is_measured_once(has, precision, monk
     found = bench.measure_learner(TINY, lambda done: None)
     assert found["precision"] == precision
     assert found["updates_per_s"] == 1e3 / found["ms_per_update"]
-    assert (FLOAT32 in found["peers"]) == has
+    assert (bench.FLOAT32 in found["peers"]) == has
 
 
 def test_the_whole_report_of_a_machine_without_the_peer(capsys, tmp_path, monkeypatch):
@@ -109,7 +75,7 @@ def test_the_whole_report_of_a_machine_without_the_peer(capsys, tmp_path, monkey
     monkeypatch.setattr(bench, "TRANSITIONS", 20)
     monkeypatch.setattr(bench, "make_sb3_model", missing)
     monkeypatch.setattr(bench, "FULL", TINY)
-    monkeypatch.setattr(bench.ProgressBar, "advance", lambda bar, figures: ticks.append(figures))
+    monkeypatch.setattr(bench.ProgressBar, "advance", lambda _, last: ticks.append(last))
     out = tmp_path / "b.json"
     status, table, _ = call(capsys, "bench", "--out", str(out))
     assert status == 0
@@ -118,33 +84,34 @@ def test_the_whole_report_of_a_machine_without_the_peer(capsys, tmp_path, monkey
     assert {"machine", "threads", "torch", "source_revision"} <= set(report)
     assert report["learner_ms_per_update"] == report["learner"]["ms_per_update"] > 0
     assert set(report["environment_steps_per_s"]) == set(SCENARIOS)
-    assert set(report["train_s_per_10k_steps"]) == {"total", *PARTS}
+    assert set(report["train_s_per_10k_steps"]) == {"total", *bench.PARTS}
     assert "highway-env grayscale" in table
     assert "Stable-Baselines3 TD3 is not installed" in table
-    assert {line[4].split("  ")[0] for line in rows(report) if len(line) > 4} == {"", "≥ 8", "≥ 10"}
+    bars = {line[4].split("  ")[0] for line in bench.rows(report) if len(line) > 4}
+    assert bars == {"", "≥ 8", "≥ 10"}
 
 
-def test_the_table_says_which_bars_are_missed():
-    per_second = partial(figures, name="steps_per_s", of=lambda seconds: 1.0 / seconds)
-    learner = figures({OURS: [20.0], SB3: [90.0]}, "ms_per_update", float)
+def test_figures_are_of_medians_and_the_table_says_which_bars_are_missed():
+    times = {bench.OURS: [1.0, 20.0, 90.0], bench.SB3: [40.0, 90.0, 95.0]}
+    learner = bench.figures(times, "ms_per_update", float)
+    peers = {bench.SB3: {"ms_per_update": 90.0, "ratio": 4.5}}
+    assert learner == {"ms_per_update": 20.0, "peers": peers}
+    times = {bench.OURS: [0.001], bench.HIGHWAY: [0.009]}
+    steps_per_s = bench.figures(times, "steps_per_s", lambda seconds: 1.0 / seconds)
     report = {
         "learner": {"batch_size": 128, **learner},
-        "environment": {"left_turn": per_second({OURS: [0.001], HIGHWAY: [0.009]})},
-        "training": {"s_per_10k_steps": dict.fromkeys(("total", *PARTS), 1.0)},
+        "environment": {"left_turn": steps_per_s},
+        "training": {"s_per_10k_steps": dict.fromkeys(("total", *bench.PARTS), 1.0)},
     }
-    update, steps, *_ = rows(report)
+    update, steps, *_ = bench.rows(report)
     assert update[-1] == "≥ 4  met"
     assert steps[0] == "left_turn with observation, steps/s"
     assert steps[1:] == ("1000.0", "111.1  highway-env grayscale", "9.00", "≥ 10  MISSED")
 
 
-def test_a_file_that_cannot_be_written_is_said_before_the_minutes_of_measuring(capsys, tmp_path):
-    refusal(capsys, "bench", "--out", str(tmp_path))
-
-
 def test_stable_baselines3_learns_from_our_experience_with_the_papers_networks():
     pytest.importorskip("stable_baselines3")
-    model = make_sb3_model(gather(20))
+    model = bench.make_sb3_model(bench.gather(20))
     # Tables A2 and A3: 1,792 features through 256, 128 and 64; the critics also see the action.
     trunk = 6 * 2 * 36 + 6 + 16 * 6 * 36 + 16
     head = 1792 * 256 + 256 + 256 * 128 + 128 + 128 * 64 + 64 + 64 + 1
@@ -160,26 +127,23 @@ def test_highway_envs_picture_shows_the_cars_where_they_are(scenario, driver, mo
     if driver:
         monkeypatch.setenv("SDL_VIDEODRIVER", driver)
     env = make_environment(scenario)
-    picture = HighwayPicture(env)
+    picture = bench.HighwayPicture(env)
     picture.reset(seed=3)
     for _ in range(5):
-        shown, _ = picture.step(np.zeros(env.action_space.shape, np.float32))
+        shown, _ = picture.step(np.zeros(1, np.float32))
     with_cars, cars = shown[-1].copy(), [*env.traffic, env.ego]
     empty = SimpleNamespace(**{**vars(picture.road), "vehicles": []})
-    monkeypatch.setattr(HighwayPicture, "road", property(lambda picture: empty))
-    without = picture.observe()[-1].copy()
-    differs = with_cars != without
+    monkeypatch.setattr(bench.HighwayPicture, "road", property(lambda picture: empty))
+    differs = with_cars != picture.observe()[-1]
     view, seen, elsewhere = env.rasteriser, 0, differs.copy()
     for car in cars:
-        x, y = (car.position - env.view_corner_m) / view.metres_per_pixel
-        if 2 < x < differs.shape[0] - 2 and 2 < y < differs.shape[1] - 2:
+        x, y = ((car.position - env.view_corner_m) / view.metres_per_pixel).astype(int)
+        if 2 <= x < differs.shape[0] - 2 and 2 <= y < differs.shape[1] - 2:
             seen += 1
             # It draws on whole pixels, a small car up to one aside.
-            assert differs[int(x) - 1 : int(x) + 2, int(y) - 1 : int(y) + 2].sum() >= 3
+            assert differs[x - 1 : x + 2, y - 1 : y + 2].sum() >= 3
             reach = int(car.LENGTH / view.metres_per_pixel)
-            elsewhere[
-                max(int(x) - reach, 0) : int(x) + reach, max(int(y) - reach, 0) : int(y) + reach
-            ] = False
+            elsewhere[max(x - reach, 0) : x + reach, max(y - reach, 0) : y + reach] = False
     assert seen >= 2
     # Nothing else has changed, but for cars that only touch the picture's edge.
     assert not elsewhere[6:-6, 6:-6].any()
@@ -187,28 +151,25 @@ def test_highway_envs_picture_shows_the_cars_where_they_are(scenario, driver, mo
 
 
 def test_a_viewer_that_draws_nothing_is_found_out():
-    picture = HighwayPicture(make_environment("left_turn"))
+    picture = bench.HighwayPicture(make_environment("left_turn"))
     picture._drawn.viewer.enabled = False
     with pytest.raises(RuntimeError, match="same picture"):
-        check_varies(picture)
+        bench.check_varies(picture)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_both_drives_meet_the_same_traffic(scenario):
-    ends: list[list[bool]] = []
-    env, picture = make_environment(scenario), HighwayPicture(make_environment(scenario))
-    for step, reset in (
-        (lambda action: any(env.step(action)[2:4]), env.reset),
-        (lambda action: picture.step(action)[1], picture.reset),
-    ):
-        ends.append([])
+    env, picture = make_environment(scenario), bench.HighwayPicture(make_environment(scenario))
+    ends: list[list[bool]] = [[], []]
 
-        def watched(action: Any, step: Any = step) -> bool:
-            ends[-1].append(step(action))
-            return ends[-1][-1]
+    def noted(place, ended):
+        ends[place].append(ended)
+        return ended
 
-        drive = driving(watched, reset)
-        for _ in range(150):
-            drive()
+    ours = bench.driving(lambda action: noted(0, any(env.step(action)[2:4])), env.reset)
+    theirs = bench.driving(lambda action: noted(1, picture.step(action)[1]), picture.reset)
+    for _ in range(150):
+        ours()
+        theirs()
     assert ends[0] == ends[1]
     assert any(ends[0])

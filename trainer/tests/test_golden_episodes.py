@@ -5,11 +5,7 @@ libm or numpy build changes and well below what a changed model does. Where the 
 meant to change, print the new digests with `python -m trainer.tests.test_golden_episodes`.
 """
 
-from __future__ import annotations
-
 import hashlib
-from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,61 +18,43 @@ from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
 QUEUE = LeftTurnConfig(traffic_cars=8, first_car_m=(-30.0, 12.0), short_gap_m=(7.0, 9.0))
 """A longer queue than usual, closely packed: the followers brake."""
 
-GOLDEN = {
-    "random": "99a651c9237ffb067728760ccd5fbf1279e7c4c5266122f08155fa63490e79ab",
-    "expert": "3f816926ad56a5b6ad373eceedb1eea9b1f318576a4ee3a215a282b9036edf42",
-    "guided": "0f2bcfc8346c08a9dd857cf4994cfe2db0f0989bc1a7437a5ab8530883dbdc26",
-    "queue": "c252a806eb9146149777fb1c514a07e0acf34b762737cad66d265a74242ebcf1",
-    "variant": "33f19cff22bc9157d7cd3de96d788ae39dca8a037c63fcd9fe3a008579504a1f",
-    "congestion, random": "b446e260c41008d3a8301dd86dd874fff1637293bbbca9a8b7756923a44a6a6d",
-    "congestion, expert": "4654583381419aa3977888a96dd3b299046bcfe12ced469540f95450dc1349b2",
-    "congestion, variant": "9ced478a7e3e511b952c8fafa6d4d3640ddbbd929e905537c8cbf60cad3a0624",
-    "dense": "321961c59e49aa7b9a1d5297b0b76f68d7f4a7a2a780e4eb72125ffefd7fa807",
-    "congestion, dense": "26ec6b10e5023e4eb244fcd3f4ea19fedf8e2e3e3dd006d20b5ca484f4a2cdc8",
-}
 
-
-def random_driver(env: Any, seed: int) -> Iterator[tuple[np.ndarray, str]]:
+def random_driver(env, seed):
     """A restless action that favours one side: in the left turn the throttle."""
     random = np.random.default_rng(seed)
     while True:
         yield random.uniform(-0.6, 1.0, 1).astype(np.float32), ""
 
 
-def expert_driver(env: Any, seed: int) -> Iterator[tuple[np.ndarray, str]]:
+def expert_driver(env, seed):
     expert = EXPERTS[env.scenario](env)
     while True:
         yield expert.act(env.frames), ""
 
 
-def guided_driver(env: Any, seed: int) -> Iterator[tuple[np.ndarray, str]]:
+def guided_driver(env, seed):
     """A policy that drives on, then one that stands still, under the guide's eyes."""
     expert = EXPERTS[env.scenario](env)
-    guide, policy = HumanGuide(expert, TRIGGERS[env.scenario](expert)), random_driver(env, seed)
-    while True:
-        action, _ = next(policy)
-        if seed % 2:
-            action = -np.abs(action)
-        intervention = guide.watch(env.frames, action)
-        if intervention is None:
-            yield action, "passes"
-        else:
-            yield intervention.action, f"{intervention.reason} {intervention.first}"
+    guide = HumanGuide(expert, TRIGGERS[env.scenario](expert))
+    for action, _ in random_driver(env, seed):
+        wanted = -np.abs(action) if seed % 2 else action
+        taken = guide.watch(env.frames, wanted)
+        yield (taken.action, f"{taken.reason} {taken.first}") if taken else (wanted, "passes")
 
 
-EPISODES: dict[str, tuple[Any, Callable[[], Any], int]] = {
-    "random": (random_driver, LeftTurnEnv, 8),
-    "expert": (expert_driver, LeftTurnEnv, 6),
-    "guided": (guided_driver, LeftTurnEnv, 8),
-    "queue": (guided_driver, partial(LeftTurnEnv, QUEUE), 4),
-    "variant": (expert_driver, partial(make_environment, "left_turn", "variant"), 4),
-    "congestion, random": (random_driver, partial(make_environment, "congestion"), 6),
-    "congestion, expert": (expert_driver, partial(make_environment, "congestion"), 2),
-    "congestion, variant": (expert_driver, partial(make_environment, "congestion", "variant"), 2),
-    "dense": (expert_driver, partial(make_environment, "left_turn", "dense"), 4),
-    "congestion, dense": (expert_driver, partial(make_environment, "congestion", "dense"), 2),
-}
-"""Name -> who drives, in which environment, how many episodes."""
+EPISODES: list[tuple[Any, ...]] = [
+    ("99a651c9237ffb06", random_driver, 8, LeftTurnEnv),
+    ("3f816926ad56a5b6", expert_driver, 6, LeftTurnEnv),
+    ("0f2bcfc8346c08a9", guided_driver, 8, LeftTurnEnv),
+    ("c252a806eb914614", guided_driver, 4, LeftTurnEnv, QUEUE),
+    ("33f19cff22bc9157", expert_driver, 4, make_environment, "left_turn", "variant"),
+    ("b446e260c41008d3", random_driver, 6, make_environment, "congestion"),
+    ("4654583381419aa3", expert_driver, 2, make_environment, "congestion"),
+    ("9ced478a7e3e511b", expert_driver, 2, make_environment, "congestion", "variant"),
+    ("321961c59e49aa7b", expert_driver, 4, make_environment, "left_turn", "dense"),
+    ("26ec6b10e5023e4e", expert_driver, 2, make_environment, "congestion", "dense"),
+]
+"""What the digest begins with; who drives, in how many episodes, in which environment."""
 
 
 def numbers(*values: float) -> bytes:
@@ -84,30 +62,29 @@ def numbers(*values: float) -> bytes:
     return " ".join(repr(round(float(value), 9) + 0.0) for value in values).encode()
 
 
-def digest(name: str) -> str:
-    drive, make, episodes = EPISODES[name]
-    env, digest = make(), hashlib.sha256()
+def digest(drive, episodes, make, *arguments):
+    env, digest = make(*arguments), hashlib.sha256()
     for seed in range(episodes):
         observation, info = env.reset(seed=seed)
         digest.update(observation.tobytes())
-        actions, ended = drive(env, seed), False
-        while not ended:
-            action, remark = next(actions)
+        for action, remark in drive(env, seed):
             observation, reward, terminated, truncated, info = env.step(action)
-            ended = terminated or truncated
             digest.update(observation.tobytes() + remark.encode())
             digest.update(str(info.pop("outcome", "")).encode())
             digest.update(numbers(*action, reward, *info.values()))
             for car in env.scene()["vehicles"]:
                 digest.update(numbers(car["x"], car["y"], car["heading_rad"], car["speed_mps"]))
+            if terminated or truncated:
+                break
     return digest.hexdigest()
 
 
-@pytest.mark.parametrize("name", EPISODES)
-def test_episodes_are_what_they_were(name):
-    assert digest(name) == GOLDEN[name]
+@pytest.mark.parametrize("row", EPISODES, ids=lambda row: row[0])
+def test_episodes_are_what_they_were(row):
+    golden, *episodes = row
+    assert digest(*episodes).startswith(golden)
 
 
 if __name__ == "__main__":
-    for episode_name in EPISODES:
-        print(f'    "{episode_name}": "{digest(episode_name)}",')
+    for _, *drives in EPISODES:
+        print(digest(*drives)[:16], *drives[2:])

@@ -1,21 +1,20 @@
-"""The human beside the policy, when it takes over, and the human model that learns from it."""
-
 from dataclasses import replace
-from itertools import repeat
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from edge_runtime.util import UserError
-from trainer.drivers import EXPERTS, load_driver, make_environment
+from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.dagger import HumanTraining
 from trainer.human.guide import HumanGuide
 from trainer.human.model import HumanModel, HumanModelConfig, load_human_model
 from trainer.learner.networks import Actor
 from trainer.scenarios.congestion import CongestionEnv
 from trainer.scenarios.left_turn import LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, Brakes, objections
+from trainer.tests.humans import BRAKE, FULL, Brakes, drive
 
 LABELLED = HumanModelConfig(updates_per_episode=1, batch_size=8, label_every_step=True)
 
@@ -43,12 +42,9 @@ def test_the_model_starts_as_an_untrained_actor_and_learns_what_it_is_shown():
 def test_one_frame_is_the_newest_one():
     model = HumanModel(HumanModelConfig(frames=1), seed=0)
     frames = np.random.default_rng(0).integers(0, 255, (2, 45, 80)).astype(np.uint8)
-    other_past = frames.copy()
-    other_past[0] = 0
-    assert model.act(frames) == model.act(other_past)
-    other_now = frames.copy()
-    other_now[1] = 0
-    assert model.act(frames) != model.act(other_now)
+    dark = np.zeros((45, 80), np.uint8)
+    assert model.act(frames) == model.act(np.stack([dark, frames[1]]))
+    assert model.act(frames) != model.act(np.stack([frames[0], dark]))
 
 
 def test_refining_takes_its_updates_under_a_falling_learning_rate():
@@ -58,17 +54,14 @@ def test_refining_takes_its_updates_under_a_falling_learning_rate():
         shade = random.integers(0, 255)
         model.add(np.full((2, 45, 80), shade, np.uint8), FULL if number % 2 else BRAKE)
     before = [parameter.clone() for parameter in model.actor.parameters()]
-    rates, losses = [], []
+    (group,), rates = model.optimiser.param_groups, []
     for loss in model.refine(config.refining_updates):
-        losses.append(loss)
-        rates.append(model.optimiser.param_groups[0]["lr"])
+        assert np.isfinite(loss)
+        rates.append(group["lr"])
     assert rates == pytest.approx([1e-3 * (1 - part / 20) for part in range(20)])
     # 45 updates in 20 parts: Adam counts them.
-    steps = {int(state["step"]) for state in model.optimiser.state.values()}
-    assert steps == {45}
-    moved = [not torch.equal(a, b) for a, b in zip(before, model.actor.parameters(), strict=True)]
-    assert any(moved)
-    assert np.isfinite(losses).all()
+    assert {int(state["step"]) for state in model.optimiser.state.values()} == {45}
+    assert not all(map(torch.equal, before, model.actor.parameters()))
 
 
 @pytest.mark.parametrize("kind", [LeftTurnEnv, CongestionEnv])
@@ -122,72 +115,65 @@ def test_episodes_are_demonstrated_watched_or_unaided_in_turn(monkeypatch):
     assert [count > 0 for count in looks] == [False, False, True, False] * 2
 
 
-def test_an_unaided_episode_without_labels_is_refused():
+def test_what_does_not_fit_together_is_refused(tmp_path):
     with pytest.raises(UserError, match="--label-every-step"):
         HumanModelConfig(unaided_share=4)
-
-
-def test_a_model_of_one_scenario_does_not_drive_in_the_other(tmp_path):
     HumanModel(HumanModelConfig(), seed=1).save(tmp_path, {"scenario": "congestion"})
     with pytest.raises(UserError, match="trained in congestion, not in left_turn"):
         load_driver(str(tmp_path), LeftTurnEnv())
-
-
-ANYWHERE = repeat(True)
-
-
-class ScriptedTrigger:
-    def __init__(self, reasons, places=ANYWHERE):
-        self.reasons, self.places = iter(reasons), iter(places)
-
-    def reset(self):
-        pass
-
-    def judge(self, action):
-        return next(self.reasons)
-
-    def may_return(self):
-        return next(self.places)
 
 
 @pytest.mark.parametrize(("scenario", "drives"), [("left_turn", 20), ("congestion", 10)])
 def test_the_trigger_lets_the_expert_drive(scenario, drives):
     """Or the policy would be punished for driving like the human: theorem 1's assumption."""
     env = make_environment(scenario)
-    counted = objections(env, EXPERTS[scenario](env), drives)
-    assert counted == {"drives": drives, "arrived": drives, "objected_of_these": 0}
+    expert, trigger = EXPERTS[scenario](env), TRIGGERS[scenario](EXPERTS[scenario](env))
+
+    def judged(observation):
+        action = expert.act(observation)
+        assert trigger.judge(action) is None
+        return action
+
+    for seed in range(drives):
+        expert.reset()
+        trigger.reset()
+        assert drive(env, judged, seed)[1]["outcome"] == "goal"
 
 
-def watch(reasons: list, places=ANYWHERE, **hold: int) -> list:
-    guide = HumanGuide(Brakes(), ScriptedTrigger(reasons, places), **hold)
-    observation = np.zeros((2, 45, 80), np.uint8)
-    return [guide.watch(observation, FULL) for _ in reasons]
+def watch(reasons, places=(), **hold):
+    """What a human does of whom the trigger says so: its steps at the wheel, and those held."""
+    judged, returned = iter(reasons), iter(places)
+    trigger: Any = SimpleNamespace(reset=lambda: None)
+    trigger.judge, trigger.may_return = lambda _: next(judged), lambda: next(returned, True)
+    guide = HumanGuide(Brakes(), trigger, **hold)
+    steps = [guide.watch(np.zeros((2, 45, 80), np.uint8), FULL) for _ in reasons]
+    taken = [step for step in steps if step]
+    assert all(step.action is BRAKE for step in taken)
+    return [step is not None for step in steps], taken
 
 
-def test_the_wheel_is_not_given_back_in_the_lane():
-    none, in_lane, through = None, False, True
-    reasons = ["collision", none, none, none, none, none, none]
-    steps = watch(reasons, hold_steps=2, places=[in_lane, in_lane, through])
-    assert [step is not None for step in steps] == [True] * 4 + [False] * 3
-    assert {step.reason for step in steps if step} == {"collision"}
+NONE, CRASH = None, "collision"
+NO, YES = False, True
 
 
-def test_the_human_holds_on_and_only_the_first_step_is_an_intervention():
-    none, crash = None, "collision"
-    steps = watch([none, crash, none, none, none, crash, none, none, none], hold_steps=3)
-    in_control = [step is not None for step in steps]
-    assert in_control == [False, True, True, True, False, True, True, True, False]
-    assert [step.first for step in steps if step] == [True, False, False, True, False, False]
-    assert all(step.action is BRAKE for step in steps if step)
-
-
-def test_by_default_the_human_holds_for_a_second_and_a_half():
-    steps = watch(["collision", *[None] * 20])
-    assert [step is not None for step in steps] == [True] * 15 + [False] * 6
-
-
-def test_a_reason_that_lasts_prolongs_the_same_intervention():
-    steps = watch(["stuck", "stuck", "collision", None, None], hold_steps=2)
-    assert [step is not None for step in steps] == [True, True, True, True, False]
-    assert [step.first for step in steps if step] == [True, False, False, False]
-    assert {step.reason for step in steps if step} == {"stuck"}
+@pytest.mark.parametrize(
+    ("reasons", "how", "held", "first"),
+    [
+        # Not given back in the lane.
+        ([CRASH] + [NONE] * 6, {"hold_steps": 2, "places": [NO, NO, YES]},
+         [YES] * 4 + [NO] * 3, [YES, NO, NO, NO]),
+        # Held on to; only the first step is an intervention.
+        ([NONE, CRASH, NONE, NONE, NONE, CRASH, NONE, NONE, NONE], {"hold_steps": 3},
+         [NO, YES, YES, YES, NO, YES, YES, YES, NO], [YES, NO, NO, YES, NO, NO]),
+        # By default for a second and a half.
+        ([CRASH] + [NONE] * 20, {}, [YES] * 15 + [NO] * 6, [YES] + [NO] * 14),
+        # A reason that lasts prolongs the same intervention.
+        (["stuck", "stuck", CRASH, NONE, NONE], {"hold_steps": 2},
+         [YES] * 4 + [NO], [YES, NO, NO, NO]),
+    ],
+)  # fmt: skip
+def test_the_human_holds_on_and_gives_back(reasons, how, held, first):
+    in_control, steps = watch(reasons, **how)
+    assert in_control == held
+    assert [step.first for step in steps] == first
+    assert {step.reason for step in steps} == {next(filter(None, reasons))}

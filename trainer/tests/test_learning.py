@@ -1,5 +1,3 @@
-"""Learning beside the environment, and what becomes of it when something fails."""
-
 import threading
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,37 +13,46 @@ from trainer.training import run as run_module
 from trainer.training.learning import LearningThread
 
 SMALL = LearnerConfig(batch_size=8, replay_capacity=60, warmup_steps=1)
-PRIORITIES = np.full(SMALL.batch_size, 2.0)
+LOSSES = Losses(1.0, 2.0, 3.0, 4.0, np.full(SMALL.batch_size, 2.0))
 PICTURE = np.random.default_rng(1).integers(0, 255, (2, 45, 80)).astype(np.uint8)
 
 
 @pytest.fixture
 def learning():
-    """One that is filled, with every third step the human's; its learner is yet to be scripted."""
+    """One that is filled, with every third step the human's; its learner's update is scripted."""
     made: Any = LearningThread(SMALL, PHIL, 1, 1)
     made.start_episode(PICTURE)
     for step in range(20):
         made.add(np.full(1, step / 20, np.float32), float(step % 5), PICTURE, False, step % 3 == 0)
+    made.learner.update = lambda batch, beta: LOSSES
     yield made
     made.close()
 
 
-def losses(critic: float) -> Losses:
-    return Losses(critic, 2.0 * critic, 3.0 * critic, 4.0 * critic, PRIORITIES)
+def noting(threads, function):
+    """The same, which notes in which thread it is called."""
+
+    def noted(*arguments):
+        threads.append(threading.current_thread())
+        return function(*arguments)
+
+    return noted
 
 
 def test_an_episode_reports_the_means_of_its_updates_and_then_forgets_them(learning):
-    scripted = [losses(1.0), losses(3.0)]
-    learning.learner.update = lambda batch, beta: scripted.pop(0)
-    for _ in range(2):
+    for scale in (1.0, 3.0):
+        scaled = Losses(scale, 2.0 * scale, 3.0 * scale, 4.0 * scale, LOSSES.priorities)
+        learning.learner.update = lambda batch, beta, scaled=scaled: scaled
         learning.begin(0.0)
         learning.finish()
-    episode = learning.end_episode(0.0)
-    found = (episode.critic_loss, episode.policy_loss, episode.cloning_loss, episode.value)
+    episode, after = learning.end_episode(0.0), learning.end_episode(0.0)
+    found, none = (
+        (each.critic_loss, each.policy_loss, each.cloning_loss, each.value)
+        for each in (episode, after)
+    )
     assert found == (2.0, 4.0, 6.0, 8.0)
     assert 1.0 < episode.policy_priority <= 2.0
-    after = learning.end_episode(0.0)
-    assert np.isnan([after.critic_loss, after.policy_loss, after.cloning_loss, after.value]).all()
+    assert np.isnan(none).all()
     assert after.learning_s == after.waiting_s == 0.0
 
 
@@ -55,7 +62,7 @@ def test_an_update_that_takes_longer_than_the_step_is_waited_for(learning):
     def held_up(batch, beta):
         begun.set()
         assert let_go.wait(10.0)
-        return losses(1.0)
+        return LOSSES
 
     learning.learner.update = held_up
     assert learning.finish() == 0.0  # nothing was begun
@@ -69,17 +76,10 @@ def test_an_update_that_takes_longer_than_the_step_is_waited_for(learning):
 
 
 def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
-    threads = []
-
-    def update(batch, beta):
-        threads.append(threading.current_thread())
-        return losses(1.0)
-
-    def act(seen):
-        threads.append(threading.current_thread())
-        return np.zeros(1, np.float32)
-
-    learning.learner.update, learning.learner.act = update, act
+    threads: list[threading.Thread] = []
+    learner = learning.learner
+    learner.update = noting(threads, learner.update)
+    learner.act = noting(threads, lambda seen: np.zeros(1, np.float32))
     learning.act(PICTURE)
     learning.begin(0.0)
     learning.finish()
@@ -92,34 +92,23 @@ def test_the_policy_acts_and_learns_in_one_thread_that_ends_with_it(learning):
 
 
 def test_validation_acts_in_the_learners_thread(tmp_path):
-    run = scripted_run(
-        tmp_path, replace(CONFIG, evaluate_every_steps=1, evaluation_runs=2), length=3
-    )
+    config = replace(CONFIG, evaluate_every_steps=1, evaluation_runs=2)
+    run = scripted_run(tmp_path, config, length=3)
     run.validation.envs = [ScriptedEnv(3, "goal") for _ in range(2)]
-    learner, threads = run.learning.learner, []
-    act = learner.act
-
-    def spy(seen):
-        threads.append(threading.current_thread())
-        return act(seen)
-
-    def spy_together(seen, averaged):
-        threads.append(threading.current_thread())
-        return np.zeros((len(seen), 1), np.float32)
-
-    learner.act, learner.act_together = spy, spy_together
-    validations = []
+    learner, validations = run.learning.learner, []
+    threads: list[threading.Thread] = []
+    learner.act = noting(threads, learner.act)
+    learner.act_together = noting(threads, lambda seen, _: np.zeros((len(seen), 1), np.float32))
     run.train(lambda metrics: validations.append(metrics.validation_distance_m))
     assert validations == [3.0]
     assert len(threads) == 3 + 3  # two episodes of three steps, side by side
-    assert len(set(threads)) == 1
-    assert threads[0] is not threading.current_thread()
+    assert len({*threads, threading.current_thread()}) == 2
 
 
 def test_an_update_runs_beside_the_step_and_knows_what_was_stored_before_it(tmp_path):
     run = scripted_run(tmp_path, CONFIG, length=4)
-    begun, moved, learner, env = threading.Event(), threading.Event(), run.learning.learner, run.env
-    update, step, known = learner.update, env.step, []
+    begun, moved, known = threading.Event(), threading.Event(), []
+    update, step = run.learning.learner.update, run.env.step
 
     def slow_update(batch, beta):
         begun.set()
@@ -128,77 +117,65 @@ def test_an_update_runs_beside_the_step_and_knows_what_was_stored_before_it(tmp_
         return update(batch, beta)
 
     def step_beside(action):
-        if run.stored:
-            assert begun.wait(10.0)
+        assert not run.stored or begun.wait(10.0)
         moved.set()
         return step(action)
 
-    learner.update, env.step = slow_update, step_beside
+    run.learning.learner.update, run.env.step = slow_update, step_beside
     run.train()
     assert known == [1, 2, 3]
 
 
-def test_an_environment_that_fails_beside_an_update_ends_the_run_and_the_thread(tmp_path):
+def test_what_fails_beside_an_update_or_in_it_ends_the_run_and_the_thread(tmp_path):
     run = scripted_run(tmp_path, CONFIG, length=9)
-    update, step, threads = run.learning.learner.update, run.env.step, []
-
-    def spy(batch, beta):
-        threads.append(threading.current_thread())
-        return update(batch, beta)
+    threads: list[threading.Thread] = []
+    step = run.env.step
 
     def failing(action):
         if len(run.stored) == 2:
             raise RuntimeError("the road is gone")
         return step(action)
 
-    run.learning.learner.update, run.env.step = spy, failing
+    run.learning.learner.update = noting(threads, run.learning.learner.update)
+    run.env.step = failing
     with pytest.raises(RuntimeError, match="the road is gone"):
         run.train()
     # The last update ran to its end, and nobody took its priorities.
     assert (len(run.learned), len(run.written), len(run.stored)) == (2, 1, 2)
     assert not threads[0].is_alive()
 
+    run, threads = scripted_run(tmp_path, CONFIG, length=9), []
 
-def test_an_update_that_fails_reaches_the_caller_and_ends_the_thread(tmp_path):
-    run = scripted_run(tmp_path, CONFIG, length=9)
-    threads = []
-
-    def failing(batch, beta):
-        threads.append(threading.current_thread())
+    def out_of_memory(batch, beta):
         raise RuntimeError("no memory is left")
 
-    run.learning.learner.update = failing
+    run.learning.learner.update = noting(threads, out_of_memory)
     with pytest.raises(RuntimeError, match="no memory"):
         run.train()
-    assert (len(run.env.actions), len(run.stored)) == (2, 1)
-    assert len(threads) == 1
+    assert (len(run.env.actions), len(run.stored), len(threads)) == (2, 1, 1)
     assert not threads[0].is_alive()
 
 
 def test_each_second_of_a_control_period_is_counted_where_it_is_spent(tmp_path, monkeypatch):
     """On a clock that stands still but for what is said to take time."""
-    run = scripted_run(tmp_path, CONFIG, length=4)
-    now_s = 0.0
+    run, now_s = scripted_run(tmp_path, CONFIG, length=4), [0.0]
 
-    def taking(seconds, function):
+    def taking(owner, name, seconds, returns=None):
+        function = getattr(owner, name)
+
         def slow(*arguments, **named):
-            nonlocal now_s
-            now_s += seconds
-            return function(*arguments, **named)
+            now_s[0] += seconds
+            found = function(*arguments, **named)
+            return found if returns is None else returns
 
-        return slow
+        setattr(owner, name, slow)
 
-    def finish():
-        finished()
-        return 8.0
-
-    finished, learning = run.learning.finish, run.learning
-    monkeypatch.setattr(run_module, "time", SimpleNamespace(perf_counter=lambda: now_s))
-    learning.act, learning.begin = taking(1.0, learning.act), taking(2.0, learning.begin)
-    run.env.step = taking(4.0, run.env.step)
-    learning.finish, learning.add = taking(8.0 + 16.0, finish), taking(32.0, learning.add)
+    monkeypatch.setattr(run_module, "time", SimpleNamespace(perf_counter=lambda: now_s[0]))
+    for name, seconds in (("act", 1.0), ("begin", 2.0), ("add", 32.0)):
+        taking(run.learning, name, seconds)
+    taking(run.env, "step", 4.0)
+    taking(run.learning, "finish", 8.0 + 16.0, returns=8.0)
     metrics = run.advance()
-    learning.close()
-    assert metrics.acting_s == 4 * 1.0
-    assert metrics.environment_s == 4 * 4.0
+    run.learning.close()
+    assert (metrics.acting_s, metrics.environment_s) == (4 * 1.0, 4 * 4.0)
     assert metrics.storing_s == 3 * 2.0 + 4 * (16.0 + 32.0)  # the first step begins no update

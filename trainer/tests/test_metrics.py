@@ -1,5 +1,3 @@
-"""A run's metrics, whatever a kill, a full disk or a stranger left of them."""
-
 import csv
 from pathlib import Path
 from typing import Any
@@ -11,19 +9,20 @@ from trainer.tests.test_commands import call, refusal
 from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_metrics, totals
 
 OLDER = [name for name in NAMES if name != "validation_reward"]
+HEAD = ",".join(NAMES) + "\r\n"
 
 
-def metrics_of(episode: int) -> EpisodeMetrics:
-    values: dict[str, Any] = dict.fromkeys(NAMES, 2.5)
-    return EpisodeMetrics(**{**values, "episode": episode, "outcome": "goal"})
+def metrics_of(episode):
+    values: Any = dict.fromkeys(NAMES, 2.5) | {"episode": episode, "outcome": "goal"}
+    return EpisodeMetrics(**values)
 
 
-def write(run_dir, lines: list[str]) -> None:
-    (run_dir / "metrics.csv").write_text("\r\n".join([",".join(NAMES), *lines]), newline="")
+def write(run_dir, lines):
+    (run_dir / "metrics.csv").write_text(HEAD + "\r\n".join(lines), newline="")
 
 
-def row(episode: int, names: list[str] = NAMES) -> str:
-    values = {**dict.fromkeys(names, "1.5"), "episode": str(episode), "outcome": "goal"}
+def row(episode, names=NAMES, **changes):
+    values = {**dict.fromkeys(names, "1.5"), "episode": str(episode), "outcome": "goal", **changes}
     return ",".join(values[name] for name in names)
 
 
@@ -33,14 +32,18 @@ def test_a_row_that_was_cut_off_is_left_out(kept, tmp_path):
     assert [each["episode"] for each in read_metrics(tmp_path)] == ["0", "1"]
 
 
-def test_what_goes_on_after_a_cut_begins_a_new_row(tmp_path):
+def test_what_goes_on_after_a_cut_begins_a_new_row_and_a_full_disk_is_one_line(tmp_path):
     write(tmp_path, [row(0), row(1), row(2)[:40]])
     writer = MetricsWriter(tmp_path, 2)
     writer.add(metrics_of(2))
-    writer.close()
     rows = read_metrics(tmp_path)
     assert [each["episode"] for each in rows] == ["0", "1", "2"]
     assert rows[2]["distance_m"] == "2.5"
+    with Path("/dev/full").open("w") as writer._file:
+        writer._csv = csv.DictWriter(writer._file, NAMES)
+        with pytest.raises(UserError, match="No space left on device"):
+            writer.add(metrics_of(0))
+        writer.close()
 
 
 def test_a_run_from_before_a_column_is_read_and_goes_on(tmp_path):
@@ -55,63 +58,40 @@ def test_a_run_from_before_a_column_is_read_and_goes_on(tmp_path):
     "content",
     [
         bytes(range(256)) * 9,
-        b"",
-        b"a,b\r\n1,2\r\n",
-        (",".join(OLDER) + ",other\r\n" + row(0)).encode(),
-        (",".join(NAMES) + "\r\n" + row(0)[:40] + "\r\n" + row(1) + "\r\n").encode(),
-        (",".join(NAMES) + "\r\n" + row(0) + ",9\r\n").encode(),
-        (",".join(NAMES) + "\r\n" + row(0).replace("1.5", "", 1) + "\r\n").encode(),
-        (",".join(NAMES) + "\r\n" + row(0).replace("1.5", "many", 1) + "\r\n").encode(),
-        (",".join(NAMES) + "\r\n" + '"' * 3 + row(0) + "\r\n").encode(),
+        "",
+        "a,b\r\n1,2\r\n",
+        ",".join(OLDER) + ",other\r\n" + row(0),
+        f"{HEAD}{row(0)[:40]}\r\n{row(1)}\r\n",
+        f"{HEAD}{row(0)},9\r\n",
+        f"{HEAD}{row(0, steps='')}\r\n",
+        f"{HEAD}{row(0, steps='many')}\r\n",
+        f'{HEAD}"""{row(0)}\r\n',
     ],
 )
 def test_anything_else_is_refused_in_a_line_that_names_it(content, capsys, tmp_path):
-    (tmp_path / "metrics.csv").write_bytes(content)
-    with pytest.raises(UserError, match=r"metrics\.csv is no metrics of a training, or damaged"):
-        read_metrics(tmp_path)
-    refusal(capsys, "plot", str(tmp_path))
-    assert (tmp_path / "metrics.csv").read_bytes() == content
+    content, path = content.encode() if isinstance(content, str) else content, tmp_path
+    (path / "metrics.csv").write_bytes(content)
+    said = "metrics.csv is no metrics of a training, or damaged"
+    assert said in refusal(capsys, "plot", str(path))
+    assert (path / "metrics.csv").read_bytes() == content
 
 
 def test_a_curve_needs_no_value_that_a_row_may_go_without(capsys, tmp_path):
     names = ("validation_success", "validation_distance_m", "validation_reward")
-    values = {**dict.fromkeys(NAMES, "1.5"), **dict.fromkeys(names, ""), "outcome": "goal"}
-    rows = [",".join({**values, "episode": str(number)}.values()) for number in (0, 1)]
-    write(tmp_path, [*rows, ""])
+    write(tmp_path, [*(row(episode, **dict.fromkeys(names, "")) for episode in (0, 1)), ""])
     assert call(capsys, "plot", str(tmp_path))[0] == 0
 
 
-def test_a_full_disk_is_one_line(tmp_path):
-    writer = MetricsWriter(tmp_path)
-    writer._file.close()
-    with Path("/dev/full").open("w") as writer._file:
-        writer._csv = csv.DictWriter(writer._file, NAMES)
-        with pytest.raises(UserError, match="No space left on device"):
-            writer.add(metrics_of(0))
-        writer.close()
-
-
 def test_a_run_is_summed_up():
-    def driven(steps, updates, outcome, validation):
-        return {
-            "total_steps": str(steps), "updates": str(updates), "human_steps": "3",
-            "interventions": "1", "outcome": outcome, "validation_success": validation,
-        }  # fmt: skip
-
-    rows = [
-        driven(20, 0, "collision", "nan"),
-        driven(90, 50, "goal", "0.5"),
-        driven(150, 110, "timeout", "0.9"),
-        driven(210, 170, "collision", "0.9"),
-        driven(280, 240, "goal", "0.8"),
-    ]
+    names = ("total_steps", "updates", "outcome", "validation_success")
+    same = {"human_steps": "3", "interventions": "1"}
+    rows = [dict(zip(names, values.split(), strict=True)) | same for values in (
+        "20 0 collision nan", "90 50 goal 0.5", "150 110 timeout 0.9", "210 170 collision 0.9",
+        "280 240 goal 0.8",
+    )]  # fmt: skip
     assert totals(rows) == {
-        "episodes": 5,
-        "steps": 280,
-        "updates": 240,
-        "human_steps": 15,
-        "takeovers": 5,
+        "episodes": 5, "steps": 280, "updates": 240, "human_steps": 15, "takeovers": 5,
         "failures": {"collision": 2, "timeout": 1},
         "validation": {"best": 0.9, "best_at_step": 150, "last": 0.8},
-    }
+    }  # fmt: skip
     assert totals([]) == {}

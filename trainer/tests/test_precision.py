@@ -1,3 +1,5 @@
+from collections import Counter
+
 import pytest
 import torch
 
@@ -10,11 +12,12 @@ from trainer.tests.test_td3 import make_batch, weights_of
 
 @pytest.fixture
 def processor(tmp_path, monkeypatch):
-    """Pretend to have a processor of these flags."""
+    """Pretend to have a processor of these flags; None: there is no list of them."""
 
-    def pretend(text: str) -> None:
+    def pretend(text):
         info = tmp_path / "cpuinfo"
-        info.write_text(text)
+        if text is not None:
+            info.write_text(text)
         monkeypatch.setattr(networks, "CPU_INFO", info)
         networks.multiplies_bfloat16.cache_clear()
 
@@ -30,6 +33,7 @@ def processor(tmp_path, monkeypatch):
         ("flags : fma avx2 avx512f", False),
         ("Features : fp asimd ebf16x", False),
         ("", False),
+        (None, False),
     ],
 )
 def test_the_processors_flags_decide(processor, flags, multiplies):
@@ -37,26 +41,17 @@ def test_the_processors_flags_decide(processor, flags, multiplies):
     assert networks.multiplies_bfloat16("cpu") == multiplies
 
 
-def test_without_a_list_of_flags_there_is_none(processor, monkeypatch, tmp_path):
-    processor("")
-    monkeypatch.setattr(networks, "CPU_INFO", tmp_path / "none")
-    assert not networks.multiplies_bfloat16("cpu")
-
-
-def updated(precisions: tuple[str, ...]) -> list[dict[str, torch.Tensor]]:
-    """The weights after one update, for each precision."""
-    learners = [
-        TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
-        for name in precisions
-    ]
-    for learner in learners:
+def updated():
+    """The weights after one update, in float32 and in bfloat16."""
+    for name in ("float32", "bfloat16"):
+        learner = TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
         learner.update(make_batch())
-    return [weights_of(learner) for learner in learners]
+        yield weights_of(learner)
 
 
 def test_a_processor_without_bfloat16_learns_in_float32(processor):
     processor("flags : fma avx2")
-    single, reduced = updated(("float32", "bfloat16"))
+    single, reduced = updated()
     assert all((single[name] == reduced[name]).all() for name in single)
 
 
@@ -64,7 +59,7 @@ def test_a_processor_without_bfloat16_learns_in_float32(processor):
     not networks.multiplies_bfloat16("cpu"), reason="this processor has no bfloat16"
 )
 def test_a_processor_with_bfloat16_learns_in_it():
-    single, reduced = updated(("float32", "bfloat16"))
+    single, reduced = updated()
     for name in ("actor", "critics"):
         assert not torch.equal(single[name], reduced[name])
 
@@ -76,20 +71,18 @@ def test_every_picture_of_an_update_is_embedded_in_its_precision(processor, monk
     embed, reduced = Picture.forward, []
 
     def spy(self, frames):
-        reduced.append((id(self), torch.is_autocast_enabled("cpu")))
-        # Whatever this processor can do.
-        with torch.autocast("cpu", enabled=False):
+        reduced.append((self, torch.is_autocast_enabled("cpu")))
+        with torch.autocast("cpu", enabled=False):  # whatever this processor can do
             return embed(self, frames)
 
     monkeypatch.setattr(Picture, "forward", spy)
     batch = make_batch()
     learner = TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
     learner.update(batch)
-    online = [learner.actor, *learner.critics.pair]
-    targets = [learner.target_actor, *learner.target_critics.pair]
-    used = [*online, *targets, learner.target_critics.first]
-    embedded = [id(network.picture) for network in used]
-    assert sorted(reduced) == sorted((network, name == "bfloat16") for network in embedded)
+    targets = learner.target_critics
+    used = [learner.actor, *learner.critics.pair, learner.target_actor, *targets.pair]
+    wanted = Counter((network.picture, name == "bfloat16") for network in [*used, targets.first])
+    assert Counter(reduced) == wanted
     reduced.clear()
     learner.act(batch.frames[0])
-    assert reduced == [(id(learner.actor.picture), False)]
+    assert reduced == [(learner.actor.picture, False)]

@@ -1,5 +1,4 @@
-"""A policy behind a network: what it drives, and what is learned from it."""
-
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,15 +26,26 @@ class Brightness:
         return np.array([observation[1].mean() / 128.0 - 1.0], np.float32)
 
 
-class Remote:
-    """A driver behind a network."""
+def frames(step):
+    """The observation of a tick: its number and the one before as pictures."""
+    return np.stack([np.full((45, 80), max(n, 0), np.uint8) for n in (step - 1, step)])
 
-    def __init__(self, driver, env, spec, seed):
-        self.driver, self.end = driver, VehicleEnd(env, spec, seed)
-        self.reset = driver.reset
 
-    def act(self, observation):
-        return self.end.tick(observation, self.driver.act)
+def number(observation):
+    """The tick of an observation whose two pictures follow each other."""
+    assert observation[1, 0, 0] - observation[0, 0, 0] in (0, 1)
+    return int(observation[1, 0, 0])
+
+
+def answer(observation):
+    return np.array([number(observation) / 100.0], np.float32)
+
+
+class Car:
+    """A vehicle that only counts; its brake action cannot be mistaken for an answer."""
+
+    brake_action = np.array([-1.0], np.float32)
+    action_space = SimpleNamespace(shape=(1,))
 
 
 class Kept:
@@ -48,36 +58,10 @@ class Kept:
     def start_episode(self, observation):
         self.current = observation
 
-    def add(self, action, reward, observation, terminal, human):
-        self.rows.append(
-            (number(self.current), float(action[0]), reward, number(observation), terminal, human)
-        )
+    def add(self, action, reward, observation, *ends):
+        seen = number(self.current), float(action[0]), reward, number(observation)
+        self.rows.append((*seen, *ends))
         self.current = np.stack([self.current[1], observation[1]])
-
-
-class Car:
-    """A vehicle that only counts; its brake action cannot be mistaken for an answer."""
-
-    brake_action = np.array([-1.0], np.float32)
-
-    class action_space:  # noqa: N801
-        shape = (1,)
-
-
-def frames(step):
-    """The observation of a tick: its number and the one before as pictures."""
-    pictures = [np.full((45, 80), max(n, 0), np.uint8) for n in (step - 1, step)]
-    return np.stack(pictures)
-
-
-def number(observation):
-    """The tick of an observation whose two pictures follow each other."""
-    assert observation[1, 0, 0] - observation[0, 0, 0] in (0, 1)
-    return int(observation[1, 0, 0])
-
-
-def answer(observation):
-    return np.array([number(observation) / 100.0], np.float32)
 
 
 def drive_delayed(spec, ticks, seed=0, terminated=False, human=()):
@@ -96,16 +80,17 @@ def drive_delayed(spec, ticks, seed=0, terminated=False, human=()):
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 def test_a_perfect_network_is_none_to_the_bit(scenario):
-    env = make_environment(scenario)
-    policy = Brightness()
+    env, policy = make_environment(scenario), Brightness()
     for seed in (0, 1):
-        remote = Remote(policy, env, LatencySpec(), seed)
+        end = VehicleEnd(env, LatencySpec(), seed)
+        remote = SimpleNamespace(
+            reset=policy.reset, act=lambda seen, end=end: end.tick(seen, policy.act)
+        )
         assert drive_episodes(env, remote, [seed]) == drive_episodes(env, policy, [seed])
 
 
 def test_a_delayed_driver_is_another_and_the_same_each_time():
-    env = make_environment("left_turn")
-    spec = parse_spec("100ms+-40ms,loss=5%")
+    env, spec = make_environment("left_turn"), parse_spec("100ms+-40ms,loss=5%")
     first, again = (drive_episodes(env, Brightness(), [3], latency=spec) for _ in range(2))
     assert first == again
     assert first[0].actions != drive_episodes(env, Brightness(), [3])[0].actions
@@ -121,8 +106,7 @@ def test_a_reward_stands_beside_the_action_that_earned_it():
 
 def test_a_humans_action_stands_beside_what_the_policy_would_have_had_to_answer():
     rows, _ = drive_delayed("100ms", 8, human=(4,))
-    (row,) = [row for row in rows if row[5]]
-    assert row == (2, pytest.approx(0.9), 4.0, 3, False, True)
+    assert [row for row in rows if row[5]] == [(2, pytest.approx(0.9), 4.0, 3, False, True)]
 
 
 @pytest.mark.parametrize("spec", ["up.loss=30%", "60ms+-50ms", "down.loss=20%,delay=120ms"])
@@ -158,6 +142,6 @@ def test_how_old_a_command_on_time_is_agrees_with_the_link(spec, ticks):
 
 
 def test_without_a_network_nothing_is_between():
-    kept: Any = Kept()
-    assert type(behind(LatencySpec(), kept, Car())) is DirectPolicy
-    assert type(behind(parse_spec("1ms"), kept, Car())) is DelayedPolicy
+    for spec, kind in (("none", DirectPolicy), ("1ms", DelayedPolicy)):
+        between: Any = behind(parse_spec(spec), Kept(), Car())
+        assert type(between) is kind

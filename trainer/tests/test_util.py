@@ -1,7 +1,3 @@
-"""One training in a directory at a time, and no human model over another."""
-
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -9,45 +5,37 @@ import subprocess
 import pytest
 
 from edge_runtime.util import UserError
+from trainer import util
 from trainer.learner.config import LearnerConfig
 from trainer.tests.test_commands import refusal
-from trainer.util import (
-    LOCK_FILE,
-    SIGNALS,
-    claimed,
-    held,
-    holder,
-    quit_on_signals,
-    revision_of,
-    source_revision,
-)
 
 
 @pytest.mark.parametrize("command", ["train", "human"])
 def test_a_second_training_in_a_directory_is_refused(command, capsys, tmp_path):
-    run_dir = tmp_path / "run"
-    with claimed(run_dir):
-        (run_dir / "metrics.csv").write_text("the first's")
-        err = refusal(capsys, command, "--out", str(run_dir), "--episodes", "1")
-        assert f"{run_dir} is being trained in by process {os.getpid()} on " in err
-    assert [path.name for path in run_dir.iterdir()] == ["metrics.csv"]
-    assert (run_dir / "metrics.csv").read_text() == "the first's"
+    with util.claimed(tmp_path):
+        err = refusal(capsys, command, "--out", str(tmp_path), "--episodes", "1")
+        assert f"{tmp_path} is being trained in by process {os.getpid()} on " in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_directory_that_nothing_came_into_goes_again(tmp_path):
-    with pytest.raises(UserError, match="no"), claimed(tmp_path / "a" / "b"):
+    with pytest.raises(UserError, match="no"), util.claimed(tmp_path / "a" / "b"):
         raise UserError("no")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "mine").mkdir()
-    with claimed(tmp_path / "mine"):
+    with util.claimed(tmp_path / "mine"):
         pass
     assert (tmp_path / "mine").is_dir()
 
 
 def test_what_a_killed_process_leaves_keeps_nobody_out(tmp_path):
-    (tmp_path / LOCK_FILE).write_text('{"pid": 1, "host": "elsewhere", "more": "than we write"}')
-    with claimed(tmp_path):
-        assert holder(tmp_path / LOCK_FILE).startswith(f"process {os.getpid()} on ")
+    lock = tmp_path / util.LOCK_FILE
+    for nameless in (b"", b"\xff", b"[]", b"{}"):
+        lock.write_bytes(nameless)
+        assert util.holder(lock) == "another process"
+    lock.write_text('{"pid": 1, "host": "elsewhere", "more": "than we write"}')
+    with util.claimed(tmp_path):
+        assert util.holder(lock).startswith(f"process {os.getpid()} on ")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -64,44 +52,29 @@ def test_a_lock_whose_file_was_taken_away_is_no_lock(tmp_path, monkeypatch):
 
     os_open = os.open
     monkeypatch.setattr("trainer.util.os.open", open_late)
-    with held(path) as mine, held(path) as second:
+    with util.held(path) as mine, util.held(path) as second:
         assert (mine, second) == (True, False)
     assert len(opened) == 3
     assert not path.exists()
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff", b"[]", b"{}"])
-def test_a_holder_without_a_name_is_another_process(content, tmp_path):
-    (tmp_path / "lock").write_bytes(content)
-    assert holder(tmp_path / "lock") == "another process"
-
-
 def test_a_lock_that_cannot_be_had_is_one_line(tmp_path):
-    (tmp_path / LOCK_FILE).mkdir()
-    with pytest.raises(UserError, match="cannot lock"), claimed(tmp_path):
+    (tmp_path / util.LOCK_FILE).mkdir()
+    with pytest.raises(UserError, match="cannot lock"), util.claimed(tmp_path):
         pass
 
 
-def test_a_human_model_is_not_written_over(capsys, tmp_path):
-    (tmp_path / "human_model.pt").write_bytes(b"mine")
-    (tmp_path / "nominal.json").write_text("{}")
-    err = refusal(capsys, "human", "--out", str(tmp_path), "--episodes", "1")
-    assert "holds a human model; choose another --out" in err
-    assert (tmp_path / "human_model.pt").read_bytes() == b"mine"
-    assert len(list(tmp_path.iterdir())) == 2
-
-
-@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("number", util.SIGNALS)
 @pytest.mark.parametrize("heeded", [True, False])
 def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number, heeded):
-    before, asked = [signal.getsignal(each) for each in SIGNALS], []
+    before, asked = [signal.getsignal(each) for each in util.SIGNALS], []
 
     def ask():
         asked.append(number)
         return heeded
 
-    with quit_on_signals(ask):
-        assert [signal.getsignal(each) for each in SIGNALS] != before
+    with util.quit_on_signals(ask):
+        assert [signal.getsignal(each) for each in util.SIGNALS] != before
         if heeded:
             signal.raise_signal(number)
             assert asked == [number]
@@ -109,7 +82,7 @@ def test_the_first_signal_asks_to_stop_and_the_next_or_one_unheeded_ends(number,
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(number)
             assert asked == [number]
-    assert [signal.getsignal(each) for each in SIGNALS] == before
+    assert [signal.getsignal(each) for each in util.SIGNALS] == before
 
 
 @pytest.mark.parametrize(
@@ -131,34 +104,29 @@ def test_what_is_out_of_range_is_told_the_range(name, value, said):
     LearnerConfig(priority_offset=1e-30, gamma=1.0, batch_size=1)
 
 
-def git(directory, *arguments: str) -> str:
-    named = ("-c", "user.name=a", "-c", "user.email=a@b")
-    command = ["git", *named, *arguments]
-    done = subprocess.run(command, cwd=directory, check=True, capture_output=True, text=True)
-    return done.stdout.strip()
-
-
 def test_changed_code_is_dirty_and_changed_results_are_not(tmp_path):
+    def git(*arguments):
+        command = ["git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments]
+        done = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True)
+        return done.stdout.strip()
+
     code, human = tmp_path / "trainer" / "code.py", tmp_path / "results" / "humans" / "human.pt"
     paper = tmp_path / "results" / "paper"
-    table, unit = paper / "README.md", paper / "left_turn.jsonl"
-    for path in (code, human, table, unit):
+    written = [paper / "README.md", paper / "left_turn.jsonl"]
+    for path in (code, human, *written):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("as committed")
-    git(tmp_path, "init", "-q")
-    git(tmp_path, "add", "-A")
-    git(tmp_path, "commit", "-qm", "all")
-    commit = git(tmp_path, "rev-parse", "HEAD")
-    table.write_text("a run has written")
-    unit.write_text("another one")
-    (unit.parent / "fig7.png").write_text("new")
-    assert revision_of(code.parent) == commit
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-qm", "all")
+    commit = git("rev-parse", "HEAD")
+    for path in (*written, paper / "fig7.png"):
+        path.write_text("a run has written")
+    assert util.revision_of(code.parent) == commit
     for path in (human, code):
         path.write_text("changed")
-        assert revision_of(code.parent) == f"{commit}-dirty"
+        assert util.revision_of(code.parent) == f"{commit}-dirty"
         path.write_text("as committed")
-
-
-def test_outside_of_a_repository_it_is_unknown_and_a_process_keeps_the_one_it_began_with(tmp_path):
-    assert revision_of(tmp_path) == "unknown"
-    assert source_revision() is source_revision()
+    # Outside of a repository it is unknown, and a process keeps the one that it began with.
+    assert util.revision_of(tmp_path.parent) == "unknown"
+    assert util.source_revision() is util.source_revision()

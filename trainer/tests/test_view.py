@@ -1,14 +1,13 @@
-"""``trainer train --rerun``: what is drawn, what it may not change, and that nobody waits."""
-
 import math
 import subprocess
 import sys
 import threading
 import time
 from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast, get_args
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -19,6 +18,7 @@ from rerun.chunk import RrdReader
 from bridge.rerun import APPLIED, HUMAN, POLICY, Sink
 from bridge.tests.viewers import in_place
 from edge_runtime.cli import run_cli
+from trainer import view
 from trainer.__main__ import main
 from trainer.drivers import make_environment
 from trainer.human.guide import Intervention, Reason
@@ -27,39 +27,20 @@ from trainer.learner.networks import Critic
 from trainer.person.recording import Recorder, read_steps
 from trainer.person.tests.people import record, recorded_step
 from trainer.pictures import CURVE_FILE
+from trainer.tests.test_commands import refusal
 from trainer.training.config import RunConfig
 from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
 from trainer.training.run import Seen, TrainingRun
-from trainer.view import (
-    CORRECTIONS,
-    DRIVERS,
-    LINES,
-    MOST_WAITING,
-    STEPS_TOGETHER,
-    Background,
-    Entry,
-    Episode,
-    Shown,
-    Steps,
-    TrainingLog,
-    Watcher,
-    q_advantage,
-    watched,
-)
+from trainer.view import Episode, Steps, Watcher
 
 ROOT = Path(__file__).parents[2]
 TINY = RunConfig(
-    seed=3,
-    episodes=1,
-    evaluate_every_steps=1,
-    evaluation_runs=1,
-    threads=1,
+    seed=3, episodes=1, evaluate_every_steps=1, evaluation_runs=1, threads=1,
     learner=LearnerConfig(batch_size=4, replay_capacity=2000, warmup_steps=60),
-)
+)  # fmt: skip
 QUICK = ["--episodes", "1", "--threads", "1", "--set", "evaluate_every_steps=0",
          "--set", "warmup_steps=100000"]  # fmt: skip
 """Options of a run that learns nothing."""
-TIMINGS = [name for name in NAMES if name.endswith("_s")]
 
 
 def values_in(rrd):
@@ -68,29 +49,25 @@ def values_in(rrd):
     for chunk in RrdReader(str(rrd)).stream().to_chunks():
         columns = chunk.to_record_batch().to_pydict()
         steps = columns.get("step", [None] * chunk.num_rows)
-        for name, values in columns.items():
+        for name in columns.keys() - {"step", "rerun.controls.RowId"}:
+            rows = found.setdefault(chunk.entity_path, [])
             if name in ("Scalars:scalars", "StateChange:state"):
-                rows = found.setdefault(chunk.entity_path, [])
-                rows += [(step, value[0]) for step, value in zip(steps, values, strict=True)]
-            elif name not in ("step", "rerun.controls.RowId"):
-                found.setdefault(chunk.entity_path, [])
+                values = (value[0] for value in columns[name])
+                rows += zip(steps, values, strict=True)
     return {path: sorted(rows, key=lambda row: row[0] or 0) for path, rows in found.items()}
 
 
 def weights(run):
     learner = run.learning.learner
-    return torch.cat([p.detach().flatten() for m in (learner.actor, learner.critics)
-                      for p in m.parameters()])  # fmt: skip
+    parts = [*learner.actor.parameters(), *learner.critics.parameters()]
+    return torch.cat([part.detach().flatten() for part in parts])
 
 
 def train(directory, rrd=None):
     directory.mkdir()
-    run = TrainingRun(TINY, directory)
-    if rrd is None:
-        run.train()
-    else:
-        with watched(run, Sink("save", str(rrd))) as on_episode:
-            run.train(on_episode)
+    run: Any = TrainingRun(TINY, directory)
+    with view.watched(run, Sink("save", str(rrd))) if rrd else nullcontext() as on_episode:
+        run.train(*filter(None, [on_episode]))
     return run
 
 
@@ -103,22 +80,22 @@ def shown(tmp_path_factory):
 
 
 def test_a_run_that_is_watched_learns_the_same(shown, tmp_path, one_thread):
-    run, _ = shown
-    alone = train(tmp_path / "alone")
+    def rows(run):
+        return [
+            {name: value for name, value in row.items() if not name.endswith("_s")}
+            for row in read_metrics(run.run_dir)
+        ]
+
+    run, alone = shown[0], train(tmp_path / "alone")
     assert torch.equal(weights(run), weights(alone))
-    rows = [read_metrics(each.run_dir) for each in (run, alone)]
-    for row in (*rows[0], *rows[1]):
-        for name in TIMINGS:
-            del row[name]
-    assert rows[0] == rows[1]
+    assert rows(run) == rows(alone)
 
 
 def test_the_view_holds_the_run(shown):
     run, found = shown
-    metrics = read_metrics(run.run_dir)
-    steps = run.learning.added
-    assert [step for step, _ in found["/action/applied"]] == list(range(steps))
-    assert [step for step, _ in found["/speed/ego"]] == list(range(steps))
+    metrics, steps = read_metrics(run.run_dir), list(range(run.learning.added))
+    for path in ("/action/applied", "/speed/ego"):
+        assert [step for step, _ in found[path]] == steps
     ends = np.cumsum([int(row["steps"]) for row in metrics]) - 1
     for path, column in (
         ("/return/episode", "episode_return"),
@@ -127,57 +104,48 @@ def test_the_view_holds_the_run(shown):
         ("/loss/critic", "critic_loss"),
         ("/success/validation", "validation_success"),
     ):
-        expected = {
-            int(end): float(row[column])
-            for end, row in zip(ends, metrics, strict=True)
-            if row[column] != "nan"
-        }
+        said = zip(ends, (row[column] for row in metrics), strict=True)
+        expected = {int(end): float(value) for end, value in said if value != "nan"}
         assert dict(found[path]) == pytest.approx(expected), path
-    pictures = ("/frames/now", "/frames/before", "/road/ego/body", "/road/traffic/body",
-                "/road/roads", "/status")  # fmt: skip
-    assert [path for path in pictures if path not in found] == []
+    pictures = {"/frames/now", "/frames/before", "/road/ego/body", "/road/traffic/body",
+                "/road/roads", "/status"}  # fmt: skip
+    assert pictures <= found.keys()
 
 
 def test_interventions_are_on_the_time_line_with_their_reasons(shown):
     run, found = shown
-    replay = run.learning.replay
-    human = replay._human[: run.learning.added]
-    told = dict(found["/driver"])
-    driver = "policy"
+    human = run.learning.replay._human[: run.learning.added]
+    told, driver = dict(found["/driver"]), "policy"
     for step, acted in enumerate(human):
         driver = told.get(step, driver)
         assert driver in (("collision", "stuck") if acted else ("policy",)), step
     assert {"policy", "collision"} <= set(told.values())
     corrected = [step for step, _ in found["/advantage/of_the_human"]]
     assert corrected
-    assert all(human[step] for step in corrected)
-
-
-def test_on_the_time_line_policy_and_human_have_their_colours_of_every_view():
-    assert {"policy": POLICY, **dict.fromkeys(get_args(Reason), HUMAN)} == DRIVERS
-    assert (LINES["action/policy"], LINES["action/applied"]) == (POLICY, APPLIED)
+    assert human[corrected].all()
+    # Policy and human have their colours of every view.
+    assert {"policy": POLICY, **dict.fromkeys(get_args(Reason), HUMAN)} == view.DRIVERS
+    assert (view.LINES["action/policy"], view.LINES["action/applied"]) == (POLICY, APPLIED)
 
 
 def test_the_q_advantage_is_the_critics():
     torch.manual_seed(1)
     critic = Critic()
     frames = np.random.default_rng(1).integers(0, 255, (2, 45, 80), dtype=np.uint8)
-    policy, human = np.array([-0.5], np.float32), np.array([0.75], np.float32)
-    batch = torch.from_numpy(frames)[None]
+    policy, human = (np.array([action], np.float32) for action in (-0.5, 0.75))
     with torch.no_grad():
-        expected = critic(batch, torch.tensor([[0.75]])) - critic(batch, torch.tensor([[-0.5]]))
-    found = q_advantage(critic, Seen(frames, policy, None, human, speed_mps=0.0))
-    assert found == pytest.approx(float(expected), abs=1e-6)
+        values = [critic(torch.from_numpy(frames)[None], torch.tensor([[action]]))
+                  for action in (0.75, -0.5)]  # fmt: skip
+    found = view.q_advantage(critic, Seen(frames, policy, None, human, speed_mps=0.0))
+    assert found == pytest.approx(float(values[0] - values[1]), abs=1e-6)
     assert found != 0.0
 
 
 def looking_on(kept):
     learner = SimpleNamespace(target_critics=SimpleNamespace(first=Critic()))
-    run = SimpleNamespace(
-        learning=SimpleNamespace(added=40, learner=learner),
-        env=SimpleNamespace(scene=lambda: {"roads": []}),
-    )
-    return Watcher(cast(TrainingRun, run), kept.append)
+    learning = SimpleNamespace(added=40, learner=learner)
+    run: Any = SimpleNamespace(learning=learning, env=SimpleNamespace(scene=lambda: {"roads": []}))
+    return Watcher(run, kept.append)
 
 
 def control_period(human):
@@ -187,50 +155,34 @@ def control_period(human):
 
 
 def test_pictures_are_at_most_ten_a_second_and_numbers_are_whole(monkeypatch):
-    kept: list[Entry] = []
+    kept: list[Any] = []
     now_s = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     watcher = looking_on(kept)
-    for _ in range(1000):  # Two seconds at 500 steps a second.
+    for _ in range(1007):  # Two seconds at 500 steps a second.
         watcher.on_step(control_period(human=False))
         now_s[0] += 0.002
-    watcher.on_episode(metrics_of(1000))
-    steps = [entry.step for part in kept if isinstance(part, Steps) for entry in part.entries]
-    assert steps == list(range(40, 1040))
-    assert all(len(part.entries) <= STEPS_TOGETHER for part in kept if isinstance(part, Steps))
-    pictures = [part for part in kept if isinstance(part, Steps) and part.frames is not None]
+    watcher.hand_over()  # An episode that is broken off is handed over, too.
+    assert [entry.step for part in kept for entry in part.entries] == list(range(40, 1047))
+    assert all(len(part.entries) <= view.STEPS_TOGETHER for part in kept)
+    pictures = [part for part in kept if part.frames is not None]
     assert len(pictures) == pytest.approx(20, abs=2)
 
 
-def test_an_episode_that_is_broken_off_is_handed_over():
-    kept: list[Entry] = []
-    watcher = looking_on(kept)
-    for _ in range(7):
-        watcher.on_step(control_period(human=False))
-    watcher.hand_over()
-    assert sum(len(part.entries) for part in kept if isinstance(part, Steps)) == 7
-
-
-def metrics_of(steps):
-    numbers = dict.fromkeys(NAMES, math.nan)
-    return EpisodeMetrics(**{**numbers, "steps": steps, "episode": 0, "outcome": "goal"})
-
-
-@pytest.mark.parametrize("human_steps", [0, 1, CORRECTIONS, CORRECTIONS + 1, 500])
+@pytest.mark.parametrize("human_steps", [0, 1, view.CORRECTIONS, view.CORRECTIONS + 1, 500])
 def test_corrections_are_spread_over_the_episode(human_steps):
-    kept: list[Entry] = []
+    kept: list[Any] = []
     watcher = looking_on(kept)
     for _ in range(human_steps):
         watcher.on_step(control_period(human=True))
-    watcher.on_episode(metrics_of(max(human_steps, 1)))
+    numbers = dict.fromkeys(NAMES, math.nan) | {"steps": max(human_steps, 1), "episode": 0}
+    watcher.on_episode(EpisodeMetrics(**{**numbers, "outcome": "goal"}))
     episode = kept[-1]
-    assert isinstance(episode, Episode)
-    assert len(episode.corrections) <= CORRECTIONS
+    steps = [step for step, _ in episode.corrections]
+    assert min(human_steps, view.CORRECTIONS // 2) <= len(steps) <= view.CORRECTIONS
     assert (episode.critic is None) == (human_steps == 0)
     if human_steps:
-        steps = [step for step, _ in episode.corrections]
         assert (steps[0], len(set(np.diff(steps)))) == (40, min(len(steps) - 1, 1))
-        assert len(steps) >= min(human_steps, CORRECTIONS // 2)
 
 
 def test_a_slow_view_holds_nobody_up():
@@ -240,8 +192,8 @@ def test_a_slow_view_holds_nobody_up():
         go_on.wait(10.0)
         drawn.append(entry)
 
-    background = Background(lambda: nullcontext(draw))
-    entries = [Steps([]) for _ in range(MOST_WAITING + 100)]
+    background = view.Background(lambda: nullcontext(draw))
+    entries = [Steps([]) for _ in range(view.MOST_WAITING + 100)]
     for entry in entries:
         background.put(entry)
     assert background.dropped in (99, 100)  # One may be in its hands already.
@@ -260,7 +212,7 @@ def test_a_view_that_fails_does_not_end_the_run(capsys, error):
     def draw(_entry):
         raise error
 
-    background = Background(lambda: nullcontext(draw))
+    background = view.Background(lambda: nullcontext(draw))
     for _ in range(3):
         background.put(Steps([]))
     background.close()
@@ -268,40 +220,35 @@ def test_a_view_that_fails_does_not_end_the_run(capsys, error):
     assert line == "viewer gone; the run is unharmed: disk full"
 
 
-@pytest.mark.parametrize("word", ["spawn", "serve"])
-@pytest.mark.parametrize("kind", ["ends at once", "is killed", "never listens"])
+@pytest.mark.parametrize(
+    ("kind", "word"),
+    [*product(["ends at once", "is killed", "never listens"], ["spawn", "serve"]),
+     ("hangs", "serve")],
+)  # fmt: skip
 def test_a_training_outlives_its_viewer(kind, word, tmp_path, capfd, monkeypatch, one_thread):
-    drawn = TrainingLog._draw_episode
+    drawn = view.TrainingLog._draw_episode
 
     def draw_late(self, episode):
         time.sleep(1.5)  # By then it is gone.
         drawn(self, episode)
 
-    monkeypatch.setattr(TrainingLog, "_draw_episode", draw_late)
+    if kind != "hangs":
+        monkeypatch.setattr(view.TrainingLog, "_draw_episode", draw_late)
     out = tmp_path / "run"
     with in_place(kind, tmp_path, monkeypatch):
         assert run_cli(main, ["train", "--rerun", word, "--out", str(out), *QUICK]) == 0
     said = capfd.readouterr().err
-    assert said.count("viewer gone; the run is unharmed: ") == 1
     assert "Traceback" not in said
-    assert (out / CURVE_FILE).exists()
-
-
-def test_a_training_is_not_held_up_by_a_viewer_that_hangs(tmp_path, monkeypatch, one_thread):
-    out = tmp_path / "run"
-    with in_place("hangs", tmp_path, monkeypatch):
-        assert main(["train", "--rerun", "serve", "--out", str(out), *QUICK]) == 0
+    if kind != "hangs":
+        assert said.count("viewer gone; the run is unharmed: ") == 1
     assert (out / CURVE_FILE).exists()
 
 
 def test_rerun_is_loaded_only_when_it_is_asked_for(tmp_path):
-    code = (
-        "import sys; from trainer.__main__ import main; main(sys.argv[1:]); "
-        "sys.exit('rerun' in sys.modules)"
-    )
+    code = "import sys; from trainer.__main__ import main; main(sys.argv[1:]); "
+    code += "sys.exit('rerun' in sys.modules)"
     command = [sys.executable, "-c", code, "train", "--out", str(tmp_path / "run"), *QUICK]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
+    subprocess.run(command, cwd=ROOT, check=True, timeout=120)
 
 
 def test_the_command_writes_a_recording(tmp_path, one_thread):
@@ -314,22 +261,22 @@ def test_the_command_writes_a_recording(tmp_path, one_thread):
 BRAKED = [0.5] * 5 + [-1.0] * 5 + [0.5] * 5
 
 
-def drive(directory, seeds=(4, 9), steps=15, sitting_policy=True, scenario="left_turn"):
+def drive(directory, seeds=(4, 9), steps=15, scenario="left_turn", **changes):
     """A recorded sitting: the policy wants half throttle, the person brakes from step 5 to 9."""
     env, recorder = make_environment(scenario), Recorder(directory)
     for episode, seed in enumerate(seeds):
         observation, _ = env.reset(seed=seed)
-        for number in range(steps):
-            action, taken = BRAKED[number], 5 <= number < 10
+        for number, action in enumerate(BRAKED[:steps]):
             frames = observation
             observation, reward, *_ = env.step(np.array([action], np.float32))
-            recorder.write(recorded_step(
-                recorder.sitting, recorder.index, scenario=scenario, seed=seed, episode=episode,
-                step=number, frames=frames.tobytes(), next_frame=observation[1].tobytes(),
-                policy_action=0.5 if sitting_policy else None, action=action, human=taken,
-                first=number == 5, reward=float(reward), speed_mps=float(env.ego.speed),
-                outcome="restarted" if number == steps - 1 else "",
-            ))  # fmt: skip
+            given = {
+                "scenario": scenario, "seed": seed, "episode": episode, "step": number,
+                "frames": frames.tobytes(), "next_frame": observation[1].tobytes(),
+                "policy_action": 0.5, "action": action, "human": 5 <= number < 10,
+                "first": number == 5, "reward": float(reward), "speed_mps": env.ego.speed,
+                "outcome": "restarted" if number == steps - 1 else "", **changes,
+            }  # fmt: skip
+            recorder.write(recorded_step(recorder.sitting, recorder.index, **given))
     recorder.close()
     return recorder.path
 
@@ -363,7 +310,7 @@ def test_each_scenario_is_shown_on_its_own_ground(tmp_path):
 def test_a_road_that_would_be_driven_differently_is_not_made_up(tmp_path):
     steps = list(read_steps(drive(tmp_path)))
     steps[7] = msgspec.structs.replace(steps[7], frames=bytes(7200))
-    shown = Shown()
+    shown = view.Shown()
     entries = list(shown.entries([record(tmp_path, steps)]))
     scenes = [entry.scene is not None for entry in entries if isinstance(entry, Steps)]
     assert scenes == [False] * 15 + [True] * 15
@@ -371,32 +318,29 @@ def test_a_road_that_would_be_driven_differently_is_not_made_up(tmp_path):
 
 
 def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):
-    path = drive(tmp_path, seeds=(4,), sitting_policy=False)
-    entries = list(Shown().entries([path]))
+    entries = list(view.Shown().entries([drive(tmp_path, seeds=(4,), policy_action=None)]))
     steps = [entry.entries[0] for entry in entries if isinstance(entry, Steps)]
     assert all(math.isnan(step.policy_action) for step in steps)
-    (episode,) = (entry for entry in entries if isinstance(entry, Episode))
-    assert (episode.metrics.human_steps, episode.metrics.interventions) == (5, 1)
-    assert episode.metrics.outcome == "restarted"
+    (metrics,) = (entry.metrics for entry in entries if isinstance(entry, Episode))
+    found = metrics.human_steps, metrics.interventions, metrics.outcome
+    assert found == (5, 1, "restarted")
 
 
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (["train", "--out", "run", "--rerun", "window"], "neither spawn nor serve"),
-        (["train", "--out", "run", "--rerun", "spawn"], "no display"),
-        (["train", "--out", "run", "--rerun", "/dev/null/a.rrd"], "/dev/null"),
-        (["view", "none", "--save", "a.rrd"], "no recording in none"),
-        (["view", "drives"], "no display for a window here"),
-        (["view", "drives", "--save", "/dev/null/a.rrd"], "Not a directory"),
+        ("train --out run --rerun window", "neither spawn nor serve"),
+        ("train --out run --rerun spawn", "no display"),
+        ("train --out run --rerun /dev/null/a.rrd", "/dev/null"),
+        ("view none --save a.rrd", "no recording in none"),
+        ("view drives", "no display for a window here"),
+        ("view drives --save /dev/null/a.rrd", "Not a directory"),
     ],
 )
 def test_bad_input_is_one_line_before_anything_is_made(words, part, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     drive(tmp_path / "drives", seeds=(4,), steps=2)
-    assert run_cli(main, words) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert part in line
+    assert part in refusal(capsys, *words.split())
     assert [path.name for path in tmp_path.iterdir()] == ["drives"]

@@ -1,7 +1,5 @@
 """People for tests: hands that follow a list, eyes that remember."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -27,12 +25,7 @@ class Puppet:
     help: tuple[str, ...] = ("a test",)
     moving = Moving()
 
-    def __init__(
-        self,
-        readings: Iterable[Reading] = (),
-        then: Reading = LET_GO,
-        presence: Iterable[bool] = (),
-    ) -> None:
+    def __init__(self, readings: Iterable[Reading] = (), then=LET_GO, presence=()) -> None:
         self._readings, self._then, self._presence = iter(readings), then, iter(presence)
         self.views: list[View] = []
 
@@ -59,12 +52,10 @@ class Discarding(Puppet):
 
     def poll(self, now_s: float) -> Reading:
         seen = self.views[-1]
-        ended = seen.message.startswith("episode")
         wishes: set[Wish] = set()
-        if ended and seen.episode + 1 == self._episodes:
-            wishes.add("quit")
-        if ended and seen.episode in self._discarded:
-            wishes.add("discard")
+        if seen.message.startswith("episode"):
+            wishes |= {"quit"} if seen.episode + 1 == self._episodes else set()
+            wishes |= {"discard"} if seen.episode in self._discarded else set()
         return Reading(-1.0, engaged=True, wishes=frozenset(wishes))
 
 

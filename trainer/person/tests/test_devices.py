@@ -1,21 +1,20 @@
-"""Keys, axes and buttons: SDL's own events, and SDL's own virtual wheel."""
-
-from __future__ import annotations
-
 import time
 from dataclasses import replace
+from itertools import count
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
 from bridge import rerun
-from trainer.drivers import load_driver, make_environment
+from trainer.drivers import EXPERTS, make_environment
 from trainer.person.devices import SIZE, JoystickHands, KeyboardHands, Window, pygame
 from trainer.person.interface import LET_GO
 from trainer.person.profile import SHIPPED, read_profile
 from trainer.person.tests.browser import first_view
 from trainer.person.tests.virtual_wheel import VirtualWheel, load_sdl
+from trainer.tests.humans import drive
 
 G29 = read_profile(SHIPPED / "g29.toml")
 
@@ -24,7 +23,7 @@ def press(hands, code, down=True):
     hands.handle(pygame.event.Event(pygame.KEYDOWN if down else pygame.KEYUP, key=code))
 
 
-def test_a_held_key_takes_over_and_its_action_grows():
+def test_a_held_key_takes_over_and_its_action_grows_until_the_window_loses_the_focus():
     hands = KeyboardHands("left_turn")
     assert not hands.read(0.0).engaged
     press(hands, pygame.K_DOWN)
@@ -33,27 +32,26 @@ def test_a_held_key_takes_over_and_its_action_grows():
     assert all(r.engaged for r in readings)
     press(hands, pygame.K_DOWN, down=False)
     assert hands.read(0.5) == LET_GO
+    press(hands, pygame.K_UP)
+    assert hands.read(0.6).engaged
+    hands.handle(pygame.event.Event(pygame.WINDOWFOCUSLOST))
+    assert not hands.read(0.7).engaged
 
 
-def test_a_tap_between_two_readings_is_not_missed():
+def test_a_tap_between_two_readings_is_not_missed_and_turning_round_does_not_first_undo():
     hands = KeyboardHands("congestion")
     hands.read(0.0)
-    press(hands, pygame.K_LEFT)
-    press(hands, pygame.K_LEFT, down=False)
+    for down in (True, False):
+        press(hands, pygame.K_LEFT, down)
     reading = hands.read(0.1)
-    assert reading.engaged
-    assert reading.action == pytest.approx(-0.25)
+    assert (reading.engaged, reading.action) == (True, pytest.approx(-0.25))
     assert not hands.read(0.2).engaged
-
-
-def test_turning_round_does_not_first_undo():
-    hands = KeyboardHands("congestion")
     press(hands, pygame.K_RIGHT)
-    for period in range(5):
+    for period in range(3, 8):
         hands.read(0.1 * period)
     press(hands, pygame.K_RIGHT, down=False)
     press(hands, pygame.K_LEFT)
-    assert hands.read(0.5).action == pytest.approx(-0.25)
+    assert hands.read(0.8).action == pytest.approx(-0.25)
 
 
 @pytest.mark.parametrize(
@@ -65,14 +63,6 @@ def test_the_space_bar_holds_without_driving_and_other_keys_do_nothing(code, eng
     press(hands, code)
     reading = hands.read(0.0)
     assert (reading.engaged, reading.action) == (engaged, 0.0)
-
-
-def test_a_window_without_focus_holds_nothing():
-    hands = KeyboardHands("left_turn")
-    press(hands, pygame.K_UP)
-    hands.read(0.0)
-    hands.handle(pygame.event.Event(pygame.WINDOWFOCUSLOST))
-    assert not hands.read(0.1).engaged
 
 
 def keys_for(wanted: float, action: float, keys: tuple[int, int], down: int | None) -> int | None:
@@ -92,28 +82,23 @@ def keys_for(wanted: float, action: float, keys: tuple[int, int], down: int | No
 def test_keys_are_enough_to_drive(scenario, keys):
     """Eyes that know the expert's mind, and a hand that is two tenths of a second behind."""
     env = make_environment(scenario)
-    expert, _ = load_driver("expert", env)
-    outcomes = []
+    expert, periods = EXPERTS[scenario](env), count()
     for seed in range(6):
-        observation, info = env.reset(seed=seed)
         expert.reset()
-        hands, down, now_s, wanted, action = KeyboardHands(scenario), None, 0.0, [0.0, 0.0], 0.0
-        ended = False
-        while not ended:
+        hands, down, wanted, action = KeyboardHands(scenario), None, [0.0, 0.0], 0.0
+
+        def act(observation, hands=hands, wanted=wanted):
+            nonlocal down, action
             wanted.append(float(expert.act(observation)[0]))
             pressed = keys_for(wanted[-3], action, keys, down)
-            if pressed != down:
-                if down:
-                    press(hands, down, down=False)
-                if pressed:
-                    press(hands, pressed)
-                down = pressed
-            now_s += 0.1
-            action = hands.read(now_s).action
-            observation, _, terminated, truncated, info = env.step(np.array([action], np.float32))
-            ended = terminated or truncated
-        outcomes.append(info["outcome"])
-    assert outcomes == ["goal"] * 6
+            for key, pressing in ((down, False), (pressed, True)):
+                if key and pressed != down:
+                    press(hands, key, pressing)
+            down = pressed
+            action = hands.read(0.1 * next(periods)).action
+            return np.array([action], np.float32)
+
+        assert drive(env, act, seed)[1]["outcome"] == "goal"
 
 
 @pytest.fixture
@@ -143,33 +128,28 @@ def test_axes_and_buttons_of_a_wheel(wheel):
     wheel.axis(0, 0.25)
     reading = read(device)
     assert reading.action == pytest.approx(1.0, abs=1e-3)
-    assert reading.by_moving
-    assert not reading.engaged
+    assert (reading.by_moving, reading.engaged) == (True, False)
     wheel.button(4, True)
     assert read(device).engaged
     wheel.button(9, True)
-    readings = [device.poll(0.0) for _ in range(3)]
-    assert [r.wishes for r in readings].count(frozenset({"pause"})) == 1
+    wishes = [device.poll(0.0).wishes for _ in range(3)]
+    assert wishes.count(frozenset({"pause"})) == 1
 
 
 def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
+    other = msgspec.structs.replace(G29, match="Thrustmaster")
+    assert not Window(JoystickHands(other, "left_turn")).present, "another device"
     device = at_the_wheel("congestion")
     wheel.axis(0, 0.25)
     assert read(device).action > 0.9
     wheel.unplug()
     reading = read(device)
-    assert not device.present
-    assert (reading.action, reading.by_moving) == (0.0, False)
+    assert (device.present, reading.action, reading.by_moving) == (False, 0.0, False)
     again = VirtualWheel()
     read(device)
     assert device.present
     again.axis(0, -0.25)
     assert read(device).action < -0.9
-
-
-def test_another_device_is_not_taken_for_the_profiles(wheel):
-    other = msgspec.structs.replace(G29, match="Thrustmaster")
-    assert not Window(JoystickHands(other, "left_turn")).present
 
 
 @pytest.fixture
@@ -185,15 +165,13 @@ def opened(monkeypatch):
     pygame.quit()
 
 
-def shown() -> pygame.Surface:
+def shown() -> Any:
     """What is in the window."""
-    surface = pygame.display.get_surface()
-    assert surface is not None
-    return surface
+    return pygame.display.get_surface()
 
 
 def found(colour):
-    """Where a colour is seen, as (left, top, right, bottom)."""
+    """Where a colour is seen in the window, as (left, top, right, bottom)."""
     mask = pygame.mask.from_threshold(shown(), colour, (12, 12, 12, 255))
     boxes = mask.get_bounding_rects()
     assert boxes, "not seen"
@@ -222,8 +200,7 @@ def test_a_window_that_is_resized_shows_all_of_it_in_its_shape(opened):
 @pytest.mark.parametrize("control", ["policy", "human", "returning"])
 def test_the_car_has_the_colour_of_who_drives(opened, control):
     opened(1920, 1080).show(replace(first_view(), control=control, human_action=0.0))
-    car = shown().subsurface((0, 0, 736, 400))
-    seen = {tuple(car.get_at((x, y)))[:3] for x in range(736) for y in range(400)}
-    others = {rerun.POLICY, rerun.HUMAN, rerun.RETURNING} - {rerun.BY_NAME[control]}
-    assert rerun.BY_NAME[control] in seen
-    assert not seen & others
+    car = pygame.surfarray.array3d(shown().subsurface((0, 0, 736, 400)))
+    seen = set(map(tuple, car.reshape(-1, 3).tolist()))
+    drivers = {rerun.POLICY, rerun.HUMAN, rerun.RETURNING}
+    assert seen & drivers == {rerun.BY_NAME[control]}

@@ -1,7 +1,3 @@
-"""Recordings: whole, cut off, foreign; sittings add up."""
-
-from __future__ import annotations
-
 import mmap
 import os
 import random
@@ -9,7 +5,7 @@ import resource
 import signal
 import struct
 import time
-from contextlib import contextmanager
+from itertools import cycle
 from typing import cast
 
 import msgspec
@@ -17,25 +13,16 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from bridge import recording
-from bridge.tests.test_recording import MIB, crafted, zeros
 from edge_runtime.files import try_to_lock_file
+from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
 from trainer.learner.replay import ReplayBuffer
-from trainer.person.recording import (
-    DISCARDED,
-    Recorder,
-    Step,
-    find_recordings,
-    read_steps,
-    sittings,
-    steps_since,
-    store_again,
-)
+from trainer.person import recording
+from trainer.person.recording import Recorder, read_steps, sittings
 from trainer.person.tests.people import record, recorded_step
 
 
-def record_some(directory, count: int) -> list[Step]:
+def record_some(directory, count: int) -> list[recording.Step]:
     """A sitting of so many steps, each of which is there before the next is taken."""
     recorder, steps = Recorder(directory), []
     for index in range(count):
@@ -75,85 +62,64 @@ def test_steps_of_another_version_are_refused_and_not_taken_for_a_torn_end(tmp_p
     class Older(msgspec.Struct):
         time_ns: int = 1
 
-    path = record(tmp_path, [cast(Step, Older())])
+    path = record(tmp_path, [cast(recording.Step, Older())])
     with pytest.raises(UserError, match="recorded by another version: Object missing"):
         list(read_steps(path))
 
 
-def test_a_sitting_is_held_until_it_is_closed(tmp_path):
-    recorder = Recorder(tmp_path)
+def test_what_is_written_is_read_and_sittings_add_up_and_are_never_overwritten(tmp_path):
+    run = tmp_path / "run"
+    first, second = record_some(run / "sittings", 2), record_some(run / "sittings", 3)
+    np.testing.assert_array_equal(first[0].next_observation, first[1].observation)
+    paths = sittings(run / "sittings")
+    assert [path.name for path in paths] == ["sitting-0001.mcap", "sitting-0002.mcap"]
+    assert [step for path in paths for step in read_steps(path)] == first + second
+    # They are found by file, directory and run, each once.
+    assert recording.find_recordings([paths[1], run, run / "sittings"]) == paths[::-1]
+    with pytest.raises(UserError, match="no recording"):
+        recording.find_recordings([tmp_path])
+
+
+def test_a_sitting_is_held_until_it_is_closed_and_without_a_step_leaves_nothing_behind(tmp_path):
+    record_some(tmp_path / "rec", 0)
+    assert sittings(tmp_path / "rec") == []
+    recorder = Recorder(tmp_path / "rec")
     recorder.write(recorded_step(1, 0))
     with recorder.path.open("rb") as other:
         assert not try_to_lock_file(other.fileno())
         recorder.close()
         assert try_to_lock_file(other.fileno())
-
-
-def test_what_is_written_is_read_and_sittings_add_up_and_are_never_overwritten(tmp_path):
-    first, second = record_some(tmp_path, 2), record_some(tmp_path, 3)
-    np.testing.assert_array_equal(first[0].next_observation, first[1].observation)
-    paths = sittings(tmp_path)
-    assert [path.name for path in paths] == ["sitting-0001.mcap", "sitting-0002.mcap"]
-    assert [step for path in paths for step in read_steps(path)] == first + second
-
-
-def test_a_sitting_without_a_step_leaves_nothing_behind(tmp_path):
-    record_some(tmp_path / "rec", 0)
-    assert sittings(tmp_path / "rec") == []
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot create"):
         Recorder(tmp_path / "file")
 
 
-def test_recordings_are_found_by_file_directory_and_run_each_once(tmp_path):
-    record_some(tmp_path / "run" / "sittings", 1)
-    record_some(tmp_path / "run" / "sittings", 1)
-    (path, other) = sittings(tmp_path / "run" / "sittings")
-    assert find_recordings([other, tmp_path / "run", path.parent]) == [other, path]
-    with pytest.raises(UserError, match="no recording"):
-        find_recordings([tmp_path])
-
-
 @pytest.mark.parametrize("data", [b"", b"\x89MCAP", b"hello" * 100])
 def test_another_file_is_refused(tmp_path, data):
-    path = tmp_path / "x.mcap"
-    path.write_bytes(data)
-    with pytest.raises(UserError, match="no recording of a sitting"):
-        list(read_steps(path))
-    with pytest.raises(UserError, match="cannot be read"):
-        list(read_steps(tmp_path / "none.mcap"))
+    (tmp_path / "x.mcap").write_bytes(data)
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(UserError, match="no regular file"):
-        list(read_steps(tmp_path / "pipe"))
+    for name, said in (
+        ("x.mcap", "no recording of a sitting"),
+        ("none.mcap", "cannot be read"),
+        ("pipe", "no regular file"),
+    ):
+        with pytest.raises(UserError, match=said):
+            list(read_steps(tmp_path / name))
 
 
-def test_a_file_made_to_keep_its_reader_busy_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(recording, "MAX_CHUNK_BYTES", MIB)
-    path = crafted(tmp_path / "sitting-0001.mcap", *[(zeros(1), MIB)] * 40)
-    with pytest.raises(UserError, match=r"sitting-0001\.mcap is refused"):
-        list(read_steps(path))
-
-
-@contextmanager
-def room_for(path, count: int):
-    """A disk that takes so many bytes more of a file."""
+@pytest.mark.parametrize(("room", "refused"), [(500, "write"), (0, "close")])
+def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path, room, refused):
+    recorder, step = Recorder(tmp_path), recorded_step(1, 0)
+    recorder.write(step)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + count, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (recorder.path.stat().st_size + room, before[1]))
     try:
-        yield
+        with pytest.raises(UserError, match="cannot write"):
+            recorder.write(recorded_step(1, 1)) if refused == "write" else recorder.close()
+        recorder.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-def test_a_full_disk_is_one_line_and_what_was_kept_stays(tmp_path):
-    for room, refused in ((500, "write"), (0, "close")):
-        recorder = Recorder(tmp_path / refused)
-        recorder.write(recorded_step(1, 0))
-        with room_for(recorder.path, room):
-            with pytest.raises(UserError, match="cannot write"):
-                recorder.write(recorded_step(1, 1)) if refused == "write" else recorder.close()
-            recorder.close()
-        assert list(read_steps(recorder.path)) == [recorded_step(1, 0)]
+    assert list(read_steps(recorder.path)) == [step]
 
 
 def penalises(intervention):
@@ -187,7 +153,7 @@ def assert_pictures(buffer, steps):
 def test_steps_come_back_with_mask_action_reward_and_pictures():
     steps = [*episode(1, 0, 4, range(1, 3)), *episode(1, 4, 3, range(0))]
     buffer = ReplayBuffer(100)
-    assert store_again(buffer, steps, shape, penalises) == (7, 2)
+    assert recording.store_again(buffer, steps, shape, penalises) == (7, 2)
     state = buffer.state_dict()
     assert state["human"].tolist() == [False, True, True, False, False, False, False]
     assert state["rewards"].tolist() == [0.0, -99.0, 2.0, 3.0, 4.0, 5.0, 6.0]
@@ -198,61 +164,52 @@ def test_steps_come_back_with_mask_action_reward_and_pictures():
     )
     assert_pictures(buffer, steps)
     # An episode that was thrown away does not come back.
-    steps[3] = replace(steps[3], outcome=DISCARDED)
+    steps[3] = replace(steps[3], outcome=recording.DISCARDED)
     buffer = ReplayBuffer(100)
-    assert store_again(buffer, steps, shape, penalises) == (3, 0)
+    assert recording.store_again(buffer, steps, shape, penalises) == (3, 0)
     assert buffer.state_dict()["rewards"].tolist() == [4.0, 5.0, 6.0]
 
 
 def test_behind_a_network_the_action_answers_an_older_picture():
-    steps = episode(1, 0, 5, range(0))
-    buffer = ReplayBuffer(100)
-    assert store_again(buffer, steps, shape, penalises, ticks_late=2) == (3, 0)
+    steps, buffer = episode(1, 0, 5, range(0)), ReplayBuffer(100)
+    assert recording.store_again(buffer, steps, shape, penalises, ticks_late=2) == (3, 0)
     state = buffer.state_dict()
     assert state["rewards"].tolist() == [2.0, 3.0, 4.0]
     np.testing.assert_allclose(state["actions"][:, 0], [0.2, 0.3, 0.4])
     assert_pictures(buffer, steps)
     # One that was killed before the network answered stores nothing.
-    assert store_again(buffer, steps[:2], shape, penalises, ticks_late=2) == (0, 0)
+    assert recording.store_again(buffer, steps[:2], shape, penalises, ticks_late=2) == (0, 0)
 
 
 @pytest.mark.parametrize(("position", "left"), [((1, 0), 5), ((1, 2), 3), ((2, 0), 2), ((3, 0), 0)])
 def test_only_what_came_after_the_checkpoint(tmp_path, position, left):
     for sitting, count in ((1, 3), (2, 2)):
         record(tmp_path, episode(sitting, 0, count, range(0)))
-    assert len(list(steps_since(tmp_path, position))) == left
+    assert len(list(recording.steps_since(tmp_path, position))) == left
 
 
 COUNT = struct.Struct("<Q")
 STEPS = [recorded_step(1, 0), recorded_step(1, 1)]
 
 
-def record_for_ever(directory, kept: mmap.mmap) -> None:
-    """What a drive does, as quickly as it can; ``kept`` counts what the recorder has taken."""
-    recorder, step = Recorder(directory), STEPS[0]
-    while True:
-        for step in STEPS:
-            recorder.write(step)
-            COUNT.pack_into(kept, 0, recorder.index)
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_no_step_that_was_kept_is_lost(tmp_path, seed):
+    """Killed while it records as quickly as it can; ``kept`` counts what the recorder took."""
     kept = mmap.mmap(-1, COUNT.size)
     child = os.fork()
     if child == 0:
         try:
-            record_for_ever(tmp_path, kept)
+            recorder = Recorder(tmp_path)
+            for step in cycle(STEPS):
+                recorder.write(step)
+                COUNT.pack_into(kept, 0, recorder.index)
         finally:
             os._exit(1)
-    deadline_s = time.monotonic() + 30.0
-    while COUNT.unpack_from(kept)[0] == 0 and time.monotonic() < deadline_s:
-        time.sleep(0.001)
+    wait_until(lambda: COUNT.unpack_from(kept)[0] > 0, "a step")
     time.sleep(random.Random(seed).uniform(0.0, 0.05))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     (count,) = COUNT.unpack_from(kept)
     steps = list(read_steps(tmp_path / "sitting-0001.mcap"))
-    assert count > 0
     assert len(steps) in (count, count + 1)
     assert steps == [STEPS[number % 2] for number in range(len(steps))]

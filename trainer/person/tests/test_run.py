@@ -1,16 +1,12 @@
-"""A learner that nobody waits for, whatever its update takes."""
-
-from __future__ import annotations
-
 import math
 import threading
-import time
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
+from edge_runtime.tests.harness import wait_until
 from trainer.learner.config import ALGORITHMS, LearnerConfig
 from trainer.person.run import KeptBack, PersonRun, UnhurriedLearning
 from trainer.training.config import RunConfig
@@ -28,7 +24,7 @@ def frames(value: int):
 class Gate:
     """Holds updates up until it is opened."""
 
-    def __init__(self, learning: LearningThread, monkeypatch) -> None:
+    def __init__(self, learning, monkeypatch):
         self.open, self.begun = threading.Event(), 0
         update = learning.learner.update
 
@@ -93,9 +89,7 @@ def test_the_next_update_begins_when_the_last_is_done(learning, monkeypatch):
     gate.open.set()
     for _ in range(3):
         unhurried.begin(0.0)
-        end_s = time.monotonic() + SOON_S
-        while inner.updating and time.monotonic() < end_s:
-            time.sleep(0.001)
+        wait_until(lambda: not inner.updating, "the update's end")
     unhurried.settle()
     assert gate.begun == 3
 
@@ -121,9 +115,7 @@ def test_a_restored_learner_acts_as_the_one_that_was_saved(learning):
     assert np.any(other.act(frames(7)) != action)
     other.load_state_dict(state)
     np.testing.assert_array_equal(other.act(frames(7)), action)
-    np.testing.assert_array_equal(
-        unhurried.act_together(frames(7)[None], averaged=True).shape, (1, 1)
-    )
+    assert unhurried.act_together(frames(7)[None], averaged=True).shape == (1, 1)
     other.close()
 
 
@@ -137,7 +129,5 @@ def test_a_restored_learner_acts_as_the_one_that_was_saved(learning):
     ],
 )
 def test_before_it_learns_it_says_so_instead_of_nan(added, loss, said):
-    config = RunConfig()
-    assert config.learner.warmup_steps == 256
-    run: Any = SimpleNamespace(config=config, learning=SimpleNamespace(added=added))
-    assert PersonRun._learned(cast(PersonRun, run), loss) == said
+    run: Any = SimpleNamespace(config=RunConfig(), learning=SimpleNamespace(added=added))
+    assert PersonRun._learned(run, loss) == said

@@ -1,7 +1,3 @@
-"""A sitting in the left turn: taking over, pausing, beginning anew, quitting; all of it kept."""
-
-from __future__ import annotations
-
 from itertools import pairwise, repeat
 from types import SimpleNamespace
 
@@ -40,80 +36,69 @@ def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=No
 
 def test_taking_over_changes_the_very_step_and_is_recorded_with_its_mask(tmp_path):
     readings = [LET_GO, LET_GO, hold(-1.0), hold(-1.0), hold(-1.0), LET_GO, LET_GO, LET_GO, LET_GO]
-    _, steps, *_ = drive_and_read(tmp_path, readings)
+    _, steps, views, _ = drive_and_read(tmp_path, readings)
     assert [s.action for s in steps[:9]] == [0.5, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0, 0.5, 0.5]
     assert [s.human for s in steps[:9]] == [False] * 2 + [True] * 5 + [False] * 2
     assert [s.first for s in steps[:9]] == [False] * 2 + [True] + [False] * 6
     assert {s.policy_action for s in steps} == {0.5}
     assert [s.human_action for s in steps[2:5]] == [-1.0] * 3
     assert MAX_SLEW == 0.5
+    # The person sees what is applied.
+    driven = [view for view in views if view.episode == 0 and not view.message]
+    np.testing.assert_array_equal(driven[0].frames, steps[0].observation)
+    for step, view in zip(steps, driven[1:], strict=False):
+        assert (view.applied_action, view.control) == (step.action, step.control)
 
 
-def test_the_car_does_what_is_recorded(tmp_path):
-    readings = [hold(1.0)] * 3 + [hold(-1.0)] * 8
+def test_a_person_who_drives_alone_is_obeyed_at_once_by_the_car_too(tmp_path):
+    readings = [LET_GO, *[hold(1.0)] * 3, *[hold(-1.0)] * 8]
     _, steps, *_ = drive_and_read(tmp_path, readings, policy=None)
-    speeds = [s.speed_mps for s in steps]
-    assert speeds[2] > speeds[0]
-    assert speeds[10] < speeds[3]
-
-
-def test_a_person_who_drives_alone_is_obeyed_at_once(tmp_path):
-    readings = [LET_GO, hold(1.0), hold(-1.0)]
-    _, steps, *_ = drive_and_read(tmp_path, readings, policy=None)
-    assert [s.action for s in steps[:3]] == [0.0, 1.0, -1.0]
-    assert all(s.human and s.control == "human" for s in steps)
+    assert [s.action for s in steps[:12]] == [0.0] + [1.0] * 3 + [-1.0] * 8
+    assert all(s.human and s.control == "human" and s.policy_action is None for s in steps)
     assert [s.first for s in steps[:3]] == [True, False, False]
-    assert steps[0].policy_action is None
+    assert steps[3].speed_mps > max(steps[1].speed_mps, steps[11].speed_mps)
 
 
 def test_quitting_ends_the_episode_and_keeps_its_last_step(tmp_path):
     outcomes, steps, *_ = drive_and_read(tmp_path, [LET_GO] * 4)
-    assert dict(outcomes) == {STOPPED: 1}
-    assert len(steps) == 5
+    assert (dict(outcomes), len(steps)) == ({STOPPED: 1}, 5)
     for step, following in pairwise(steps):
         np.testing.assert_array_equal(step.next_observation, following.observation)
-    assert (steps[-1].truncated, steps[-1].terminated) == (True, False)
-    assert steps[-1].outcome == STOPPED
+    last = steps[-1]
+    assert (last.truncated, last.terminated, last.outcome) == (True, False, STOPPED)
 
 
 def test_a_sitting_that_is_over_has_nobody_to_heed(tmp_path):
     sitting = make_sitting(tmp_path, Puppet())
-    assert sitting.quit()
-    assert sitting.stop
+    assert (sitting.quit(), sitting.stop) == (True, True)
     sitting.stop = False
     sitting.close()
-    assert not sitting.quit()
-    assert not sitting.stop
+    assert (sitting.quit(), sitting.stop) == (False, False)
 
 
-def test_restarting_begins_another_episode(tmp_path):
-    readings = [LET_GO, LET_GO, wish("restart"), *[LET_GO] * 14]
-    outcomes, steps, *_ = drive_and_read(tmp_path, readings)
-    assert outcomes[RESTARTED] == 1
-    assert [s.step for s in steps if s.episode == 0] == [0, 1, 2]
-    assert steps[3].episode == 1
-    assert steps[3].seed != steps[0].seed
-
-
-def test_an_episode_that_is_thrown_away_ends_and_is_marked(tmp_path):
-    readings = [hold(1.0), hold(1.0), wish("discard"), *[LET_GO] * 14]
+@pytest.mark.parametrize(("wished", "outcome"), [("restart", RESTARTED), ("discard", DISCARDED)])
+def test_an_episode_begun_anew_or_thrown_away_ends_and_is_marked(tmp_path, wished, outcome):
+    readings = [hold(1.0), hold(1.0), wish(wished), *[LET_GO] * 14]
     outcomes, steps, _, sitting = drive_and_read(tmp_path, readings)
-    assert dict(outcomes) == {DISCARDED: 1, STOPPED: 1}
-    assert [step.outcome for step in steps if step.episode == 0] == ["", "", DISCARDED]
+    assert dict(outcomes) == {outcome: 1, STOPPED: 1}
+    assert [(s.step, s.outcome) for s in steps[:3]] == [(0, ""), (1, ""), (2, outcome)]
     assert steps[2].truncated
-    assert [step.episode for step in steps[3:]] == [1] * (len(steps) - 3)
-    assert [episode[0].episode for episode in read_episodes(steps)] == [1]
-    assert (sitting.discarded, sitting.episodes, sitting.human_steps) == (1, 1, 0)
+    assert [step.episode for step in steps] == [0] * 3 + [1] * (len(steps) - 3)
+    assert steps[3].seed != steps[0].seed
+    kept = [episode[0].episode for episode in read_episodes(steps)]
+    counted = kept, sitting.discarded, sitting.episodes, sitting.human_steps > 0
+    discarded = wished == "discard"
+    assert counted == ([1] if discarded else [0, 1], discarded, 2 - discarded, not discarded)
 
 
 def test_what_has_just_ended_can_still_be_thrown_away(tmp_path):
     person = Discarding(discarded={0}, episodes=2)
     outcomes, steps, *_ = drive_and_read(tmp_path, person=person, policy=1.0)
-    first, second = ([step for step in steps if step.episode == number] for number in (0, 1))
+    (last,) = (step for step in steps if step.outcome == DISCARDED)
     assert outcomes[DISCARDED] == 1
-    assert (first[-1].outcome, first[-1].terminated or first[-1].truncated) == (DISCARDED, True)
-    assert DISCARDED not in {step.outcome for step in (*first[:-1], *second)}
-    assert [step.index for step in (*first, *second)] == list(range(len(first) + len(second)))
+    assert last is [step for step in steps if step.episode == 0][-1]
+    assert last.terminated or last.truncated
+    assert [step.index for step in steps] == list(range(len(steps)))
 
 
 @pytest.mark.parametrize("wished", ["discard", "restart"])
@@ -126,11 +111,10 @@ def test_a_pause_holds_the_car_still_and_goes_on_where_it_was(tmp_path):
     pause = wish("pause")
     readings = [LET_GO, LET_GO, pause, *[LET_GO] * 10, pause, *[LET_GO] * 3]
     _, steps, views, _ = drive_and_read(tmp_path, readings)
-    assert [s.step for s in steps] == list(range(len(steps)))
-    assert len(steps) == 7
-    paused = [view for view in views if view.paused]
-    assert len(paused) >= 10
-    assert len({str(view.scene) for view in paused}) == 1
+    assert [s.step for s in steps] == list(range(7))
+    scenes = [str(view.scene) for view in views if view.paused]
+    assert len(scenes) >= 10
+    assert len(set(scenes)) == 1
 
 
 @pytest.mark.parametrize(
@@ -139,14 +123,6 @@ def test_a_pause_holds_the_car_still_and_goes_on_where_it_was(tmp_path):
 def test_out_of_a_pause_one_can_quit_restart_or_discard(tmp_path, wished, outcome):
     readings = [LET_GO, wish("pause"), LET_GO, wish(wished), *[LET_GO] * 3]
     assert drive_and_read(tmp_path, readings)[0][outcome] == 1
-
-
-def test_the_person_sees_what_is_applied(tmp_path):
-    _, steps, views, _ = drive_and_read(tmp_path, [hold(-1.0)] * 6)
-    driven = [view for view in views if view.episode == 0 and not view.message]
-    for step, view in zip(steps, driven[1:], strict=False):
-        assert (view.applied_action, view.control) == (step.action, step.control)
-    np.testing.assert_array_equal(driven[0].frames, steps[0].observation)
 
 
 def test_without_the_person_no_episode_begins(tmp_path):
@@ -160,8 +136,8 @@ def test_nobody_demonstrates_where_nobody_is(tmp_path):
     readings = [hold(1.0)] * 2 + [LET_GO] * 2 + [hold(1.0)]
     there = [True, True, True, False, False]
     steps = drive_and_read(tmp_path, readings, policy=None, presence=there)[1][:5]
-    assert [step.human for step in steps] == [True, True, False, False, True]
-    assert [step.control for step in steps] == ["human"] * 2 + ["policy"] * 2 + ["human"]
+    human, policy = (True, "human"), (False, "policy")
+    assert [(step.human, step.control) for step in steps] == [human, human, policy, policy, human]
     assert [step.first for step in steps] == [True, False, False, False, True]
 
 

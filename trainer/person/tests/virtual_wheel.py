@@ -5,8 +5,6 @@ As a program, ``python -m trainer.person.tests.virtual_wheel COMMAND ...`` plugs
 ``button N 0|1``; each is answered on stdout with ``did LINE TIME_NS``.
 """
 
-from __future__ import annotations
-
 import ctypes
 import sys
 import threading
@@ -34,7 +32,7 @@ class Description(ctypes.Structure):
 class VirtualWheel:
     """Plugged in when made; SDL must have been started with its joysticks."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self._sdl = load_sdl()
         description = Description(1, WHEEL_TYPE, AXES, BUTTONS, name=NAME)
         self.index = self._sdl.SDL_JoystickAttachVirtualEx(ctypes.byref(description))
@@ -42,16 +40,16 @@ class VirtualWheel:
             raise RuntimeError(self._sdl.SDL_GetError().decode())
         self._joystick = self._sdl.SDL_JoystickOpen(self.index)
 
-    def axis(self, number: int, place: float) -> None:
+    def axis(self, number, place):
         """Put an axis to a place in [-1, 1]."""
         value = round(min(max(place, -1.0), 1.0) * 32767)
         self._sdl.SDL_JoystickSetVirtualAxis(self._joystick, number, ctypes.c_int16(value))
 
-    def button(self, number: int, down: bool) -> None:
+    def button(self, number, down):
         """Press or release a button."""
-        self._sdl.SDL_JoystickSetVirtualButton(self._joystick, number, ctypes.c_uint8(down))
+        self._sdl.SDL_JoystickSetVirtualButton(self._joystick, number, ctypes.c_uint8(bool(down)))
 
-    def unplug(self) -> None:
+    def unplug(self):
         """Pull it out."""
         self._sdl.SDL_JoystickDetachVirtual(self.index)
 
@@ -71,18 +69,15 @@ def load_sdl():
     return sdl if hasattr(sdl, "SDL_JoystickAttachVirtualEx") else None
 
 
-def obey(wheel: VirtualWheel) -> None:
+def obey(wheel):
     """Do what stdin says."""
     for line in sys.stdin:
         what, number, value = line.split()
-        if what == "axis":
-            wheel.axis(int(number), float(value))
-        else:
-            wheel.button(int(number), value == "1")
+        {"axis": wheel.axis, "button": wheel.button}[what](int(number), float(value))
         print(f"did {line.strip()} {time.time_ns()}", flush=True)
 
 
-def main(argv: list[str]) -> int:
+def main(argv):
     """Plug in, and run the trainer beside it."""
     from trainer.person.devices import pygame
 
