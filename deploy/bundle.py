@@ -38,8 +38,8 @@ from edge_runtime import tls
 from edge_runtime.cli import Command, examples
 from edge_runtime.config import NONE, Config, load_config
 from edge_runtime.files import check_writable, make_directory, write_atomic
-from edge_runtime.policy import DEFAULT_PUBLIC_KEY, Policy, load_policy
-from edge_runtime.util import UserError, read_bytes
+from edge_runtime.policy import Policy, load_policy
+from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes
 
 NAME = "install.pyz"
 DEFAULT_OUT = "build/bundles"

@@ -34,8 +34,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from edge_runtime import tls
 from edge_runtime.cli import Command, examples, whole_number
 from edge_runtime.files import check_writable, make_directory, write_atomic, write_json
-from edge_runtime.policy import DEFAULT_PUBLIC_KEY
-from edge_runtime.util import UserError, read_bytes
+from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError, read_bytes
 from edge_runtime.wire import DEFAULT_VEHICLE_ID, check_vehicle_id
 
 DEFAULT_KEY = str(DEFAULT_PUBLIC_KEY.with_suffix(".key"))

@@ -20,8 +20,7 @@ from deploy.installer.layout import DEFAULT_ROOT
 from deploy.installer.systemd import WAYS
 from deploy.installer.verify import Manifest
 from edge_runtime.cli import examples
-from edge_runtime.policy import DEFAULT_PUBLIC_KEY
-from edge_runtime.util import UserError
+from edge_runtime.util import DEFAULT_PUBLIC_KEY, UserError
 
 _UNATTENDED = ("-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 """A password asked for in the middle would hang a script, and so would a board without power."""

@@ -19,14 +19,13 @@ import msgspec
 import numpy as np
 
 from edge_runtime import log
-from edge_runtime.util import PathLike, UserError, read_bytes
+from edge_runtime.util import DEFAULT_PUBLIC_KEY, PathLike, UserError, read_bytes
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_SHAPE, MAX_TEXT_CHARS
 
 if TYPE_CHECKING:  # `deploy` and an operator's commands need no onnxruntime.
     import onnxruntime
 
 SIGNATURE_SUFFIX = ".sig"
-DEFAULT_PUBLIC_KEY = Path("keys/policy.pub")
 
 VERIFIED = "verified"
 BESIDE = "signed by the key beside it"

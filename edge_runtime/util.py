@@ -9,9 +9,12 @@ import json
 import os
 import signal
 import stat
+from pathlib import Path
 from typing import Any, BinaryIO, Dict, Set, Union
 
 PathLike = Union[str, "os.PathLike[str]"]
+DEFAULT_PUBLIC_KEY = Path("keys/policy.pub")
+"""Where `deploy keys` writes it, and whoever loads a policy looks for it."""
 MAX_FILE_MIB = 64
 """More than any policy, certificate, configuration or report needs."""
 
