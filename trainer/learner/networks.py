@@ -142,7 +142,7 @@ class Critic(nn.Module):
     Args:
         action_size: length of an action.
         frames: how many of the newest frames it sees.
-        action_bound: of the action's initial weights; None: as one more feature among 1,792.
+        action_bound: of the action's initial weights; 0: as one more feature among 1,792.
         normalised: whether the picture's share of the first connected layer, and each hidden layer,
             is normalised to mean 0 and variance 1 (layer normalisation).
     """
@@ -151,7 +151,7 @@ class Critic(nn.Module):
         self,
         action_size: int = 1,
         frames: int = 2,
-        action_bound: float | None = None,
+        action_bound: float = 0.0,
         normalised: bool = False,
     ) -> None:
         super().__init__()
@@ -182,7 +182,7 @@ class CriticPair(nn.Module):
         self,
         action_size: int = 1,
         frames: int = 2,
-        action_bound: float | None = None,
+        action_bound: float = 0.0,
         normalised: bool = False,
     ) -> None:
         super().__init__()

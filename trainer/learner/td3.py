@@ -64,7 +64,7 @@ class TD3Learner:
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames).to(self.device)
             critics = CriticPair(
-                action_size, config.frames, config.action_bound or None, config.critic_norm
+                action_size, config.frames, config.action_bound, config.critic_norm
             )
             self.critics = critics.to(self.device)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)

@@ -66,7 +66,7 @@ class ReferenceLearner:
             torch.manual_seed(seed)
             self.actor = Actor(action_size, config.frames)
             self.critics = CriticPair(
-                action_size, config.frames, config.action_bound or None, config.critic_norm
+                action_size, config.frames, config.action_bound, config.critic_norm
             )
         self.target_actor = copy.deepcopy(self.actor)
         self.target_critics = copy.deepcopy(self.critics)
