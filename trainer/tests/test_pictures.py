@@ -1,8 +1,8 @@
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pytest
 from PIL import Image, ImageSequence
 
 from trainer.__main__ import main
@@ -19,10 +19,12 @@ def test_a_take_over_shows_who_drives_and_both_actions():
     guide = HumanGuide(expert, TRIGGERS["left_turn"](expert))
     never_brakes, _ = load_driver("constant:1", env)
     moments = list(drive_moments(env, never_brakes, guide, seed=8, seconds=20.0))
-    taken = [moment for moment in moments if moment.intervention is not None]
-    left = [moment for moment in moments[:-1] if moment.intervention is None]
+    taken = [moment for moment in moments if moment.intervention]
+    left = [moment for moment in moments[:-1] if not moment.intervention]
     assert all(moment.policy_action == 1.0 for moment in [*taken, *left])
-    assert all(moment.action == float(moment.intervention.action[0]) for moment in taken)
+    for moment in moments:
+        if moment.intervention:
+            assert moment.action == float(moment.intervention.action[0])
     for moment, colour in ((taken[0], HUMAN), (left[0], POLICY)):
         assert tuple(np.asarray(draw_moment(moment, "pedal"))[29, 30]) == colour
 
@@ -39,27 +41,15 @@ def test_the_commands_film_is_small_and_plays_in_real_time(tmp_path):
     assert out.stat().st_size < 500_000
 
 
-@pytest.mark.parametrize(
-    ("words", "part"),
-    [
-        ("picture expert --out a.jpg", "a picture is a .png, a film a .gif"),
-        ("picture expert --human expert --out a.png", "takes over in a film"),
-        ("picture none --out a.gif", "none is no policy"),
-        ("plot one two", "does not exist"),
-    ],
-)
-def test_bad_input_is_one_line(words, part, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert part in refusal(capsys, *words.split())
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_curves_of_several_runs_end_with_the_shortest(tmp_path, capsys):
     dirs = [str(tmp_path / name) for name in ("one", "two")]
     for directory, episodes in zip(dirs, (30, 12), strict=True):
         writer = MetricsWriter(Path(directory))
         for episode in range(episodes):
-            values = dict.fromkeys(NAMES, 1.0) | {"episode": episode, "outcome": "goal"}
+            values: dict[str, Any] = dict.fromkeys(NAMES, 1.0) | {
+                "episode": episode,
+                "outcome": "goal",
+            }
             values["validation_success"] = 0.5 if episode % 5 == 4 else math.nan
             writer.add(EpisodeMetrics(**values))
         writer.close()
