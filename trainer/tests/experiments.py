@@ -1,7 +1,5 @@
 """A tiny plan, stores in a directory, and records out of the air for figures and verdicts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path

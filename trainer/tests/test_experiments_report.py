@@ -1,5 +1,3 @@
-"""Records out of the air, judged, drawn and reported; and the command around it."""
-
 import json
 import re
 from pathlib import Path
@@ -9,46 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError
-from trainer.__main__ import main
-from trainer.experiments import claims
-from trainer.experiments.claims import (
-    CLAIMS,
-    HI,
-    IA,
-    PER,
-    PHIL,
-    Claim,
-    ahead,
-    first_reached,
-    judge,
-    judge_both,
-    level,
-    sooner,
-    sooner_by,
-)
-from trainer.experiments.data import (
-    ALONE,
-    DISTANCE,
-    SUCCESS,
-    TRAINING,
-    Estimate,
-    Holds,
-    Line,
-    Scene,
-    above,
-    all_of,
-    load,
-    mean_estimate,
-    within,
-)
+from trainer.experiments import claims, data
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
 from trainer.experiments.report import write_report
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
+from trainer.tests.test_commands import call
 
 SEEDS = 3
-LEFT = Scene("left_turn", "nominal")
+LEFT = data.Scene("left_turn", "nominal")
 
 
 @pytest.fixture(scope="module")
@@ -63,60 +30,64 @@ def few_resamples(monkeypatch):
 
 def finding(results, test, ours, others, bar=0.0):
     """Of success in the left turn."""
-    claim = Claim("fig7", "", "", test, ["left_turn"], [ours], others, [SUCCESS], bar)
-    return judge(results, claim, ALONE)
+    claim = claims.Claim("fig7", "", "", test, ["left_turn"], [ours], others, [data.SUCCESS], bar)
+    return claims.judge(results, claim, data.ALONE)
 
 
 class TestStatistics:
     def test_an_interval_as_in_the_tables(self):
-        found = mean_estimate([1.0, 2.0, 3.0])
-        assert found[:3] == pytest.approx((2.0, 2.0 - 4.302653 / 3**0.5, 2.0 + 4.302653 / 3**0.5))
-        assert mean_estimate([]).size == 0
-        assert np.isinf(mean_estimate([1.0]).high)
+        found, half = data.mean_estimate([1.0, 2.0, 3.0]), 4.302653 / 3**0.5
+        assert found[:3] == pytest.approx((2.0, 2.0 - half, 2.0 + half))
+        assert data.mean_estimate([]).size == 0
+        assert np.isinf(data.mean_estimate([1.0]).high)
 
     @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=9), st.floats(-1e3, 1e3))
     def test_a_verdict_never_says_both(self, values, least):
-        found = mean_estimate(values)
+        found = data.mean_estimate(values)
         assert (found.low <= found.value <= found.high) or len(set(values)) == 1
         opposite = {"yes": "no", "no": "yes", "undecided": "undecided"}
-        assert above(found.times(-1.0), -least) == opposite[above(found, least)]
+        assert data.above(found.times(-1.0), -least) == opposite[data.above(found, least)]
 
     @pytest.mark.parametrize(
         ("low", "high", "holds"),
         [(-0.5, 0.5, "yes"), (-0.5, 1.5, "undecided"), (1.5, 2.0, "no"), (-3.0, -1.5, "no")],
     )
     def test_one_level(self, low, high, holds):
-        assert within(Estimate(0.5 * (low + high), low, high, 5), 1.0) == holds
+        assert data.within(data.Estimate(0.5 * (low + high), low, high, 5), 1.0) == holds
 
     @pytest.mark.parametrize(
         ("answers", "holds"),
-        [("yy", "yes"), ("yu", "undecided"), ("nu", "no"), ("", "undecided")],
+        [
+            (["yes", "yes"], "yes"),
+            (["yes", "undecided"], "undecided"),
+            (["no", "undecided"], "no"),
+            ([], "undecided"),
+        ],
     )
     def test_all_of_several(self, answers, holds):
-        said: dict[str, Holds] = {"y": "yes", "n": "no", "u": "undecided"}
-        assert all_of([said[answer] for answer in answers]) == holds
+        assert data.all_of(answers) == holds
 
 
 class TestData:
     def test_curves_lie_on_multiples_of_500_steps(self, everything):
-        (result,) = everything.of("left_turn", PHIL)[:1]
-        curve = result.curve(TRAINING, DISTANCE)
+        result = everything.of("left_turn", claims.PHIL)[0]
+        curve, (steps, values) = (
+            found(data.TRAINING, data.DISTANCE) for found in (result.curve, result.points)
+        )
         assert len(curve) == 12
-        steps, values = result.points(TRAINING, DISTANCE)
         assert curve[1] == pytest.approx(values[(steps > 500) & (steps <= 1000)].mean())
-        assert result.end(TRAINING, DISTANCE) == pytest.approx(values[steps > 4500].mean())
+        end = result.end(data.TRAINING, data.DISTANCE)
+        assert end == pytest.approx(values[steps > 4500].mean())
 
-    def test_distances_end_at_the_goal(self, everything):
-        assert everything.pooled(LEFT, PHIL, DISTANCE).max() == 21.0
-
-    def test_the_papers_drives_are_the_first_ones(self, everything):
-        (result,) = everything.of("left_turn", Line("human_model"))
-        own = everything.pooled(LEFT, Line("human_model"), DISTANCE, paper=True)
-        assert own.tolist() == result.drives("nominal", DISTANCE)[:PAPER_TESTS].tolist()
+    def test_distances_end_at_the_goal_and_the_papers_drives_are_the_first(self, everything):
+        assert everything.pooled(LEFT, claims.PHIL, data.DISTANCE).max() == 21.0
+        (result,) = everything.of("left_turn", data.Line("human_model"))
+        own = everything.pooled(LEFT, data.Line("human_model"), data.DISTANCE, paper=True)
+        assert own.tolist() == result.drives("nominal", data.DISTANCE)[:PAPER_TESTS].tolist()
 
     def test_time_is_compared_where_both_arrive(self, everything):
-        found = everything.differences(LEFT, PHIL, IA, "time_s")
-        one, other = everything.of("left_turn", PHIL)[0], everything.of("left_turn", IA)[0]
+        found = everything.differences(LEFT, claims.PHIL, claims.IA, "time_s")
+        one, other = (everything.of("left_turn", each)[0] for each in (claims.PHIL, claims.IA))
         both = one.reached("nominal") & other.reached("nominal")
         assert 0 < both.sum() < len(both)
         times = one.drives("nominal", "time_s") - other.drives("nominal", "time_s")
@@ -124,67 +95,73 @@ class TestData:
 
 
 class TestClaims:
-    def test_who_is_ahead_and_who_is_not(self, everything):
-        assert finding(everything, ahead, PHIL, [IA, HI, PER]).holds == "yes"
-        found = finding(everything, ahead, PER, [HI])
-        assert found.holds == "no"
-        assert "vanilla TD3 over HI-TD3" in found.ours
-        assert finding(everything, level, PHIL, [PHIL]).holds == "yes"
-        assert finding(everything, level, PHIL, [PER]).holds == "no"
-        assert finding(everything, ahead, PHIL, [None], bar=0.5).holds == "yes"
+    @pytest.mark.parametrize(
+        ("test", "ours", "others", "bar", "holds"),
+        [
+            (claims.ahead, claims.PHIL, [claims.IA, claims.HI, claims.PER], 0.0, "yes"),
+            (claims.ahead, claims.PER, [claims.HI], 0.0, "no"),
+            (claims.level, claims.PHIL, [claims.PHIL], 0.0, "yes"),
+            (claims.level, claims.PHIL, [claims.PER], 0.0, "no"),
+            (claims.ahead, claims.PHIL, [None], 0.5, "yes"),
+            (claims.sooner, claims.PHIL, [claims.PER], 0.0, "yes"),
+            (claims.sooner, claims.PHIL, [claims.PER], 50.0, "no"),
+        ],
+    )
+    def test_who_is_ahead_or_sooner_and_who_is_not(
+        self, everything, test, ours, others, bar, holds
+    ):
+        found = finding(everything, test, ours, others, bar)
+        assert found.holds == holds
+        assert ("vanilla TD3 over HI-TD3" in found.ours) == (ours is claims.PER)
 
     def test_missing_trainings_leave_it_open(self):
         results = results_of([unit for unit in units_of(["fig7"], SEEDS) if unit != UNIT], SEEDS)
-        for other, holds in ((PER, "undecided"), (IA, "yes")):
-            assert finding(results, ahead, PHIL, [other]).holds == holds
+        for other, holds in ((claims.PER, "undecided"), (claims.IA, "yes")):
+            assert finding(results, claims.ahead, claims.PHIL, [other]).holds == holds
 
     def test_how_much_sooner(self):
         """Straight lines, so that the steps can be worked out by hand: the other ends at 0.875."""
+
+        def sooner_by(ours, theirs, **how):
+            found, said = claims.sooner_by(ours, theirs, data.ALONE, data.SUCCESS, **how)
+            return found.value, said
+
         units = [Unit("left_turn", name, NORMAL, 1) for name in ("phil_td3", "per_td3")]
         results = results_of(units, 1)
         for unit, end in zip(units, (2_000, 6_000), strict=True):
             columns = results.found[unit].record["validation"]
             columns["at_step"] = list(range(500, 6_001, 500))
             columns["success"] = [min(step / end, 1.0) for step in columns["at_step"]]
-        own, other = (results.of("left_turn", line) for line in (PHIL, PER))
-        for first, second in ((own, other), (own, own)):
-            level_at = second[0].end(ALONE, SUCCESS)
-            found, said = sooner_by(first, second, ALONE, SUCCESS)
-            steps = (2_000 * level_at, (6_000 if second is other else 2_000) * level_at)
-            assert found.value == pytest.approx(steps[1] / steps[0])
-            assert said == f"{steps[0]:,.0f} against {steps[1]:,.0f} steps"
-        found, said = sooner_by(other, own, ALONE, SUCCESS)
-        assert found.value == pytest.approx(2_000 / 6_000)
+        own, other = (results.of("left_turn", line) for line in (claims.PHIL, claims.PER))
+        least = other[0].end(data.ALONE, data.SUCCESS)
+        said = f"{2_000 * least:,.0f} against {6_000 * least:,.0f} steps"
+        assert sooner_by(other, own)[0] == pytest.approx(2_000 / 6_000)
+        assert sooner_by(own, own) == (pytest.approx(1.0), "2,000 against 2,000 steps")
+        assert sooner_by(own, other) == (pytest.approx(3.0), said)
         other[0].record["validation"]["success"] = [0.1] * 12
-        assert sooner_by(other, own, ALONE, SUCCESS)[1] == "never against 2,000 steps"
-        assert sooner_by(other, own, ALONE, SUCCESS, common=True)[1] == "500 against 500 steps"
-
-    def test_it_takes_several_seeds_to_be_sooner(self, everything):
-        assert finding(everything, sooner, PHIL, [PER]).holds == "yes"
-        assert finding(everything, sooner, PHIL, [PER], bar=50.0).holds == "no"
+        assert sooner_by(other, own)[1] == "never against 2,000 steps"
+        assert sooner_by(other, own, common=True)[1] == "500 against 500 steps"
 
     @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12), st.floats(0.0, 1.0))
     def test_a_level_is_reached_where_the_curve_crosses_it(self, values, least):
         grid = 500.0 * np.arange(1, len(values) + 1, dtype=np.float64)
         curve = np.array(values, np.float64)
-        steps = first_reached(grid, curve, least)
+        steps = claims.first_reached(grid, curve, least)
         if np.isinf(steps):
             assert curve.max() < least
         else:
             assert np.interp(steps, grid, curve) == pytest.approx(least, abs=1e-6) or steps == 500.0
             assert (curve[grid < steps] <= least).all()
-            assert steps <= first_reached(grid, curve, min(least + 0.1, 1.0))
+            assert steps <= claims.first_reached(grid, curve, min(least + 0.1, 1.0))
 
-    def test_every_claim_is_judged(self, everything):
-        for claim in CLAIMS:
+    def test_every_claim_is_judged_and_nothing_is_said_of_nothing(self, everything):
+        results = results_of([], SEEDS)
+        for claim in claims.CLAIMS:
             assert claim.source in EXPERIMENTS
-            for found in filter(None, judge_both(everything, claim)):
+            for found in filter(None, claims.judge_both(everything, claim)):
                 assert found.holds in ("yes", "no", "undecided")
                 assert found.ours not in ("", "not measured")
-
-    def test_nothing_is_said_of_nothing(self):
-        results = results_of([], SEEDS)
-        assert {judge_both(results, claim)[0].holds for claim in CLAIMS} == {"undecided"}
+            assert claims.judge_both(results, claim)[0].holds == "undecided"
 
 
 @pytest.fixture
@@ -202,7 +179,7 @@ def test_the_report_is_made_of_the_records_alone(store):
     for name in re.findall(r"\((\w+\.png)\)", page):
         assert (store.results / name).stat().st_size > 1000
     rows = [line for line in page.splitlines() if line.startswith("| left turn: PHIL-TD3")]
-    assert len(rows) == sum(claim.text.startswith("left turn: PHIL-TD3") for claim in CLAIMS)
+    assert len(rows) == sum(claim.text.startswith("left turn: PHIL-TD3") for claim in claims.CLAIMS)
     assert any("| yes |" in row for row in rows)
     anchors = {f"#{re.sub('[^a-z0-9 -]', '', line[3:].lower()).replace(' ', '-')}"
                for line in page.splitlines() if line.startswith("## ")}  # fmt: skip
@@ -211,76 +188,48 @@ def test_the_report_is_made_of_the_records_alone(store):
     assert str(store.results.parent) not in page
 
 
-def test_records_of_other_settings_are_left_out(store):
+def test_records_of_other_settings_are_left_out_and_those_that_lack_something_refused(store):
     unit = Unit("left_turn", "ia_td3", NORMAL, 2)
-    store.put(unit, {**synthetic(unit), "id": "of another time"})
-    results = load(store, 2)
+    record = synthetic(unit)
+    store.put(unit, {**record, "id": "of another time"})
+    results = data.load(store, 2)
     assert results.stale == [unit]
-    assert not results.complete("left_turn", IA, DISTANCE)
-
-
-def test_records_that_lack_something_are_refused(store):
-    unit = Unit("left_turn", "ia_td3", NORMAL, 2)
-    record = {**synthetic(unit), "id": store.id(unit)}
+    assert not results.complete("left_turn", claims.IA, data.DISTANCE)
     del record["validation"]["success"]
-    store.put(unit, record)
+    store.put(unit, {**record, "id": store.id(unit)})
     with pytest.raises(UserError, match="lacks columns of validation"):
-        load(store, 2)
+        data.load(store, 2)
 
 
-class TestCommand:
-    def said(self, capsys, *arguments):
-        status = run_cli(main, ["experiment", *map(str, arguments)])
-        return status, capsys.readouterr()
+def said(capsys, *arguments):
+    return call(capsys, "experiment", *map(str, arguments))
 
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            (["fig99"], "invalid choice"),
-            (["fig7", "--seeds", "0"], "--seeds"),
-            (["report", "status"], "stand alone"),
-            (["table1", "--scenario", "congestion"], "nothing to compute"),
-            (["report", "--results", "nowhere"], "no results"),
-        ],
-    )
-    def test_bad_input_is_one_line(self, capsys, arguments, words):
-        try:
-            status, said = self.said(capsys, *arguments)
-        except SystemExit as ending:
-            status, said = ending.code, capsys.readouterr()
-        assert status == 2
-        assert words in said.err.splitlines()[-1]
 
-    def test_status_counts_the_units(self, capsys, store):
-        places = [
-            word
-            for name in ("results", "runs", "humans")
-            for word in (f"--{name}", getattr(store, name))
-        ]
-        status, said = self.said(capsys, "status", "--seeds", 2, *places)
-        assert status == 0
-        # They are of another plan: done for it, and of other settings for the command's.
-        last = said.out.splitlines()[-1]
-        assert last.startswith("0 of ")
-        assert "; 10 records of other settings" in last
+def test_status_counts_the_units(capsys, store):
+    places = ("--results", store.results, "--runs", store.runs, "--humans", store.humans)
+    status, out, _ = said(capsys, "status", "--seeds", 2, *places)
+    assert status == 0
+    # They are of another plan: done for it, and of other settings for the command's.
+    last = out.splitlines()[-1]
+    assert last.startswith("0 of ")
+    assert "; 10 records of other settings" in last
 
-    def test_without_its_human_a_unit_is_left_out(self, capsys, tmp_path):
-        status, said = self.said(
-            capsys, "table1", "--humans", tmp_path, "--results", tmp_path, "--runs", tmp_path
-        )
-        assert status == 0
-        assert "no human model" in said.err
-        assert "0 of 16 units were done" in said.out
+
+def test_without_its_human_a_unit_is_left_out(capsys, tmp_path):
+    places = ("--humans", tmp_path, "--results", tmp_path, "--runs", tmp_path)
+    status, out, err = said(capsys, "table1", *places)
+    assert status == 0
+    assert "no human model" in err
+    assert "0 of 16 units were done" in out
 
 
 def test_stopping_soon_leaves_it_to_the_same_command(tmp_path, capsys):
     store = store_in(tmp_path)
     write_human(store)
-    arguments = ["experiment", "fig7", "--scenario", "left_turn", "--seeds", "1", "--quick",
-                 "--max-minutes", "0.0001", "--humans", str(store.humans),
-                 "--runs", str(store.runs)]  # fmt: skip
-    assert main(arguments) == 0
-    assert "the same command goes on" in capsys.readouterr().out
+    more = ("--quick", "--max-minutes", 0.0001, "--humans", store.humans, "--runs", store.runs)
+    status, out, _ = said(capsys, "fig7", "--scenario", "left_turn", "--seeds", 1, *more)
+    assert status == 0
+    assert "the same command goes on" in out
     assert not (store.runs / "quick/results/left_turn.jsonl").exists()
 
 

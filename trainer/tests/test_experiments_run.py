@@ -1,11 +1,8 @@
-"""Units from their first step to their record: killed, resumed, side by side, and their ids."""
-
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,43 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
 from trainer.drivers import BEST_FILE, CHECKPOINT_FILE
 from trainer.evaluate import CONDITIONS
 from trainer.experiments import plan as planned
 from trainer.experiments import run as running
-from trainer.experiments.plan import (
-    CONSTANT,
-    EXPERIMENTS,
-    HUMAN_MODEL,
-    LINES,
-    NORMAL,
-    SETTINGS,
-    Unit,
-    run_config,
-    training_id,
-    unit_id,
-    units_of,
-)
-from trainer.experiments.run import (
-    BUSY,
-    FAILED,
-    FINISHED,
-    STOPPED,
-    Task,
-    compute,
-    compute_parcel,
-    keep,
-    pack,
-    run_on_ray,
-    run_units,
-)
 from trainer.learner.config import ALGORITHMS, PRINTED_LEARNER
 from trainer.tests.experiments import TINY, UNIT, Soon, store_in, without_times, write_human
 from trainer.training.metrics import METRICS_FILE
 from trainer.training.run import TrainingRun
 
-GUIDED = Unit("left_turn", "phil_td3", NORMAL, 1)
+GUIDED = planned.Unit("left_turn", "phil_td3", planned.NORMAL, 1)
 ROOT = Path(__file__).parents[2]
 
 
@@ -62,34 +34,28 @@ def store(tmp_path):
 def straight(tmp_path_factory):
     """A unit that was never stopped."""
     store = store_in(tmp_path_factory.mktemp("straight"))
-    assert compute(Task(UNIT, store)) == FINISHED
+    assert running.compute(running.Task(UNIT, store)) == running.FINISHED
     return store
 
 
 def test_a_unit_ends_as_a_record_and_an_actor(straight):
-    record = straight.find([UNIT])[0][UNIT]
+    (record,) = straight.records("left_turn").values()
+    ends = record["training"]["end_step"]
     assert set(record["tests"]) == set(CONDITIONS)
     for columns in record["tests"].values():
         assert {len(values) for values in columns.values()} == {TINY.test_runs}
-    assert record["training"]["end_step"][-1] >= TINY.steps["left_turn"]
-    assert record["totals"]["steps"] == record["training"]["end_step"][-1]
+    assert record["totals"]["steps"] == ends[-1] >= TINY.steps["left_turn"]
     assert record["tested_actor_at_step"] in record["validation"]["at_step"]
     assert record["human"] is None
     assert record["computed"]["processor"]
+    # It says what was trained: enough to train it again by hand.
+    config = planned.run_config(UNIT, TINY, straight.humans).as_dict()
+    assert {**config, **record["config"]} == json.loads(json.dumps(config))
     run_dir = straight.run_dir(UNIT)
+    assert (run_dir / METRICS_FILE).is_file()
     assert (run_dir / BEST_FILE).is_file()
     assert not (run_dir / CHECKPOINT_FILE).exists()
-    text = straight.records_file("left_turn").read_text()
-    assert len(text.splitlines()) == 1
-    assert str(straight.runs.parent) not in text
-
-
-def test_stops_at_checkpoints_change_nothing(store, straight):
-    assert compute(Task(UNIT, store, stop_at_s=1.0)) == STOPPED, "time was over before it began"
-    ends = [compute(Task(UNIT, store, stop_at_s=Soon(1e18))) for _ in range(2)]
-    assert ends == [STOPPED, STOPPED]
-    assert compute(Task(UNIT, store)) == FINISHED
-    assert without_times(store, UNIT) == without_times(straight, UNIT)
+    assert str(straight.runs.parent) not in straight.records_file("left_turn").read_text()
 
 
 def test_a_killed_command_goes_on_to_the_same_record(store, straight, tmp_path):
@@ -97,27 +63,25 @@ def test_a_killed_command_goes_on_to_the_same_record(store, straight, tmp_path):
     code = (
         "from pathlib import Path; from trainer.tests.experiments import *; "
         "from trainer.experiments.run import *; "
-        f"run_units([Task(UNIT, store_in(Path({str(tmp_path)!r})))], 1)"
+        f"run_units([running.Task(UNIT, store_in(Path({str(tmp_path)!r})))], 1)"
     )
     command = [sys.executable, "-c", code]
     process = subprocess.Popen(command, cwd=ROOT, start_new_session=True)
     checkpoint = store.run_dir(UNIT) / CHECKPOINT_FILE
-    until_s = time.monotonic() + 120.0
-    while not checkpoint.exists() and time.monotonic() < until_s:
-        time.sleep(0.02)
+    wait_until(checkpoint.exists, "a checkpoint", 120.0)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert not store.records("left_turn")
-    assert compute(Task(UNIT, store)) == FINISHED
+    assert running.compute(running.Task(UNIT, store)) == running.FINISHED
     assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
 def test_two_processes_share_one_file_of_records(store):
     """Each of three units is computed once, and no record is lost."""
     write_human(store)
-    units = [UNIT, GUIDED, Unit("left_turn", HUMAN_MODEL, NORMAL, 0)]
-    ends = run_units([Task(unit, store) for unit in units], 2)
-    assert ends == {FINISHED: 3}
+    units = [UNIT, GUIDED, planned.Unit("left_turn", planned.HUMAN_MODEL, planned.NORMAL, 0)]
+    ends = running.run_units([running.Task(unit, store) for unit in units], 2)
+    assert ends == {running.FINISHED: 3}
     assert list(store.records("left_turn")) == sorted(units)
     assert set(store.find(units)[0]) == set(units)
 
@@ -125,37 +89,32 @@ def test_two_processes_share_one_file_of_records(store):
 def test_a_unit_that_another_process_has_is_left_to_it(store, monkeypatch):
     monkeypatch.setattr(running, "PATIENCE_S", 0.0)
     with store.lock(UNIT) as mine:
-        assert mine
-        assert compute(Task(UNIT, store)) == BUSY
+        assert (mine, running.compute(running.Task(UNIT, store))) == (True, running.BUSY)
 
 
-def test_a_unit_that_is_done_is_not_trained_again(straight, tmp_path, monkeypatch):
+def test_a_unit_is_not_trained_again_but_tests_that_change_are_driven_with_its_actor(
+    straight, tmp_path, monkeypatch
+):
     monkeypatch.setattr(TrainingRun, "train", lambda *_: pytest.fail("trained again"))
-    assert compute(Task(UNIT, replace(straight, runs=tmp_path))) == FINISHED
-
-
-def test_tests_that_change_are_driven_with_the_actor_that_was_kept(straight, tmp_path, monkeypatch):
-    monkeypatch.setattr(TrainingRun, "train", lambda *_: pytest.fail("trained again"))
+    assert running.compute(running.Task(UNIT, replace(straight, runs=tmp_path))) == running.FINISHED
     more = replace(straight, plan=replace(TINY, test_runs=5), results=tmp_path)
-    assert compute(Task(UNIT, more)) == FINISHED
+    assert running.compute(running.Task(UNIT, more)) == running.FINISHED
     ours, theirs = (each.find([UNIT])[0][UNIT] for each in (more, straight))
     assert ours["id"] != theirs["id"]
     assert ours["training"] == theirs["training"]
-    for condition in CONDITIONS:
-        assert len(ours["tests"][condition]["outcome"]) == 5
+    assert {len(ours["tests"][condition]["outcome"]) for condition in CONDITIONS} == {5}
 
 
 def test_a_failure_is_one_units_failure(store, capfd):
     write_human(store).write_bytes(b"no human")
-    ends = run_units([Task(GUIDED, store)], 1)
-    assert ends == {FAILED: 1}
+    assert running.run_units([running.Task(GUIDED, store)], 1) == {running.FAILED: 1}
     (line,) = [line for line in capfd.readouterr().err.splitlines() if "failed" in line]
     assert str(GUIDED) in line
 
 
 def test_the_floor_is_searched_and_driven(store):
-    unit = Unit("left_turn", CONSTANT, NORMAL, 0)
-    assert compute(Task(unit, store)) == FINISHED
+    unit = planned.Unit("left_turn", planned.CONSTANT, planned.NORMAL, 0)
+    assert running.compute(running.Task(unit, store)) == running.FINISHED
     record = store.records("left_turn")[unit]
     assert record["success_of"][f"{record['action']:g}"] == max(record["success_of"].values())
 
@@ -172,38 +131,33 @@ def test_damaged_records_are_refused_in_one_line(straight, tmp_path, damage):
 
 class TestIds:
     def test_what_decides_changes_the_id_and_nothing_else_does(self, store, tmp_path, monkeypatch):
-        elsewhere = store_in(tmp_path / "elsewhere")
+        def id_of(unit=GUIDED, where=store, **changes):
+            return planned.unit_id(unit, replace(TINY, **changes), where.humans)
+
+        elsewhere, nowhere = store_in(tmp_path / "elsewhere"), store_in(tmp_path / "nowhere")
         human = write_human(store)
         write_human(elsewhere)
-        first = unit_id(GUIDED, TINY, store.humans)
-        assert first == unit_id(GUIDED, replace(TINY, checkpoint_every=7), store.humans)
-        assert first == unit_id(GUIDED, TINY, elsewhere.humans)
-        unguided = unit_id(UNIT, TINY, store.humans)
-        assert unguided == unit_id(UNIT, TINY, tmp_path / "nowhere"), "nobody guides it"
-        plans: list[dict] = [
-            {"steps": {"left_turn": 300}},
-            {"evaluation_runs": 3},
-            {"test_runs": 4},
-            {"learner": {"tau": 0.5}},
-        ]
-        others = (GUIDED._replace(seed=2), GUIDED._replace(setting="biased"))
-        ids = [first, unguided, *(unit_id(other, TINY, store.humans) for other in others)]
-        ids += [unit_id(GUIDED, replace(TINY, **change), store.humans) for change in plans]
+        assert id_of() == id_of(checkpoint_every=7) == id_of(where=elsewhere)
+        assert id_of(UNIT) == id_of(UNIT, nowhere), "nobody guides it"
+        ids = [
+            id_of(), id_of(UNIT), id_of(GUIDED._replace(seed=2)),
+            id_of(GUIDED._replace(setting="biased")), id_of(steps={"left_turn": 300}),
+            id_of(evaluation_runs=3), id_of(test_runs=4), id_of(learner={"tau": 0.5}),
+        ]  # fmt: skip
         with monkeypatch.context() as patch:
             row = replace(ALGORITHMS["phil_td3"], advantage_weight=2.0)
             patch.setitem(ALGORITHMS, "phil_td3", row)
-            ids.append(unit_id(GUIDED, TINY, store.humans))
+            ids.append(id_of())
         with monkeypatch.context() as patch:
             patch.setattr(planned, "behaviour", lambda *_: "another scene")
-            ids.append(unit_id(GUIDED, TINY, store.humans))
+            ids.append(id_of())
         human.unlink()
         write_human(store, seed=2)
-        ids.append(unit_id(GUIDED, TINY, store.humans))
+        ids.append(id_of())
         assert len(set(ids)) == len(ids)
-
-    def test_tests_do_not_name_the_training(self, tmp_path):
-        more = replace(TINY, test_runs=9)
-        assert training_id(UNIT, TINY, tmp_path) == training_id(UNIT, more, tmp_path)
+        # Tests do not name the training.
+        plans = (replace(TINY, test_runs=number) for number in (2, 9))
+        assert len({planned.training_id(UNIT, each, tmp_path) for each in plans}) == 1
 
     def test_a_scene_that_does_another_thing_is_another_scene(self):
         nominal = planned.behaviour("left_turn", "nominal")
@@ -219,57 +173,44 @@ class TestIds:
 
 class TestPlan:
     def test_every_experiment_is_computed_by_all(self):
-        everything = units_of(["all"], 2)
+        everything = planned.units_of(["all"], 2)
         assert len(set(everything)) == len(everything)
-        for name in EXPERIMENTS:
-            units = units_of([name], 2)
-            assert units, name
-            assert set(units) <= set(everything)
+        for name in planned.EXPERIMENTS:
+            assert set() < set(planned.units_of([name], 2)) <= set(everything)
 
     def test_work_goes_by_priority_and_then_seed_by_seed(self):
-        units = units_of(["all"], 5)
-        assert {unit.algorithm for unit in units[:4]} == {HUMAN_MODEL, CONSTANT}
+        units = planned.units_of(["all"], 5)
+        assert {unit.algorithm for unit in units[:4]} == {planned.HUMAN_MODEL, planned.CONSTANT}
         first = units[4:44]
-        assert {unit.setting for unit in first} == {NORMAL}
+        assert {unit.setting for unit in first} == {planned.NORMAL}
         assert [unit.seed for unit in first] == sorted(unit.seed for unit in first)
         assert units[44].setting == "biased"
 
     def test_the_settings_are_what_they_say(self, store):
         write_human(store)
-
-        def config(setting):
-            return run_config(GUIDED._replace(setting=setting), planned.PLAN, store.humans)
-
-        assert {setting for _, setting, _ in LINES} == set(SETTINGS)
-        assert config("one_frame").learner.frames == 1
-        assert config("printed").learner == PRINTED_LEARNER
-        assert config("biased").poor_guidance == "biased"
-        assert config("random").poor_guidance == "random"
-        assert config("random").poor_guidance_share == config("biased").poor_guidance_share > 0.3
-        steps = {config(setting).steps for setting in SETTINGS}
-        assert steps == {planned.PLAN.steps["left_turn"]}
-
-
-def test_the_record_says_what_was_trained(straight):
-    """Enough to train it again by hand."""
-    record = json.loads(straight.records_file("left_turn").read_text())
-    config = run_config(UNIT, TINY, straight.humans).as_dict()
-    assert {**config, **record["config"]} == json.loads(json.dumps(config))
-    assert (straight.run_dir(UNIT) / METRICS_FILE).is_file()
+        units = {setting: GUIDED._replace(setting=setting) for setting in planned.SETTINGS}
+        of = {name: planned.run_config(units[name], planned.PLAN, store.humans) for name in units}
+        assert {setting for _, setting, _ in planned.LINES} == set(planned.SETTINGS)
+        assert of["one_frame"].learner.frames == 1
+        assert of["printed"].learner == PRINTED_LEARNER
+        assert (of["biased"].poor_guidance, of["random"].poor_guidance) == ("biased", "random")
+        assert of["random"].poor_guidance_share == of["biased"].poor_guidance_share > 0.3
+        assert {each.steps for each in of.values()} == {planned.PLAN.steps["left_turn"]}
 
 
 UNITS = [UNIT._replace(seed=seed) for seed in (1, 2, 3)]
 
 
-def test_a_parcel_goes_on_elsewhere_and_brings_back_the_same_record(tmp_path):
-    store, other = store_in(tmp_path / "ours"), store_in(tmp_path / "theirs")
-    task = Task(UNIT, store, stop_at_s=Soon(1e18))
-    assert keep(task, *compute_parcel(pack(task))) == STOPPED
-    task = replace(task, stop_at_s=float("inf"))
-    assert "checkpoint.pt" in pack(task)[2]
-    assert keep(task, *compute_parcel(pack(task))) == FINISHED
-    assert compute(Task(UNIT, other)) == FINISHED
-    assert without_times(store, UNIT) == without_times(other, UNIT)
+def test_a_parcel_goes_on_elsewhere_and_brings_back_the_same_record(store, straight):
+    """Wherever it is stopped, and also before its time began."""
+    assert running.compute(running.Task(UNIT, store, stop_at_s=1.0)) == running.STOPPED
+    assert running.compute(running.Task(UNIT, store, stop_at_s=Soon(1e18))) == running.STOPPED
+    task = running.Task(UNIT, store, stop_at_s=Soon(1e18))
+    assert running.keep(task, *running.compute_parcel(running.pack(task))) == running.STOPPED
+    task = running.Task(UNIT, store)
+    assert "checkpoint.pt" in running.pack(task)[2]
+    assert running.keep(task, *running.compute_parcel(running.pack(task))) == running.FINISHED
+    assert without_times(store, UNIT) == without_times(straight, UNIT)
 
 
 @pytest.fixture(scope="module")
@@ -291,6 +232,6 @@ def test_a_cluster_computes_all_units_but_the_one_that_fails(store, cluster):
     run_dir = store.run_dir(UNITS[0])
     run_dir.mkdir(parents=True)
     (run_dir / "checkpoint.pt").write_bytes(b"no checkpoint")
-    ends = run_on_ray([Task(unit, store) for unit in UNITS], cluster.address)
-    assert ends == {FAILED: 1, FINISHED: 2}
+    ends = running.run_on_ray([running.Task(unit, store) for unit in UNITS], cluster.address)
+    assert ends == {running.FAILED: 1, running.FINISHED: 2}
     assert list(store.find(UNITS)[0]) == UNITS[1:]

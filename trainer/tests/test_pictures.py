@@ -3,7 +3,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from PIL import Image, ImageSequence
 
 from trainer.__main__ import main
@@ -40,21 +39,6 @@ def test_the_commands_film_is_small_and_plays_in_real_time(tmp_path):
         assert film.info["loop"] == 0
     assert sum(times_ms) == 19 * 100 + 1500
     assert out.stat().st_size < 500_000
-
-
-@pytest.mark.parametrize(
-    ("words", "part"),
-    [
-        ("picture expert --out a.jpg", "a picture is a .png, a film a .gif"),
-        ("picture expert --human expert --out a.png", "takes over in a film"),
-        ("picture none --out a.gif", "none is no policy"),
-        ("plot one two", "does not exist"),
-    ],
-)
-def test_bad_input_is_one_line(words, part, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert part in refusal(capsys, *words.split())
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_curves_of_several_runs_end_with_the_shortest(tmp_path, capsys):

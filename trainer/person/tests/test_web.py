@@ -316,11 +316,9 @@ async def test_a_name_that_is_not_this_machines_is_refused(cockpit, host):
     status, text, _ = await status_of(cockpit.url, headers=headers)
     assert (status, "address" in text) == (421, True)
     assert await refusal(cockpit, origin=f"http://{headers['Host']}", headers=headers) == 421
-
-
-@pytest.mark.parametrize("host", ["localhost:7", "LOCALHOST", "[::1]:80", "127.0.0.1"])
-async def test_loopback_by_any_port_is_let_in_as_through_a_tunnel(cockpit, host):
-    assert (await status_of(cockpit.url, headers={"Host": host}))[0] == 200
+    # Loopback is let in by any port, as through a tunnel.
+    for here in ("localhost:7", "LOCALHOST", "[::1]:80", "127.0.0.1"):
+        assert (await status_of(cockpit.url, headers={"Host": here}))[0] == 200
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.2"])
