@@ -234,7 +234,10 @@ def test_a_kill_loses_at_most_the_last_second_and_repair_gives_the_index_back(tm
 def test_a_torn_file_is_read_up_to_the_tear(drive, tmp_path, keep, repair):
     recording, _ = drive
     torn = tmp_path / "torn.mcap"
-    torn.write_bytes(recording.read_bytes()[: int(recording.stat().st_size * keep)])
+    first = chunks(recording)[0]
+    whole_to = first.chunk_start_offset + first.chunk_length  # Else there is nothing to repair.
+    cut = max(whole_to + 1, int(recording.stat().st_size * keep))
+    torn.write_bytes(recording.read_bytes()[:cut])
     whole, part = states_in(recording), states_in(torn)
     assert part == whole[: len(part)]
     read_again = Recording(torn)
