@@ -27,15 +27,8 @@ FAULT_BRIGHTNESS = 200.0
 SLOW_LOOPS = 1500
 _SLOW_SIZE = 256
 
-PEDAL = Action(
-    name="pedal",
-    meaning="positive accelerates, negative brakes",
-    unit="aperture",
-    low=-1.0,
-    high=1.0,
-)
-STEERING = Action(
-    name="steering", meaning="positive steers left", unit="fraction of full", low=-1.0, high=1.0
+PEDAL, STEERING = (
+    Action(name=name, meaning="m", unit="u", low=-1.0, high=1.0) for name in ("pedal", "steering")
 )
 
 
@@ -61,14 +54,11 @@ def write_policy(
     graph = _graph(kind, value, len(actions), loops)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
+    training = {"seed": 0, "episodes": 0, "config": {}, "source_revision": "test"}
     fields: Dict[str, Any] = {
-        "scenario": "left_turn",
-        "algorithm": "test",
-        "observation": Observation(),
-        "action": list(actions),
-        "training": {"seed": 0, "episodes": 0, "config": {}, "source_revision": "test"},
-        "created": "2025-01-01T00:00:00Z",
-    }
+        "scenario": "left_turn", "algorithm": "test", "observation": Observation(),
+        "action": list(actions), "training": training, "created": "2025-01-01T00:00:00Z",
+    }  # fmt: skip
     manifest = Manifest(**{**fields, **(manifest_changes or {})})
     helper.set_model_props(model, {MANIFEST_KEY: encode_manifest(manifest)})
     data = model.SerializeToString()
