@@ -4,8 +4,6 @@ The test keeps its own few facts (the last fault, the states since, the last per
 looks at the table: a command to drive is held against the facts alone.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any, Optional

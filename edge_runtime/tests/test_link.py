@@ -1,7 +1,5 @@
 """The edge's end of the wire without a network: a session that only notes what is asked of it."""
 
-from __future__ import annotations
-
 import socketserver
 import threading
 import time
@@ -57,9 +55,8 @@ def test_the_tokens_are_declared_again_for_each_router_that_comes(session):
         (["0000000000000001-elder"] * 3, [0, 1, 1], 1),
         ([letter * 16 for letter in "ffefee"], [0] * 6, 2),
     ],
-    ids=["the younger of two gives way at the second look", "the elder goes on and counts"],
 )
-def test_of_two_runtimes(session, claims, given, rivals):
+def test_of_two_runtimes_the_younger_gives_way_and_the_elder_counts(session, claims, given, rivals):
     give_way = MagicMock()
     presence = Presence(session, "k", lambda: session, give_way)
     for claim, times_given in zip(claims, given):

@@ -1,7 +1,5 @@
 """Files that a command reads: regular, of a sane size, and nested no deeper than can be read."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 from typing import Any, Dict, List, Optional, Union, get_type_hints
 
@@ -162,10 +160,8 @@ def padded_to(size: int) -> bytes:
 def test_what_is_just_in_bounds_is_accepted_and_one_more_is_not():
     assert len(padded_to(65_536)) == 65_536
     assert isinstance(wire.decode_state(padded_to(65_536)), State)
-    assert wire.decode_state(padded_to(65_537)) == (
-        Reason.OVERSIZED,
-        "65537 bytes, at most 65536 are read",
-    )
+    too_long = (Reason.OVERSIZED, "65537 bytes, at most 65536 are read")
+    assert wire.decode_state(padded_to(65_537)) == too_long
     for count in (256, 257):
         state = wire.decode_state(wire.encode(make_state(0, session="x" * count)))
         assert isinstance(state, State) == (count == 256)
