@@ -1,7 +1,6 @@
 """Small policy files for tests, made with the onnx package (which the board never sees)."""
 
-from __future__ import annotations
-
+import hashlib
 from pathlib import Path
 from typing import Any, Dict, Optional, Sequence
 
@@ -12,14 +11,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from onnx import helper, numpy_helper
 
-from edge_runtime.policy import (
-    MANIFEST_KEY,
-    Action,
-    Manifest,
-    Observation,
-    encode_manifest,
-    policy_id_of,
-)
+from edge_runtime.policy import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
 
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.
@@ -45,11 +37,9 @@ def write_policy(
 ) -> str:
     """Write a policy file and return its policy_id; sign it as `path`.sig where a key is given.
 
-    kind: "constant" always answers `value`; "mean" answers the mean brightness scaled to
-    [-1, 1], a different number for different frames; "nan" is "constant" until the frames are
-    brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then takes about a second at
-    SLOW_LOOPS `loops`, and in proportion at others.
-    `manifest_changes` replaces fields of the manifest, to write files that must be refused.
+    kind: "constant" always answers `value`; "mean" the mean brightness scaled to [-1, 1]; "nan" is
+    "constant" until the frames are brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then
+    takes about a second at SLOW_LOOPS `loops`, and in proportion at others.
     """
     graph = _graph(kind, value, len(actions), loops)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
@@ -65,7 +55,7 @@ def write_policy(
     Path(path).write_bytes(data)
     if key is not None:
         Path(f"{path}.sig").write_bytes(key.sign(data))
-    return policy_id_of(data)
+    return hashlib.sha256(data).hexdigest()
 
 
 def public_pem(key: Any) -> bytes:
