@@ -62,31 +62,21 @@ def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIE
 
 
 class EdgeProcess:
-    """`python -m edge_runtime run` as a process of its own."""
-
     def __init__(
-        self,
-        *arguments: str,
-        python: str = sys.executable,
-        cwd: Optional[Path] = None,
-        stderr: Any = subprocess.PIPE,
-        environment: Optional[Dict[str, str]] = None,
+        self, *arguments: str, python: str = sys.executable, environment: Any = (), **options: Any
     ) -> None:
-        self.process = subprocess.Popen(
-            [python, "-m", "edge_runtime", "run", *arguments],
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            text=True,
-            cwd=cwd,
-            env={**os.environ, **(environment or {})},
+        command = [python, "-m", "edge_runtime", "run", *arguments]
+        options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
+        self.process: subprocess.Popen = subprocess.Popen(
+            command, env={**os.environ, **dict(environment)}, **options
         )
         assert self.process.stdout is not None
         self.ready_line = self.process.stdout.readline().strip()
 
-    def end(self, timeout_s: float = PATIENCE_S) -> int:
+    def end(self) -> int:
         """SIGTERM, then the exit status. Afterwards `log` holds its stderr."""
         self.process.terminate()
-        _, self.log = self.process.communicate(timeout=timeout_s)
+        _, self.log = self.process.communicate(timeout=PATIENCE_S)
         return self.process.returncode
 
     def __enter__(self) -> EdgeProcess:
@@ -102,40 +92,32 @@ class Simulator:
     """The simulator's end of the wire: a router that sends states and keeps what comes back."""
 
     def __init__(self, endpoint: str, vehicle_id: str = "hunter01") -> None:
-        self.endpoint = endpoint
-        self.vehicle_id = vehicle_id
+        self.endpoint, self.vehicle_id = endpoint, vehicle_id
         self.commands: queue.Queue[Command] = queue.Queue()
         self.health: List[Health] = []
         self.feedback: List[Feedback] = []
         self._session = open_session(listen=endpoint, mode="router")
-        kept: Dict[str, Any] = {
-            "command": (wire.decode_command, self.commands.put),
-            "health": (wire.decode_health, self.health.append),
-            "feedback": (wire.decode_feedback, self.feedback.append),
-        }
-        self._subscribers: List[Any] = [
-            self._session.declare_subscriber(wire.key(vehicle_id, topic), partial(self._keep, *how))
-            for topic, how in kept.items()
-        ]
         self.alive = threading.Event()
-        alive = wire.key(vehicle_id, "alive")
-        self._subscribers.append(
-            self._session.liveliness().declare_subscriber(alive, self._note_alive, history=True)
-        )
+        alive, tokens = wire.key(vehicle_id, "alive"), self._session.liveliness()
+        self._subscribers = [tokens.declare_subscriber(alive, self._note_alive, history=True)]
+        for topic, decode, keep in (
+            ("command", wire.decode_command, self.commands.put),
+            ("health", wire.decode_health, self.health.append),
+            ("feedback", wire.decode_feedback, self.feedback.append),
+        ):
+            hear = partial(self._keep, decode, keep)
+            key = wire.key(vehicle_id, topic)
+            self._subscribers.append(self._session.declare_subscriber(key, hear))
 
     def wait_for_edge(self) -> None:
-        """Until the edge runtime's token is there and its health arrives."""
         assert self.alive.wait(PATIENCE_S), "no edge runtime came"
         wait_until(lambda: self.health, "a health message")
 
     def send(self, state: Any, key: str = "") -> None:
         """Publish a State, or bytes as they are; all arrive, on however busy a machine."""
         payload = state if isinstance(state, bytes) else wire.encode(state)
-        self._session.put(
-            key or wire.key(self.vehicle_id, "state"),
-            payload,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-        )
+        key = key or wire.key(self.vehicle_id, "state")
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def ask(self, state: State, timeout_s: float = PATIENCE_S) -> Command:
         """Send a state and wait for the command that answers it, dropping all before."""
@@ -147,28 +129,23 @@ class Simulator:
             if place == (state.session, state.episode, state.step):
                 return command
 
-    def next_command(self, timeout_s: float = PATIENCE_S) -> Command:
-        """The next command, whatever it answers."""
-        return self.commands.get(timeout=timeout_s)
+    def next_command(self) -> Command:
+        return self.commands.get(timeout=PATIENCE_S)
 
     def drain(self) -> List[Command]:
-        """All commands that came so far."""
         return [self.commands.get_nowait() for _ in range(self.commands.qsize())]
 
     def query(self, topic: str) -> Dict[str, Any]:
         """The status or rearm query, as an operator's command asks it."""
         return ask(self.endpoint, self.vehicle_id, topic)
 
-    def close(self) -> None:
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
-        self._session.close()
-
     def __enter__(self) -> Simulator:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._session.close()
 
     def _keep(self, decode: Callable, keep: Callable, sample: Any) -> None:
         message = decode(bytes(sample.payload))
@@ -180,7 +157,6 @@ class Simulator:
 
 
 def run_command(*arguments: str, cwd: Optional[Path] = None) -> subprocess.CompletedProcess:
-    """`python -m edge_runtime ARGUMENTS` to its end."""
     command = [sys.executable, "-m", "edge_runtime", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=cwd, check=False)
 
@@ -195,11 +171,9 @@ def exit_status(main: Callable[[List[str]], int], arguments: List[str]) -> int:
 
 def render_table(events, states, after):
     """A table of transitions as README.md shows it: a row for each event, a column a state."""
-    lines = [
-        "| event | " + " | ".join(f"in {state.value}" for state in states) + " |",
-        "|---" * (len(states) + 1) + "|",
+    rows = [
+        ["event", *(f"in {state.value}" for state in states)],
+        *([event.value, *(after(state, event).value for state in states)] for event in events),
     ]
-    for event in events:
-        cells = (after(state, event).value for state in states)
-        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    first, *others = (f"| {' | '.join(row)} |" for row in rows)
+    return "\n".join((first, "|---" * len(rows[0]) + "|", *others))

@@ -1,7 +1,6 @@
 """Small policy files for tests, made with the onnx package (which the board never sees)."""
 
-from __future__ import annotations
-
+import hashlib
 from pathlib import Path
 from typing import Any, Dict, Optional, Sequence
 
@@ -12,14 +11,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from onnx import helper, numpy_helper
 
-from edge_runtime.policy import (
-    MANIFEST_KEY,
-    Action,
-    Manifest,
-    Observation,
-    encode_manifest,
-    policy_id_of,
-)
+from edge_runtime.policy import MANIFEST_KEY, Action, Manifest, Observation, encode_manifest
 
 # Above this mean brightness (0 to 255) the faulty kinds show their fault; no probe picture of
 # `load_policy` is as bright, so they load like a good policy and fail on white frames.
@@ -27,15 +19,8 @@ FAULT_BRIGHTNESS = 200.0
 SLOW_LOOPS = 1500
 _SLOW_SIZE = 256
 
-PEDAL = Action(
-    name="pedal",
-    meaning="positive accelerates, negative brakes",
-    unit="aperture",
-    low=-1.0,
-    high=1.0,
-)
-STEERING = Action(
-    name="steering", meaning="positive steers left", unit="fraction of full", low=-1.0, high=1.0
+PEDAL, STEERING = (
+    Action(name=name, meaning="m", unit="u", low=-1.0, high=1.0) for name in ("pedal", "steering")
 )
 
 
@@ -52,30 +37,25 @@ def write_policy(
 ) -> str:
     """Write a policy file and return its policy_id; sign it as `path`.sig where a key is given.
 
-    kind: "constant" always answers `value`; "mean" answers the mean brightness scaled to
-    [-1, 1], a different number for different frames; "nan" is "constant" until the frames are
-    brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then takes about a second at
-    SLOW_LOOPS `loops`, and in proportion at others.
-    `manifest_changes` replaces fields of the manifest, to write files that must be refused.
+    kind: "constant" always answers `value`; "mean" the mean brightness scaled to [-1, 1]; "nan" is
+    "constant" until the frames are brighter than FAULT_BRIGHTNESS, then NaN; "slow" likewise, then
+    takes about a second at SLOW_LOOPS `loops`, and in proportion at others.
     """
     graph = _graph(kind, value, len(actions), loops)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
     model.ir_version = ir_version
+    training = {"seed": 0, "episodes": 0, "config": {}, "source_revision": "test"}
     fields: Dict[str, Any] = {
-        "scenario": "left_turn",
-        "algorithm": "test",
-        "observation": Observation(),
-        "action": list(actions),
-        "training": {"seed": 0, "episodes": 0, "config": {}, "source_revision": "test"},
-        "created": "2025-01-01T00:00:00Z",
-    }
+        "scenario": "left_turn", "algorithm": "test", "observation": Observation(),
+        "action": list(actions), "training": training, "created": "2025-01-01T00:00:00Z",
+    }  # fmt: skip
     manifest = Manifest(**{**fields, **(manifest_changes or {})})
     helper.set_model_props(model, {MANIFEST_KEY: encode_manifest(manifest)})
     data = model.SerializeToString()
     Path(path).write_bytes(data)
     if key is not None:
         Path(f"{path}.sig").write_bytes(key.sign(data))
-    return policy_id_of(data)
+    return hashlib.sha256(data).hexdigest()
 
 
 def public_pem(key: Any) -> bytes:

@@ -15,7 +15,7 @@ OK = protocol.SystemStatus(0, protocol.CAN_CONTROL, 24.0, 0, 0, 0)
 STREAM_S = 0.02
 PEDAL = {"pedal": 1.0}
 CAR = CarSettings(
-    throttle_mps2=1.0, brake_mps2=2.0, max_speed_mps=0.5, full_steering_rad=0.3, wheelbase_m=1.0
+    throttle_mps2=1.0, brake_mps2=2.0, max_speed_mps=5.0, full_steering_rad=0.3, wheelbase_m=1.0
 )
 
 
@@ -40,7 +40,6 @@ class Rig:
         return self
 
     def exchange(self, due):
-        """The vehicle takes what a tick gave, and reports."""
         raise NotImplementedError
 
     def enabled(self):
@@ -91,7 +90,6 @@ class HunterRig(Rig):
                 self.tell(protocol.SYSTEM_STATUS, self.status)
 
     def disturb(self, number):
-        """Any frame, and another status from now on."""
         self.status = OK._replace(mode=number % 4, state=number % 3)
         can_ids, data = [*protocol.FRAMES, 0x7FF], number.to_bytes(8, "big", signed=True)
         self.core.hear(can_ids[number % len(can_ids)], data[: number % 50 or 7], self.now_s)
@@ -121,7 +119,6 @@ class Ros2Rig(Rig):
         self.centre_rad = 0.0
 
     def disturb(self, number):
-        """Any odometry."""
         self.core.hear(number, float(number), -(float(number) ** 8), self.now_s)
 
     def exchange(self, motion):

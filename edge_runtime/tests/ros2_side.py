@@ -4,8 +4,6 @@ Written with a second library (rosbags, definitions of its own) and plain number
 of ros2/node.py. Messages are dictionaries with the names of the .msg files.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time
@@ -71,9 +69,7 @@ ZERO = {"x": 0.0, "y": 0.0, "z": 0.0}
 
 
 class RosHunter:
-    """Takes a Twist with a yaw rate and turns it into the inner wheel's angle as hunter_ros2 does;
-    publishes Odometry at 50 Hz, whether commands come or not. Close it: it has a session.
-    """
+    """Turns the yaw rate of a Twist into the inner wheel's angle; publishes Odometry at 50 Hz."""
 
     def __init__(self, listen=None, connect=None, namespace=""):
         self.twists: list = []
@@ -84,13 +80,12 @@ class RosHunter:
         self._session = session = open_session(listen=listen, connect=connect, mode="router")
         self.tokens, watcher = watch_tokens(session)
         prefix = f"{namespace}/" if namespace else ""
-        self._odometry = session.declare_publisher(f"{prefix}odom")
-        self.put = self._odometry.put  # something else on the odometry's topic
+        odometry = session.declare_publisher(f"{prefix}odom")
+        self.put = odometry.put  # something else on the odometry's topic
         self._declared = [
             session.declare_subscriber(f"{prefix}cmd_vel", self._hear_twist),
             session.declare_subscriber(f"{prefix}ackermann_cmd", self._hear_drive),
-            watcher,
-            self._odometry,
+            *(watcher, odometry),
         ]
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -108,7 +103,6 @@ class RosHunter:
 
     @property
     def asked_mps(self):
-        """The newest speed that it was told."""
         return float(self.twists[-1]["linear"]["x"]) if self.twists else 0.0
 
     def _hear_twist(self, sample):
@@ -136,7 +130,6 @@ class RosHunter:
                 self.put(serialize(ODOMETRY, self.message()))
 
     def message(self):
-        """Its odometry now."""
         slope = math.tan(abs(self.inner_rad))
         centre = math.atan(WHEELBASE_M * slope / (WHEELBASE_M + TRACK_M / 2 * slope))
         yaw_radps = self.speed_mps / WHEELBASE_M * math.tan(math.copysign(centre, self.inner_rad))

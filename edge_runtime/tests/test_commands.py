@@ -1,10 +1,7 @@
 """The command line as a user meets it, wrong inputs first."""
 
-from __future__ import annotations
-
 import hashlib
 import json
-import logging
 import os
 import subprocess
 import sys
@@ -17,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import edge_runtime
-from edge_runtime import cli, log
+from edge_runtime import cli
 from edge_runtime.__main__ import main
 from edge_runtime.commands import render_status
 from edge_runtime.config import Config, load_config
@@ -28,17 +25,13 @@ from edge_runtime.util import UserError
 
 
 def fails_with_one_line(result, *words):
-    assert result.returncode == 2, result.stderr
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1, result.stderr
-    for word in words:
-        assert word in result.stderr
+    found = (result.returncode, result.stdout, result.stderr.count("\n"))
+    assert found == (2, "", 1), result.stderr
+    assert [word for word in words if word not in result.stderr] == []
 
 
 @pytest.fixture
 def settings(tmp_path):
-    """Writes edge.toml."""
-
     def write(text):
         (tmp_path / "edge.toml").write_text(text)
         return tmp_path / "edge.toml"
@@ -48,9 +41,7 @@ def settings(tmp_path):
 
 def test_check_prints_manifest_and_latency(make_policy, tmp_path):
     signed, out = make_policy(), tmp_path / "report.json"
-    result = run_command(
-        "check", str(signed.path), "--public-key", str(signed.public_key), "--out", str(out)
-    )
+    result = run_command("check", *signed.flags[1:], "--out", str(out))
     assert (result.returncode, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     assert report == json.loads(out.read_text())
@@ -61,10 +52,13 @@ def test_check_prints_manifest_and_latency(make_policy, tmp_path):
 
 @pytest.mark.parametrize("command", [["check"], ["run", "--policy"]])
 def test_policies_that_may_not_drive(tmp_path, command):
+    """Each in a process of its own: by then the signals are the run's."""
     good, cut, foreign = (tmp_path / name for name in ("good.onnx", "cut.onnx", "foreign.onnx"))
     write_policy(good)
     cut.write_bytes(good.read_bytes()[:-40])
     foreign.write_bytes(b"\x7fELF" + bytes(100))
+    absent = run_command(*command, "absent.onnx", cwd=tmp_path)
+    fails_with_one_line(absent, "absent.onnx", "does not exist")
     fails_with_one_line(run_command(*command, str(good)), "not signed", "--allow-unsigned")
     for bad in (cut, foreign):
         result = run_command(*command, str(bad), "--allow-unsigned")
@@ -96,15 +90,7 @@ def test_policies_that_may_not_drive(tmp_path, command):
 def test_wrong_arguments(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     status = exit_status(main, arguments)
-    fails_with_one_line(
-        subprocess.CompletedProcess(arguments, status, *capsys.readouterr()), *words
-    )
-
-
-def test_a_policy_that_is_not_there(tmp_path):
-    # In a process of its own: by then the signals are the run's.
-    result = run_command("run", "--policy", "absent.onnx", cwd=tmp_path)
-    fails_with_one_line(result, "absent.onnx", "does not exist")
+    fails_with_one_line(subprocess.CompletedProcess([], status, *capsys.readouterr()), *words)
 
 
 def test_status_with_a_simulator_but_no_edge():
@@ -154,16 +140,14 @@ def test_wrong_config_files(settings, text):
 
 @pytest.mark.parametrize("flags", [{"log_level": "loud", "policy": "p.onnx"}, {}])
 def test_a_wrong_flag_is_not_blamed_on_the_file(settings, flags):
-    with pytest.raises(UserError) as caught:
+    with pytest.raises(UserError, match=r"^((?!edge\.toml).)*$"):
         load_config(settings("log_level = 'debug'"), flags)
-    assert "edge.toml" not in str(caught.value)
 
 
 def test_flags_win_over_the_file(settings):
     path = settings("policy = 'file.onnx'\nvehicle_id = 'from_file'\nallow_unsigned = true")
     config = load_config(path, {"policy": "flag.onnx", "connect": None, "allow_unsigned": None})
-    found = (config.policy, config.vehicle_id, config.allow_unsigned)
-    assert found == ("flag.onnx", "from_file", True)
+    assert config == Config(policy="flag.onnx", vehicle_id="from_file", allow_unsigned=True)
 
 
 def test_a_bus_in_the_file_may_be_of_a_vehicle_that_is_off_but_not_on_the_command_line(settings):
@@ -210,38 +194,24 @@ def test_a_stranger_that_answers_for_the_runtime_is_one_line(topic, answer):
         fails_with_one_line(run_command(topic, "--connect", endpoint))
 
 
-def test_help_shows_every_default_that_says_something() -> None:
+def test_help_shows_every_default_that_says_something():
     parser = cli.ArgumentParser(prog="x")
-    parser.add_argument("--seed", type=int, default=0, help="of everything")
-    parser.add_argument("--rate", default=1.5, help="in Hz")
-    parser.add_argument("--out", default=None, help="file")
-    parser.add_argument("--set", action="append", default=[], help="a setting")
-    parser.add_argument("--only", default=["a", "b"], help="these parts (default: all)")
+    for option, default, text in (
+        ("--seed", 0, "of everything"), ("--rate", 1.5, "in Hz"), ("--out", None, "file"),
+        ("--set", [], "a setting"), ("--only", ["a", "b"], "these parts (default: all)"),
+    ):  # fmt: skip
+        parser.add_argument(option, default=default, help=text)
     parser.add_argument("--quiet", action="store_true", help="say less")
     text = " ".join(parser.format_help().split())
     for said in ("of everything (default: 0)", "in Hz (default: 1.5)", "parts (default: all)"):
         assert said in text
-    assert text.count("(default: ") == 3
-    assert "None" not in text
-    assert "False" not in text
+    assert (text.count("(default: "), text.count("None"), text.count("False")) == (3, 0, 0)
 
 
 HOSTILE = "\x1b[2J\x1b]0;owned\x07\x9b31m\u202e"
 
 
-@pytest.mark.parametrize("log_format", log.FORMATS)
-def test_a_log_line_holds_nothing_that_a_terminal_acts_upon(capsys, log_format):
-    before = logging.getLogger("edge_runtime").handlers
-    log.configure("info", log_format)
-    log.event("info", "rejected", reason="malformed", detail=HOSTILE, name=HOSTILE.strip())
-    log.close()
-    logging.getLogger("edge_runtime").handlers = before
-    (line,) = capsys.readouterr().err.split("\n")[:-1]
-    assert line.isprintable()
-    assert "x1b" in line or "u001b" in line
-
-
-def test_nor_does_an_error_or_a_status():
+def test_an_error_or_a_status_holds_nothing_that_a_terminal_acts_upon():
     assert str(UserError(f"no file {HOSTILE}")).isprintable()
     assert str(UserError("file \x1b]0;x\x07\nis not")) == "file \\x1b]0;x\\x07 is not"
     health = msgspec.structs.asdict(HEALTH)
@@ -253,18 +223,14 @@ def test_nor_does_an_error_or_a_status():
 
 def into_a_full_disk(*command, unbuffered=""):
     """Run with a stdout that takes nothing; ``unbuffered`` as PYTHONUNBUFFERED has it."""
-    with open("/dev/full", "w") as full:
-        return subprocess.run(
-            [sys.executable, "-m", *command], stdout=full, stderr=subprocess.PIPE, text=True,
-            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
-        )  # fmt: skip
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    shell = ["sh", "-c", 'exec "$@" > /dev/full', "sh", sys.executable, "-m", *command]
+    return subprocess.run(shell, capture_output=True, text=True, env=environment)
 
 
 @pytest.mark.parametrize("package", ["edge_runtime", "deploy.installer", "deploy", "bridge"])
 def test_a_full_disk_behind_stdout_is_one_line(package):
-    done = into_a_full_disk(package, "--help")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
-    assert "No space left on device" in done.stderr
+    fails_with_one_line(into_a_full_disk(package, "--help"), "No space left on device")
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
@@ -274,8 +240,7 @@ def test_a_command_that_cannot_print_its_result_ends_with_one_line(make_policy, 
     assert (done.returncode, done.stderr) == (2, line)
     run = ["edge_runtime", "run", *flags, "--connect", "tcp/127.0.0.1:1"]
     done = into_a_full_disk(*run, unbuffered=unbuffered)
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False)
     assert done.stderr.endswith(line)
     assert " ended " in done.stderr  # in order
 

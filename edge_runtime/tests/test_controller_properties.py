@@ -4,16 +4,15 @@ The test keeps its own few facts (the last fault, the states since, the last per
 looks at the table: a command to drive is held against the facts alone.
 """
 
-from __future__ import annotations
-
 import math
-from typing import Optional
+from functools import partial
+from typing import Any, Optional
 
 import numpy as np
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
+from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
 from edge_runtime.controller import ActionLimit, Controller, Order, Received, shared_limits
 from edge_runtime.tests.harness import make_state
@@ -36,19 +35,17 @@ outputs = st.one_of(
 
 
 class AnyHistory(RuleBasedStateMachine):
-    vehicle = False
-    armed_at_start = True
-
-    @initialize()
-    def start(self) -> None:
-        self.limits = shared_limits([PEDAL, STEERING], SLOW if self.vehicle else {})
-        self.controller = Controller(self.limits, self.vehicle, self.armed_at_start)
+    def __init__(self, vehicle: bool, armed_at_start: bool) -> None:
+        super().__init__()
+        self.vehicle = vehicle
+        self.limits = shared_limits([PEDAL, STEERING], SLOW if vehicle else {})
+        self.controller = Controller(self.limits, vehicle, armed_at_start)
         self.now_s = 100.0
         self.step = 0
         self.session = 0
         self.arrived_s: Optional[float] = None
         self.good_in_a_row = 0
-        self.permitted = self.armed_at_start
+        self.permitted = armed_at_start
         self.last: Optional[Order] = None
         self.last_s = -math.inf
         self.stop_s: Optional[float] = None  # the last safe stop, while the watchdog is on time
@@ -58,12 +55,12 @@ class AnyHistory(RuleBasedStateMachine):
         for left in reversed(range(count)):
             self._state([0.5, 0.1], gap_s, late=late, final=final and left == 0)
 
-    @rule(
-        output=outputs, gap_s=gaps, wait_s=waits,
-        duration_s=durations, final=st.booleans(), late=st.booleans(),
-    )  # fmt: skip
-    def any_state(self, output, **how):
-        self._state(output, **how)
+    @rule(how=st.fixed_dictionaries({
+        "output": outputs, "gap_s": gaps, "wait_s": waits, "duration_s": durations,
+        "final": st.booleans(), "late": st.booleans(),
+    }))  # fmt: skip
+    def any_state(self, how):
+        self._state(**how)
 
     @rule(gap_s=gaps)
     def another_simulator(self, gap_s):
@@ -132,17 +129,14 @@ class AnyHistory(RuleBasedStateMachine):
             self.now_s = max(self.now_s, due_s + JUST_AFTER_S)
             order = self.controller.tick(self.now_s)
             if order is not None:
-                self._check_tick(order)
+                assert order.mode == "safe_stop"
+                if self.stop_s is not None and order.reason != "inference_too_long":
+                    assert self.now_s - self.stop_s == pytest.approx(T, abs=1e-4)
                 self._note(order)
         self.now_s = end_s
-        if self.last is not None and self.last.mode == "drive" and not self.last_is_final:
+        if self.last and self.last.mode == "drive" and not self.last.answers.state.final:
             assert self.arrived_s is not None
             assert self.now_s - self.arrived_s <= SILENT_S + 2 * JUST_AFTER_S
-
-    def _check_tick(self, order: Order) -> None:
-        assert order.mode == "safe_stop"
-        if self.stop_s is not None and order.reason != "inference_too_long":
-            assert self.now_s - self.stop_s == pytest.approx(T, abs=1e-4)
 
     def _note(self, order: Order) -> None:
         if order.mode == "drive":
@@ -163,7 +157,6 @@ class AnyHistory(RuleBasedStateMachine):
         for value, row in zip(order.action, self.limits.values()):
             assert row.low <= value <= row.high
         self.last, self.last_s = order, self.now_s
-        self.last_is_final = order.answers.state.final
         self.stop_s = self.now_s if self._is_stopped() else None
 
     def _check_drive(self, order: Order) -> None:
@@ -179,18 +172,10 @@ class AnyHistory(RuleBasedStateMachine):
                 assert abs(value - last) <= row.slew_per_s * min(since_s, T) + 1e-9
 
 
-class AnyHistoryWithVehicle(AnyHistory):
-    vehicle = True
-
-
-class AnyHistoryOfAService(AnyHistory):
-    vehicle = True
-    armed_at_start = False
-
-
-patient = settings(max_examples=60, stateful_step_count=30, deadline=None, derandomize=True)
-TestAnyHistory = AnyHistory.TestCase
-TestAnyHistoryWithVehicle = AnyHistoryWithVehicle.TestCase
-TestAnyHistoryOfAService = AnyHistoryOfAService.TestCase
-for case in (TestAnyHistory, TestAnyHistoryWithVehicle, TestAnyHistoryOfAService):
-    case.settings = patient
+@pytest.mark.parametrize(
+    ("vehicle", "armed_at_start"), [(False, True), (True, True), (True, False)]
+)
+def test_any_history(vehicle, armed_at_start):
+    patient = settings(max_examples=60, stateful_step_count=30, deadline=None, derandomize=True)
+    make: Any = partial(AnyHistory, vehicle, armed_at_start)
+    run_state_machine_as_test(make, settings=patient)

@@ -1,13 +1,11 @@
 """The driver on a real python-can bus within this process, its threads running."""
 
-from __future__ import annotations
-
 import contextlib
-import itertools
 import socket
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import can
@@ -17,21 +15,11 @@ from can.interfaces.udp_multicast.utils import pack_message
 from edge_runtime.config import DEFAULT_BUS, Config, SimilaritySettings
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.tests.rigs import CAR, LEFT_TURN, PEDAL
+from edge_runtime.transport import free_endpoint
 from edge_runtime.util import UserError
-from edge_runtime.vehicles import make_vehicle, stream, vehicle_limits
+from edge_runtime.vehicles import hunter, make_vehicle, stream, vehicle_limits
 from edge_runtime.vehicles.core import State
-from edge_runtime.vehicles.hunter import (
-    GROUP,
-    PORT,
-    BusName,
-    Gate,
-    HunterVehicle,
-    open_bus,
-    parse_bus,
-    protocol,
-)
-
-_numbers = itertools.count()
+from edge_runtime.vehicles.hunter import BusName, Gate, HunterVehicle, open_bus, parse_bus, protocol
 
 
 class Chassis:
@@ -70,8 +58,8 @@ class Chassis:
 
 
 @pytest.fixture
-def channel():
-    return f"hunter-{next(_numbers)}"
+def channel(request):
+    return request.node.name
 
 
 @pytest.fixture
@@ -88,8 +76,6 @@ def vehicle(channel):
 
 
 def drive(chassis, vehicle):
-    """Full throttle at 10 Hz until it moves."""
-
     def is_quick():
         vehicle.command(PEDAL, time.monotonic())
         return chassis.speeds[-1] > 0.2
@@ -126,9 +112,7 @@ def test_it_enables_drives_brakes_and_parks(chassis, vehicle):
     vehicle.close()
 
 
-def test_commands_that_cease_end_in_a_latched_stop_also_before_the_next_period(
-    chassis, vehicle, monkeypatch
-):
+def test_commands_that_cease_latch_a_stop_before_the_next_period(chassis, vehicle, monkeypatch):
     for period_s in (stream.PERIOD_S, 3.0):
         enable(vehicle)
         drive(chassis, vehicle)
@@ -169,9 +153,8 @@ def test_what_waited_before_it_listened_is_not_taken_for_fresh(chassis, vehicle)
 
 
 def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(channel):
-    with can.Bus(interface="virtual", channel=channel) as receiver, can.Bus(
-        interface="virtual", channel=channel
-    ) as sender:
+    bus = partial(can.Bus, interface="virtual", channel=channel)
+    with bus() as receiver, bus() as sender:
         gate = Gate(sender)
         with pytest.raises(RuntimeError, match="before the vehicle is enabled"):
             gate.send(protocol.MOTION_COMMAND, bytes(8))
@@ -196,32 +179,28 @@ def test_nothing_passes_the_gate_before_it_is_opened_and_then_only_our_frames(ch
         ("udp_multicast:239.1.2.3:7", BusName("udp_multicast", "239.1.2.3", None, 7)),
         ("slcan:/dev/ttyACM0", BusName("slcan", "/dev/ttyACM0", 500_000)),
         ("slcan:/dev/ttyACM0:250000", BusName("slcan", "/dev/ttyACM0", 250_000)),
-        ("udp_multicast:", BusName("udp_multicast", GROUP, None, PORT)),
-        ("udp_multicast:239.1.2.3", BusName("udp_multicast", "239.1.2.3", None, PORT)),
+        ("udp_multicast:", BusName("udp_multicast", hunter.GROUP, None, hunter.PORT)),
+        ("udp_multicast:239.1.2.3", BusName("udp_multicast", "239.1.2.3", None, hunter.PORT)),
     ],
 )
 def test_names_of_buses(text, name):
     assert parse_bus(text) == name
 
 
-NO_NAMES = {
-    "write it as INTERFACE:CHANNEL": (
-        "", "can0", "socketcan:", ":can0", "slcan:a:fast", "slcan:a:0",
-    ),
-    "'socketcan:can0:500000'.*ip link.*write socketcan:can0": ("socketcan:can0:500000",),
-    "write it as udp_multicast:239": [
-        f"udp_multicast:{channel}"
-        for channel in (
-            "10.0.0.1", "239.1.2.3:0", "239.1.2.3:70000", "239.1.2:3", "ff15::1", "any",
-            "239.1.2.3:",
-        )
+NO_NAMES = ("", "can0", "socketcan:", ":can0", "slcan:a:fast", "slcan:a:0")
+NO_UDP = ("10.0.0.1", "239.1.2.3:0", "239.1.2.3:70000", "239.1.2:3", "ff15::1", "any", "239.1.2.3:")
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        ("write it as INTERFACE:CHANNEL", NO_NAMES),
+        ("'socketcan:can0:500000'.*ip link.*write socketcan:can0", ["socketcan:can0:500000"]),
+        ("write it as udp_multicast:239", [f"udp_multicast:{channel}" for channel in NO_UDP]),
     ],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("words", NO_NAMES)
-def test_what_is_no_name_of_a_bus_is_refused_in_one_line(words):
-    for text in NO_NAMES[words]:
+)
+def test_what_is_no_name_of_a_bus_is_refused_in_one_line(words, names):
+    for text in names:
         with pytest.raises(UserError, match=f"^.*{words}.*$"):  # a dot is no new line
             parse_bus(text)
 
@@ -257,21 +236,17 @@ def test_the_registry_makes_it_for_a_known_scenario_only(channel):
 
 @pytest.fixture
 def port():
-    """A free one for UDP."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("", 0))
-        return one.getsockname()[1]
+    return int(free_endpoint("udp").rsplit(":", 1)[1])
 
 
 def sent_packets():
     """Packets sent by each interface but the loopback's own."""
-    lines = Path("/proc/net/dev").read_text().splitlines()[2:]
-    fields = {line.split(":")[0].strip(): line.split(":")[1].split() for line in lines}
-    return sum(int(values[9]) for name, values in fields.items() if name != "lo")
+    rows = (row.split(":") for row in Path("/proc/net/dev").read_text().splitlines()[2:])
+    return sum(int(values.split()[9]) for name, values in rows if name.strip() != "lo")
 
 
 def test_frames_reach_the_other_end_and_no_network(port):
-    name = f"udp_multicast:{GROUP}:{port}"
+    name = f"udp_multicast:{hunter.GROUP}:{port}"
     count = 300
     with open_bus(parse_bus(name)) as near, open_bus(parse_bus(name)) as far:
         before = sent_packets()
@@ -288,7 +263,7 @@ def test_frames_reach_the_other_end_and_no_network(port):
 
 def test_what_is_sent_through_a_networks_device_is_not_heard(port):
     """As a neighbour's frames come: the kernel loops them back from the device they leave by."""
-    with open_bus(parse_bus(f"udp_multicast:{GROUP}:{port}")) as far, socket.socket(
+    with open_bus(parse_bus(f"udp_multicast:{hunter.GROUP}:{port}")) as far, socket.socket(
         socket.AF_INET, socket.SOCK_DGRAM
     ) as stranger, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         asked.connect(("192.0.2.1", 9))  # our address on a network; nothing is sent
@@ -296,5 +271,5 @@ def test_what_is_sent_through_a_networks_device_is_not_heard(port):
         stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
         stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, device)
         frame = can.Message(arbitration_id=0x111, data=bytes(8), is_extended_id=False)
-        stranger.sendto(pack_message(frame), (GROUP, port))
+        stranger.sendto(pack_message(frame), (hunter.GROUP, port))
         assert far.recv(0.2) is None

@@ -148,9 +148,6 @@ def test_the_end_stands_and_parks_unless_a_person_drives(driving, ends):
     assert driving.core.tick(driving.now_s) == []
 
 
-# What of chassis and bus stops it.
-
-
 @pytest.mark.parametrize(("change", "words", "outranks"), CHASSIS_SAYS)
 def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(driving, change, words, outranks):
     driving.status = OK._replace(**change)
@@ -172,22 +169,14 @@ def test_what_the_chassis_says_stops_it_until_it_is_enabled_again(driving, chang
 @pytest.mark.parametrize(
     ("frame", "message", "cause", "words"),
     [
-        (
-            protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 90, 0b10),
-            Event.FAULT, "rear left motor: motor overtemperature",
-        ),
-        (
-            protocol.MOTION_COMMAND, protocol.MotionCommand(0.0, 0.0),
-            Event.FOREIGN, "somebody else sends 0x111",
-        ),
-        (
-            protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0),
-            Event.LYING, "the chassis reports 3.0 m/s",
-        ),
-        (
-            protocol.MOTION_STATUS, protocol.MotionStatus(0.0, 1.0),
-            Event.LYING, "a steering angle of 1.00 rad",
-        ),
+        (protocol.REAR_LEFT_SLOW, protocol.MotorSlow(24.0, 30, 90, 0b10),
+         Event.FAULT, "rear left motor: motor overtemperature"),
+        (protocol.MOTION_COMMAND, protocol.MotionCommand(0.0, 0.0),
+         Event.FOREIGN, "somebody else sends 0x111"),
+        (protocol.MOTION_STATUS, protocol.MotionStatus(3.0, 0.0),
+         Event.LYING, "the chassis reports 3.0 m/s"),
+        (protocol.MOTION_STATUS, protocol.MotionStatus(0.0, 1.0),
+         Event.LYING, "a steering angle of 1.00 rad"),
         (None, "bus-off", Event.BUS, "the CAN bus fails: bus-off"),
     ],
 )  # fmt: skip

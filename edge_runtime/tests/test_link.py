@@ -1,11 +1,9 @@
 """The edge's end of the wire without a network: a session that only notes what is asked of it."""
 
-from __future__ import annotations
-
-import contextlib
 import socketserver
 import threading
 import time
+from itertools import count
 from types import SimpleNamespace
 from typing import Any, List
 from unittest.mock import MagicMock
@@ -57,9 +55,8 @@ def test_the_tokens_are_declared_again_for_each_router_that_comes(session):
         (["0000000000000001-elder"] * 3, [0, 1, 1], 1),
         ([letter * 16 for letter in "ffefee"], [0] * 6, 2),
     ],
-    ids=["the younger of two gives way at the second look", "the elder goes on and counts"],
 )
-def test_of_two_runtimes(session, claims, given, rivals):
+def test_of_two_runtimes_the_younger_gives_way_and_the_elder_counts(session, claims, given, rivals):
     give_way = MagicMock()
     presence = Presence(session, "k", lambda: session, give_way)
     for claim, times_given in zip(claims, given):
@@ -74,8 +71,8 @@ def test_of_two_runtimes(session, claims, given, rivals):
 def test_nobody_there_is_nobody_else(session):
     fail = MagicMock(side_effect=UserError("nobody answers"))
     presence = Presence(session, "k", fail, fail)
-    presence.look()
-    presence.look()
+    for _ in range(2):
+        presence.look()
     assert presence.rivals == 0
     assert not require_free(fail, "hunter01")
     assert require_free(lambda: session, "hunter01")
@@ -87,9 +84,8 @@ def link(session) -> Link:
 
 
 def test_a_link_that_gave_way_sends_nothing(session, link):
-    link.send("health", HEALTH)
-    link.gave_way = True
-    link.send("health", HEALTH)
+    for link.gave_way in (False, True):
+        link.send("health", HEALTH)
     assert session.declare_publisher().put.call_count == 1
 
 
@@ -120,21 +116,6 @@ def test_the_session_is_closed_where_the_link_cannot_be_made(session, monkeypatc
     assert session.close.call_count == 2  # the one that asked for other runtimes, and its own
 
 
-@contextlib.contextmanager
-def server(answer):
-    """Answers each connection with these bytes, then closes it."""
-
-    class Answers(socketserver.BaseRequestHandler):
-        def handle(self):
-            self.request.recv(1)
-            self.request.sendall(answer)
-
-    with socketserver.TCPServer(("127.0.0.1", 0), Answers) as listening:
-        threading.Thread(target=listening.serve_forever, daemon=True).start()
-        yield f"tcp/127.0.0.1:{listening.server_address[1]}"
-        listening.shutdown()
-
-
 def test_a_host_that_does_not_exist_and_a_name_that_cannot_be():
     for endpoint in ("tcp/no-such-host.invalid:1", "tcp/a..b:7447", "udp/a..b:7447"):
         answers, why = look(endpoint, None)
@@ -155,8 +136,14 @@ TLS_ALERT = b"\x15\x03\x03\x00\x02\x02\x28"  # TLS 1.2, fatal, handshake failure
     ],
 )
 def test_a_server_that_speaks_tls_and_one_that_speaks_something_else(answer, words):
-    with server(answer) as endpoint:
-        assert words in look(endpoint, None)[1]
+    class Answers(socketserver.BaseRequestHandler):
+        def handle(self):
+            self.request.recv(1)
+            self.request.sendall(answer)
+
+    with socketserver.TCPServer(("127.0.0.1", 0), Answers) as listening:
+        threading.Thread(target=listening.handle_request, daemon=True).start()
+        assert words in look(f"tcp/127.0.0.1:{listening.server_address[1]}", None)[1]
 
 
 @pytest.fixture
@@ -170,23 +157,17 @@ def said(monkeypatch) -> List[str]:
 def test_it_is_said_at_once_and_every_five_seconds_until_a_state_came(said):
     heard: List[str] = []
     look = Waiting(lambda: bool(heard), lambda: f"because {len(said)}").look
-    assert [look(now_s) for now_s in (100.0, 100.1, 104.9)] == [True] * 3
-    assert said == ["because 0"]
-    assert [look(now_s) for now_s in (105.0, 109.9)] == [True] * 2
-    assert said == ["because 0", "because 1"]
+    for now_s, lines in ((100.0, 1), (100.1, 1), (104.9, 1), (105.0, 2), (109.9, 2)):
+        assert look(now_s)
+        assert said == ["because 0", "because 1"][:lines]
     heard.append("a state")
     assert not look(110.0)
     assert len(said) == 2
 
 
 def test_a_state_that_comes_during_the_look_is_not_waited_for(said):
-    heard: List[str] = []
-
-    def why() -> str:
-        heard.append("a state")
-        return "too late"
-
-    assert Waiting(lambda: bool(heard), why).look(0.0)
+    looks = count()
+    assert Waiting(lambda: next(looks) > 0, lambda: "too late").look(0.0)
     assert said == []
 
 

@@ -1,7 +1,5 @@
 """What goes onto the board: a wheel that stands alone and loads no more than it needs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct
@@ -40,7 +38,6 @@ def loaded_by(what: str) -> List[Path]:
 @pytest.mark.parametrize(
     ("what", "most_lines"),
     [("import edge_runtime.run", 2880), ("import edge_runtime.__main__, edge_runtime.run", 3150)],
-    ids=["the run itself", "with the command line"],
 )
 def test_run_without_a_vehicle_loads_no_more_than_it_needs(what, most_lines):
     loaded = loaded_by(what)
@@ -68,9 +65,8 @@ def wheel(tmp_path_factory):
 
 
 def run(*command, cwd=None):
-    return subprocess.run(
-        list(map(str, command)), capture_output=True, text=True, cwd=cwd, timeout=200, check=False
-    )
+    words = [str(word) for word in command]
+    return subprocess.run(words, capture_output=True, text=True, cwd=cwd, timeout=200)
 
 
 def pip(python, *arguments, cwd=None):
@@ -82,10 +78,9 @@ def pip(python, *arguments, cwd=None):
 
 def find_python38():
     pyenv = sorted(Path.home().glob(".pyenv/versions/3.8*/bin/python"))
-    for candidate in filter(None, [shutil.which("python3.8"), *pyenv]):
-        if run(candidate, "-c", "import sys; print(sys.version_info[:2])").stdout == "(3, 8)\n":
-            return candidate
-    return None
+    there = filter(None, [shutil.which("python3.8"), *pyenv])
+    version = ("-c", "import sys; print(sys.version_info[:2])")
+    return next((python for python in there if run(python, *version).stdout == "(3, 8)\n"), None)
 
 
 def test_the_wheel_holds_only_the_runtime(wheel):

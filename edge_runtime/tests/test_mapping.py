@@ -6,20 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN
-from edge_runtime.tests.rigs import SPEC as HUNTER
+from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, SPEC
 from edge_runtime.util import UserError
-from edge_runtime.vehicles.mapping import (
-    CARS,
-    LEAD_S,
-    SPECS,
-    SetPoint,
-    car_of,
-    similarity_to,
-    wish_of,
-)
+from edge_runtime.vehicles import mapping
+from edge_runtime.vehicles.mapping import CARS, SPECS, SetPoint, car_of, similarity_to, wish_of
 
-MOST = HUNTER.max_speed_mps
+MOST = SPEC.max_speed_mps
 unit = st.floats(-1, 1)
 
 
@@ -35,7 +27,7 @@ def test_curvature_by_hand(share):
 @pytest.mark.parametrize("scenario", CARS)
 @given(steering=unit, scale=st.floats(0.01, 2.0), curvature=st.floats(-1e6, 1e6))
 def test_steering_there_and_back(scenario, steering, scale, curvature):
-    similarity = similarity_to(CARS[scenario], HUNTER, scale)
+    similarity = similarity_to(CARS[scenario], SPEC, scale)
     assert similarity.scale == scale
     centre_rad = similarity.centre_rad(steering)
     assert similarity.steering(centre_rad) == pytest.approx(steering, abs=1e-9)
@@ -43,9 +35,8 @@ def test_steering_there_and_back(scenario, steering, scale, curvature):
 
 
 def test_a_scenarios_car_on_the_hunter():
-    assert similarity_to(car_of("left_turn", "hunter"), HUNTER) == LEFT_TURN
+    assert similarity_to(car_of("left_turn", "hunter"), SPEC) == LEFT_TURN
     assert LEFT_TURN.scale == 0.25
-    assert LEFT_TURN.follow_speed(0.0, 4.0, 100.0) == 1.0
     with pytest.raises(UserError, match=r"'parking'.*congestion, left_turn.*\[similarity.car\]"):
         car_of("parking", "hunter")
 
@@ -74,7 +65,7 @@ def test_a_vehicle_that_is_held_up_does_not_wind_up():
     speed = 0.0
     for _ in range(100):
         speed = pedal_to_speed(speed, 1.0, measured=0.0)
-    assert speed == pytest.approx(0.75 * LEAD_S)
+    assert speed == pytest.approx(0.75 * mapping.LEAD_S)
     assert pedal_to_speed(0.0, 0.5, measured=1.0) == pytest.approx(1.0 - 0.375)
     assert pedal_to_speed(0.0, -0.5, measured=1.0) == 0.0  # a brake that does not bite
 
@@ -100,9 +91,9 @@ def test_without_a_pedal_it_follows_the_scenarios_car_within_its_accelerations()
 def test_ackermann_by_hand():
     """A circle of 2 m radius at the rear axle's middle: the inner wheel's is 1.6975 m."""
     centre = math.atan(0.650 / 2.0)
-    inner = HUNTER.inner_rad(centre)
+    inner = SPEC.inner_rad(centre)
     assert inner == pytest.approx(math.atan(0.650 / (2.0 - 0.3025)))
-    assert HUNTER.inner_rad(-centre) == -inner
+    assert SPEC.inner_rad(-centre) == -inner
 
 
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
@@ -125,12 +116,12 @@ PEDALS, SPEEDS_MPS = st.floats(-3, 3), st.floats(-2, 2)
 @given(st.lists(st.tuples(PEDALS, PEDALS, st.floats(-0.1, 0.3), SPEEDS_MPS), max_size=40))
 def test_a_set_point_stays_within_the_limits_and_turns_no_faster_than_its_rate(steps):
     set_point = SetPoint(CONGESTION)
-    full_rad = HUNTER.inner_rad(CONGESTION.centre_rad(-1.0))
+    full_rad = SPEC.inner_rad(CONGESTION.centre_rad(-1.0))
     for pedal, steering, step_s, measured_mps in steps:
         before_rad = set_point.inner_rad
         wish = wish_of({"pedal": pedal, "steering": steering}, None)
         set_point.follow(wish, step_s, measured_mps)
-        most_rad = HUNTER.max_steering_rate_radps * min(max(step_s, 0.0), 0.1)
+        most_rad = SPEC.max_steering_rate_radps * min(max(step_s, 0.0), 0.1)
         assert abs(set_point.inner_rad - before_rad) <= most_rad + 1e-12
         assert abs(set_point.inner_rad) <= full_rad + 1e-12
         assert 0.0 <= set_point.speed_mps <= MOST

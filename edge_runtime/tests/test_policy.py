@@ -1,7 +1,5 @@
 """Which policies may drive; and no byte of one, nor of its signature, can change: all are tried."""
 
-from __future__ import annotations
-
 import hashlib
 import random
 import re
@@ -13,13 +11,12 @@ import onnx
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from edge_runtime import policy as module
-from edge_runtime.policy import MANIFEST_KEY, infer, load_policy, read_onnx, verify
-from edge_runtime.tests.harness import run_command
+from edge_runtime.policy import MANIFEST_KEY, Action, infer, load_policy, read_onnx, verify
 from edge_runtime.tests.policies import PEDAL, STEERING, public_pem, write_policy
 from edge_runtime.util import UserError
 from edge_runtime.wire import MAX_TEXT_CHARS
@@ -28,7 +25,7 @@ POLICIES = Path(module.__file__).parents[1] / "results" / "policies"
 
 
 def action(name, low=-1.0, high=1.0):
-    return type(PEDAL)(name=name, meaning="m", unit="u", low=low, high=high)
+    return Action(name=name, meaning="m", unit="u", low=low, high=high)
 
 
 def refused(path, match, **options):
@@ -38,7 +35,6 @@ def refused(path, match, **options):
 
 @pytest.fixture
 def plain(tmp_path):
-    """Where an unsigned policy file may lie."""
     return tmp_path / "p.onnx"
 
 
@@ -82,20 +78,9 @@ def test_an_answer_of_another_shape_than_one_row_of_actions_is_none(plain, shape
     assert infer(policy, frames)[0] is None
 
 
-def test_two_files_that_act_differently_never_share_an_id(tmp_path):
-    """One of the same weights that answers full throttle whatever it sees, for a start."""
-    paths = [tmp_path / name for name in ("good.onnx", "bad.onnx")]
-    write_policy(paths[0], "mean")
-    model = onnx.load(str(paths[0]))
-    model.graph.node[-1].op_type = "Max"  # of the answer and 1
-    onnx.save(model, str(paths[1]))
-    good, bad = (load_policy(path, allow_unsigned=True) for path in paths)
-    assert bad.act(np.full((2, 45, 80), 9, np.uint8)) == [1.0]
-    assert good.policy_id != bad.policy_id
-
-
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 def test_a_policy_from_before_with_an_id_in_its_manifest_still_drives(scenario):
+    """Its id is the whole file's, so two that act differently never share one."""
     path = POLICIES / f"{scenario}.onnx"
     assert b'"policy_id":' in path.read_bytes()
     policy = load_policy(path, POLICIES / "policy.pub")
@@ -126,9 +111,7 @@ def test_trust_without_a_key_or_signature(make_policy, tmp_path, monkeypatch):
     assert load_policy(signed.path).trust == module.VERIFIED
 
 
-def test_a_key_beside_the_policy_counts_only_where_its_maker_does_not(
-    make_policy, tmp_path, monkeypatch
-):
+def test_a_key_beside_the_policy_is_not_trusted(make_policy, tmp_path, monkeypatch):
     """Whoever brings a policy can bring a key, too; the one of the working directory is mine."""
     (tmp_path / "home" / "keys").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "home")
@@ -229,7 +212,6 @@ def test_what_the_onnx_package_wrote_is_read_and_every_truncation_refused(writte
         assert refused_or_without_manifest(data[:length]), length
 
 
-@settings(deadline=None)
 @given(st.data())
 def test_foreign_and_damaged_bytes_raise_only_user_errors(written, data):
     assert refused_or_without_manifest(data.draw(st.binary(max_size=200)))
@@ -238,23 +220,17 @@ def test_foreign_and_damaged_bytes_raise_only_user_errors(written, data):
     refused_or_without_manifest(bytes(damaged))
 
 
-def outside(tensor):
+def outside(tensor=None):
+    tensor = tensor or helper.make_tensor("w", TensorProto.FLOAT, [1], [1.0])
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value="../elsewhere.bin")
     return tensor
 
 
-def weight():
-    return helper.make_tensor("w", TensorProto.FLOAT, [1], [1.0])
-
-
-def sparse_weight():
-    return helper.make_sparse_tensor(
-        outside(helper.make_tensor("w", TensorProto.FLOAT, [1], [1.0])),
-        helper.make_tensor("places", TensorProto.INT64, [1], [0]),
-        [2],
-    )
+def sparse():
+    places = helper.make_tensor("places", TensorProto.INT64, [1], [0])
+    return helper.make_sparse_tensor(outside(), places, [2])
 
 
 def loop_body(model):
@@ -267,55 +243,43 @@ def constant(**value):
     return helper.make_node("Constant", [], ["c"], **value)
 
 
-ELSEWHERE, SPARSE = "another file", "sparse weights"
-HIDDEN = {
-    "in an initializer": (lambda m: outside(m.graph.initializer[0]), ELSEWHERE),
-    "in an initializer that says so and names no file": (
-        lambda m: setattr(m.graph.initializer[0], "data_location", TensorProto.EXTERNAL), ELSEWHERE,
-    ),
-    "in a constant": (lambda m: m.graph.node.append(constant(value=outside(weight()))), ELSEWHERE),
-    "in a nested graph": (lambda m: loop_body(m).initializer.append(outside(weight())), ELSEWHERE),
-    "in a constant of a nested graph": (
-        lambda m: loop_body(m).node.append(constant(value=outside(weight()))), ELSEWHERE,
-    ),
-    "in a sparse initializer": (
-        lambda m: m.graph.sparse_initializer.append(sparse_weight()), SPARSE,
-    ),
-    "in a sparse initializer of a nested graph": (
-        lambda m: loop_body(m).sparse_initializer.append(sparse_weight()), SPARSE,
-    ),
-    "in a sparse constant": (
-        lambda m: m.graph.node.append(constant(sparse_value=sparse_weight())), SPARSE,
-    ),
-    "in a list of sparse tensors": (
-        lambda m: m.graph.node.append(constant(values=[sparse_weight()])), SPARSE,
-    ),
-    "in a function of the model": (
-        lambda m: m.functions.append(
-            helper.make_function(
-                "mine", "f", [], ["c"], [constant(value=outside(weight()))],
-                [helper.make_opsetid("", 17)],
-            )
+def function():
+    opset, body = helper.make_opsetid("", 17), [constant(value=outside())]
+    return helper.make_function("mine", "f", [], ["c"], body, [opset])
+
+
+HIDDEN: dict = {
+    "another file": {
+        "in an initializer": lambda m: outside(m.graph.initializer[0]),
+        "in an initializer that says so and names no file": lambda m: setattr(
+            m.graph.initializer[0], "data_location", TensorProto.EXTERNAL
         ),
-        "functions of its own",
-    ),
-    "in a graph for training": (
-        lambda m: m.training_info.add().algorithm.initializer.append(outside(weight())),
-        "graphs for training",
-    ),
-    "nowhere, in a model that names no operator set": (
-        lambda m: m.ClearField("opset_import"), "names no operator set",
-    ),
-}  # fmt: skip
+        "in a constant": lambda m: m.graph.node.append(constant(value=outside())),
+        "in a nested graph": lambda m: loop_body(m).initializer.append(outside()),
+        "in its constant": lambda m: loop_body(m).node.append(constant(value=outside())),
+    },
+    "sparse weights": {
+        "in an initializer": lambda m: m.graph.sparse_initializer.append(sparse()),
+        "in a nested graph": lambda m: loop_body(m).sparse_initializer.append(sparse()),
+        "in a constant": lambda m: m.graph.node.append(constant(sparse_value=sparse())),
+        "in a list": lambda m: m.graph.node.append(constant(values=[sparse()])),
+    },
+    "functions of its own": {"": lambda m: m.functions.append(function())},
+    "graphs for training": {
+        "": lambda m: m.training_info.add().algorithm.initializer.append(outside())
+    },
+    "names no operator set": {"": lambda m: m.ClearField("opset_import")},
+}
 
 
-@pytest.mark.parametrize("place", HIDDEN)
-def test_weights_that_may_lie_outside_the_file_are_refused(written, place):
-    hide, what = HIDDEN[place]
+@pytest.mark.parametrize(
+    ("what", "place"), [(what, place) for what, places in HIDDEN.items() for place in places]
+)
+def test_weights_that_may_lie_outside_the_file_are_refused(written, what, place):
     model = onnx.load(str(written))
     model.graph.initializer[0].data_location = TensorProto.DEFAULT  # it says where it is
     assert read_onnx(model.SerializeToString())[1] == 17
-    hide(model)
+    HIDDEN[what][place](model)
     with pytest.raises(UserError, match=what):
         read_onnx(model.SerializeToString())
 
@@ -353,53 +317,32 @@ def test_endless_nesting_ends():
 GROUP_ORDER = 2**252 + 27742317777372353535851937790883648493  # of Ed25519, RFC 8032
 
 
-@pytest.fixture
-def signed(tmp_path):
-    """A small policy's bytes, its signature and the public key."""
-    key = Ed25519PrivateKey.generate()
-    path = tmp_path / "p.onnx"
-    write_policy(path, key=key)
-    return path.read_bytes(), Path(f"{path}.sig").read_bytes(), public_pem(key)
-
-
-def is_accepted(policy, signature, public_key):
-    try:
-        verify(policy, signature, public_key)
-    except UserError:
-        return False
-    return True
-
-
 def changed(data, place, flip):
     return data[:place] + bytes([data[place] ^ flip]) + data[place + 1 :]
 
 
-def test_every_byte_of_a_small_policy_and_every_bit_of_its_signature_count(signed):
-    data, signature, public_key = signed
-    assert is_accepted(data, signature, public_key)
-    draw = random.Random(1)
-    for place in range(len(data)):
-        flip = draw.randint(1, 255)
-        assert not is_accepted(changed(data, place, flip), signature, public_key), (place, flip)
-    for place in range(len(signature)):
-        for bit in range(8):
-            assert not is_accepted(data, changed(signature, place, 1 << bit), public_key), place
-
-
-def test_bytes_more_less_or_elsewhere_are_refused(signed):
-    data, signature, public_key = signed
-    half = len(data) // 2
-    for other in (b"", data[:-1], data[1:], data + b"\0", b"\0" + data, data[half:] + data[:half]):
-        assert not is_accepted(other, signature, public_key)
+def test_every_byte_of_a_small_policy_and_every_bit_of_its_signature_count(make_policy):
+    signed, draw = make_policy(), random.Random(1)
+    data, signature = signed.path.read_bytes(), Path(f"{signed.path}.sig").read_bytes()
+    public_key, half = signed.public_key.read_bytes(), len(data) // 2
+    verify(data, signature, public_key)
     # S plus the group's order solves the same equation; it must not pass as another file.
     number = int.from_bytes(signature[32:], "little") + GROUP_ORDER
-    second_form = signature[:32] + number.to_bytes(32, "little")
-    for other in (second_form, signature[:-1], signature + b"\n", b"", bytes(64)):
-        assert not is_accepted(data, other, public_key)
+    others = [
+        *((changed(data, place, draw.randint(1, 255)), signature) for place in range(len(data))),
+        *((data, changed(signature, bit // 8, 1 << bit % 8)) for bit in range(8 * 64)),
+        *((other, signature) for other in (b"", data[:-1], data[1:], data + b"\0", b"\0" + data)),
+        (data[half:] + data[:half], signature),
+        (data, signature[:32] + number.to_bytes(32, "little")),
+        *((data, other) for other in (signature[:-1], signature + b"\n", b"", bytes(64))),
+    ]
+    for policy, other in others:
+        with pytest.raises(UserError):
+            verify(policy, other, public_key)
 
 
 @pytest.mark.parametrize("region", ["graph", "manifest", "signature"])
-def test_a_changed_file_is_refused_whatever_the_flags_also_by_the_command(make_policy, region):
+def test_a_changed_file_is_refused_whatever_the_flags(make_policy, region):
     signed = make_policy()
     signature = Path(f"{signed.path}.sig")
     path = signature if region == "signature" else signed.path
@@ -407,9 +350,7 @@ def test_a_changed_file_is_refused_whatever_the_flags_also_by_the_command(make_p
     place = {"graph": 12, "manifest": data.find(b"algorithm"), "signature": 40}[region]
     assert place >= 0
     path.write_bytes(changed(data, place, 1))
-    names = f"{re.escape(str(signature))}, public key {re.escape(str(signed.public_key))}"
+    words = (re.escape(str(signature)), re.escape(str(signed.public_key)))
+    names = "{}, public key {}: .* the file was changed".format(*words)
     for allow_unsigned in (False, True):
         refused(signed.path, names, public_key=signed.public_key, allow_unsigned=allow_unsigned)
-    result = run_command("check", str(signed.path), "--public-key", str(signed.public_key))
-    assert (result.returncode, result.stdout, result.stderr.count("\n")) == (2, "", 1)
-    assert "the file was changed" in result.stderr

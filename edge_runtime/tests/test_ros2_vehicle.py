@@ -8,8 +8,7 @@ import time
 import pytest
 
 from edge_runtime.config import Config, Ros2Settings
-from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state, run_command, wait_until
-from edge_runtime.tests.policies import write_policy
+from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state, wait_until
 from edge_runtime.tests.rigs import CONGESTION, LEFT_TURN, PEDAL, STREAM_S, Ros2Rig
 from edge_runtime.tests.ros2_side import RosHunter
 from edge_runtime.transport import free_endpoint
@@ -107,9 +106,7 @@ def report(vehicle):
 
 
 def command_until(vehicle, action, condition, what, scenario_speed_mps=None):
-    """A control loop in its place, and an operator: where it stopped while this machine paused,
-    it is enabled again.
-    """
+    """Command it, and enable it again where it stopped while this machine paused."""
 
     def holds():
         if vehicle.state is State.STOPPED:
@@ -167,7 +164,6 @@ def test_both_kinds_of_command_below_a_namespace_and_their_tokens(linked):
     vehicle, hunter = linked(CONGESTION, namespace="robot", ackermann_topic="ackermann_cmd")
 
     def turns():
-        """At full speed; and so its odometry says."""
         at_speed = hunter.drives and hunter.drives[-1]["drive"]["speed"] > 0.99
         steering = report(vehicle).action["steering"]
         return at_speed and steering == pytest.approx(-1.0, abs=0.01)
@@ -213,22 +209,17 @@ def test_settings_that_cannot_be_are_one_line(make, changes, part):
         make(**changes)
 
 
-# `run` itself.
+def test_a_busy_port_is_one_line_with_the_settings_name(make):
+    busy = free_endpoint()
+    with RosHunter(listen=busy), pytest.raises(UserError, match=r"another with \[ros2\] listen$"):
+        make(listen=busy)
 
 
-def run_flags(folder, table):
-    """The flags of a run with this [ros2] table."""
-    policy, settings = folder / "full.onnx", folder / "edge.toml"
-    write_policy(policy, "constant", 1.0)
-    settings.write_text(f"[ros2]\n{table}")
-    return f"--policy {policy} --allow-unsigned --vehicle ros2 --config {settings}".split()
-
-
-def test_it_drives_stops_with_the_link_and_drives_again_only_after_a_rearm(tmp_path):
-    endpoint, ros_endpoint = free_endpoint(), free_endpoint()
-    table = {"listen": ros_endpoint, "twist_topic": "/cmd_vel", "odometry_topic": "/odom"}
-    lines = "".join(f'{name} = "{value}"\n' for name, value in table.items())
-    flags = [*run_flags(tmp_path, lines + 'namespace = "/any"'), "--connect", endpoint]
+def test_it_drives_stops_with_the_link_and_drives_again_only_after_a_rearm(make_policy, tmp_path):
+    endpoint, ros_endpoint, settings = free_endpoint(), free_endpoint(), tmp_path / "edge.toml"
+    topics = "twist_topic = '/cmd_vel'\nodometry_topic = '/odom'\nnamespace = '/any'"
+    settings.write_text(f"vehicle = 'ros2'\n[ros2]\nlisten = '{ros_endpoint}'\n{topics}")
+    flags = [*make_policy(value=1.0).flags, "--connect", endpoint, "--config", str(settings)]
     with Simulator(endpoint) as simulator, EdgeProcess(*flags) as edge, RosHunter(
         connect=ros_endpoint
     ) as hunter:
@@ -266,12 +257,3 @@ def test_it_drives_stops_with_the_link_and_drives_again_only_after_a_rearm(tmp_p
         assert hunter.asked_mps == 0.0
         assert not simulator.query("rearm")["accepted"]
         assert edge.end() == 0
-
-
-def test_a_busy_port_is_one_line_with_the_settings_name(tmp_path):
-    busy = free_endpoint()
-    with RosHunter(listen=busy):
-        result = run_command("run", *run_flags(tmp_path, f'listen = "{busy}"'))
-    assert result.returncode == 2
-    (line,) = result.stderr.splitlines()
-    assert line.endswith("in use; choose another with [ros2] listen")

@@ -1,7 +1,5 @@
 """The real process against a real simulator session. Limits are loose: machines are busy."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import itertools
@@ -11,11 +9,9 @@ import time
 
 import pytest
 
-from edge_runtime.commands import ask
 from edge_runtime.files import Hold
 from edge_runtime.tests.harness import EdgeProcess, Simulator, make_state, run_command, wait_until
 from edge_runtime.transport import free_endpoint
-from edge_runtime.util import UserError
 from edge_runtime.wire import CONTROL_PERIOD_S, FRAMES_BYTES
 
 WHITE_FRAMES = {"frames": b"\xff" * FRAMES_BYTES}
@@ -37,20 +33,18 @@ def edge_and_simulator(make_policy):
         yield start
 
 
-def drive(simulator, steps, **changes):
-    """Send states at 1/T and give the commands that answer them."""
+def drive(simulator, steps):
     commands = []
     for step in steps:
         begun_s = time.monotonic()
-        commands.append(simulator.ask(make_state(step, **changes)))
+        commands.append(simulator.ask(make_state(step)))
         time.sleep(max(0.0, CONTROL_PERIOD_S - (time.monotonic() - begun_s)))
     return commands
 
 
 def last_health(simulator, condition):
     return wait_until(
-        lambda: next((h for h in reversed(simulator.health) if condition(h)), None),
-        "a health message as expected",
+        lambda: next(filter(condition, reversed(simulator.health)), None), "such a health message"
     )
 
 
@@ -92,8 +86,7 @@ def test_every_signal_that_would_end_it_in_mid_drive_is_a_stop(edge_and_simulato
     last = command_of_reason(simulator, "runtime_ended")
     assert (last.mode, last.action) == ("safe_stop", [-1.0])
     _, log = edge.process.communicate(timeout=20.0)
-    assert edge.process.returncode == 0
-    assert " ended " in log
+    assert (edge.process.returncode, " ended " in log) == (0, True)
 
 
 def test_silence_stops_at_the_control_rate_and_fresh_states_drive_again(edge_and_simulator):
@@ -114,27 +107,16 @@ def test_silence_stops_at_the_control_rate_and_fresh_states_drive_again(edge_and
     assert health.inference_ms["p50"] > 0
 
 
-@pytest.mark.parametrize(
-    ("kind", "bad", "good", "reason"),
-    [
-        ("nan", WHITE_FRAMES, {}, "output_not_finite"),
-        (
-            "constant", {"task": "congestion, steering -1 to 1"},
-            {"task": "left_turn, pedal -1 to 1"}, "other_task",
-        ),
-    ],
-)  # fmt: skip
-def test_a_state_that_cannot_be_driven_on_stops_and_good_ones_drive_again(
-    edge_and_simulator, kind, bad, good, reason
-):
-    edge, simulator = edge_and_simulator(kind)
+def test_a_policy_that_answers_nan_stops_and_drives_again_when_it_answers(edge_and_simulator):
+    edge, simulator = edge_and_simulator("nan")
     assert simulator.ask(make_state(0)).mode == "drive"
     for step in range(1, 9):
-        command = simulator.ask(make_state(step, **bad))
-        assert (command.mode, command.reason, command.action) == ("safe_stop", reason, [-1.0])
-    assert "drive" in {command.mode for command in drive(simulator, range(9, 29), **good)}
+        command = simulator.ask(make_state(step, **WHITE_FRAMES))
+        found = (command.mode, command.reason, command.action)
+        assert found == ("safe_stop", "output_not_finite", [-1.0])
+    assert "drive" in {command.mode for command in drive(simulator, range(9, 29))}
     assert edge.end() == 0
-    assert f"reason={reason}" in edge.log
+    assert "reason=output_not_finite" in edge.log
     assert "Traceback" not in edge.log
 
 
@@ -202,8 +184,7 @@ def test_a_vehicle_moves_stops_and_waits_for_the_operator(edge_and_simulator):
     assert last_health(simulator, lambda h: h.needs_rearm)
     steps = itertools.count(40)
 
-    def is_taken():
-        """Whether the operator's query, made between two states, is taken."""
+    def is_taken():  # an operator's query, made between two states
         simulator.ask(make_state(next(steps)))
         return simulator.query("rearm")["accepted"]
 
@@ -214,10 +195,9 @@ def test_a_vehicle_moves_stops_and_waits_for_the_operator(edge_and_simulator):
 def test_a_second_runtime_with_the_same_vehicle_id_does_not_start(edge_and_simulator, make_policy):
     edge, simulator = edge_and_simulator()
     second = run_command("run", *make_policy().flags, "--connect", simulator.endpoint)
-    assert (second.returncode, second.stdout) == (2, "")
     (line,) = second.stderr.splitlines()
-    assert "another edge runtime" in line
-    assert "hunter01" in line
+    assert (second.returncode, second.stdout) == (2, "")
+    assert "another edge runtime is connected with vehicle id hunter01" in line
     assert simulator.ask(make_state(0, final=True)).mode == "drive"
     assert edge.end() == 0
 
@@ -266,7 +246,6 @@ def test_it_finds_a_simulator_that_starts_later_and_again(make_policy):
 
 @pytest.fixture
 def lock(tmp_path):
-    """A file that somebody holds a lock on."""
     with open(tmp_path / "hold", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield lock
@@ -281,33 +260,28 @@ def test_it_is_free_when_the_lock_is_and_stays_so(lock, tmp_path):
         assert not hold.is_on()
         assert hold.refusal() == ""
     assert not Hold(str(tmp_path / "absent")).is_on()
-    with pytest.raises(UserError, match="cannot be read: Is a directory"):  # not taken for free
-        Hold(str(tmp_path))
 
 
-def test_a_runtime_on_hold_hears_and_says_nothing(make_policy, tmp_path, lock):
-    endpoint, settings = free_endpoint(), tmp_path / "edge.toml"
-    settings.write_text(f"hold = '{lock.name}'\n")
-    flags = [*make_policy().flags, "--connect", endpoint, "--config", str(settings)]
-    with Simulator(endpoint) as simulator, EdgeProcess(*flags, "--vehicle", "mock") as edge:
-        simulator.wait_for_edge()
-        steps = itertools.count()
+def test_a_runtime_on_hold_hears_and_says_nothing(edge_and_simulator, tmp_path, lock):
+    settings, steps = tmp_path / "edge.toml", itertools.count()
+    settings.write_text(f"vehicle = 'mock'\nhold = '{lock.name}'\n")
+    edge, simulator = edge_and_simulator("constant", "--config", str(settings))
 
-        def feed(count):
-            for step in itertools.islice(steps, count):
-                simulator.send(make_state(step))
-                time.sleep(0.05)
+    def feed(count):
+        for step in itertools.islice(steps, count):
+            simulator.send(make_state(step))
+            time.sleep(0.05)
 
-        feed(10)
-        assert wait_until(lambda: simulator.health[-1].accepted, "accepted states")
-        assert simulator.commands.empty()
-        # The vehicle has taken no command: its feedback names the last one.
-        assert {feedback.step for feedback in simulator.feedback} == {-1}
-        answer = ask(endpoint, "hunter01", "rearm")
-        assert not answer["accepted"]
-        assert "installer" in answer["detail"]
-        lock.close()
-        feed(6)
-        assert simulator.next_command().session == "simulator-a"
-        assert wait_until(lambda: simulator.feedback[-1].step >= 0, "a command at the vehicle")
-        assert edge.end() == 0
+    feed(10)
+    assert wait_until(lambda: simulator.health[-1].accepted, "accepted states")
+    assert simulator.commands.empty()
+    # The vehicle has taken no command: its feedback names the last one.
+    assert {feedback.step for feedback in simulator.feedback} == {-1}
+    answer = simulator.query("rearm")
+    assert not answer["accepted"]
+    assert "installer" in answer["detail"]
+    lock.close()
+    feed(6)
+    assert simulator.next_command().session == "simulator-a"
+    assert wait_until(lambda: simulator.feedback[-1].step >= 0, "a command at the vehicle")
+    assert edge.end() == 0

@@ -1,7 +1,5 @@
 """What a service needs: lines for machines, priority, the board watched."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import json
@@ -12,7 +10,8 @@ import sys
 import threading
 import time
 from types import SimpleNamespace
-from typing import Any, List
+from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -24,6 +23,7 @@ from edge_runtime.loop import ControlLoop
 from edge_runtime.service import Notifier, look
 from edge_runtime.tests.harness import EdgeProcess, make_state, wait_until
 from edge_runtime.tests.policies import PEDAL
+from edge_runtime.tests.test_commands import HOSTILE
 from edge_runtime.tests.test_vehicle_base import BrokenVehicle
 from edge_runtime.transport import free_endpoint
 from edge_runtime.vehicles.base import VehicleRunner
@@ -51,10 +51,7 @@ def test_the_hottest_sensor_counts_and_a_silent_one_does_not(tmp_path):
 
 def test_what_the_system_refuses_is_named_and_the_rest_applied(monkeypatch):
     asked: list = []
-
-    def refuse(*_: Any) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
+    refuse = MagicMock(side_effect=PermissionError(1, "Operation not permitted"))
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: asked.append(cpus))
@@ -65,13 +62,17 @@ def test_what_the_system_refuses_is_named_and_the_rest_applied(monkeypatch):
     assert service.claim_resources(0, [], False) == []
 
 
-def test_lines_as_text_and_the_fields_of_json(capfd):
+def test_lines_as_text_and_the_fields_of_json_without_what_a_terminal_acts_upon(capfd):
     for log_format in log.FORMATS:
         log.configure("info", log_format)
         log.event("debug", "unseen")
+        log.event("info", "rejected", detail=HOSTILE, name=HOSTILE.strip())
         log.event("warning", "mode", was="drive", detail="two words", level="no level")
         log.close()
-    text, line = capfd.readouterr().err.splitlines()
+    hostile_text, text, hostile_line, line = capfd.readouterr().err.split("\n")[:-1]
+    for hostile in (hostile_text, hostile_line):
+        assert hostile.isprintable()
+        assert "1b[2J" in hostile
     assert text.endswith("Z WARNING mode was=drive detail='two words' level='no level'")
     fields = json.loads(line)
     assert fields.pop("time").endswith("Z")
@@ -105,12 +106,9 @@ class Systemd:
         self.socket.settimeout(wait_s)
         return self.socket.recv(4096).decode()
 
-    def until(self, start: str) -> List[str]:
-        """The messages up to the first that begins so, which is the last of them."""
-        found = [self.next()]
-        while not found[-1].startswith(start):
-            found.append(self.next())
-        return found
+    def until(self, start: str) -> str:
+        """The first message from now on that begins so."""
+        return next(text for text in iter(self.next, "") if text.startswith(start))
 
     def is_told_nothing(self, wait_s: float) -> bool:
         """Whether nothing more comes within this time."""
@@ -144,7 +142,7 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
         edge.process.send_signal(signal.SIGCONT)
         assert systemd.next() == "WATCHDOG=1"
         assert edge.end() == 0
-        assert systemd.until("STOPPING")[-1] == "STOPPING=1"
+        assert systemd.until("STOPPING") == "STOPPING=1"
     lines = [json.loads(line) for line in edge.log.splitlines()]
     assert [line["event"] for line in lines] == ["not_permitted", "waiting", "ended"]
     assert list(lines[0])[:3] == ["time", "level", "event"]
@@ -157,8 +155,7 @@ def test_a_service_from_its_start_to_its_end(make_policy, tmp_path, systemd):
 class FakePolicy:
     """Answers 0.5 at once, or waits while it is told to hang."""
 
-    policy_id = "p"
-    manifest = SimpleNamespace(action=[PEDAL])
+    policy_id, manifest = "p", SimpleNamespace(action=[PEDAL])
 
     def __init__(self) -> None:
         self.free = threading.Event()
@@ -170,22 +167,18 @@ class FakePolicy:
 
 
 class FakeLink:
-    """Keeps the handler of states; counts what is sent."""
+    """Keeps the handler of states, and the last message of a topic with how many came before."""
 
-    vehicle_id = "hunter01"
-    rivals = 0
+    vehicle_id, rivals = "hunter01", 0
 
     def __init__(self) -> None:
-        self.sent = {"command": 0, "health": 0}
-        self.commands: list = []
+        self.sent: dict = {"command": (0, None), "health": (0, None)}
 
     def declare(self, on_state: Any, *_: Any) -> None:
         self.state_comes = on_state
 
     def send(self, topic: str, message: Any) -> None:
-        self.sent[topic] += 1
-        if topic == "command":
-            self.commands = [message]
+        self.sent[topic] = self.sent[topic][0] + 1, message
 
 
 @pytest.fixture
@@ -194,11 +187,10 @@ def running():
     with contextlib.ExitStack() as ends:
 
         def start(notifier: Any, vehicle: Any = None) -> Any:
-            policy: Any = FakePolicy()
-            link: Any = FakeLink()
+            policy, link = FakePolicy(), FakeLink()
             controller = Controller(shared_limits([PEDAL], {}), needs_rearm=False)
             runner = vehicle and VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
-            control = ControlLoop(policy, controller, link, runner, notifier)
+            control = ControlLoop(policy, controller, link, runner, notifier)  # type: ignore[arg-type]
             control.start()
             main = threading.Thread(target=control.run)
             main.start()
@@ -225,10 +217,10 @@ def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     assert systemd.next() == "WATCHDOG=1"
     policy.free.clear()
     link.state_comes(encode(make_state(0)))
-    assert systemd.until("STATUS")[-1] == "STATUS=safe_stop inference_too_long"
-    before = link.sent["command"]
+    assert systemd.until("STATUS") == "STATUS=safe_stop inference_too_long"
+    before, _ = link.sent["command"]
     wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message for a while")
-    assert link.sent["command"] > before  # the safe stops go on
+    assert link.sent["command"][0] > before  # the safe stops go on
     policy.free.set()
     assert systemd.next() == "WATCHDOG=1"
 
@@ -236,20 +228,20 @@ def test_a_policy_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
 def test_a_policys_thread_that_died_is_a_fault_and_lets_systemd_step_in(running, systemd):
     control, link, policy = running(systemd.notifier())
     link.state_comes(encode(make_state(0)))
-    assert systemd.until("STATUS")[-1] == "STATUS=drive"
+    assert systemd.until("STATUS") == "STATUS=drive"
     policy.act = lambda frames: sys.exit("no exception that inference catches")
     link.state_comes(encode(make_state(1)))
-    assert systemd.until("STATUS")[-1] == "STATUS=safe_stop policy_thread_dead"
+    assert systemd.until("STATUS") == "STATUS=safe_stop policy_thread_dead"
     wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message any more")
-    before = link.sent["command"]
+    before, _ = link.sent["command"]
     for step in range(2, 8):  # a simulator that lives on changes nothing
         link.state_comes(encode(make_state(step)))
         time.sleep(0.1)
-    assert link.sent["command"] > before  # the safe stops go on
-    health = control.health()
-    found = (health.mode, health.reason, health.deadline_misses)
-    assert found == ("safe_stop", "policy_thread_dead", 0)
-    assert link.commands[-1].reason == "policy_thread_dead"
+    count, command = link.sent["command"]
+    assert count > before  # the safe stops go on
+    for said in (command, control.health()):
+        assert (said.mode, said.reason) == ("safe_stop", "policy_thread_dead")
+    assert control.health().deadline_misses == 0
     assert "restart" in control._rearm()
 
 
@@ -261,7 +253,7 @@ def test_a_driver_that_hangs_lets_systemd_step_in(running, systemd, monkeypatch)
     vehicle.broken = "hang"
     wait_until(lambda: systemd.is_told_nothing(0.3), "no watchdog message for a while")
     vehicle.go_on()
-    assert systemd.until("WATCHDOG")[-1] == "WATCHDOG=1"
+    assert systemd.until("WATCHDOG") == "WATCHDOG=1"
 
 
 def test_health_says_what_stopped_the_vehicle_when_it_has_passed(running):
@@ -313,19 +305,13 @@ PERIOD = {"WATCHDOG_USEC": "3000000"}
 @pytest.mark.parametrize(
     ("environment", "period_s"),
     [
-        (PERIOD, 1.5),
-        ({**PERIOD, "WATCHDOG_PID": str(os.getpid())}, 1.5),
-        ({**PERIOD, "WATCHDOG_PID": "1"}, None),
-        ({"WATCHDOG_USEC": "0"}, None),
+        (PERIOD, 1.5), ({**PERIOD, "WATCHDOG_PID": str(os.getpid())}, 1.5),
+        ({**PERIOD, "WATCHDOG_PID": "1"}, None), ({"WATCHDOG_USEC": "0"}, None),
         ({"WATCHDOG_USEC": "soon"}, None),
-        ({}, None),
-        ({"NOTIFY_SOCKET": ""}, None),
-        ({"NOTIFY_SOCKET": "vsock:2"}, None),
+        ({}, None), ({"NOTIFY_SOCKET": ""}, None), ({"NOTIFY_SOCKET": "vsock:2"}, None),
     ],
-)
-def test_the_watchdog_period_is_half_of_systemds_and_without_it_nothing_is_said(
-    environment, period_s
-):
+)  # fmt: skip
+def test_the_watchdog_period_is_half_of_systemds_or_nothing_is_said(environment, period_s):
     notifier = Notifier(environment)
     notifier.tell("READY=1")
     assert notifier.watchdog_period_s == period_s

@@ -5,26 +5,23 @@ import math
 import time
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.vehicles import stream
-from edge_runtime.vehicles.core import Speeds
 from edge_runtime.vehicles.stream import Stream
 
 
 @pytest.fixture
 def started():
-    """Starts streams that note when they sent; ended with the test."""
+    """Starts streams that note when they sent, and pause at the first; ended with the test."""
     with contextlib.ExitStack() as ends:
 
-        def make(late_at_s=lambda: math.inf, during=lambda: None):
+        def make(late_at_s=lambda: math.inf, pause_s=0.0):
             sent = []
 
             def send():
                 sent.append(time.monotonic())
-                during()
+                time.sleep(0.0 if sent[1:] else pause_s)
                 return True
 
             running = Stream("test", send, late_at_s)
@@ -33,12 +30,6 @@ def started():
             return running, sent
 
         yield make
-
-
-def once(pause_s):
-    """A pause of the process, at the first call only."""
-    pauses = [pause_s]
-    return lambda: time.sleep(pauses.pop()) if pauses else None
 
 
 def test_it_sends_fifty_times_a_second(started):
@@ -61,13 +52,13 @@ def test_a_stop_and_a_command_that_gets_too_old_do_not_wait_for_the_period(start
 
 def test_what_was_held_up_is_followed_at_once(started, monkeypatch):
     monkeypatch.setattr(stream, "PERIOD_S", 2.0)
-    _, sent = started(during=once(2.5))
+    _, sent = started(pause_s=2.5)
     wait_until(lambda: len(sent) >= 2, "the next")
     assert sent[1] - sent[0] < 3.9  # the next period would have come 4 s after the first
 
 
 def test_after_a_pause_it_sends_once_and_not_for_each_missed_period(started):
-    _, sent = started(during=once(0.5))
+    _, sent = started(pause_s=0.5)
     wait_until(lambda: len(sent) > 10, "ten more")
     assert sent[10] - sent[1] > 0.12
 
@@ -82,36 +73,3 @@ def test_it_streams_until_the_condition_holds_and_never_longer_than_the_limit(st
     began_s = time.monotonic()
     running.run_until(lambda: False, limit_s=60.0)
     assert time.monotonic() - began_s < 30.0
-
-
-accelerations = st.floats(-5.0, 5.0)
-periods = st.floats(0.005, 0.1)
-
-
-def test_before_the_first_it_stands_and_two_in_one_moment_are_no_acceleration():
-    speeds = Speeds()
-    assert (speeds.speed_mps, speeds.stands, speeds.acceleration_mps2()) == (0.0, True, 0.0)
-    for speed_mps in (3.0, 4.0):
-        speeds.note(speed_mps, 0.0)
-        assert (speeds.stands, speeds.acceleration_mps2()) == (False, 0.0)
-
-
-@given(accelerations, periods, st.integers(2, 60), st.floats(-1.0, 1.0))
-def test_an_even_acceleration_is_found_at_any_rate(acceleration, period_s, count, start_mps):
-    speeds = Speeds()
-    for number in range(count):
-        speeds.note(start_mps + acceleration * number * period_s, 100.0 + number * period_s)
-    assert speeds.acceleration_mps2() == pytest.approx(acceleration, abs=1e-6)
-    assert speeds.speed_mps == start_mps + acceleration * (count - 1) * period_s
-
-
-@given(st.lists(st.floats(-10.0, 10.0), min_size=1), periods)
-def test_what_is_older_than_a_control_period_counts_no_more(earlier, period_s):
-    speeds = Speeds()
-    for number, speed_mps in enumerate(earlier):
-        speeds.note(speed_mps, number * period_s)
-    later_s = len(earlier) * period_s + 0.2
-    speeds.note(1.0, later_s)
-    assert speeds.acceleration_mps2() == 0.0
-    speeds.note(1.1, later_s + 0.1)
-    assert speeds.acceleration_mps2() == pytest.approx(1.0)

@@ -4,13 +4,13 @@ import math
 from pathlib import Path
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import edge_runtime
 from edge_runtime.tests.harness import render_table
 from edge_runtime.tests.rigs import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
-from edge_runtime.vehicles.core import LEADS_TO, Event, Finding, State
+from edge_runtime.vehicles.core import LEADS_TO, Event, Finding, Speeds, State
 from edge_runtime.vehicles.mapping import wish_of
 from edge_runtime.vehicles.ros2 import ROS2_LEADS_TO
 
@@ -45,8 +45,7 @@ def test_a_vehicle_that_stands_has_its_brake_on_unless_it_is_asked_to_go(rig):
     rig.step(20, PEDAL)
     assert rig.report.action["pedal"] == 0.0
     rig.core.brake(rig.now_s, latch=False)
-    rig.step()
-    assert rig.report.action["pedal"] == -1.0
+    assert rig.step().report.action["pedal"] == -1.0
 
 
 def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig):
@@ -132,15 +131,12 @@ def test_without_a_fresh_command_it_stops_within_the_promise(rig):
     assert 0.2 < stopped_s - last_s <= 0.25 + 0.02
 
 
-NAN, INF = float("nan"), float("inf")
-
-
 @pytest.mark.parametrize(
     ("action", "speed_mps", "words"),
     [
-        *(({"pedal": value}, None, "not finite") for value in (NAN, INF)),
-        *(({"steering": value}, 1.0, "not finite") for value in (NAN, INF)),
-        *(({}, value, "not finite") for value in (NAN, INF)),
+        *(({"pedal": value}, None, "not finite") for value in (math.nan, math.inf)),
+        *(({"steering": value}, 1.0, "not finite") for value in (math.nan, math.inf)),
+        *(({}, value, "not finite") for value in (math.nan, math.inf)),
         # No pedal means the speed of the scenario's car only where there is a steering beside it.
         *((lacks, speed, "lacks an action") for lacks, speed in (({}, 6.0), ({}, None))),
         ({"steering": 0.1}, None, "lacks an action"),
@@ -188,13 +184,10 @@ def be_stuck(rig):
 @pytest.mark.parametrize(
     ("stop", "cause"),
     [
-        (fall_silent, Event.SILENT),
-        (command_no_more, Event.COMMAND_LATE),
-        (brake, Event.BRAKE),
-        (lie, Event.LYING),
-        (be_stuck, Event.STUCK),
+        (fall_silent, Event.SILENT), (command_no_more, Event.COMMAND_LATE), (brake, Event.BRAKE),
+        (lie, Event.LYING), (be_stuck, Event.STUCK),
     ],
-)
+)  # fmt: skip
 def test_every_stop_latches_until_it_is_enabled_again(rig, stop, cause):
     words = stop(rig.driving())
     assert rig.core.cause is cause
@@ -224,7 +217,6 @@ def test_only_a_confirmation_enables_and_only_we_lead_out_of_a_stop(leads_to):
 
 
 def test_the_readme_shows_the_table():
-    """Written out a second time, every pair of state and event."""
     readme = Path(edge_runtime.__file__).with_name("README.md").read_text(encoding="utf-8")
     assert render_table(Event, State, after) in readme
 
@@ -260,7 +252,6 @@ HAPPENINGS = st.one_of(
 
 @pytest.mark.parametrize("make_rig", [HunterRig, Ros2Rig])
 @example([("enable",), ("tick", 6), ("command", 6e307, 0.0, None), ("tick", 1)])  # inf * 0 s
-@settings(deadline=None)
 @given(st.lists(HAPPENINGS, max_size=60))
 def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(make_rig, happenings):
     rig, commanded_s, may_move = make_rig("congestion"), -1e9, False
@@ -290,3 +281,35 @@ def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(make_rig
             rig.disturb(*values)
         assert abs(rig.inner_rad) <= SPEC.max_inner_steering_rad
         assert all(-1.0 <= value <= 1.0 for value in rig.report.action.values())
+
+
+def test_before_the_first_it_stands_and_two_in_one_moment_are_no_acceleration():
+    speeds = Speeds()
+    assert (speeds.speed_mps, speeds.stands, speeds.acceleration_mps2()) == (0.0, True, 0.0)
+    for speed_mps in (3.0, 4.0):
+        speeds.note(speed_mps, 0.0)
+        assert (speeds.stands, speeds.acceleration_mps2()) == (False, 0.0)
+
+
+periods = st.floats(0.005, 0.1)
+
+
+@given(st.floats(-5.0, 5.0), periods, st.integers(2, 60), st.floats(-1.0, 1.0))
+def test_an_even_acceleration_is_found_at_any_rate(acceleration, period_s, count, start_mps):
+    speeds = Speeds()
+    for number in range(count):
+        speeds.note(start_mps + acceleration * number * period_s, 100.0 + number * period_s)
+    assert speeds.acceleration_mps2() == pytest.approx(acceleration, abs=1e-6)
+    assert speeds.speed_mps == start_mps + acceleration * (count - 1) * period_s
+
+
+@given(st.lists(st.floats(-10.0, 10.0), min_size=1), periods)
+def test_what_is_older_than_a_control_period_counts_no_more(earlier, period_s):
+    speeds = Speeds()
+    for number, speed_mps in enumerate(earlier):
+        speeds.note(speed_mps, number * period_s)
+    later_s = len(earlier) * period_s + 0.2
+    speeds.note(1.0, later_s)
+    assert speeds.acceleration_mps2() == 0.0
+    speeds.note(1.1, later_s + 0.1)
+    assert speeds.acceleration_mps2() == pytest.approx(1.0)

@@ -1,11 +1,10 @@
 """Files that a command reads: regular, of a sane size, and nested no deeper than can be read."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import socket
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from edge_runtime.config import load_config
 from edge_runtime.files import Hold, check_writable, write_atomic, write_json_out
 from edge_runtime.policy import load_policy
 from edge_runtime.service import WINDOW, LatencyWindow
-from edge_runtime.tests.harness import run_command
 from edge_runtime.util import UserError, printable, read_bytes
 
 
@@ -82,23 +80,19 @@ def test_a_link_stays_and_the_file_behind_it_is_written(tmp_path, there):
     assert os.listdir(target.parent) == ["out.json"]
 
 
-def test_run_cli_turns_errors_into_one_line(tmp_path, capsys):
-    (tmp_path / "file").touch()
-    below = tmp_path / "file" / "below"
-
-    def fails(error):
+def test_run_cli_turns_errors_into_one_line(capsys):
+    def fails(error, argv):
         raise error
 
-    cases: list = [
-        (lambda _: fails(UserError("two\nlines")), 2, "error: two lines\n"),
-        (lambda _: fails(KeyboardInterrupt), 130, "interrupted\n"),
-        (lambda _: os.listdir(below), 2, f"error: {below}: Not a directory\n"),
-        (len, 1, ""),
-    ]
-    for run, status, line in cases:
-        assert (run_cli(run, ["a"]), capsys.readouterr().err) == (status, line)
+    for error, status, line in (
+        (UserError("two\nlines"), 2, "error: two lines\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (NotADirectoryError(20, "Not a directory", "file"), 2, "error: file: Not a directory\n"),
+    ):
+        assert (run_cli(partial(fails, error), []), capsys.readouterr().err) == (status, line)
+    assert run_cli(len, ["a"]) == 1
     with pytest.raises(OSError, match="about a socket"):  # an error about no file is not hidden
-        run_cli(lambda _: fails(OSError("about a socket")), [])
+        run_cli(partial(fails, OSError("about a socket")), [])
 
 
 def test_the_latency_window_forgets():
@@ -139,31 +133,14 @@ def test_what_is_too_large_is_refused_before_it_is_read(tmp_path, reader):
 
 
 @pytest.mark.parametrize(
-    ("json_opens", "toml_opens", "closes"), [("[", "[", "]"), ('{"a":', "{a=", "}")]
+    ("reader", "opens", "closes"),
+    [("json", "[", "]"), ("json", '{"a":', "}"), ("config", "[", "]"), ("config", "{a=", "}")],
 )
-def test_nested_thousands_deep_it_is_one_line(tmp_path, json_opens, toml_opens, closes):
-    path, depth = tmp_path / "deep", 100_000
-    path.write_text(json_opens * depth + "1" + closes * depth)
-    with pytest.raises(UserError, match=r"thing .* is not JSON: "):
-        util.read_json(path, "thing")
-    path.write_text("a = " + toml_opens * depth + "1" + closes * depth)
-    with pytest.raises(UserError, match=r"config file .* is no TOML: "):
-        load_config(path, {})
-
-
-def test_run_ends_with_one_line(make_policy, tmp_path, special):
-    deep, held = tmp_path / "deep.toml", tmp_path / "held.toml"
-    deep.write_text("a = " + "[" * 100_000)
-    held.write_text(f"hold = '{special[0]}'\n")
-    flags = make_policy().flags
-    for arguments in (
-        ["--policy", str(special[0]), "--allow-unsigned"],
-        ["--policy", "/dev/zero", "--allow-unsigned"],
-        [*flags, "--config", str(deep)],
-        [*flags, "--config", str(held)],
-    ):
-        done = run_command("run", *arguments)
-        assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+def test_nested_thousands_deep_it_is_one_line(tmp_path, reader, opens, closes):
+    begins = "a = " if reader == "config" else ""
+    (tmp_path / "deep").write_text(begins + opens * 100_000 + "1" + closes * 100_000)
+    with pytest.raises(UserError, match=r"^(thing|config file) .* is (not JSON|no TOML): .*$"):
+        READERS[reader](tmp_path / "deep")
 
 
 def test_one_is_not_many():
@@ -188,7 +165,6 @@ def test_what_a_terminal_acts_upon_is_written_out(text, shown):
 
 @pytest.fixture
 def all_at_default():
-    """Every signal as a fresh process has it."""
     numbers = signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}
     before = {number: signal.signal(number, signal.SIG_DFL) for number in numbers}
     yield
