@@ -7,7 +7,7 @@ from trainer.learner import networks
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.networks import Picture
 from trainer.learner.td3 import TD3Learner
-from trainer.tests.test_td3 import make_batch, weights_of
+from trainer.tests.test_td3 import make_batch
 
 
 @pytest.fixture
@@ -41,33 +41,16 @@ def test_the_processors_flags_decide(processor, flags, multiplies):
     assert networks.multiplies_bfloat16("cpu") == multiplies
 
 
-def updated():
-    """The weights after one update, in float32 and in bfloat16."""
-    for name in ("float32", "bfloat16"):
-        learner = TD3Learner(LearnerConfig(batch_size=12, precision=name), PHIL, seed=0)
-        learner.update(make_batch())
-        yield weights_of(learner)
-
-
-def test_a_processor_without_bfloat16_learns_in_float32(processor):
-    processor("flags : fma avx2")
-    single, reduced = updated()
-    assert all((single[name] == reduced[name]).all() for name in single)
-
-
-@pytest.mark.skipif(
-    not networks.multiplies_bfloat16("cpu"), reason="this processor has no bfloat16"
-)
-def test_a_processor_with_bfloat16_learns_in_it():
-    single, reduced = updated()
-    for name in ("actor", "critics"):
-        assert not torch.equal(single[name], reduced[name])
-
-
-@pytest.mark.parametrize("name", ["float32", "bfloat16"])
-def test_every_picture_of_an_update_is_embedded_in_its_precision(processor, monkeypatch, name):
+@pytest.mark.parametrize(
+    ("name", "flags", "autocast"),
+    [("float32", "avx512_bf16", False), ("bfloat16", "avx512_bf16", True),
+     ("bfloat16", "fma avx2", False)],
+)  # fmt: skip
+def test_every_picture_of_an_update_is_embedded_in_its_precision(
+    processor, monkeypatch, name, flags, autocast
+):
     """Online and target networks alike, the Q advantage's too; acting is always float32."""
-    processor("flags : avx512_bf16")
+    processor(f"flags : {flags}")
     embed, reduced = Picture.forward, []
 
     def spy(self, frames):
@@ -81,7 +64,7 @@ def test_every_picture_of_an_update_is_embedded_in_its_precision(processor, monk
     learner.update(batch)
     targets = learner.target_critics
     used = [learner.actor, *learner.critics.pair, learner.target_actor, *targets.pair]
-    wanted = Counter((network.picture, name == "bfloat16") for network in [*used, targets.first])
+    wanted = Counter((network.picture, autocast) for network in [*used, targets.first])
     assert Counter(reduced) == wanted
     reduced.clear()
     learner.act(batch.frames[0])
