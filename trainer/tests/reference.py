@@ -119,15 +119,12 @@ class ReferenceLearner:
             self.actor_optimiser.step()
         self.critic_optimiser.step()
         if self.updates % c.policy_delay == 0:
-            self._update_targets()
-        losses = (each.item() for each in (critic_loss, policy, cloning, values.mean()))
-        return Losses(*losses, priorities.double().numpy())
-
-    @torch.no_grad()
-    def _update_targets(self) -> None:
-        for online, target in (
-            (self.actor, self.target_actor),
-            (self.critics, self.target_critics),
-        ):
-            for new, old in zip(online.parameters(), target.parameters(), strict=True):
-                old.lerp_(new, self.config.tau)
+            for online, target in (
+                (self.actor, self.target_actor),
+                (self.critics, self.target_critics),
+            ):
+                for new, old in zip(online.parameters(), target.parameters(), strict=True):
+                    old.data.lerp_(new.data, c.tau)
+        loss, mean_value = critic_loss.item(), values.mean().item()
+        drawn_by = priorities.double().numpy()
+        return Losses(loss, policy.item(), cloning.item(), mean_value, drawn_by)

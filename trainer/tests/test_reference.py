@@ -11,8 +11,6 @@ from trainer.learner.td3 import TD3Learner
 from trainer.tests.reference import ReferenceLearner
 from trainer.tests.test_td3 import SMALL, make_batch, same_weights, weights_of
 
-UPDATES = 3
-
 
 def both(config: LearnerConfig, algorithm: Algorithm) -> tuple[TD3Learner, ReferenceLearner]:
     """With targets that differ from the online networks, as they do after some updates."""
@@ -34,11 +32,11 @@ def both(config: LearnerConfig, algorithm: Algorithm) -> tuple[TD3Learner, Refer
 def check(config: LearnerConfig, algorithm: Algorithm, humans: int = 4) -> None:
     fast, plain = both(config, algorithm)
     start = weights_of(fast)
-    for seed in range(UPDATES):
+    for seed in range(3):
         batch, off = make_batch(seed, humans), 1e-3 if seed else 1e-5
         ours, wanted = fast.update(batch, beta=0.5), plain.update(batch, beta=0.5)
         np.testing.assert_allclose(ours[:4], wanted[:4], rtol=off, atol=0.01 * off)
-        np.testing.assert_allclose(ours.priorities, wanted.priorities, rtol=10 * off)
+        np.testing.assert_allclose(ours.priorities, wanted.priorities, rtol=max(off, 1e-4))
         modules = (fast.actor, plain.actor), (fast.critics, plain.critics)
         for pair in () if seed else modules:
             for p, right_p in zip(*(module.parameters() for module in pair), strict=True):
