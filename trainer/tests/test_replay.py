@@ -28,9 +28,8 @@ def sample(buffer, size=64, seed=0):
 class Source:
     """Feeds episodes of numbered frames; step n is rewarded with n + 1, its action is n / 100.
 
-    ``stored``: of each transition the older picture of its first observation, whose newer one is
-    the key; the rewards from it to the episode's end; and whether that end was terminal.
-    """
+    ``stored``: newer picture of a transition's first observation -> the older one, the rewards from
+    it to the episode's end, and whether that end was terminal."""
 
     def __init__(self, buffer):
         self.buffer, self.next = buffer, 0
