@@ -1,25 +1,13 @@
-"""Pedals, a driver that knows only one of them, and whole episodes."""
+"""Pedals, and whole episodes."""
 
 import numpy as np
 
 FULL, NOTHING, BRAKE = (np.array([pedal], np.float32) for pedal in (1.0, 0.0, -1.0))
 
 
-class Brakes:
-    resets = 0
-
-    def reset(self):
-        self.resets += 1
-
-    def act(self, observation):
-        return BRAKE
-
-
 def episode(env, driver, seed=None):
-    """Drive until the end with a driver, a function of the picture or one action throughout.
-
-    Gives the action, reward and info of each step; without a seed it begins where the car is.
-    """
+    """The action, reward and info of each step with a driver, a function of the picture or one
+    action throughout; without a seed it begins where the car is."""
     act = getattr(driver, "act", driver if callable(driver) else lambda _: driver)
     observation = env.frames if seed is None else env.reset(seed=seed)[0]
     ended = False

@@ -16,6 +16,53 @@ def t(*values: float) -> torch.Tensor:
 
 
 HUMAN = torch.tensor([False, True, False, True])
+PENALISED = torch.tensor([True, False, True, False])
+ERRORS, ADVANTAGES = t(2.0, 2.0, 1.0, 1.0), t(0.0, 3.0, 0.0, 3.0)
+HALVES, ONES = t(0.5, 0.25), t(1.0, 1.0, 1.0, 1.0)
+TARGETS, VALUES = t(1.0, 3.0, 2.0, 1.0), t(1.0, 10.0, 3.0, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("equation", "given", "wanted"),
+    [
+        # Eq. 17: only the first step of an intervention is penalised.
+        (eq.shaped_reward, (0.5, -10.0, True, False), -9.5),
+        (eq.shaped_reward, (0.5, -10.0, True, True), 0.5),
+        (eq.shaped_reward, (0.5, -10.0, False, True), 0.5),
+        (eq.shaped_reward, (0.5, -10.0, False, False), 0.5),
+        # ... or on the overruled action.
+        (eq.overruled_loss, (t(-9, 5, -10, 5), PENALISED, -10.0, t(2, 1, 1, 1)), 2.0 * 1.0 / 4),
+        (eq.smoothed_target_action, (t(0, 0, 0.9, -0.9), t(2, -2, 0.3, -0.3), 0.5),
+         [0.5, -0.5, 1.0, -1.0]),
+        # Eq. 22: the smaller value, and none at terminals; several steps have a power of gamma.
+        (eq.td_target, (t(1, 1), t(0, 1), (t(2, 5), t(4, 3)), 0.5), [1.0 + 0.5 * 2.0, 1.0]),
+        (eq.td_target, (t(1, 1), t(0, 0), (t(4, 4), t(9, 9)), t(0.5, 0.25)), [3.0, 2.0]),
+        # Eq. 21b, which cannot overflow.
+        (eq.q_advantage, (t(1, 0), t(0, 2), 4.0), [math.e, math.exp(-2.0)]),
+        (eq.q_advantage, (t(1e6), t(-1e6), 4.0), [math.exp(4.0)]),
+        # Eq. 21a; other schemes are weights.
+        (eq.priority, (t(2, -2, 0, 0.5), t(9, 3, 9, 1), HUMAN, 0.001),
+         [2.001, 5.001, 0.001, 1.501]),
+        (eq.priority, (ERRORS, ADVANTAGES, HUMAN, 0.0, 1.0, 2.0, 0.0), [2.0, 4.0, 1.0, 2.0]),
+        (eq.priority, (ERRORS, ADVANTAGES, HUMAN, 0.0, 1.0, 0.0, 1.0), [2.0, 3.0, 1.0, 3.0]),
+        # Eq. 15.
+        (eq.importance_weights, (HALVES, 1.0, False), [2.0, 4.0]),
+        (eq.importance_weights, (HALVES, 1.0, True), [0.5, 1.0]),
+        (eq.importance_weights, (HALVES, 0.0, True), [1.0, 1.0]),
+        # Eq. 22, split: policy (1 + 4) / 2, human (9 + 1) / 2. Eq. 16 weighs each squared error.
+        (eq.critic_loss, (0.0 * ONES, TARGETS, HUMAN, ONES, True), 2.5 + 5.0),
+        (eq.critic_loss, (0.0 * ONES, TARGETS, HUMAN, ONES, False), 15.0 / 4),
+        (eq.critic_loss, (t(0, 0), t(1, 2), HUMAN[:2], t(1, 0.5), False), (1.0 + 2.0) / 2),
+        # Eq. 23: the policy's term, and cloning's.
+        (eq.policy_loss, (VALUES, HUMAN, True), -2.0),
+        (eq.policy_loss, (VALUES, HUMAN, False), -8.5),
+        (eq.behaviour_cloning_loss, (t(0, 0.5, 0, -1)[:, None], t(9, 1, 9, 1)[:, None], HUMAN),
+         (0.25 + 4.0) / 2),
+    ],
+)  # fmt: skip
+def test_by_hand(equation, given, wanted):
+    found = torch.as_tensor(equation(*given), dtype=torch.float64).tolist()
+    assert found == pytest.approx(wanted, rel=1e-12)
 
 
 def test_equation_18_the_human_has_full_authority():
@@ -41,96 +88,6 @@ def test_noise_keeps_its_deviation_whatever_its_correlation(correlation):
         series.append(drawn)
     assert series[-1].std() == pytest.approx(1.0, rel=0.02)
     assert np.corrcoef(series[-2], series[-1])[0, 1] == pytest.approx(correlation, abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("human", "before", "shaped"),
-    [(True, False, -9.5), (True, True, 0.5), (False, True, 0.5), (False, False, 0.5)],
-)
-def test_equation_17_only_the_first_step_of_an_intervention_is_penalised(human, before, shaped):
-    assert eq.shaped_reward(0.5, -10.0, human, before) == shaped
-
-
-def test_target_smoothing_is_symmetric():
-    action = t(0.0, 0.0, 0.9, -0.9)
-    noise = t(2.0, -2.0, 0.3, -0.3)
-    smoothed = eq.smoothed_target_action(action, noise, bound=0.5)
-    assert smoothed.tolist() == [0.5, -0.5, 1.0, -1.0]
-
-
-def test_equation_22_target_takes_the_smaller_value_and_stops_at_terminals():
-    target = eq.td_target(t(1.0, 1.0), t(0.0, 1.0), (t(2.0, 5.0), t(4.0, 3.0)), gamma=0.5)
-    assert target.tolist() == [1.0 + 0.5 * 2.0, 1.0]
-
-
-def test_a_target_over_several_steps_bootstraps_by_its_own_power_of_gamma():
-    target = eq.td_target(t(1.0, 1.0), t(0.0, 0.0), (t(4.0, 4.0), t(9.0, 9.0)), t(0.5, 0.25))
-    assert target.tolist() == [3.0, 2.0]
-
-
-def test_equation_17_on_the_overruled_action():
-    penalised = torch.tensor([True, False, True, False])
-    loss = eq.overruled_loss(t(-9.0, 5.0, -10.0, 5.0), penalised, -10.0, t(2.0, 1.0, 1.0, 1.0))
-    assert loss.item() == 2.0 * 1.0 / 4
-
-
-def test_equation_21b_q_advantage():
-    advantage = eq.q_advantage(t(1.0, 0.0), t(0.0, 2.0), exponent_bound=4.0)
-    assert advantage.tolist() == pytest.approx([math.e, math.exp(-2.0)])
-
-
-def test_q_advantage_cannot_overflow():
-    advantage = eq.q_advantage(t(1e6), t(-1e6), exponent_bound=4.0)
-    assert advantage.item() == pytest.approx(math.exp(4.0))
-
-
-def test_equation_21a_tdqa_priority():
-    td_error, advantage = t(2.0, -2.0, 0.0, 0.5), t(9.0, 3.0, 9.0, 1.0)
-    priority = eq.priority(td_error, advantage, HUMAN, offset=0.001)
-    assert priority.tolist() == pytest.approx([2.001, 5.001, 0.001, 1.501])
-
-
-def test_other_priority_schemes_are_weights():
-    td_error, advantage = t(2.0, 2.0, 1.0, 1.0), t(0.0, 3.0, 0.0, 3.0)
-    td_only = eq.priority(td_error, advantage, HUMAN, 0.0, 1.0, 2.0, 0.0)
-    assert td_only.tolist() == [2.0, 4.0, 1.0, 2.0]
-    advantage_only = eq.priority(td_error, advantage, HUMAN, 0.0, 1.0, 0.0, 1.0)
-    assert advantage_only.tolist() == [2.0, 3.0, 1.0, 3.0]
-
-
-def test_equation_15_importance_weights():
-    probabilities = t(0.5, 0.25)
-    assert eq.importance_weights(probabilities, 1.0, normalise=False).tolist() == [2.0, 4.0]
-    assert eq.importance_weights(probabilities, 1.0, normalise=True).tolist() == [0.5, 1.0]
-    assert eq.importance_weights(probabilities, 0.0, normalise=True).tolist() == [1.0, 1.0]
-
-
-def test_equation_22_critic_loss_means_each_kind_by_itself():
-    values, targets = t(0.0, 0.0, 0.0, 0.0), t(1.0, 3.0, 2.0, 1.0)
-    weights = t(1.0, 1.0, 1.0, 1.0)
-    # Policy: (1 + 4) / 2; human: (9 + 1) / 2.
-    split = eq.critic_loss(values, targets, HUMAN, weights, split=True)
-    assert split.item() == pytest.approx(2.5 + 5.0)
-    whole = eq.critic_loss(values, targets, HUMAN, weights, split=False)
-    assert whole.item() == pytest.approx(15.0 / 4)
-
-
-def test_equation_16_weighs_each_squared_error():
-    loss = eq.critic_loss(t(0.0, 0.0), t(1.0, 2.0), HUMAN[:2], t(1.0, 0.5), split=False)
-    assert loss.item() == pytest.approx((1.0 + 2.0) / 2)
-
-
-def test_equation_23_policy_term():
-    values = t(1.0, 10.0, 3.0, 20.0)
-    assert eq.policy_loss(values, HUMAN, split=True).item() == pytest.approx(-2.0)
-    assert eq.policy_loss(values, HUMAN, split=False).item() == pytest.approx(-8.5)
-
-
-def test_equation_23_cloning_term():
-    actions = torch.tensor([[0.0], [0.5], [0.0], [-1.0]])
-    human_actions = torch.tensor([[9.0], [1.0], [9.0], [1.0]])
-    loss = eq.behaviour_cloning_loss(actions, human_actions, HUMAN)
-    assert loss.item() == pytest.approx((0.25 + 4.0) / 2)
 
 
 @given(st.lists(st.floats(-10, 10), min_size=1, max_size=8), st.booleans())

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from edge_runtime.util import UserError
+from trainer import drivers
 from trainer.drivers import BEST_FILE, OnnxDriver, load_actor, load_driver, make_environment
 from trainer.evaluate import drive_episodes, drive_together
 from trainer.learner.networks import Actor
@@ -60,26 +61,20 @@ def test_an_action_out_of_its_domain_is_one_line(action):
         load_driver(f"constant:{action}", make_environment("left_turn"))
 
 
-class Brightness:
-    """A driver without memory whose action follows its pictures."""
-
-    def reset(self):
-        """It has no memory."""
-
-    def act(self, observation):
-        return self.together(observation[None])[0]
-
-    def together(self, observations):
-        means = observations.mean(axis=(2, 3), dtype=np.float64) / 255.0
-        return np.tanh(3.0 * (means[:, 1:] - 0.25)).astype(np.float32)
+@drivers.TogetherDriver
+def brightness(observations):
+    """Its action follows the newer picture."""
+    means = observations.mean(axis=(2, 3), dtype=np.float64) / 255.0
+    return np.tanh(3.0 * (means[:, 1:] - 0.25)).astype(np.float32)
 
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 @pytest.mark.parametrize("condition", ["nominal", "noise"])
 @pytest.mark.parametrize("lanes", [1, 3, 8])
 def test_side_by_side_is_one_after_the_other(scenario, condition, lanes):
-    driver, seeds = Brightness(), range(5)
-    wanted = drive_episodes(make_environment(scenario), driver, seeds, condition)
+    env, drive, seeds = make_environment(scenario), brightness.act_together, range(5)
+    wanted, nominal = (drive_episodes(env, brightness, seeds, it) for it in (condition, "nominal"))
+    assert (wanted == nominal) == (condition == "nominal")
     envs = [make_environment(scenario) for _ in range(lanes)]
-    assert drive_together(envs, driver.together, seeds, condition) == wanted
-    assert drive_together(envs, driver.together, [], condition) == []
+    assert drive_together(envs, drive, seeds, condition) == wanted
+    assert drive_together(envs, drive, [], condition) == []

@@ -48,24 +48,13 @@ class TestStatistics:
         opposite = {"yes": "no", "no": "yes", "undecided": "undecided"}
         assert data.above(found.times(-1.0), -least) == opposite[data.above(found, least)]
 
-    @pytest.mark.parametrize(
-        ("low", "high", "holds"),
-        [(-0.5, 0.5, "yes"), (-0.5, 1.5, "undecided"), (1.5, 2.0, "no"), (-3.0, -1.5, "no")],
-    )
-    def test_one_level(self, low, high, holds):
-        assert data.within(data.Estimate(0.5 * (low + high), low, high, 5), 1.0) == holds
-
-    @pytest.mark.parametrize(
-        ("answers", "holds"),
-        [
-            (["yes", "yes"], "yes"),
-            (["yes", "undecided"], "undecided"),
-            (["no", "undecided"], "no"),
-            ([], "undecided"),
-        ],
-    )
-    def test_all_of_several(self, answers, holds):
-        assert data.all_of(answers) == holds
+    def test_one_level_and_all_of_several(self):
+        spans = [(-0.5, 0.5), (-0.5, 1.5), (1.5, 2.0), (-3.0, -1.5)]
+        found = [data.within(data.Estimate(0.5 * sum(ends), *ends, 5), 1.0) for ends in spans]
+        assert found == ["yes", "undecided", "no", "no"]
+        answers: list[list[data.Holds]]
+        answers = [["yes", "yes"], ["yes", "undecided"], ["no", "undecided"], []]
+        assert list(map(data.all_of, answers)) == ["yes", "undecided", "no", "undecided"]
 
 
 class TestData:

@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from edge_runtime.tests.harness import wait_until
 from edge_runtime.util import UserError
@@ -32,7 +30,6 @@ def store(tmp_path):
 
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory):
-    """A unit that was never stopped."""
     store = store_in(tmp_path_factory.mktemp("straight"))
     assert running.compute(running.Task(UNIT, store)) == running.FINISHED
     return store
@@ -165,10 +162,9 @@ class TestIds:
         assert planned.behaviour("left_turn", "variant") != nominal
         assert planned.behaviour("left_turn", "nominal", printed_reward=True) != nominal
 
-    @given(st.permutations(["a", "b", "c"]))
-    def test_the_order_of_values_does_not_matter(self, names):
-        values = {name: {"x": 1, "y": name} for name in names}
-        assert planned.digest(values) == planned.digest(dict(sorted(values.items())))
+    def test_the_order_of_values_does_not_matter(self):
+        one, other = {"a": {"x": 1, "y": 2}, "b": 3}, {"b": 3, "a": {"y": 2, "x": 1}}
+        assert planned.digest(one) == planned.digest(other)
 
 
 class TestPlan:

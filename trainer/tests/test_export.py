@@ -9,25 +9,18 @@ from deploy.certs import write_key_pair
 from edge_runtime.policy import load_policy, read_onnx
 from edge_runtime.util import UserError
 from trainer import export as export_module
-from trainer.export import (
-    Export,
-    export_policy,
-    parity,
-    real_observations,
-    write_policy,
-)
+from trainer.export import Export, export_policy, parity, real_observations, write_policy
 from trainer.learner.networks import Actor
 
 LABEL = {"scenario": "left_turn", "algorithm": "phil_td3", "seed": 4, "episode": 12}
 
 
 def make_actor(frames: int = 2) -> Actor:
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(0)
         actor = Actor(frames=frames)
         # Large weights: a policy whose actions spread over the whole range.
-        with torch.no_grad():
-            actor.head.output.weight.mul_(20)
+        actor.head.output.weight.mul_(20)
     return actor
 
 

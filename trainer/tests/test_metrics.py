@@ -1,6 +1,5 @@
 import csv
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -10,11 +9,6 @@ from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter, read_
 
 OLDER = [name for name in NAMES if name != "validation_reward"]
 HEAD = ",".join(NAMES) + "\r\n"
-
-
-def metrics_of(episode):
-    values: Any = dict.fromkeys(NAMES, 2.5) | {"episode": episode, "outcome": "goal"}
-    return EpisodeMetrics(**values)
 
 
 def write(run_dir, lines):
@@ -35,14 +29,14 @@ def test_a_row_that_was_cut_off_is_left_out(kept, tmp_path):
 def test_what_goes_on_after_a_cut_begins_a_new_row_and_a_full_disk_is_one_line(tmp_path):
     write(tmp_path, [row(0), row(1), row(2)[:40]])
     writer = MetricsWriter(tmp_path, 2)
-    writer.add(metrics_of(2))
+    writer.add(EpisodeMetrics(2, distance_m=2.5, outcome="goal"))
     rows = read_metrics(tmp_path)
     assert [each["episode"] for each in rows] == ["0", "1", "2"]
     assert rows[2]["distance_m"] == "2.5"
     with Path("/dev/full").open("w") as writer._file:
         writer._csv = csv.DictWriter(writer._file, NAMES)
         with pytest.raises(UserError, match="No space left on device"):
-            writer.add(metrics_of(0))
+            writer.add(EpisodeMetrics(0))
         writer.close()
 
 

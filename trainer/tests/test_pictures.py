@@ -1,6 +1,5 @@
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageSequence
@@ -10,7 +9,7 @@ from trainer.drivers import EXPERTS, TRIGGERS, load_driver, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.pictures import HUMAN, POLICY, draw_moment, drive_moments
 from trainer.tests.test_commands import refusal
-from trainer.training.metrics import NAMES, EpisodeMetrics, MetricsWriter
+from trainer.training.metrics import EpisodeMetrics, MetricsWriter
 
 
 def test_a_take_over_shows_who_drives_and_both_actions():
@@ -22,9 +21,7 @@ def test_a_take_over_shows_who_drives_and_both_actions():
     taken = [moment for moment in moments if moment.intervention]
     left = [moment for moment in moments[:-1] if not moment.intervention]
     assert all(moment.policy_action == 1.0 for moment in [*taken, *left])
-    for moment in moments:
-        if moment.intervention:
-            assert moment.action == float(moment.intervention.action[0])
+    assert all(m.action == m.intervention.action[0] for m in moments if m.intervention)
     for moment, colour in ((taken[0], HUMAN), (left[0], POLICY)):
         assert tuple(np.asarray(draw_moment(moment, "pedal"))[29, 30]) == colour
 
@@ -46,12 +43,8 @@ def test_curves_of_several_runs_end_with_the_shortest(tmp_path, capsys):
     for directory, episodes in zip(dirs, (30, 12), strict=True):
         writer = MetricsWriter(Path(directory))
         for episode in range(episodes):
-            values: dict[str, Any] = dict.fromkeys(NAMES, 1.0) | {
-                "episode": episode,
-                "outcome": "goal",
-            }
-            values["validation_success"] = 0.5 if episode % 5 == 4 else math.nan
-            writer.add(EpisodeMetrics(**values))
+            validated = 0.5 if episode % 5 == 4 else math.nan
+            writer.add(EpisodeMetrics(episode, steps=9, validation_success=validated))
         writer.close()
     assert "--out F.png" in refusal(capsys, "plot", *dirs)
     out = tmp_path / "curves.png"

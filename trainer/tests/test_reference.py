@@ -9,25 +9,40 @@ import torch
 from trainer.learner.config import ALGORITHMS, PHIL, Algorithm, LearnerConfig
 from trainer.learner.td3 import TD3Learner
 from trainer.tests.reference import ReferenceLearner
-from trainer.tests.test_td3 import SMALL, make_batch, weights_of
-
-UPDATES = 3
+from trainer.tests.test_td3 import SMALL, make_batch, same_weights, weights_of
 
 
 def both(config: LearnerConfig, algorithm: Algorithm) -> tuple[TD3Learner, ReferenceLearner]:
+    """With targets that differ from the online networks, as they do after some updates."""
     fast = TD3Learner(config, algorithm, seed=2)
     plain = ReferenceLearner(replace(config, precision="float32"), algorithm, seed=2)
+    for learner in (fast, plain):
+        random = torch.Generator().manual_seed(5)
+        with torch.no_grad():
+            for module in (learner.target_actor, learner.target_critics):
+                for p in module.parameters():
+                    p.add_(0.02 * torch.randn(p.shape, generator=random))
+            # Fresh critics hardly feel the action: without this, whose it was would not show.
+            learner.target_actor.head.output.bias.add_(0.5)
+            for critic in learner.target_critics.pair:
+                critic.action.weight += 0.5
     return fast, plain
 
 
 def check(config: LearnerConfig, algorithm: Algorithm, humans: int = 4) -> None:
     fast, plain = both(config, algorithm)
     start = weights_of(fast)
-    for seed in range(UPDATES):
-        batch = make_batch(seed, humans)
+    for seed in range(3):
+        batch, off = make_batch(seed, humans), 1e-3 if seed else 1e-5
         ours, wanted = fast.update(batch, beta=0.5), plain.update(batch, beta=0.5)
-        np.testing.assert_allclose(ours[:4], wanted[:4], rtol=1e-3, atol=1e-5)
-        np.testing.assert_allclose(ours.priorities, wanted.priorities, rtol=1e-3)
+        np.testing.assert_allclose(ours[:4], wanted[:4], rtol=off, atol=0.01 * off)
+        np.testing.assert_allclose(ours.priorities, wanted.priorities, rtol=max(off, 1e-4))
+        modules = (fast.actor, plain.actor), (fast.critics, plain.critics)
+        for pair in () if seed else modules:
+            for p, right_p in zip(*(module.parameters() for module in pair), strict=True):
+                if right_p.grad is not None:  # a delayed policy's turn is still to come
+                    assert p.grad is not None
+                    assert (p.grad - right_p.grad).norm() <= 1e-3 * right_p.grad.norm()
     for name, flat in weights_of(fast).items():
         # Adam amplifies rounding where a gradient is nearly nothing: compare the step as a whole.
         right = weights_of(plain)[name]
@@ -51,6 +66,7 @@ def test_every_algorithm(name):
         {"cloning_weight": 0.0},
         {"gamma": 0.5, "tau": 0.1},
         {"target_noise": 0.0},
+        {"target_noise": 0.5},
         {"penalty_on": "human"},
         {"intervention_penalty": -3.0},
         {"critic_norm": False},
@@ -78,7 +94,5 @@ def test_reduced_precision_is_near_and_repeatable():
     for got, right in zip(fast.actor.parameters(), plain.actor.parameters(), strict=True):
         assert got.grad is not None
         assert right.grad is not None
-        cosine = torch.cosine_similarity(got.grad.flatten(), right.grad.flatten(), dim=0)
-        assert cosine > 0.99
-    for name, flat in weights_of(fast).items():
-        assert torch.equal(flat, weights_of(again)[name])
+        assert torch.cosine_similarity(got.grad.flatten(), right.grad.flatten(), dim=0) > 0.99
+    assert same_weights(fast, again)

@@ -7,23 +7,8 @@ import pytest
 from bridge.network import LatencySpec, parse_spec
 from trainer.drivers import make_environment
 from trainer.evaluate import drive_episodes
-from trainer.training.delayed import (
-    DelayedPolicy,
-    DirectPolicy,
-    VehicleEnd,
-    behind,
-    ticks_late,
-)
-
-
-class Brightness:
-    """A policy whose action says which picture it saw."""
-
-    def reset(self):
-        pass
-
-    def act(self, observation):
-        return np.array([observation[1].mean() / 128.0 - 1.0], np.float32)
+from trainer.tests.test_evaluate import brightness
+from trainer.training.delayed import DelayedPolicy, DirectPolicy, VehicleEnd, behind, ticks_late
 
 
 def frames(step):
@@ -80,20 +65,20 @@ def drive_delayed(spec, ticks, seed=0, terminated=False, human=()):
 
 @pytest.mark.parametrize("scenario", ["left_turn", "congestion"])
 def test_a_perfect_network_is_none_to_the_bit(scenario):
-    env, policy = make_environment(scenario), Brightness()
+    env = make_environment(scenario)
     for seed in (0, 1):
         end = VehicleEnd(env, LatencySpec(), seed)
-        remote = SimpleNamespace(
-            reset=policy.reset, act=lambda seen, end=end: end.tick(seen, policy.act)
+        remote: Any = SimpleNamespace(
+            reset=brightness.reset, act=lambda seen, end=end: end.tick(seen, brightness.act)
         )
-        assert drive_episodes(env, remote, [seed]) == drive_episodes(env, policy, [seed])
+        assert drive_episodes(env, remote, [seed]) == drive_episodes(env, brightness, [seed])
 
 
 def test_a_delayed_driver_is_another_and_the_same_each_time():
     env, spec = make_environment("left_turn"), parse_spec("100ms+-40ms,loss=5%")
-    first, again = (drive_episodes(env, Brightness(), [3], latency=spec) for _ in range(2))
+    first, again = (drive_episodes(env, brightness, [3], latency=spec) for _ in range(2))
     assert first == again
-    assert first[0].actions != drive_episodes(env, Brightness(), [3])[0].actions
+    assert first[0].actions != drive_episodes(env, brightness, [3])[0].actions
 
 
 def test_a_reward_stands_beside_the_action_that_earned_it():

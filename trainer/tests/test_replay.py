@@ -28,9 +28,8 @@ def sample(buffer, size=64, seed=0):
 class Source:
     """Feeds episodes of numbered frames; step n is rewarded with n + 1, its action is n / 100.
 
-    ``stored``: of each transition the older picture of its first observation, whose newer one is
-    the key; the rewards from it to the episode's end; and whether that end was terminal.
-    """
+    ``stored``: newer picture of a transition's first observation -> the older one, the rewards from
+    it to the episode's end, and whether that end was terminal."""
 
     def __init__(self, buffer):
         self.buffer, self.next = buffer, 0
@@ -46,6 +45,15 @@ class Source:
             self.buffer.add(action, step + 1.0, pair(now, now + 1), goal and last, human=acts)
             rewards = [n + 1.0 for n in range(step, steps)]
             self.stored[now] = max(now - 1, first), rewards, goal
+
+
+def filled(*episodes, capacity=100, **options):
+    """A buffer with episodes of so many steps, all the human's where the number is negative."""
+    buffer = ReplayBuffer(capacity, **options)
+    source = Source(buffer)
+    for steps in episodes:
+        source.episode(abs(steps), human=steps < 0)
+    return buffer, source
 
 
 @settings(max_examples=80, deadline=None)
@@ -92,10 +100,8 @@ def test_a_return_ends_at_an_overruled_action_with_what_that_is_worth(overruled_
         buffer.add(*given, step == 5, step >= 3, None, step == 3)
     batch = sample(buffer, 200)
     assert batch.spans is not None
-    rows = {
-        number(batch.frames[row, 1]): (batch.rewards[row], batch.spans[row], batch.terminals[row])
-        for row in range(200)
-    }
+    found = zip(batch.rewards, batch.spans, batch.terminals, strict=True)
+    rows = dict(zip(map(number, batch.frames[:, 1]), found, strict=True))
     assert sorted(rows) == list(range(6))
     assert rows[1] == before
     # The human's own return knows nothing of it.
@@ -120,19 +126,14 @@ def test_the_overruled_action_is_kept_beside_the_humans():
     [(50, [25] * 5, 50, 50), (40, [1] * 60, 15, 25)],  # short ones are forgotten early
 )
 def test_a_full_ring_keeps_the_newest_and_mixes_no_pictures(capacity, steps, least, most):
-    buffer = ReplayBuffer(capacity)
-    source = Source(buffer)
-    for length in steps:
-        source.episode(length)
+    buffer, source = filled(*steps, capacity=capacity)
     assert least <= len(buffer) <= most
     drawn = {number(picture) for picture in sample(buffer, 1000).frames[:, 1]}
     assert drawn == set(list(source.stored)[-len(buffer) :])
 
 
 def test_new_transitions_get_the_highest_priority():
-    buffer = ReplayBuffer(10)
-    source = Source(buffer)
-    source.episode(3)
+    buffer, source = filled(3)
     buffer.update_priorities(np.arange(3), np.array([0.1, 7.0, 0.2]))
     source.episode(1)
     weights = np.array([0.1, 7.0, 0.2, 7.0]) ** 0.6
@@ -141,8 +142,7 @@ def test_new_transitions_get_the_highest_priority():
 
 
 def test_probabilities_follow_equation_20():
-    buffer = ReplayBuffer(10, alpha=0.5)
-    Source(buffer).episode(2)
+    buffer, _ = filled(2, alpha=0.5)
     buffer.update_priorities(np.array([0, 1]), np.array([1.0, 16.0]))
     batch = sample(buffer, 1000)
     # 1^0.5 : 16^0.5 = 1 : 4.
@@ -155,10 +155,7 @@ def test_probabilities_follow_equation_20():
 
 
 def test_with_alpha_zero_all_are_drawn_alike_and_the_forgotten_never():
-    buffer = ReplayBuffer(40, alpha=0.0)
-    source = Source(buffer)
-    for _ in range(60):
-        source.episode(1)
+    buffer, _ = filled(*[1] * 60, capacity=40, alpha=0.0)
     buffer.update_priorities(buffer._ring.alive[:3], np.array([0.5, 2.0, 9.0]))
     batch = sample(buffer, 1000)
     assert set(batch.indices) == set(buffer._ring.alive)
@@ -166,31 +163,25 @@ def test_with_alpha_zero_all_are_drawn_alike_and_the_forgotten_never():
 
 
 def test_the_human_is_counted_and_its_priorities_kept_apart():
-    buffer = ReplayBuffer(100)
-    source = Source(buffer)
-    source.episode(4)
-    source.episode(6, human=True)
+    buffer, _ = filled(4, -6)
     assert buffer.human_count == 6
     buffer.update_priorities(np.arange(10), np.array([2.0] * 4 + [3.0] * 6))
     assert buffer.mean_priorities() == (2.0, 3.0)
 
 
 @pytest.mark.parametrize("separate", [False, True])
-@pytest.mark.parametrize("human", [False, True])
-def test_a_restored_buffer_draws_the_same(human, separate):
+@pytest.mark.parametrize("steps", [11, -11])
+def test_a_restored_buffer_draws_the_same(steps, separate):
     """Also of separate buffers of which one is empty."""
-    buffer, copy = (ReplayBuffer(30, separate=separate) for _ in range(2))
-    source = Source(buffer)
-    for _ in range(4):
-        source.episode(11, human)
+    buffer, _ = filled(*[steps] * 4, capacity=30, separate=separate)
+    copy = ReplayBuffer(30, separate=separate)
     buffer.update_priorities(np.arange(20), np.linspace(0.1, 5, 20))
     copy.load_state_dict(buffer.state_dict())
     a, b = sample(buffer, seed=3), sample(copy, seed=3)
-    assert (a.human == human).all()
+    assert (a.human == (steps < 0)).all()
     assert np.isfinite(a.probabilities).all()
-    np.testing.assert_array_equal(a.indices, b.indices)
-    np.testing.assert_array_equal(a.frames, b.frames)
-    np.testing.assert_allclose(a.probabilities, b.probabilities)
+    for name in ("indices", "frames", "probabilities"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name))
 
 
 def test_a_hundred_thousand_transitions_fit_into_400_mb():
@@ -202,10 +193,7 @@ def test_a_hundred_thousand_transitions_fit_into_400_mb():
 
 def test_separate_buffers_are_drawn_from_by_their_size_and_within_by_priority():
     """RD2: however high the human's priorities, their number decides how often they are drawn."""
-    buffer = ReplayBuffer(100, alpha=1.0, separate=True)
-    source = Source(buffer)
-    source.episode(30)
-    source.episode(10, human=True)
+    buffer, _ = filled(30, -10, alpha=1.0, separate=True)
     priorities = np.concatenate([np.linspace(1.0, 2.0, 30), [70.0], np.full(9, 10.0)])
     buffer.update_priorities(np.arange(40), priorities)
     batch = sample(buffer, 4000)
@@ -217,10 +205,7 @@ def test_separate_buffers_are_drawn_from_by_their_size_and_within_by_priority():
 
 
 def test_a_slot_that_changes_hands_leaves_the_other_buffer():
-    buffer = ReplayBuffer(10, separate=True)
-    source = Source(buffer)
-    source.episode(10, human=True)
-    source.episode(10)
+    buffer, _ = filled(-10, 10, capacity=10, separate=True)
     assert buffer.human_count == 0
     assert not sample(buffer).human.any()
 

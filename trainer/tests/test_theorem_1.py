@@ -24,10 +24,7 @@ Table = NDArray[np.float64]
 
 
 class Mdp(NamedTuple):
-    """A continuing decision process: next states' probabilities, and rewards.
-
-    Both are [state, action, next state].
-    """
+    """A continuing decision process; both tables are [state, action, next state]."""
 
     transitions: Table
     rewards: Table
@@ -56,35 +53,32 @@ def optimal_actions(values: Table) -> NDArray[np.bool_]:
     return values > values.max(axis=1, keepdims=True) - 1e-6
 
 
-def potential_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
-    """Eq. A1 with the potential of eq. A2."""
+def potential_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> tuple[Mdp, Table]:
+    """Eq. A1, and its potential [state] of eq. A2."""
     potential = np.where(unacceptable, PENALTY / GAMMA, 0.0)
-    return mdp._replace(rewards=mdp.rewards + GAMMA * potential - potential[:, None, None])
+    rewards = mdp.rewards + GAMMA * potential - potential[:, None, None]
+    return mdp._replace(rewards=rewards), potential
 
 
 def intervention_shaped(mdp: Mdp, unacceptable: NDArray[np.bool_]) -> Mdp:
-    """Eq. 17 as the proof reads it: whoever enters an unacceptable state pays, and goes there.
-
-    The human stays in control while the car is in one, so that only entering is penalised. The
-    trainer stores something else: the overruled action is never carried out, and the penalty stands
-    beside the human's. What that changes, the last test shows.
+    """Eq. 17 as the proof reads it: whoever enters an unacceptable state goes there, and pays; the
+    human stays in control as long as the car is in one. The trainer never carries the overruled
+    action out, and the penalty stands beside the human's: what that changes, the last test shows.
     """
     rewards = mdp.rewards.copy()
     for place in np.ndindex(rewards.shape):
-        state, _, following = place
-        rewards[place] = equations.shaped_reward(
-            float(rewards[place]), PENALTY, bool(unacceptable[following]), bool(unacceptable[state])
-        )
+        after, before = bool(unacceptable[place[2]]), bool(unacceptable[place[0]])
+        rewards[place] = equations.shaped_reward(float(rewards[place]), PENALTY, after, before)
     return mdp._replace(rewards=rewards)
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.lists(st.booleans(), min_size=STATES, max_size=STATES))
 def test_the_proofs_potential_changes_no_optimal_policy_whatever_the_human_dislikes(seed, disliked):
-    mdp, unacceptable = random_mdp(seed), np.array(disliked)
-    shaped = optimal_values(potential_shaped(mdp, unacceptable))
-    potential = np.where(unacceptable, PENALTY / GAMMA, 0.0)
-    np.testing.assert_allclose(shaped, optimal_values(mdp) - potential[:, None], atol=1e-6)
+    mdp = random_mdp(seed)
+    shaped, potential = potential_shaped(mdp, np.array(disliked))
+    wanted = optimal_values(mdp) - potential[:, None]
+    np.testing.assert_allclose(optimal_values(shaped), wanted, atol=1e-6)
 
 
 @settings(max_examples=40, deadline=None)
@@ -102,7 +96,7 @@ def test_intervention_shaping_keeps_the_optimum_where_only_bad_states_are_unacce
 
 
 @pytest.fixture
-def detour() -> Mdp:
+def detour():
     """From state 0, action 0 leads straight on through 1 to the reward in 2, action 1 to the same
     by a longer way through 3 and 4; then all begins anew. Action 2 stays."""
     following = [(1, 3, 0), (2, 2, 1), (0, 0, 0), (4, 4, 3), (2, 2, 4), (0, 0, 5)]
@@ -112,7 +106,6 @@ def detour() -> Mdp:
 
 
 def best_at_the_fork(mdp):
-    """The optimal one of state 0's actions."""
     (best,) = np.flatnonzero(optimal_actions(optimal_values(mdp))[0])
     return best
 
@@ -125,7 +118,7 @@ def test_a_human_who_dislikes_the_optimal_way_or_wavers_changes_the_optimum(deto
     # penalty is then a random one, of this mean; a potential over states cannot waver.
     wavering = detour._replace(rewards=0.2 * detour.rewards + 0.8 * shaped.rewards)
     # The proof's own potential, which gives the penalty back, would have kept it.
-    kept = potential_shaped(detour, unacceptable)
+    kept, _ = potential_shaped(detour, unacceptable)
     assert [best_at_the_fork(mdp) for mdp in (detour, shaped, wavering, kept)] == [0, 1, 1, 0]
 
 
@@ -133,9 +126,8 @@ def test_a_human_who_dislikes_the_optimal_way_or_wavers_changes_the_optimum(deto
 def test_a_penalty_beside_the_humans_own_action_keeps_the_optimum_while_take_overs_are_rare(
     detour, share, best
 ):
-    """As the trainer stores it: in state 0 the policy asks for what the human refuses, the human
-    takes action 0 instead, and of the transitions with that action this share is penalised.
-    """
+    """As the trainer stores it: in state 0 the human refuses what the policy asks for and takes
+    action 0 instead; of the transitions with that action this share is penalised."""
     rewards = detour.rewards.copy()
     rewards[0, 0, 1] += share * equations.shaped_reward(0.0, PENALTY, True, False)
     assert best_at_the_fork(detour._replace(rewards=rewards)) == best

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -46,6 +47,14 @@ def actor_of(run):
     return run.learning.learner.actor.state_dict()
 
 
+def rows_of(run):
+    """The metrics of a run but for times, which are never the same."""
+    return [
+        {name: value for name, value in row.items() if not name.endswith("_s")}
+        for row in read_metrics(run.run_dir)
+    ]
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> TrainingRun:
     return train(TINY, tmp_path_factory.mktemp("run"))
@@ -57,11 +66,11 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
     assert config.pop("source_revision")
     assert config == json.loads(json.dumps(TINY.as_dict()))
     rows = read_metrics(directory)
-    assert [int(row["episode"]) for row in rows] == [0, 1, 2, 3]
     assert list(rows[0]) == NAMES
-    assert [row["validation_success"] != "nan" for row in rows] == [False, True, False, True]
-    assert int(rows[-1]["total_steps"]) == sum(int(row["steps"]) for row in rows)
-    human_steps = sum(int(row["human_steps"]) for row in rows)
+    found = [(row["episode"], row["validation_success"] != "nan") for row in rows]
+    assert found == [("0", False), ("1", True), ("2", False), ("3", True)]
+    steps, human_steps = (sum(int(row[name]) for row in rows) for name in ("steps", "human_steps"))
+    assert int(rows[-1]["total_steps"]) == steps
     assert human_steps == trained.learning.replay.human_count > 0
     assert list((directory / "tensorboard").iterdir())
     label = {"scenario": "left_turn", "algorithm": "phil_td3", "seed": 3}
@@ -70,12 +79,6 @@ def test_a_run_leaves_config_metrics_checkpoint_and_best_actor(trained):
 
 
 def test_the_same_seed_or_two_parts_give_the_same_weights_and_metrics(trained, tmp_path):
-    def rows(run):
-        return [
-            {name: value for name, value in row.items() if not name.endswith("_s")}
-            for row in read_metrics(run.run_dir)
-        ]
-
     parts = tmp_path / "parts"
     parts.mkdir()
     first = TrainingRun(TINY, parts)
@@ -83,7 +86,7 @@ def test_the_same_seed_or_two_parts_give_the_same_weights_and_metrics(trained, t
     assert first.episode == 2
     for run in (train(TINY, tmp_path / "again"), train(TINY, parts, resume=True)):
         assert same_actors(actor_of(trained), actor_of(run))
-        assert rows(run) == rows(trained)
+        assert rows_of(run) == rows_of(trained)
 
 
 def command(directory: Path, *extra: str) -> list[str]:
@@ -98,14 +101,12 @@ def command(directory: Path, *extra: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
-    """A run in one go."""
     directory = tmp_path_factory.mktemp("runs") / "whole"
     subprocess.run(command(directory), check=True, capture_output=True)
     return directory
 
 
 def begin(directory: Path, *extra: str, episodes: int) -> subprocess.Popen[str]:
-    """The same run, some episodes far."""
     process = subprocess.Popen(command(directory, *extra), stderr=subprocess.PIPE, text=True)
     end_s = time.monotonic() + 120
     while len(read_metrics(directory)) < episodes and time.monotonic() < end_s:
@@ -149,14 +150,11 @@ def test_who_quits_gets_one_more_episode_and_a_deadline_none_but_both_a_checkpoi
 ):
     run = TrainingRun(replace(TINY, checkpoint_every=100), tmp_path)
 
-    def broken(*_):
-        raise BrokenPipeError
-
     def on_episode(_):
         if quits:
             # The reader of stderr is gone, as `tee`, which has had the same ^C.
             with monkeypatch.context() as patch:
-                patch.setattr("os.write", broken)
+                patch.setattr("os.write", Mock(side_effect=BrokenPipeError))
                 assert ask_to_quit(run)
 
     run.train(on_episode, deadline_s=time.monotonic() + late_s)

@@ -8,6 +8,7 @@ from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -28,8 +29,10 @@ from trainer.person.recording import Recorder, read_steps
 from trainer.person.tests.people import record, recorded_step
 from trainer.pictures import CURVE_FILE
 from trainer.tests.test_commands import refusal
+from trainer.tests.test_td3 import same_weights
+from trainer.tests.test_training import rows_of
 from trainer.training.config import RunConfig
-from trainer.training.metrics import NAMES, EpisodeMetrics, read_metrics
+from trainer.training.metrics import EpisodeMetrics, read_metrics
 from trainer.training.run import Seen, TrainingRun
 from trainer.view import Episode, Steps, Watcher
 
@@ -57,12 +60,6 @@ def values_in(rrd):
     return {path: sorted(rows, key=lambda row: row[0] or 0) for path, rows in found.items()}
 
 
-def weights(run):
-    learner = run.learning.learner
-    parts = [*learner.actor.parameters(), *learner.critics.parameters()]
-    return torch.cat([part.detach().flatten() for part in parts])
-
-
 def train(directory, rrd=None):
     directory.mkdir()
     run: Any = TrainingRun(TINY, directory)
@@ -80,15 +77,9 @@ def shown(tmp_path_factory):
 
 
 def test_a_run_that_is_watched_learns_the_same(shown, tmp_path, one_thread):
-    def rows(run):
-        return [
-            {name: value for name, value in row.items() if not name.endswith("_s")}
-            for row in read_metrics(run.run_dir)
-        ]
-
     run, alone = shown[0], train(tmp_path / "alone")
-    assert torch.equal(weights(run), weights(alone))
-    assert rows(run) == rows(alone)
+    assert same_weights(run.learning.learner, alone.learning.learner)
+    assert rows_of(run) == rows_of(alone)
 
 
 def test_the_view_holds_the_run(shown):
@@ -97,13 +88,11 @@ def test_the_view_holds_the_run(shown):
     for path in ("/action/applied", "/speed/ego"):
         assert [step for step, _ in found[path]] == steps
     ends = np.cumsum([int(row["steps"]) for row in metrics]) - 1
-    for path, column in (
-        ("/return/episode", "episode_return"),
-        ("/priority/human", "human_priority"),
-        ("/priority/policy", "policy_priority"),
-        ("/loss/critic", "critic_loss"),
-        ("/success/validation", "validation_success"),
-    ):
+    for path, column in {
+        "/return/episode": "episode_return", "/loss/critic": "critic_loss",
+        "/priority/human": "human_priority", "/priority/policy": "policy_priority",
+        "/success/validation": "validation_success",
+    }.items():  # fmt: skip
         said = zip(ends, (row[column] for row in metrics), strict=True)
         expected = {int(end): float(value) for end, value in said if value != "nan"}
         assert dict(found[path]) == pytest.approx(expected), path
@@ -175,8 +164,7 @@ def test_corrections_are_spread_over_the_episode(human_steps):
     watcher = looking_on(kept)
     for _ in range(human_steps):
         watcher.on_step(control_period(human=True))
-    numbers = dict.fromkeys(NAMES, math.nan) | {"steps": max(human_steps, 1), "episode": 0}
-    watcher.on_episode(EpisodeMetrics(**{**numbers, "outcome": "goal"}))
+    watcher.on_episode(EpisodeMetrics(0, steps=max(human_steps, 1), outcome="goal"))
     episode = kept[-1]
     steps = [step for step, _ in episode.corrections]
     assert min(human_steps, view.CORRECTIONS // 2) <= len(steps) <= view.CORRECTIONS
@@ -209,10 +197,7 @@ class PanicError(BaseException):
 
 @pytest.mark.parametrize("error", [OSError("disk full"), PanicError("disk full")])
 def test_a_view_that_fails_does_not_end_the_run(capsys, error):
-    def draw(_entry):
-        raise error
-
-    background = view.Background(lambda: nullcontext(draw))
+    background = view.Background(lambda: nullcontext(Mock(side_effect=error)))
     for _ in range(3):
         background.put(Steps([]))
     background.close()
@@ -261,7 +246,7 @@ def test_the_command_writes_a_recording(tmp_path, one_thread):
 BRAKED = [0.5] * 5 + [-1.0] * 5 + [0.5] * 5
 
 
-def drive(directory, seeds=(4, 9), steps=15, scenario="left_turn", **changes):
+def drive(directory, seeds=(4, 9), steps=15, scenario="left_turn", policy: float | None = 0.5):
     """A recorded sitting: the policy wants half throttle, the person brakes from step 5 to 9."""
     env, recorder = make_environment(scenario), Recorder(directory)
     for episode, seed in enumerate(seeds):
@@ -269,14 +254,13 @@ def drive(directory, seeds=(4, 9), steps=15, scenario="left_turn", **changes):
         for number, action in enumerate(BRAKED[:steps]):
             frames = observation
             observation, reward, *_ = env.step(np.array([action], np.float32))
-            given = {
-                "scenario": scenario, "seed": seed, "episode": episode, "step": number,
-                "frames": frames.tobytes(), "next_frame": observation[1].tobytes(),
-                "policy_action": 0.5, "action": action, "human": 5 <= number < 10,
-                "first": number == 5, "reward": float(reward), "speed_mps": env.ego.speed,
-                "outcome": "restarted" if number == steps - 1 else "", **changes,
-            }  # fmt: skip
-            recorder.write(recorded_step(recorder.sitting, recorder.index, **given))
+            recorder.write(recorded_step(
+                recorder.sitting, recorder.index, scenario=scenario, seed=seed, episode=episode,
+                step=number, frames=frames.tobytes(), next_frame=observation[1].tobytes(),
+                policy_action=policy, action=action, human=5 <= number < 10, first=number == 5,
+                reward=float(reward), speed_mps=env.ego.speed,
+                outcome="restarted" if number == steps - 1 else "",
+            ))  # fmt: skip
     recorder.close()
     return recorder.path
 
@@ -318,12 +302,11 @@ def test_a_road_that_would_be_driven_differently_is_not_made_up(tmp_path):
 
 
 def test_a_person_who_drives_alone_has_no_policy_beside(tmp_path):
-    entries = list(view.Shown().entries([drive(tmp_path, seeds=(4,), policy_action=None)]))
+    entries = list(view.Shown().entries([drive(tmp_path, seeds=(4,), policy=None)]))
     steps = [entry.entries[0] for entry in entries if isinstance(entry, Steps)]
     assert all(math.isnan(step.policy_action) for step in steps)
-    (metrics,) = (entry.metrics for entry in entries if isinstance(entry, Episode))
-    found = metrics.human_steps, metrics.interventions, metrics.outcome
-    assert found == (5, 1, "restarted")
+    (found,) = (entry.metrics for entry in entries if isinstance(entry, Episode))
+    assert (found.human_steps, found.interventions, found.outcome) == (5, 1, "restarted")
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,6 @@ WHY = "document.getElementById('why').textContent"
 
 @cache
 def first_view(scenario: str = "left_turn") -> View:
-    """What a person sees of a scenario's first moment."""
     env = make_environment(scenario)
     frames, info = env.reset(seed=3)
     return View(
@@ -45,7 +44,6 @@ def first_view(scenario: str = "left_turn") -> View:
 
 
 def view_of_step(step: int) -> View:
-    """The same, told apart by its step."""
     return replace(first_view(), step=step)
 
 
@@ -55,7 +53,6 @@ def origin(cockpit):
 
 @asynccontextmanager
 async def page(cockpit, **more):
-    """A page's WebSocket."""
     options = {"origin": origin(cockpit), **more}
     async with (
         aiohttp.ClientSession() as session,
@@ -71,7 +68,6 @@ async def say(link, engaged=False, action=0.0, **more):
 
 
 async def hear(link, kind):
-    """The next message of a kind."""
     while True:
         message = await link.receive_json(timeout=WAIT_S)
         if message["kind"] == kind:
@@ -83,7 +79,6 @@ def poll(cockpit):
 
 
 async def reads(cockpit, condition):
-    """Poll until the reading is as wanted; that reading."""
     async with asyncio.timeout(PATIENCE_S):
         while not condition(reading := poll(cockpit)):
             await asyncio.sleep(0.005)
@@ -91,11 +86,8 @@ async def reads(cockpit, condition):
 
 
 async def until(page, expression):
-    """Wait until a JavaScript expression is true.
-
-    playwright's own ``wait_for_function`` evaluates within the page, which the page's security
-    policy forbids.
-    """
+    """Wait until a JavaScript expression is true; the page's security policy forbids playwright's
+    own ``wait_for_function``, which evaluates within the page."""
     async with asyncio.timeout(PATIENCE_S):
         while not await page.evaluate(f"Boolean({expression})"):
             await asyncio.sleep(0.01)
@@ -145,12 +137,7 @@ class Tunnel:
 
 @asynccontextmanager
 async def open_browser(scripts=(), **options):
-    """A page (playwright's) in a fresh Chromium.
-
-    Args:
-        scripts: run in every page before its own.
-        options: of playwright's context: size, touch and so on.
-    """
+    """A page in a fresh Chromium; ``scripts`` run before its own, ``options`` are playwright's."""
     from playwright.async_api import async_playwright  # here: only browser tests need it
 
     async with async_playwright() as playwright:
@@ -166,7 +153,6 @@ async def open_browser(scripts=(), **options):
 
 
 async def quit_sitting(page):
-    """Quit, and be sure."""
     await page.keyboard.press("KeyQ")
     await page.keyboard.press("KeyQ")
 
@@ -180,7 +166,6 @@ def address(process):
 
 
 async def take_picture(url, path):
-    """The cockpit in the middle of a take-over."""
     async with open_browser() as page:
         await page.goto(url)
         await until(page, POLICY_DRIVES)

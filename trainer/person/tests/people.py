@@ -17,10 +17,8 @@ QUICK = 1000.0
 
 
 class Puppet:
-    """A person who does what a list says, and then ``then`` for good; remembers every view.
-
-    ``presence``: whether the device is there, each time it is asked for; then it is for good.
-    """
+    """A person who does what a list says, and then ``then`` for good; ``presence``: whether the
+    device is there, each time it is asked for, and then for good."""
 
     help: tuple[str, ...] = ("a test",)
     moving = Moving()
@@ -60,12 +58,10 @@ class Discarding(Puppet):
 
 
 def hold(action: float) -> Reading:
-    """The person holds, and says so."""
     return Reading(action, engaged=True)
 
 
 def wish(*wishes) -> Reading:
-    """The person wishes something, and holds nothing."""
     return Reading(wishes=frozenset(wishes))
 
 
@@ -73,12 +69,10 @@ QUIT = wish("quit")
 
 
 def make_sitting(directory: Path, person: Puppet, alone: bool = False) -> Sitting:
-    """A quick sitting of a person in the left turn."""
     return Sitting(person, Recorder(directory), make_environment("left_turn"), alone, QUICK)
 
 
 def record(directory: Path, steps: Iterable[Step]) -> Path:
-    """Record the steps as a sitting; the recording."""
     recorder = Recorder(directory)
     for step in steps:
         recorder.write(step)

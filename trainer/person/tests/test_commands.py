@@ -1,6 +1,7 @@
 import json
 from itertools import repeat
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -120,10 +121,7 @@ def test_a_device_and_a_scenario_are_all_that_must_be_said(sit_down):
 
 
 def test_a_validation_that_is_left_out_costs_nothing_else(sit_down, monkeypatch):
-    def interrupted(*_arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(TrainingRun, "_validate", interrupted)
+    monkeypatch.setattr(TrainingRun, "_validate", Mock(side_effect=KeyboardInterrupt))
     status, out, errors = sit_down(Puppet([LET_GO] * 3, then=QUIT), *TRAIN_HERE)
     assert status == 0
     assert "validation left out" in errors

@@ -74,10 +74,7 @@ def keys_for(wanted: float, action: float, keys: tuple[int, int], down: int | No
 
 @pytest.mark.parametrize(
     ("scenario", "keys"),
-    [
-        ("left_turn", (pygame.K_DOWN, pygame.K_UP)),
-        ("congestion", (pygame.K_LEFT, pygame.K_RIGHT)),
-    ],
+    [("left_turn", (pygame.K_DOWN, pygame.K_UP)), ("congestion", (pygame.K_LEFT, pygame.K_RIGHT))],
 )
 def test_keys_are_enough_to_drive(scenario, keys):
     """Eyes that know the expert's mind, and a hand that is two tenths of a second behind."""
@@ -154,7 +151,6 @@ def test_a_wheel_that_is_pulled_out_lets_go_and_comes_back(wheel):
 
 @pytest.fixture
 def opened(monkeypatch):
-    """Opens a window on a screen of a size."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
     def opened(*screen):
@@ -166,7 +162,6 @@ def opened(monkeypatch):
 
 
 def shown() -> Any:
-    """What is in the window."""
     return pygame.display.get_surface()
 
 

@@ -49,7 +49,6 @@ class Training:
         )
 
     def close(self) -> None:
-        """Kill it, if it is still there."""
         self.process.kill()
         self.process.communicate()
 
@@ -63,7 +62,6 @@ class Training:
         return int(answer.split()[-1])
 
     def wait_for_step(self, wanted: Callable[[Step], bool]) -> Step:
-        """The first step of the newest sitting that is as wanted."""
         end_s = time.monotonic() + SOON_S
         while time.monotonic() < end_s and self.process.poll() is None:
             for step in newest_sitting(self.run_dir):
@@ -73,13 +71,11 @@ class Training:
         raise AssertionError(f"no such step: {self.process.poll()}")
 
     def end(self) -> tuple[int, str]:
-        """Wait for its end: exit status, and stderr."""
         _, errors = self.process.communicate(timeout=SOON_S)
         return self.process.returncode, errors
 
 
 def newest_sitting(run_dir: Path) -> list[Step]:
-    """The steps of the sitting that is going on, or was last."""
     there = sittings(run_dir / DIRECTORY)
     with suppress(UserError):  # one that has just begun is an empty file
         return list(read_steps(there[-1])) if there else []
@@ -98,11 +94,7 @@ def all_in_replay(run_dir: Path) -> list[Step]:
 
 
 def first_of_the_persons(steps: Sequence[Step]) -> int:
-    """The index of the step with which the only intervention begins.
-
-    The action has moved from what was applied before towards what the person wants, as far as it
-    may.
-    """
+    """The index of the step that begins the only intervention; it moves as far as it may."""
     (index,) = (index for index, step in enumerate(steps) if step.first)
     taken, last = steps[index], steps[index].policy_action
     assert not any(step.human for step in steps[:index])
@@ -115,10 +107,8 @@ def first_of_the_persons(steps: Sequence[Step]) -> int:
 
 
 def assert_taken_over_at_once(steps: Sequence[Step], began_ns: int, done_ns: int) -> None:
-    """The first control period that asked the hands after ``done_ns`` is already the person's.
-
-    One between ``began_ns`` and ``done_ns`` may be: a key is down before the press is confirmed.
-    """
+    """The first control period that asked the hands after ``done_ns`` is already the person's; an
+    earlier one may be: a key is down before the press is confirmed."""
     taken = first_of_the_persons(steps)
     assert steps[taken].time_ns >= began_ns
     assert steps[taken - 1].time_ns < done_ns
@@ -126,7 +116,6 @@ def assert_taken_over_at_once(steps: Sequence[Step], began_ns: int, done_ns: int
 
 @pytest.fixture
 def display():
-    """A screen without a screen."""
     for program in ("Xvfb", "xdotool"):
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed (Debian packages xvfb and xdotool)")

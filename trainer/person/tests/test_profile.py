@@ -114,7 +114,6 @@ class Trembling:
                 places.pop(0)
 
     def answer(self, line):
-        """Press what is asked for, and let go when told."""
         for word, (axis, place) in self._answers.items():
             if word in line:
                 self._coming[axis] = [0.5, 0.7, 0.4, 0.6] * 5 + [place]
@@ -129,7 +128,6 @@ ANSWERS = {"LEFT": (0, 0.5), "RIGHT": (0, -0.4), "THROTTLE": (2, 0.9), "BRAKE": 
 
 @pytest.fixture
 def ask(monkeypatch):
-    """Asks whoever answers so, in a hurry."""
     for name, value in {"STEADY_S": 0.05, "FIRST_S": 0.0, "LOOK_S": 0.001}.items():
         monkeypatch.setattr(module, name, value)
 

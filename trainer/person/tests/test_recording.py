@@ -127,7 +127,6 @@ def penalises(intervention):
 
 
 def shape(reward, intervention):
-    """A penalty of 100 for taking over."""
     return reward - 100.0 * penalises(intervention)
 
 
@@ -143,7 +142,6 @@ def episode(sitting: int, first: int, length: int, human: range):
 
 
 def assert_pictures(buffer, steps):
-    """What is drawn from the buffer is what was recorded."""
     batch = buffer.sample(200, np.random.default_rng(0))
     for row, index in enumerate(batch.indices):
         np.testing.assert_array_equal(batch.frames[row], steps[index].observation)

@@ -2,6 +2,7 @@ import math
 import threading
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,21 +22,6 @@ def frames(value: int):
     return np.full((2, 45, 80), value, np.uint8)
 
 
-class Gate:
-    """Holds updates up until it is opened."""
-
-    def __init__(self, learning, monkeypatch):
-        self.open, self.begun = threading.Event(), 0
-        update = learning.learner.update
-
-        def held_up(batch, beta=0.0):
-            self.begun += 1
-            assert self.open.wait(SOON_S)
-            return update(batch, beta)
-
-        monkeypatch.setattr(learning.learner, "update", held_up)
-
-
 @pytest.fixture
 def learning(one_thread):
     inner = LearningThread(CONFIG, ALGORITHMS["phil_td3"], 0, 1)
@@ -47,9 +33,23 @@ def learning(one_thread):
     unhurried.close()
 
 
-def test_while_an_update_hangs_everything_goes_on(learning, monkeypatch):
+@pytest.fixture
+def gate(learning, monkeypatch):
+    """Updates are held up until it is open."""
+    learner, gate = learning[0].learner, SimpleNamespace(open=threading.Event(), begun=0)
+    update = learner.update
+
+    def held_up(batch, beta=0.0):
+        gate.begun += 1
+        assert gate.open.wait(SOON_S)
+        return update(batch, beta)
+
+    monkeypatch.setattr(learner, "update", held_up)
+    return gate
+
+
+def test_while_an_update_hangs_everything_goes_on(learning, gate):
     inner, unhurried = learning
-    gate = Gate(inner, monkeypatch)
     before = unhurried.act(frames(7))
     unhurried.begin(0.0)
     for _ in range(5):
@@ -63,9 +63,9 @@ def test_while_an_update_hangs_everything_goes_on(learning, monkeypatch):
     assert np.any(unhurried.act(frames(7)) != before)
 
 
-def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(learning, monkeypatch):
-    inner, unhurried = learning
-    gate, episode = Gate(inner, monkeypatch), KeptBack(unhurried)
+def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(learning, gate):
+    _, unhurried = learning
+    episode = KeptBack(unhurried)
     unhurried.begin(0.0)
     for discarded, reward in ((True, 9.0), (False, 3.0)):
         episode.start_episode(frames(10))
@@ -83,9 +83,8 @@ def test_an_episode_is_stored_in_its_order_after_the_update_or_not_at_all(learni
     assert state["terminals"].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
 
 
-def test_the_next_update_begins_when_the_last_is_done(learning, monkeypatch):
+def test_the_next_update_begins_when_the_last_is_done(learning, gate):
     inner, unhurried = learning
-    gate = Gate(inner, monkeypatch)
     gate.open.set()
     for _ in range(3):
         unhurried.begin(0.0)
@@ -96,11 +95,7 @@ def test_the_next_update_begins_when_the_last_is_done(learning, monkeypatch):
 
 def test_what_an_update_raises_comes_out(learning, monkeypatch):
     inner, unhurried = learning
-
-    def fail(batch, beta=0.0):
-        raise RuntimeError("no more memory")
-
-    monkeypatch.setattr(inner.learner, "update", fail)
+    monkeypatch.setattr(inner.learner, "update", Mock(side_effect=RuntimeError("no more memory")))
     unhurried.begin(0.0)
     with pytest.raises(RuntimeError, match="no more memory"):
         unhurried.settle()

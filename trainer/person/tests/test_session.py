@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from trainer.drivers import constant_driver
 from trainer.person.interface import LET_GO
 from trainer.person.recording import DISCARDED, read_episodes, read_steps
 from trainer.person.session import RESTARTED, STOPPED, Pacer, drive
@@ -11,24 +12,11 @@ from trainer.person.takeover import MAX_SLEW
 from trainer.person.tests.people import QUIT, Discarding, Puppet, hold, make_sitting, wish
 
 
-class Steady:
-    """A policy of one action."""
-
-    def __init__(self, action: float) -> None:
-        self.action = np.array([action], np.float32)
-
-    def reset(self) -> None:
-        """No memory."""
-
-    def act(self, observation):
-        return self.action
-
-
 def drive_and_read(directory, readings=(), policy: float | None = 0.5, person=None, presence=()):
     """Drive as the readings say, then quit: outcomes, recorded steps, views, and the sitting."""
     person = person or Puppet(readings, QUIT, presence)
     sitting = make_sitting(directory, person, alone=policy is None)
-    outcomes = drive(sitting, None if policy is None else Steady(policy), 0, None)
+    outcomes = drive(sitting, None if policy is None else constant_driver(policy), 0, None)
     sitting.close()
     path = sitting.recorder.path
     return outcomes, list(read_steps(path)) if path.exists() else [], person.views, sitting

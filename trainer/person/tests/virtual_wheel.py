@@ -41,16 +41,13 @@ class VirtualWheel:
         self._joystick = self._sdl.SDL_JoystickOpen(self.index)
 
     def axis(self, number, place):
-        """Put an axis to a place in [-1, 1]."""
-        value = round(min(max(place, -1.0), 1.0) * 32767)
-        self._sdl.SDL_JoystickSetVirtualAxis(self._joystick, number, ctypes.c_int16(value))
+        place = ctypes.c_int16(round(place * 32767))
+        self._sdl.SDL_JoystickSetVirtualAxis(self._joystick, number, place)
 
     def button(self, number, down):
-        """Press or release a button."""
         self._sdl.SDL_JoystickSetVirtualButton(self._joystick, number, ctypes.c_uint8(bool(down)))
 
     def unplug(self):
-        """Pull it out."""
         self._sdl.SDL_JoystickDetachVirtual(self.index)
 
 
@@ -70,7 +67,6 @@ def load_sdl():
 
 
 def obey(wheel):
-    """Do what stdin says."""
     for line in sys.stdin:
         what, number, value = line.split()
         {"axis": wheel.axis, "button": wheel.button}[what](int(number), float(value))
@@ -78,7 +74,6 @@ def obey(wheel):
 
 
 def main(argv):
-    """Plug in, and run the trainer beside it."""
     from trainer.person.devices import pygame
 
     pygame.display.init()
