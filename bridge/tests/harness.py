@@ -32,13 +32,10 @@ class BridgeProcess:
     """``python -m bridge`` with a subcommand; killed at the end of the block if need be."""
 
     def __init__(self, *arguments: str, environment: dict[str, str] | None = None) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "bridge", *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **(environment or {})},
-        )
+        self.process: Any = subprocess.Popen(
+            [sys.executable, "-m", "bridge", *arguments], stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True, env={**os.environ, **(environment or {})},
+        )  # fmt: skip
         self.output, self.errors = "", ""
 
     def wait(self, timeout_s: float = 60.0) -> int:
@@ -55,23 +52,18 @@ class BridgeProcess:
             self.process.communicate()
 
 
-def start_edge(
-    endpoint: str, policy: Path, *options: str, stderr: Any = subprocess.PIPE
-) -> EdgeProcess:
+def start_edge(endpoint, policy, *options, stderr=subprocess.PIPE) -> EdgeProcess:
     """Start ``python -m edge_runtime run`` with an unsigned test policy and wait until ready."""
     fixed = ("--policy", str(policy), "--connect", endpoint, "--allow-unsigned")
     return EdgeProcess(*fixed, *options, stderr=stderr)
 
 
 def bridge_status(arguments: list[str]) -> int:
-    """Run ``python -m bridge`` in this process; return its exit status."""
     return exit_status(main, arguments)
 
 
 def wait_until_driving(edge: EdgeProcess) -> None:
-    """Wait for the log line with which the edge runtime says that it drives."""
-    log = edge.process.stderr
-    assert log is not None
+    log: Any = edge.process.stderr
     wait_until(lambda: "now=drive" in log.readline(), "the first drive")
 
 
@@ -97,45 +89,36 @@ def refused(run: BridgeProcess, out: Path, *parts: str) -> None:
 
 
 def make_policy(folder: Path, kind: str = "mean", value: float = 0.3) -> Path:
-    """Write a test policy file."""
     path = folder / f"{kind}{value:g}.onnx"
     write_policy(path, kind, value)
     return path
 
 
 def start_simulate(endpoint: str, out: Path, env: str, *options: str) -> BridgeProcess:
-    """Start ``python -m bridge simulate``."""
     fixed = ["simulate", "--env", env, "--listen", endpoint, "--out", str(out)]
     return BridgeProcess(*fixed, *options)
 
 
 def simulate(folder: Path, endpoint: str, env: str, options: Sequence[str]) -> dict[str, Any]:
-    """Run ``simulate`` to its end and return the report."""
     out = folder / f"report-{time.monotonic_ns()}.json"
     with start_simulate(endpoint, out, env, *options) as run:
         assert run.wait(PATIENCE_S * 3) == 0, run.errors
     return read(out)
 
 
-def simulate_undisturbed(
-    folder: Path, endpoint: str, env: str, options: Sequence[str], attempts: int = 4
-) -> dict[str, Any]:
-    """Run ``simulate`` again where the machine itself stood still for over 2 T in the middle.
-
-    In real time such a stop has a reason of the edge runtime's; an injected one is ``no_command``.
-    """
+def simulate_undisturbed(folder, endpoint, env, options, attempts=4) -> dict[str, Any]:
+    """Run ``simulate`` again where the machine itself stood still for over 2 T in the middle."""
     for _ in range(attempts):
         report = simulate(folder, endpoint, env, options)
         reasons = {event["reason"] for event in report["safe_stop_events"]}
         if report["clock"] == "lockstep" and not report["wall_clock_stalls"]:
             return report
-        if report["clock"] == "realtime" and reasons <= {"no_command"}:
+        if report["clock"] == "realtime" and reasons <= {"no_command"}:  # an injected one's reason
             return report
     raise AssertionError(f"disturbed {attempts} times: {report['safe_stop_events']}")
 
 
 def drive_in_process(policy_path: Path, seed: int) -> tuple[str, np.ndarray]:
-    """Drive one episode of TOY without any wire; return its outcome and actions."""
     policy = load_policy(str(policy_path), allow_unsigned=True)
     environment = gymnasium.make(TOY)
     frames, info = environment.reset(seed=seed)
@@ -148,12 +131,10 @@ def drive_in_process(policy_path: Path, seed: int) -> tuple[str, np.ndarray]:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Return a JSON report."""
     return json.loads(path.read_text())
 
 
 def rerun(*arguments: str) -> str:
-    """Run rerun's own reader; what it prints."""
     command = [sys.executable, "-m", "rerun", *arguments]
     return subprocess.run(command, check=True, capture_output=True, timeout=60, text=True).stdout
 
@@ -178,7 +159,6 @@ def make_feedback(step: int, **changes: Any) -> Feedback:
 
 
 def decoded(payload: bytes) -> State:
-    """The state that a clock has published."""
     state = decode_state(payload)
     assert isinstance(state, State)
     return state
@@ -188,7 +168,6 @@ LEFT_TURN = Path(__file__).parents[2] / "hil_tests" / "recordings" / "left_turn.
 
 
 def chunks(path: Path) -> list[ChunkIndex]:
-    """Where the chunks of a whole recording lie."""
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
@@ -205,7 +184,6 @@ def messages_of(path: Path, chunk: ChunkIndex) -> int:
 
 
 def flip(path: Path, at: int, count: int = 4) -> None:
-    """Turn round every bit of some bytes."""
     data = bytearray(path.read_bytes())
     data[at : at + count] = bytes(byte ^ 0xFF for byte in data[at : at + count])
     path.write_bytes(data)

@@ -1,7 +1,5 @@
 """Bad input is one line and exit status 2 for every command, and nothing is written."""
 
-from __future__ import annotations
-
 import shlex
 
 import pytest
@@ -98,10 +96,7 @@ def test_bad_input_is_one_line_and_status_2(command, part, refusal, busy, monkey
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (tmp_path / "there.mcap").write_bytes(b"mine")
     words = {"TOY": TOY, "BUSY": busy, "LEFT_TURN": str(LEFT_TURN)}
-    arguments = [
-        free_endpoint() if word == "FREE" else words.get(word, word)
-        for word in shlex.split(command)
-    ]
-    assert part in refusal(*arguments)
+    found = (free_endpoint() if w == "FREE" else words.get(w, w) for w in shlex.split(command))
+    assert part in refusal(*found)
     assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]
     assert (tmp_path / "there.mcap").read_bytes() == b"mine"

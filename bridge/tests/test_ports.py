@@ -1,27 +1,19 @@
 """Both ends and the relay between them: what each hears, takes, and holds back."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import subprocess
 import sys
 import time
+from functools import partial
+from typing import Any
 
 import pytest
 
 from bridge.network import parse_spec
 from bridge.ports import ANY_VEHICLE, SimulatorPort, open_listener
 from bridge.relay import DOWN, RelayTraffic
-from bridge.tests.harness import (
-    SHORT_TOY,
-    BridgeProcess,
-    make_command,
-    make_policy,
-    read,
-    simulate,
-    start_edge,
-)
+from bridge.tests import harness
 from edge_runtime.commands import ask
 from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import free_endpoint, open_session
@@ -67,13 +59,13 @@ def test_a_simulator_hears_its_own_commands_and_feedback_only(sessions):
 def test_a_listener_hears_what_was_put_to_one_vehicle(sessions, vehicle_id):
     endpoint, router, client = sessions
     port = SimulatorPort(router, "v1")
+    topics = ("state", "command", "feedback", "health")
     with open_listener(endpoint, vehicle_id, 5.0) as feed:
-        for topic in ("state", "command", "feedback", "health"):
+        for topic in topics:
             put_wildly(client, topic)
         time.sleep(HEARS_S)
         heard = iter(lambda: feed.next(0.1), None)
         found = {(one.key, one.payload) for one in heard if one.topic in TOPICS}
-    topics = ("state", "command", "feedback", "health")
     assert found == {(f"phil/v1/{topic}", b"own") for topic in topics}
     port.close()
 
@@ -103,24 +95,19 @@ def test_a_signal_that_another_thread_takes_ends_the_wait():
     assert process.returncode == 0
 
 
-SPEC = "40ms+-5ms,loss=10%,duplicate=10%"
-
-
 class Rig:
-    """A relay's traffic whose deliveries are kept with their time."""
-
     def __init__(self, spec: str) -> None:
         self.came: list[tuple[str, bytes, float]] = []
-        deliver = {name: self._keeper(name) for name in ("state", *DOWN)}
+        deliver: Any = {name: partial(self._keep, name) for name in ("state", *DOWN)}
         self.traffic = RelayTraffic(parse_spec(spec), 0, deliver)
         self.take, self.close = self.traffic.take, self.traffic.close
 
-    def _keeper(self, name):
-        return lambda payload: self.came.append((name, payload, time.monotonic()))
+    def _keep(self, name, payload):
+        self.came.append((name, payload, time.monotonic()))
 
 
 def test_every_topic_is_held_back_and_nothing_is_changed():
-    state, command = encode(make_state(0)), encode(make_command(0))
+    state, command = encode(make_state(0)), encode(harness.make_command(0))
     with contextlib.closing(Rig("up.delay=30ms,down.delay=60ms")) as rig:
         began_s = time.monotonic()
         rig.take("command", command)
@@ -159,20 +146,19 @@ def test_outages_begin_to_count_with_the_first_state():
 
 
 def test_two_unmodified_ends_drive_through_a_relay(tmp_path):
-    policy, out = make_policy(tmp_path), tmp_path / "relay.json"
+    policy, out = harness.make_policy(tmp_path), tmp_path / "relay.json"
     simulator, listen = free_endpoint(), free_endpoint()
-    link = ("relay", "--listen", listen, "--connect", simulator, "--latency", SPEC)
-    with BridgeProcess(*link, "--seed", "9", "--out", str(out)) as relay:
-        assert relay.process.stdout is not None
-        ready = relay.process.stdout.readline()
-        assert ready.startswith("ready vehicle_id=hunter01")
-        with start_edge(listen, policy):
-            options = ["--clock", "realtime", "--episodes", "1"]
-            report = simulate(tmp_path, simulator, SHORT_TOY, options)
+    spec = "40ms+-5ms,loss=10%,duplicate=10%"
+    link = ("relay", "--listen", listen, "--connect", simulator, "--latency", spec)
+    with harness.BridgeProcess(*link, "--seed", "9", "--out", str(out)) as relay:
+        assert relay.process.stdout.readline().startswith("ready vehicle_id=hunter01")
+        with harness.start_edge(listen, policy):
+            options = ["--clock", "realtime"]
+            report = harness.simulate(tmp_path, simulator, harness.SHORT_TOY, options)
             assert ask(listen, "hunter01", "status")["accepted"] > 10
         relay.process.terminate()
         assert relay.wait() == 0, relay.errors
-    counts = read(out)
+    counts = harness.read(out)
     json.dumps(counts, allow_nan=False)
     states, commands, _, health = counts["topics"].values()
     assert report["latency_ms"]["p50"] > 75

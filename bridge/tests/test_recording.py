@@ -1,7 +1,5 @@
 """Recordings: how they are written, cut off, damaged, mended, and made to keep a reader busy."""
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import io
@@ -71,7 +69,6 @@ def told_in(path: Path) -> list[tuple[str, int, bytes]]:
 
 @contextlib.contextmanager
 def writing(path: Path, dropped: int = 0):
-    """A recording that is finished at the end of the block."""
     with contextlib.closing(RecordingWriter(path)) as writer:
         yield writer
         writer.finish(dropped)
@@ -108,12 +105,9 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
     """Ints beyond 64 bits signed, and 3,000 mutated messages of every topic."""
     random = np.random.default_rng(1)
     good = [
-        encode(make_state(1, episode=2**63)),
-        encode(make_state(1)),
-        encode(make_command(1)),
-        encode(health(1, 2.0, stale=2**63)),
-        encode_scene({"vehicles": []}, Stamps(1, 1, 0.1)),
-    ]
+        encode(make_state(1, episode=2**63)), encode(make_state(1)), encode(make_command(1)),
+        encode(health(1, 2.0, stale=2**63)), encode_scene({"vehicles": []}, Stamps(1, 1, 0.1)),
+    ]  # fmt: skip
     with writing(tmp_path / "a.mcap") as writer:
         for number in range(3000):
             payload = bytearray(good[number % len(good)])
@@ -130,7 +124,6 @@ def test_no_payload_stops_the_recorder_or_a_replay(tmp_path):
 
 
 def start_record(endpoint: str, path: Path, *options: str) -> BridgeProcess:
-    """Start ``record`` and wait until it writes."""
     run = BridgeProcess("record", "--out", str(path), "--connect", endpoint, *options)
     # A file is made before its first bytes are in it.
     wait_until(lambda: path.exists() and path.stat().st_size > 0, "the recording to begin")
@@ -150,7 +143,6 @@ def states_in(path: Path) -> list[tuple[int, Any]]:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """A recorded drive in lock-step, and its report."""
     folder, endpoint = tmp_path_factory.mktemp("drive"), free_endpoint()
     recording, out = folder / "drive.mcap", folder / "r.json"
     with (
@@ -170,12 +162,12 @@ def test_everything_on_the_wire_is_recorded_and_mcap_reads_it(drive):
     with recording.open("rb") as stream:
         for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
             counts[channel.topic] += 1
-    assert counts["phil/hunter01/state"] == counts["view/hunter01/frames"] == steps + 1
-    assert counts["phil/hunter01/scene"] == counts["view/hunter01/scene"] == steps + 1
-    assert counts["phil/hunter01/command"] >= steps
-    assert counts["phil/hunter01/health"] >= 1
-    assert counts["phil/hunter01/alive"] >= 1  # It came.
-    assert counts["phil/hunter01/simulator"] == 2  # It came, and it went.
+    name = "hunter01"
+    for topic in ("phil/{}/state", "phil/{}/scene", "view/{}/frames", "view/{}/scene"):
+        assert counts[topic.format(name)] == steps + 1
+    for topic, least in (("command", steps), ("health", 1), ("alive", 1)):  # The last: it came.
+        assert counts[f"phil/{name}/{topic}"] >= least
+    assert counts[f"phil/{name}/simulator"] == 2  # It came, and it went.
     assert [state.step for _, state in states_in(recording)] == list(range(steps + 1))
 
 
@@ -271,37 +263,28 @@ def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
 
 def test_a_feed_that_falls_behind_drops_and_counts():
     feed, endpoint = WireListener(), free_endpoint()
-    session = open_session(listen=endpoint, mode="router")
-    try:
+    with contextlib.closing(open_session(listen=endpoint, mode="router")) as session:
         subscriber = session.declare_subscriber("phil/v/state", feed.hearer("state"))
         for _ in range(QUEUE_MESSAGES + 5):
             session.put("phil/v/state", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
         wait_until(lambda: feed.dropped == 5, "the queue to be full")
         subscriber.undeclare()
-    finally:
-        session.close()
     assert feed.waiting == QUEUE_MESSAGES
 
 
-class WithoutSimulator(WireListener):
-    """An edge runtime behind a router, whose simulator has gone: it goes on saying how it is."""
+def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path, monkeypatch):
+    """It is behind a router, its simulator has gone, and it goes on saying how it is."""
+    listener = WireListener()
+    listener.simulator_gone.set()
+    said = iter([Heard("phil/car/health", "health", b"", 1, 0)] * 1000)
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.simulator_gone.set()
-        self.said = 0
-
-    def next(self, timeout_s: float) -> Heard | None:
+    def hear(_timeout_s):
         time.sleep(0.005)
-        self.said += 1
-        if self.said > 1000:
-            raise AssertionError("it listens on")
-        return Heard("phil/car/health", "health", b"", 1, 0)
+        return next(said)  # They come to an end where it listens on.
 
-
-def test_a_recording_ends_though_an_edge_runtime_stays(tmp_path):
+    monkeypatch.setattr(listener, "next", hear)
     with writing(tmp_path / "drive.mcap") as writer:
-        _listen(WithoutSimulator(), writer, SimpleNamespace(duration_s=None, linger_s=0.05))
+        _listen(listener, writer, SimpleNamespace(duration_s=None, linger_s=0.05))
     assert writer.messages > 0
 
 
@@ -337,7 +320,6 @@ def without_chunk(number: int) -> list[tuple[str, int, bytes]]:
 
 @pytest.fixture
 def repair(capsys):
-    """Run ``bridge repair`` to a good end; return what it prints."""
 
     def repaired(*arguments):
         capsys.readouterr()
@@ -398,14 +380,6 @@ def test_a_replay_says_damaged_and_replays_the_rest(tmp_path, capsys):
     assert line.startswith("the recording is damaged (1 damaged place of")
 
 
-def test_a_broken_index_is_written_anew_and_no_message_is_lost(copy, repair):
-    flip(copy, copy.stat().st_size - 100)
-    count = len(told_in(LEFT_TURN))
-    assert f"{count} messages; left out: 1 damaged place" in repair(copy)
-    with copy.open("rb") as stream:
-        assert len(list(make_reader(stream).iter_messages())) == count
-
-
 def test_bytes_that_are_gone_take_no_more_with_them(copy):
     """The index is not where it says; its names are good all the same."""
     data = copy.read_bytes()
@@ -435,16 +409,22 @@ def test_a_file_without_a_checksum_over_all_of_it_is_not_called_whole(copy, tmp_
     assert "is whole" in repair(out)
 
 
-def test_a_change_outside_of_the_chunks_is_said_and_mended(copy, tmp_path, repair):
-    whole = tmp_path / "whole.mcap"
-    repair(copy, "--out", whole)
-    flip(whole, chunks(whole)[3].chunk_start_offset + 9)  # when its first message came
-    said = repair(whole)
-    assert (
-        f"{len(told_in(LEFT_TURN))} messages; left out: bytes that changed outside of its chunks"
-        in said
-    )
+@pytest.mark.parametrize(
+    ("at", "says"),
+    [
+        (lambda path: path.stat().st_size - 100, "1 damaged place"),  # in the index
+        # when the first message of a chunk came
+        (lambda path: chunks(path)[3].chunk_start_offset + 9, "bytes that changed outside of its"),
+    ],
+)
+def test_what_is_broken_outside_of_the_chunks_is_said_and_mended(copy, tmp_path, repair, at, says):
+    whole, count = tmp_path / "whole.mcap", len(told_in(LEFT_TURN))
+    repair(copy, "--out", whole)  # with a checksum over all of it
+    flip(whole, at(whole))
+    assert f"{count} messages; left out: {says}" in repair(whole)
     assert whole.with_name("whole.mcap.damaged").exists()
+    with whole.open("rb") as stream:
+        assert len(list(make_reader(stream).iter_messages())) == count
     assert "is whole" in repair(whole)
 
 
@@ -497,7 +477,6 @@ def small(tmp_path_factory):
 
 
 def is_whole(path) -> bool:
-    """Whether `repair` would say so."""
     recording = Recording(path)
     try:
         collections.deque(recording.messages(), maxlen=0)
@@ -522,7 +501,6 @@ HEADER_BYTES = 17
 
 
 def zeros(mib: int, tells_size: bool = True) -> bytes:
-    """That many MiB, compressed to almost nothing."""
     stream = io.BytesIO()
     compressor = zstandard.ZstdCompressor(write_content_size=tells_size)
     with compressor.stream_writer(stream, size=mib * MIB, closefd=False) as writer:
@@ -531,20 +509,19 @@ def zeros(mib: int, tells_size: bool = True) -> bytes:
     return stream.getvalue()
 
 
-def crafted(path, *chunks: tuple[bytes, int], filling: bytes = b""):
+def crafted(path, *chunks: tuple[bytes, int]):
     """A recording of chunks, each of its data and of what it announces to unpack to."""
     builder = RecordBuilder()
     builder.write(MCAP0_MAGIC)
     Header("", "").write(builder)
     for data, announced in chunks:
         Chunk("zstd", data, 0, 0, 0, announced).write(builder)
-    path.write_bytes(builder.end() + filling)
+    path.write_bytes(builder.end())
     return path
 
 
 @pytest.fixture
 def unpacked(monkeypatch):
-    """The sizes of the chunks that are unpacked."""
     sizes, breakup = [], records.breakup_chunk
 
     def count(chunk, validate_crc):
@@ -556,25 +533,21 @@ def unpacked(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("mib", "announced_mib", "tells_size", "count", "most_mib"),
+    ("mib", "said_mib", "tells_size", "count", "most_mib"),
     [(1024, 1024, True, 40, 0), (1024, 1, True, 40, 0), (1024, 1024, False, 40, 0),
      (64, 1, False, 1, 1)],
 )  # fmt: skip
-def test_a_chunk_that_unpacks_to_too_much_is_passed_over(
-    tmp_path, unpacked, mib, announced_mib, tells_size, count, most_mib
-):
+def test_a_bomb_is_passed_over(tmp_path, unpacked, mib, said_mib, tells_size, count, most_mib):
     """Whether the chunk says so itself, or its data alone do, or neither."""
     bomb = zeros(mib, tells_size)
-    path = crafted(tmp_path / "bomb.mcap", *[(bomb, announced_mib * MIB)] * count)
+    path = crafted(tmp_path / "bomb.mcap", *[(bomb, said_mib * MIB)] * count)
     recording = Recording(path)
     assert list(recording.messages()) == []
     assert recording.damaged_bytes == path.stat().st_size - len(MCAP0_MAGIC) - HEADER_BYTES
     assert sum(unpacked) <= most_mib * MIB
 
 
-def test_chunks_that_unpack_to_too_much_together_are_refused(
-    tmp_path, monkeypatch, unpacked, refusal
-):
+def test_many_small_bombs_together_are_refused(tmp_path, monkeypatch, unpacked, refusal):
     monkeypatch.setattr(records, "MAX_CHUNK_BYTES", MIB)
     path = crafted(tmp_path / "bomb.mcap", *[(zeros(1), MIB)] * 100)
     for command in (["repair"], ["view", "--save", str(tmp_path / "a.rrd")]):
@@ -595,8 +568,6 @@ def test_empty_messages_count_though_they_hardly_have_bytes(tmp_path):
 
 
 class ReadCounting(io.BytesIO):
-    """A file in memory that counts what is read of it."""
-
     name = "crafted.mcap"
     read_bytes = 0
 

@@ -1,7 +1,5 @@
 """``python -m bridge replay``: recordings written by hand, whose right answers are known."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -74,7 +72,6 @@ def hand(tmp_path):
 
 
 def replay(hand, policy=None, *options):
-    """Replay in process what was written by hand; the exit status and the report."""
     hand.close()
     folder, out = hand.path.parent, hand.path.with_suffix(".json")
     policy = policy or make_policy(folder, "constant", 0.3)
@@ -111,9 +108,8 @@ def test_another_policy_differs_and_the_tolerance_decides(hand, tmp_path, capsys
     first = report["first_differences"][0]
     assert (first["session"], first["episode"], first["step"]) == ("here", 0, 0)
     assert first["recorded"] == [{"mode": "drive", "reason": "", "action": [0.3]}]
-    assert (
-        "episode 0 step 0: recorded drive [0.3]; replayed drive [0.31]" in capsys.readouterr().out
-    )
+    line = "episode 0 step 0: recorded drive [0.3]; replayed drive [0.31]"
+    assert line in capsys.readouterr().out
     assert replay(hand, policy, "--tolerance", "0.02")[0] == 0
 
 

@@ -1,7 +1,5 @@
 """What is said of a drive: a line an episode, the last line, a vehicle's errors and its lag."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex
@@ -10,17 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bridge.report import (
-    LAG_STEP_S,
-    EpisodeResult,
-    SafeStopEvent,
-    TrackingLog,
-    episode_line,
-    make_report,
-    markdown_table,
-    summarise,
-    summary_line,
-)
+from bridge import report as reports
 from bridge.tests.harness import (
     SHORT_TOY,
     SLOW_TOY,
@@ -34,13 +22,13 @@ from bridge.tests.harness import (
 from edge_runtime.__main__ import main as edge_main
 from edge_runtime.transport import free_endpoint
 
-RESULT = EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, 0.0, 123)
+RESULT = reports.EpisodeResult(0, "goal", 21.0, 1.0, 12.3, 0.0, 0.0, 123)
 
 
 def report_of(outcomes, stops=(), rejected=None):
-    return make_report(
+    return reports.make_report(
         [replace(RESULT, outcome=outcome) for outcome in outcomes],
-        [SafeStopEvent(0, 3, reason, 0.2) for reason in stops],
+        [reports.SafeStopEvent(0, 3, reason, 0.2) for reason in stops],
         latencies_ms=[1.0],
         command_ages_ms=[1.0],
         facts={
@@ -52,24 +40,24 @@ def report_of(outcomes, stops=(), rejected=None):
 
 def test_every_outcome_is_named_and_every_reason():
     outcomes = ["goal", "timeout", "goal", "collision", "timeout", "timeout"]
-    line = summary_line(report_of(outcomes, ["no_command", "no_command", "vehicle_fault"]))
+    line = reports.summary_line(report_of(outcomes, ["no_command", "no_command", "vehicle_fault"]))
     assert line == (
         "6 episodes: 2 goal (33%), 3 timeout (50%), 1 collision (17%); latency p50 1.0 ms,"
         " p99 1.0 ms; 3 safe stops (2 no_command, 1 vehicle_fault); 0 rejected messages"
     )
-    line = summary_line(report_of(["timeout"], ["no_command"], {"stale": 2}))
+    line = reports.summary_line(report_of(["timeout"], ["no_command"], {"stale": 2}))
     assert "0 goal (0%), 1 timeout (100%)" in line
     assert "1 safe stop (1 no_command); 2 rejected messages (2 stale)" in line
     assert "38" not in line  # A stop is told as a stop, and not as missed deadlines.
-    assert episode_line(2, 5, RESULT, []) == "episode 2 of 5: goal after 12.3 s"
-    stop = SafeStopEvent(1, 3, "no\x1bcommand", 0.2)
-    assert episode_line(2, 5, RESULT, [stop]).endswith("; 1 safe stop (1 no\\x1bcommand)")
+    assert reports.episode_line(2, 5, RESULT, []) == "episode 2 of 5: goal after 12.3 s"
+    stop = reports.SafeStopEvent(1, 3, "no\x1bcommand", 0.2)
+    assert reports.episode_line(2, 5, RESULT, [stop]).endswith("; 1 safe stop (1 no\\x1bcommand)")
 
 
 def test_summarise_by_hand():
     ends = {"goal": 10.0, "collision": 20.0}.items()
     results = [replace(RESULT, outcome=outcome, distance_m=way_m) for outcome, way_m in ends]
-    report = summarise(results, "left_turn", "nominal", "id", 7)
+    report = reports.summarise(results, "left_turn", "nominal", "id", 7)
     assert report["success_rate"] == report["collision_rate"] == 0.5
     assert report["surviving_distance_m"] == {"mean": 15.0, "std": 5.0}
     assert set(report) == {
@@ -79,11 +67,11 @@ def test_summarise_by_hand():
     }  # fmt: skip
     json.dumps(report, allow_nan=False)
     with pytest.raises(ValueError, match="no episode"):
-        summarise([], "left_turn", "nominal", "id", 7)
+        reports.summarise([], "left_turn", "nominal", "id", 7)
 
 
 def test_a_table_in_markdown_keeps_its_columns():
-    lines = markdown_table(["row", "p50"], [["a|b", 1], ["c", None]])
+    lines = reports.markdown_table(["row", "p50"], [["a|b", 1], ["c", None]])
     assert list(lines) == ["| row | p50 |", "|---|---|", "| a/b | 1 |", "| c | None |", ""]
 
 
@@ -94,7 +82,6 @@ def test_without_a_terminal_each_episode_is_told_as_it_ends(tmp_path):
         start_edge(endpoint, policy),
         start_simulate(endpoint, tmp_path / "r.json", SHORT_TOY, *options) as run,
     ):
-        assert run.process.stderr is not None
         first = run.process.stderr.readline()
         assert run.process.poll() is None  # It comes while the others are still driven.
         assert run.wait() == 0
@@ -105,7 +92,6 @@ def test_without_a_terminal_each_episode_is_told_as_it_ends(tmp_path):
 
 
 def test_a_car_that_waits_for_its_rearm_says_so_at_both_ends_with_the_command(tmp_path):
-    """And the command is the right one."""
     policy, endpoint, log = make_policy(tmp_path, "constant"), free_endpoint(), tmp_path / "log"
     config = tmp_path / "edge.toml"
     config.write_text("armed_at_start = false\n")
@@ -115,7 +101,6 @@ def test_a_car_that_waits_for_its_rearm_says_so_at_both_ends_with_the_command(tm
         start_edge(endpoint, policy, "--vehicle", "mock", "--config", str(config), stderr=errors),
         start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY, "--clock", "realtime") as run,
     ):
-        assert run.process.stderr is not None
         told = run.process.stderr.readline()
         assert told == f"the vehicle stands until it is re-armed: {rearm}\n"
         assert f"waits_for_rearm command='{rearm}'" in log.read_text()
@@ -129,7 +114,6 @@ STEPS = 120
 
 
 def asked_at(step):
-    """A pedal that wanders like a policy's, float in [-1, 1]."""
     return float(np.clip(0.7 * math.sin(0.31 * step) + 0.5 * math.sin(0.113 * step), -1, 1))
 
 
@@ -139,7 +123,7 @@ def ns(time_s):
 
 def log_of(reached, episodes=2):
     """The log of a vehicle that has reached ``reached(t)`` at t, in each of the episodes."""
-    log = TrackingLog()
+    log = reports.TrackingLog()
     for zero_s in (0.0, 100.0)[:episodes]:
         log.begin()
         for step in range(STEPS):
@@ -168,7 +152,7 @@ def follower(dead_s, constant_s):
 
 
 def begun():
-    log = TrackingLog()
+    log = reports.TrackingLog()
     log.begin()
     return log
 
@@ -205,7 +189,7 @@ def test_a_speed_is_compared_with_its_set_point_at_the_same_moment():
             )
         )  # fmt: skip
     report = log.report([])
-    assert report["lag_ms"] == {"speed": pytest.approx(200, abs=1e3 * LAG_STEP_S)}
+    assert report["lag_ms"] == {"speed": pytest.approx(200, abs=1e3 * reports.LAG_STEP_S)}
     assert report["speed_error_mps"]["max"] == pytest.approx(2 * math.sin(0.2), abs=0.01)
     assert report["scale"] == pytest.approx(0.25)
 
@@ -215,7 +199,7 @@ def test_what_was_not_measured_is_none():
     report = log_of(lambda time_s: 0.5).report(["pedal"])
     assert report["speed_error_mps"] == none
     assert (report["lag_ms"]["speed"], report["scale"]) == (None, None)
-    nothing = TrackingLog().report(["pedal"])
+    nothing = reports.TrackingLog().report(["pedal"])
     assert nothing["action_error"] == {"pedal": none}
     assert nothing["lag_ms"] == {"speed": None, "pedal": None}
     log = begun()

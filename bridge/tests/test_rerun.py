@@ -1,7 +1,5 @@
 """The views in rerun: geometry, pace, where a recording goes, and `bridge view` beside a drive."""
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -20,31 +18,12 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 import bridge.rerun
+from bridge import messages
 from bridge.__main__ import main
-from bridge.messages import (
-    Pace,
-    Scene,
-    SeenCar,
-    SeenScene,
-    Stamps,
-    decode_scene,
-    encode_scene,
-    read_scene,
-)
 from bridge.rerun import Sink, check_sink, flush, free_port, open_sink, read_sink
 from bridge.rerun.draw import outline, view_bounds
 from bridge.rerun.wire_view import Timeline, WireLog
-from bridge.tests.harness import (
-    LEFT_TURN,
-    SLOW_TOY,
-    BridgeProcess,
-    flip_chunk,
-    make_command,
-    make_policy,
-    rerun,
-    start_edge,
-    start_simulate,
-)
+from bridge.tests import harness
 from bridge.tests.toy import ToyEnv
 from bridge.tests.viewers import NO_GPU, in_place, listens
 from edge_runtime.tests.harness import make_state, wait_until
@@ -53,17 +32,17 @@ from edge_runtime.util import UserError
 
 
 def test_a_car_that_heads_down_the_picture_is_long_in_y():
-    car = SeenCar(x=5.0, y=2.0, heading_rad=math.pi / 2, length_m=4.0, width_m=2.0)
+    car = messages.SeenCar(x=5.0, y=2.0, heading_rad=math.pi / 2, length_m=4.0, width_m=2.0)
     xs, ys = zip(*outline(car), strict=True)
     assert (min(xs), max(xs)) == pytest.approx((4.0, 6.0))
     assert (min(ys), max(ys)) == pytest.approx((0.0, 4.0))
-    x_range, y_range = view_bounds(SeenScene(vehicles=[car]))
+    x_range, y_range = view_bounds(messages.SeenScene(vehicles=[car]))
     assert x_range[0] < 4.0 < 6.0 < x_range[1]
     assert y_range[0] < 0.0 < 4.0 < y_range[1]
 
     def bounds(x):
-        car = SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
-        return view_bounds(SeenScene(path=[[0.0, 0.0], [10.0, 0.0]], vehicles=[car]))
+        car = messages.SeenCar(x=x, y=0.0, heading_rad=0.0, length_m=4.0, width_m=2.0)
+        return view_bounds(messages.SeenScene(path=[[0.0, 0.0], [10.0, 0.0]], vehicles=[car]))
 
     assert bounds(-60.0) == bounds(5.0)  # One far from the path does not shrink the picture.
     assert bounds(-15.0)[0][0] == pytest.approx(bounds(5.0)[0][0] - 15.0)
@@ -71,30 +50,26 @@ def test_a_car_that_heads_down_the_picture_is_long_in_y():
 
 def test_episodes_stand_end_to_end():
     timeline = Timeline()
-    assert timeline.place(0, 0).total_step == 0
-    assert timeline.place(0, 7).total_step == 7
-    assert timeline.place(1, 0).total_step == 8
-    assert timeline.place(0, 5).total_step == 5
+    steps = [timeline.place(*place).total_step for place in ((0, 0), (0, 7), (1, 0), (0, 5))]
+    assert steps == [0, 7, 8, 5]
     late = timeline.place(1, 2)
     assert (late.episode_time_s, late.sim_time_s) == (0.2, 1.0)
 
 
 def test_a_scene_is_read_without_what_is_not_drawn():
     scene = {
-        "roads": [[[0.0, 0.0], [9.0, 0.0]]],
-        "goal": [9.0, 0.0],
-        "stop_line": [1.0, 2.0],
+        "roads": [[[0.0, 0.0], [9.0, 0.0]]], "goal": [9.0, 0.0], "stop_line": [1.0, 2.0],
         "vehicles": [{"id": 7, "x": 1.0, "y": 2.0, "heading_rad": 0.0, "length_m": 4.0,
                       "width_m": 2.0, "speed_mps": 3.0, "ego": True}],
     }  # fmt: skip
-    seen = read_scene(scene)
+    seen = messages.read_scene(scene)
     assert (seen.roads, seen.goal, seen.path) == ([[[0.0, 0.0], [9.0, 0.0]]], [9.0, 0.0], ())
-    assert seen.vehicles == [SeenCar(1.0, 2.0, 0.0, 4.0, 2.0, ego=True)]
+    assert seen.vehicles == [messages.SeenCar(1.0, 2.0, 0.0, 4.0, 2.0, ego=True)]
 
 
 @given(st.lists(st.floats(0, 0.2), min_size=1, max_size=300), st.floats(1, 100))
 def test_no_rate_is_passed(steps, rate_hz):
-    pace, now_s, passed = Pace(1.0 / rate_hz), 0.0, 0
+    pace, now_s, passed = messages.Pace(1.0 / rate_hz), 0.0, 0
     for step in steps:
         now_s += step
         passed += pace.due(now_s)
@@ -104,15 +79,15 @@ def test_no_rate_is_passed(steps, rate_hz):
 
 @given(st.lists(st.floats(-0.02, 0.02), min_size=50, max_size=200))
 def test_jitter_at_the_rate_itself_costs_nothing(jitters):
-    pace = Pace(0.05)
+    pace = messages.Pace(0.05)
     assert all(pace.due(step * 0.05 + jitter) for step, jitter in enumerate(jitters))
 
 
 def test_what_comes_faster_is_thinned_out_and_a_pause_brings_no_burst():
-    pace = Pace(0.1)
+    pace = messages.Pace(0.1)
     assert sum(pace.due(0.01 * n) for n in range(1000)) == pytest.approx(100, abs=2)
     assert sum(pace.due(60.0 + 0.01 * n) for n in range(100)) == pytest.approx(10, abs=2)
-    pace = Pace(0.0)
+    pace = messages.Pace(0.0)
     assert all(pace.due(now_s) for now_s in [0.0, 0.0, 5.0, 5.0, 4.0])
 
 
@@ -218,48 +193,36 @@ def test_what_the_trainer_takes_loads_neither_zenoh_nor_rerun():
 
 
 def verify(recording):
-    """Fail unless rerun itself can read the recording; return what it holds."""
-    rerun("rrd", "verify", str(recording))
-    return rerun("rrd", "stats", str(recording))
+    harness.rerun("rrd", "verify", str(recording))
+    return harness.rerun("rrd", "stats", str(recording))
 
 
-def start_view(endpoint, path, *options):
-    return BridgeProcess("view", "--save", str(path), "--connect", endpoint, *options)
-
-
-def test_a_view_records_the_drive_and_ends_with_the_simulator(tmp_path):
+@pytest.mark.parametrize(
+    "told", ["the drive ends", "the view is interrupted", "the simulator is killed"]
+)
+def test_a_view_keeps_what_it_recorded_and_ends_with_the_simulator(told, tmp_path):
     endpoint, recording = free_endpoint(), tmp_path / "drive.rrd"
-    policy = make_policy(tmp_path, "constant")
+    words = ("view", "--save", str(recording), "--connect", endpoint)
     with (
-        start_view(endpoint, recording) as view,
-        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY) as run,
+        harness.BridgeProcess(*words) as view,
+        harness.start_simulate(endpoint, tmp_path / "r.json", harness.SLOW_TOY) as run,
     ):
         wait_until(lambda: list(tmp_path.glob(".drive.rrd*")), "the recording to begin")
-        with start_edge(endpoint, policy):
-            assert run.wait() == 0, run.errors
+        if told == "the drive ends":
+            with harness.start_edge(endpoint, harness.make_policy(tmp_path, "constant")):
+                assert run.wait() == 0, run.errors
+        else:
+            time.sleep(0.3)
+            assert not recording.exists()
+            if told == "the view is interrupted":
+                view.process.send_signal(signal.SIGTERM)
+            else:
+                run.process.kill()
         assert view.wait(20) == 0, view.errors
     found = verify(recording)
     entities = ("frames/now", "road/ego/body", "action/asked", "latency/round_trip", "mode/mode")
-    assert [entity for entity in entities if entity not in found] == []
-
-
-@pytest.mark.parametrize("told", ["the view is interrupted", "the simulator is killed"])
-def test_a_view_that_ends_early_keeps_what_it_recorded(told, tmp_path):
-    endpoint, recording = free_endpoint(), tmp_path / "cut.rrd"
-    with (
-        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY) as run,
-        start_view(endpoint, recording) as view,
-    ):
-        wait_until(lambda: list(tmp_path.glob(".cut.rrd*")), "the recording to begin")
-        time.sleep(0.3)
-        assert not recording.exists()
-        if told == "the view is interrupted":
-            view.process.send_signal(signal.SIGTERM)
-        else:
-            run.process.kill()
-        assert view.wait(20) == 0, view.errors
-    verify(recording)
-    assert list(tmp_path.glob(".cut*")) == []
+    assert told != "the drive ends" or [one for one in entities if one not in found] == []
+    assert list(tmp_path.glob(".drive*")) == []
 
 
 def test_a_late_viewer_does_not_call_it_silence(monkeypatch):
@@ -272,29 +235,24 @@ def test_a_late_viewer_does_not_call_it_silence(monkeypatch):
     assert events == ["no command: the simulator brakes by itself"]
 
 
-def test_a_recording_is_shown_without_a_drive(tmp_path, capsys):
-    out = tmp_path / "left_turn.rrd"
-    assert main(["view", str(LEFT_TURN), "--save", str(out)]) == 0
-    found = verify(out)
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_recording_is_shown_without_a_drive_and_without_what_is_broken(damaged, tmp_path, capsys):
+    path, out = tmp_path / "drive.mcap", tmp_path / "drive.rrd"
+    shutil.copy(harness.LEFT_TURN, path)
+    if damaged:
+        harness.flip_chunk(path, 3)
+    assert main(["view", str(path), "--save", str(out)]) == 0
+    found, said = verify(out), capsys.readouterr()
     entities = ("frames/now", "road/ego/body", "road/roads", "action/asked", "latency/uplink",
                 "latency/inference", "mode/reason", "rejected/edge/all")  # fmt: skip
     assert [entity for entity in entities if entity not in found] == []
-    assert capsys.readouterr().out == f"wrote {out}\n"
-
-
-def test_a_damaged_recording_is_shown_without_what_is_broken(tmp_path, capsys):
-    damaged, out = tmp_path / "drive.mcap", tmp_path / "drive.rrd"
-    shutil.copy(LEFT_TURN, damaged)
-    flip_chunk(damaged, 3)
-    assert main(["view", str(damaged), "--save", str(out)]) == 0
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "is damaged (1 damaged place of" in line
-    assert "road/ego/body" in verify(out)
+    assert said.out == f"wrote {out}\n"
+    assert len(said.err.splitlines()) == damaged
+    assert ("is damaged (1 damaged place of" in said.err) is damaged
 
 
 @pytest.fixture
 def kept(monkeypatch):
-    """The numbers that a log draws, by entity."""
     numbers: dict[str, list[float]] = {}
     monkeypatch.setattr(
         WireLog, "_scalar", lambda _, path, value: numbers.setdefault(path, []).append(value)
@@ -303,7 +261,7 @@ def kept(monkeypatch):
 
 
 def make_scene(**fields):
-    return Scene(episode=0, step=9, sim_time_s=0.9, **fields)
+    return messages.Scene(episode=0, step=9, sim_time_s=0.9, **fields)
 
 
 def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(kept):
@@ -313,7 +271,7 @@ def test_a_round_trip_is_split_once_by_the_stamps_of_its_own_state(kept):
         sent_ns = 10**18 + step * 100 * ms
         log.write_state(make_state(step, sent_ns=sent_ns), sent_ns)
         received_ns = sent_ns + (20 + step) * ms
-        command = make_command(
+        command = harness.make_command(
             step, received_ns=received_ns, inference_ns=2 * ms, sent_ns=received_ns + 3 * ms
         )
         log.write_command(command, received_ns)
@@ -356,10 +314,10 @@ def test_live_pictures_are_at_most_ten_a_second(monkeypatch):
 def test_a_scene_survives_the_wire_with_numpy_numbers_inside_and_what_is_none_is_none():
     environment = ToyEnv()
     environment.reset(seed=1)
-    stamps = Stamps(episode=2, step=3, sim_time_s=0.3, rejected={"stale": 2})
-    scene = decode_scene(encode_scene(environment.scene(), stamps))
+    stamps = messages.Stamps(episode=2, step=3, sim_time_s=0.3, rejected={"stale": 2})
+    scene = messages.decode_scene(messages.encode_scene(environment.scene(), stamps))
     assert scene is not None
     assert (scene.episode, scene.step, scene.vehicles[0].ego) == (2, 3, True)
     assert scene.path == [[0.0, 0.0], [14.0, 0.0]]
     for payload in (b"", b"\xc1", b"\x80", bytes(70_000)):
-        assert decode_scene(payload) is None
+        assert messages.decode_scene(payload) is None

@@ -1,7 +1,5 @@
 """Our messages as ROS 2 messages: by hand, and over their whole range."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import json
@@ -15,28 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge import ros2
 from bridge.messages import Heard
-from bridge.ros2 import (
-    UNKNOWN,
-    DeadReckoning,
-    Outlet,
-    Policies,
-    Policy,
-    drive_of,
-    image_of,
-    odometry_of,
-    twist_of,
-)
-from bridge.tests.harness import (
-    SLOW_TOY,
-    BridgeProcess,
-    make_command,
-    make_feedback,
-    make_policy,
-    read,
-    start_edge,
-    start_simulate,
-)
+from bridge.tests import harness
 from edge_runtime.tests import ros2_side
 from edge_runtime.tests.harness import make_state, wait_until
 from edge_runtime.transport import free_endpoint, open_session
@@ -45,21 +24,22 @@ from edge_runtime.vehicles.mapping import CARS
 from edge_runtime.vehicles.ros2 import topic_key
 from edge_runtime.wire import encode
 
-PEDAL = Policy(["pedal"], CARS["left_turn"])
-STEERING = Policy(["steering"], CARS["congestion"])
+PEDAL = ros2.Policy(["pedal"], CARS["left_turn"])
+STEERING = ros2.Policy(["steering"], CARS["congestion"])
 S = 10**9
 
 
 def command(*action):
-    return make_command(1, action=list(action), sent_ns=3 * S + 5)
+    return harness.make_command(1, action=list(action), sent_ns=3 * S + 5)
 
 
 def feedback(speed_mps, *action, **changes):
-    return make_feedback(1, speed_mps=speed_mps, action=list(action), **changes)
+    return harness.make_feedback(1, speed_mps=speed_mps, action=list(action), **changes)
 
 
 def test_the_newer_frame_is_shown():
-    image = image_of(make_state(1, frames=bytes([1]) * 3600 + bytes([2]) * 3600, sent_ns=2 * S + 7))
+    frames = bytes([1]) * 3600 + bytes([2]) * 3600
+    image = ros2.image_of(make_state(1, frames=frames, sent_ns=2 * S + 7))
     assert image.data == bytes([2]) * 3600
     assert (image.header.stamp.sec, image.header.stamp.nanosec) == (2, 7)
 
@@ -69,18 +49,18 @@ def test_the_newer_frame_is_shown():
     [(1.0, 2.0, 2.3, 3.0), (-1.0, 2.0, 1.6, 4.0), (-1.0, 0.1, 0.0, 4.0), (1.0, 5.9, 6.0, 3.0)],
 )
 def test_a_pedal_is_the_speed_at_the_end_of_the_period(pedal, now_mps, speed, acceleration):
-    drive = drive_of(command(pedal), now_mps, PEDAL).drive
+    drive = ros2.drive_of(command(pedal), now_mps, PEDAL).drive
     assert (drive.speed, drive.acceleration) == pytest.approx((speed, acceleration))
     assert drive.steering_angle == 0.0
 
 
 def test_steering_to_the_right_is_negative_and_keeps_the_speed():
     """Congestion's +1 turns right, by 0.15 rad at a bicycle that turns about its centre."""
-    stamped = drive_of(command(1.0), 5.0, STEERING)
+    stamped = ros2.drive_of(command(1.0), 5.0, STEERING)
     assert (stamped.drive.speed, stamped.drive.acceleration) == (5.0, 0.0)
     curvature = -math.sin(math.atan(0.5 * math.tan(0.15))) / 2.5
     assert stamped.drive.steering_angle == pytest.approx(math.atan(5.0 * curvature))
-    twist = twist_of(stamped.drive, STEERING.car)
+    twist = ros2.twist_of(stamped.drive, STEERING.car)
     assert twist.linear.x == 5.0
     assert twist.angular.z == pytest.approx(5.0 * curvature)
 
@@ -88,17 +68,17 @@ def test_steering_to_the_right_is_negative_and_keeps_the_speed():
 @given(st.floats(-1, 1), st.floats(0, 20))
 def test_no_command_asks_for_more_than_the_car_can(value, speed_mps):
     for policy in (PEDAL, STEERING):
-        drive = drive_of(command(value), speed_mps, policy).drive
+        drive = ros2.drive_of(command(value), speed_mps, policy).drive
         assert 0.0 <= drive.speed <= 6.0
         assert abs(drive.steering_angle) < math.pi / 2
-        assert math.isfinite(twist_of(drive, policy.car).angular.z)
+        assert math.isfinite(ros2.twist_of(drive, policy.car).angular.z)
     # An action of more or fewer numbers than the policy's names is taken as none.
-    assert drive_of(command(0.5, 0.5), 1.0, PEDAL).drive.steering_angle == 0.0
+    assert ros2.drive_of(command(0.5, 0.5), 1.0, PEDAL).drive.steering_angle == 0.0
     assert PEDAL.action([], "pedal") is None
 
 
 def test_a_circle_of_dead_reckoning_ends_where_it_began():
-    pose = DeadReckoning()
+    pose = ros2.DeadReckoning()
     # 2 pi m at 1 m/s around a circle of 1 m to the left, in 100 steps.
     for step in range(101):
         pose.advance(1.0, 1.0, round(step * math.tau / 100 * S))
@@ -110,7 +90,7 @@ def test_a_circle_of_dead_reckoning_ends_where_it_began():
 
 
 def test_a_gap_and_a_clock_that_goes_back_invent_no_way():
-    pose = DeadReckoning()
+    pose = ros2.DeadReckoning()
     for time_ns in (100 * S, 50 * S, 50 * S):
         pose.advance(2.0, 0.0, time_ns)
     assert pose.way_m == 0.0
@@ -119,24 +99,22 @@ def test_a_gap_and_a_clock_that_goes_back_invent_no_way():
 
 
 def test_the_odometry_says_what_it_does_not_know():
-    pose = DeadReckoning()
+    pose = ros2.DeadReckoning()
     pose.advance(1.0, 0.0, 0)
     pose.advance(1.0, 0.0, S // 2)
-    unsteered = odometry_of(feedback(1.0, 0.5), pose, PEDAL.curvature([0.5]))
-    assert unsteered.pose.covariance[7] == unsteered.pose.covariance[35] == UNKNOWN
+    unsteered = ros2.odometry_of(feedback(1.0, 0.5), pose, PEDAL.curvature([0.5]))
+    assert unsteered.pose.covariance[7] == unsteered.pose.covariance[35] == ros2.UNKNOWN
     assert unsteered.pose.covariance[0] == pytest.approx(0.05**2)
     steered = feedback(1.0, -1.0)
     curvature = STEERING.curvature(steered.action, 0.25)
     assert curvature is not None
     assert curvature > 0  # to the left
-    message = odometry_of(steered, pose, curvature)
+    message = ros2.odometry_of(steered, pose, curvature)
     assert message.twist.twist.angular.z == pytest.approx(curvature)
     assert message.pose.covariance[35] == pytest.approx(0.05**2)
 
 
 class FakeNode:
-    """Where an Outlet would publish to: what was published, by topic."""
-
     def __init__(self):
         self.published = defaultdict(list)
 
@@ -151,7 +129,7 @@ def heard(topic, payload, at_s=0.0):
 
 def outlet_with(status, rate_hz=20.0):
     node: Any = FakeNode()
-    return node, Outlet(node, Policies(status, clock_s=lambda: 0.0), rate_hz)
+    return node, ros2.Outlet(node, ros2.Policies(status, clock_s=lambda: 0.0), rate_hz)
 
 
 def status_of(scenario, *names):
@@ -247,20 +225,22 @@ def ros2_machine(endpoint):
 
 def start_ros2(endpoint, ros_endpoint, out):
     words = ("--connect", endpoint, "--ros2-listen", ros_endpoint, "--out", str(out))
-    return BridgeProcess("ros2", *words)
+    return harness.BridgeProcess("ros2", *words)
 
 
 def test_a_drive_is_shown_to_ros_2_and_ends_with_the_simulator(tmp_path):
     endpoint, ros_endpoint, out = free_endpoint(), free_endpoint(), tmp_path / "ros2.json"
-    policy = make_policy(tmp_path, "constant", 0.5)
+    policy = harness.make_policy(tmp_path, "constant", 0.5)
     with (
-        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY, "--episodes", "2") as run,
+        harness.start_simulate(
+            endpoint, tmp_path / "r.json", harness.SLOW_TOY, "--episodes", "2"
+        ) as run,
         start_ros2(endpoint, ros_endpoint, out) as shown,
         ros2_machine(ros_endpoint) as (tokens, told),
     ):
         assert shown.process.stdout.readline().startswith("ready vehicle_id=hunter01")
         wait_until(lambda: len(tokens) == 5, "the tokens of four topics and the node")
-        with start_edge(endpoint, policy, "--vehicle", "mock"):
+        with harness.start_edge(endpoint, policy, "--vehicle", "mock"):
             assert run.wait() == 0, run.errors
         assert shown.wait(20) == 0, shown.errors
         wait_until(lambda: not tokens, "the tokens to go")
@@ -278,7 +258,7 @@ def test_a_drive_is_shown_to_ros_2_and_ends_with_the_simulator(tmp_path):
     ways = [message["pose"]["pose"]["position"]["x"] for message in told["odom"]]
     assert ways == sorted(ways)
     assert ways[-1] > 0
-    report = read(out)
+    report = harness.read(out)
     assert report["sent"]["hunter01/odom"] >= len(ways)
     assert report["dropped"] == 0
     assert "sent: hunter01/image_raw" in shown.output
@@ -287,7 +267,7 @@ def test_a_drive_is_shown_to_ros_2_and_ends_with_the_simulator(tmp_path):
 def test_a_sigterm_ends_it_with_its_counts(tmp_path):
     endpoint, out = free_endpoint(), tmp_path / "counts.json"
     with (
-        start_simulate(endpoint, tmp_path / "r.json", SLOW_TOY),
+        harness.start_simulate(endpoint, tmp_path / "r.json", harness.SLOW_TOY),
         start_ros2(endpoint, free_endpoint(), out) as shown,
     ):
         shown.process.stdout.readline()
@@ -299,7 +279,7 @@ def test_a_sigterm_ends_it_with_its_counts(tmp_path):
                 time.sleep(0.1)
         shown.process.send_signal(signal.SIGTERM)
         assert shown.wait(20) == 0, shown.errors
-    assert read(out)["rejected"]["feedback_malformed"] >= 1
+    assert harness.read(out)["rejected"]["feedback_malformed"] >= 1
 
 
 def test_a_sigterm_is_an_interrupt_before_the_session_opens(monkeypatch, refusal):

@@ -1,9 +1,4 @@
-"""A small environment that keeps the contract of the wire: a car on a straight road.
-
-Importing this registers it, so ``--env bridge.tests.toy:BridgeToy-v0`` works in another process.
-"""
-
-from __future__ import annotations
+"""A car on a straight road. Importing this registers it, also in another process (--env)."""
 
 import time
 from typing import Any
@@ -19,18 +14,14 @@ PERIOD_S = 0.1
 class ToyEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """Full pedal is 3 m/s2, full brake -4 m/s2; the picture's brightness follows the distance."""
 
-    def __init__(
-        self, goal_m: float = GOAL_M, max_steps: int = 80, wall_s: float = 0.0, reward: float = 0.1
-    ) -> None:
+    def __init__(self, goal_m=GOAL_M, max_steps=80, wall_s=0.0, reward=0.1) -> None:
         self.observation_space = spaces.Box(0, 255, (2, 45, 80), np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.brake_action = np.array([-1.0], np.float32)
         self._goal_m, self._max_steps, self._wall_s = goal_m, max_steps, wall_s
         self._reward = reward
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed=None, options=None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         self._steps, self._distance_m = 0, 0.0
         self._speed_mps = float(self.np_random.uniform(3.0, 5.0))
@@ -80,10 +71,5 @@ VARIANTS: dict[str, dict[str, float]] = {
 }
 for name, options in VARIANTS.items():
     if name not in gymnasium.registry:
-        gymnasium.register(
-            name,
-            entry_point="bridge.tests.toy:ToyEnv",
-            kwargs=options,
-            disable_env_checker=True,
-            order_enforce=False,
-        )
+        made: Any = {"entry_point": "bridge.tests.toy:ToyEnv", "kwargs": options}
+        gymnasium.register(name, **made, disable_env_checker=True, order_enforce=False)

@@ -45,7 +45,6 @@ def in_place(kind, folder, monkeypatch):
 
 
 def listens(host, port):
-    """Whether somebody answers there."""
     try:
         socket.create_connection((host, port), 1.0).close()
     except OSError:

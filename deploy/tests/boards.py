@@ -4,8 +4,6 @@ The bundle's wheels are the edge runtime's own and one of a single line, which p
 libraries of the Python that runs the tests: nothing is downloaded and little is unpacked.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import platform
@@ -71,13 +69,10 @@ class Workshop:
         return inputs._replace(**changes)  # type: ignore[arg-type]
 
     def make(self, value: float = 0.1, **changes: object) -> Made:
-        """A bundle for this computer."""
         return make_bundle(self.inputs(value, **changes), HERE, self.folder / "bundles")
 
 
 class Board:
-    """A root of its own on this computer."""
-
     def __init__(self, root: Path, workshop: Workshop) -> None:
         self.root = root
         self.workshop = workshop
@@ -88,26 +83,18 @@ class Board:
         self.installer = ["-m", "deploy.tests.process_service"]
 
     def command(self, command: str, *arguments: object) -> list[str]:
-        """The installer's command line."""
-        head = [sys.executable, *self.installer, command, "--root", str(self.root)]
-        return [*head, *map(str, arguments)]
+        words = [*self.installer, command, "--root", self.root, *arguments]
+        return [sys.executable, *map(str, words)]
 
-    def run(self, command: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-        """The installer as a process."""
-        return subprocess.run(
-            self.command(command, *arguments),
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
+    def run(self, command: str, *arguments: object):
+        line = self.command(command, *arguments)
+        return subprocess.run(line, capture_output=True, text=True, timeout=120)
 
-    def install(
-        self, bundle: Path, service: str = "none", *more: str
-    ) -> subprocess.CompletedProcess[str]:
-        """Install with the workshop's key and a short settling time."""
+    def install(self, bundle: Path, service: str = "none", *more: str):
         trust = ("--trust", str(self.workshop.public_key))
         return self.run("install", bundle, *trust, "--service", service, *QUICK, *more)
 
     def status(self) -> dict:
-        """What `status --json` says."""
         done = self.run("status", "--json")
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)

@@ -3,8 +3,6 @@
 ``python -m deploy.tests.process_service`` takes what `install.pyz` takes, and `--service process`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

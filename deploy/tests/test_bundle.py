@@ -1,7 +1,5 @@
 """What goes into a bundle, that it is the same again, its wheels, and which bundle is believed."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os
@@ -33,18 +31,9 @@ from deploy.bundle import (
     make_bundle,
     read_lock,
 )
+from deploy.installer import verify
 from deploy.installer.__main__ import trusted_key
 from deploy.installer.layout import Layout, unpack_wheel
-from deploy.installer.verify import (
-    MANIFEST,
-    Manifest,
-    parse_manifest,
-    read_bundle,
-    read_public_key,
-    ssh_key,
-    to_json,
-)
-from deploy.installer.verify import UserError as InstallerError
 from deploy.tests.boards import HERE
 from edge_runtime.config import load_config
 from edge_runtime.tests.harness import exit_status
@@ -55,10 +44,9 @@ MAX_JETPACK5_BYTES = 45_000_000
 
 @pytest.fixture(scope="module")
 def party(tmp_path_factory):
-    """A vehicle's TLS folder, and another vehicle's."""
     folder = tmp_path_factory.mktemp("tls") / "certs"
-    assert exit_status(main, ["certs", "--out", str(folder), "--vehicle-id", "hunter01",
-                          "--vehicle-id", "other"]) == 0  # fmt: skip
+    words = ["certs", "--out", str(folder), "--vehicle-id=hunter01", "--vehicle-id=other"]
+    assert exit_status(main, words) == 0
     (folder / "edge-hunter01" / "ca.key.pem").write_text("never to leave the workstation")
     return folder
 
@@ -71,13 +59,11 @@ def read(made) -> dict[str, bytes]:
 def test_the_same_inputs_give_the_same_bytes(workshop, tmp_path):
     again = build_edge_wheel(tmp_path)
     assert again.read_bytes() == workshop.edge_wheel.read_bytes()
-    inputs = workshop.inputs()
-    one = make_bundle(inputs, HERE, tmp_path / "one")
-    two = make_bundle(inputs._replace(wheels=[again, workshop.host]), HERE, tmp_path / "two")
-    assert one.path.name == two.path.name
-    assert one.path.read_bytes() == two.path.read_bytes()
-    signatures = [made.path.with_name(f"{made.path.name}.sig") for made in (one, two)]
-    assert signatures[0].read_bytes() == signatures[1].read_bytes()
+    inputs, made = workshop.inputs(), []
+    for number, each in enumerate((inputs, inputs._replace(wheels=[again, workshop.host]))):
+        folder = make_bundle(each, HERE, tmp_path / str(number)).path.parent
+        made.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert (made[0], len(made[0])) == (made[1], 2)  # the bundle and its signature
     assert build_installer() == build_installer()
 
 
@@ -124,11 +110,10 @@ def test_it_holds_what_the_board_needs_and_nothing_else(workshop, party, tmp_pat
     settings = tmp_path / "board.toml"
     settings.write_bytes(contents["config.toml"])
     read_back = load_config(settings, {})
-    assert (read_back.connect, read_back.vehicle) == ("tls/10.0.0.1:7447", "mock")
-    assert (read_back.policy, read_back.tls, read_back.hold) == (
-        "policy.onnx", "tls", "../../state/hold",
-    )  # fmt: skip
-    assert not read_back.armed_at_start
+    names = ("connect", "vehicle", "policy", "tls", "hold", "armed_at_start")
+    assert [getattr(read_back, name) for name in names] == [
+        "tls/10.0.0.1:7447", "mock", "policy.onnx", "tls", "../../state/hold", False,
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -181,9 +166,7 @@ def test_the_certificates_must_be_this_vehicles(workshop, party, tmp_path, name)
         "--wheels /dev/null/wheels", "--out /dev/null/bundles",
     ))],
 )  # fmt: skip
-def test_a_mistake_is_one_line_before_anything_is_downloaded(
-    workshop, tmp_path, capsys, monkeypatch, arguments
-):
+def test_a_mistake_is_said_before_any_download(workshop, tmp_path, capsys, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
     if "--wheels" not in arguments:
         monkeypatch.setattr(bundle_module, "gather", lambda *_: pytest.fail("downloads"))
@@ -222,7 +205,7 @@ def test_packages_come_out_scripts_stay_in_and_no_two_wheels_hold_the_same_file(
     found = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
     assert found == {"a/__init__.py", "a-1.dist-info/RECORD", "b.py", "c/d.so"}
     for clash in ("b.py", "b.py/x.py", "b-1.data/purelib/b.py"):
-        with pytest.raises(InstallerError, match="another wheel"):
+        with pytest.raises(verify.UserError, match="another wheel"):
             unpack_wheel(wheel(clash), "b-1.whl", tmp_path)
 
 
@@ -237,7 +220,7 @@ LEAVES = ("../x.py", "/x.py", "a/../../x.py", "a\\..\\x.py", "a-1.data/purelib/.
     ],
 )
 def test_what_is_no_wheel_or_leaves_the_folder_is_refused(tmp_path, data, match):
-    with pytest.raises(InstallerError, match=match):
+    with pytest.raises(verify.UserError, match=match):
         unpack_wheel(data, "a-1.whl", tmp_path / "site")
     assert not (tmp_path / "x.py").exists()
 
@@ -284,8 +267,8 @@ def test_a_wheel_with_another_hash_is_not_taken(tmp_path, monkeypatch):
 
 FILES = {"config.toml": b"a = 1\n", "empty": b"", "wheels/a-1.whl": bytes(range(256)) * 5}
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(32))
-MADE = Manifest("0.1.0-a-b", HERE, "hunter01", "p" * 64)
-CONTENTS = {**FILES, MANIFEST: to_json(MADE)}
+MADE = verify.Manifest("0.1.0-a-b", HERE, "hunter01", "p" * 64)
+CONTENTS = {**FILES, verify.MANIFEST: verify.to_json(MADE)}
 
 
 def pem_of(key) -> bytes:
@@ -303,18 +286,17 @@ def bundle(tmp_path):
 
 
 def write(path, data: bytes, key: Ed25519PrivateKey = KEY) -> None:
-    """A bundle of these bytes, and the key's signature of them."""
     path.write_bytes(data)
     path.with_name(f"{path.name}.sig").write_bytes(_sign(data, key))
 
 
 def refused(path, match: str = "is refused", key: bytes = PUBLIC) -> None:
-    with pytest.raises(InstallerError, match=match):
-        read_bundle(str(path), key)
+    with pytest.raises(verify.UserError, match=match):
+        verify.read_bundle(str(path), key)
 
 
 def test_what_was_put_in_comes_out_and_others_read_it_too(bundle, tmp_path):
-    opened = read_bundle(str(bundle), PUBLIC)
+    opened = verify.read_bundle(str(bundle), PUBLIC)
     assert (opened.manifest, opened.files) == (MADE, CONTENTS)
     subprocess.run(["tar", "--extract", "--file", bundle], cwd=tmp_path, check=True)
     assert all((tmp_path / name).read_bytes() == data for name, data in CONTENTS.items())
@@ -338,8 +320,8 @@ def test_any_one_byte_changed_is_found(bundle):
     # A signature is text: a few changes, as of a line's end, leave what it says as it was.
     taken = 0
     for _ in changed(bundle.with_name("bundle.tar.sig")):
-        with contextlib.suppress(InstallerError):
-            assert read_bundle(str(bundle), PUBLIC).files == CONTENTS
+        with contextlib.suppress(verify.UserError):
+            assert verify.read_bundle(str(bundle), PUBLIC).files == CONTENTS
             taken += 1
     assert taken < 10
 
@@ -389,23 +371,25 @@ def test_what_is_signed_and_no_bundle_is_refused(bundle, what):
     refused(bundle, "holds what no bundle holds" if what in STRANGE else "is refused")
 
 
+BAD_VERSIONS = [verify.to_json(MADE._replace(version=version)) for version in ("../x", "")]
+
+
 @pytest.mark.parametrize(
     ("raw", "match"),
     [
-        *((raw, "manifest is not valid") for raw in (b"", b"[]", b"{}")),
-        *((to_json(MADE._replace(version=v)), "manifest is not valid") for v in ("../x", "")),
-        (to_json(MADE).replace(b'"format":1', b'"format":2'), "format is 2"),
+        *((raw, "manifest is not valid") for raw in (b"", b"[]", b"{}", *BAD_VERSIONS)),
+        (verify.to_json(MADE).replace(b'"format":1', b'"format":2'), "format is 2"),
     ],
 )
 def test_a_signed_manifest_that_makes_no_sense_is_refused(raw, match):
-    with pytest.raises(InstallerError, match=match):
-        parse_manifest(raw)
+    with pytest.raises(verify.UserError, match=match):
+        verify.parse_manifest(raw)
 
 
 @pytest.mark.parametrize("name", ["missing.tar", ".", "pipe", "/dev/zero"])
 def test_what_cannot_be_read_is_one_line(tmp_path, name):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InstallerError, match=r"cannot be read|is not a file"):
+    with pytest.raises(verify.UserError, match=r"cannot be read|is not a file"):
         trusted_key(Layout(str(tmp_path)), str(tmp_path / name))
     refused(tmp_path / name, r"cannot be read|is not a file")
 
@@ -421,9 +405,9 @@ def test_an_ssh_keygen_that_cannot_verify_is_said(bundle, tmp_path, monkeypatch)
 def test_a_key_is_the_same_however_its_lines_end_and_what_is_none_is_said(tmp_path):
     path, pem = tmp_path / "key.pub", pem_of(ec.generate_private_key(ec.SECP256R1()))
     path.write_bytes(PUBLIC.replace(b"\n", b"\r\n"))
-    assert ssh_key(read_public_key(str(path))) == ssh_key(PUBLIC)
-    assert ssh_key(PUBLIC) != ssh_key(pem_of(Ed25519PrivateKey.generate()))
+    assert verify.ssh_key(verify.read_public_key(str(path))) == verify.ssh_key(PUBLIC)
+    assert verify.ssh_key(PUBLIC) != verify.ssh_key(pem_of(Ed25519PrivateKey.generate()))
     for wrong in (b"", b"\xff\xfe", pem, pem[:-30], pem.replace(b"PUBLIC", b"PRIVATE")):
         path.write_bytes(wrong)
-        with pytest.raises(InstallerError, match="public key is not"):
-            read_public_key(str(path))
+        with pytest.raises(verify.UserError, match="public key is not"):
+            verify.read_public_key(str(path))

@@ -10,11 +10,7 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    load_pem_private_key,
-    load_pem_public_key,
-)
+from cryptography.hazmat.primitives import serialization as form
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from deploy.__main__ import main
@@ -48,7 +44,6 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def party(made, tmp_path):
-    """A copy of one party's folder, to spoil."""
     shutil.copytree(made / "edge-hunter01", tmp_path / "party")
     return tmp_path / "party"
 
@@ -84,9 +79,8 @@ def test_what_is_missing_is_made_and_nothing_before_it_changes(tmp_path, capsys)
     assert make(folder, "--vehicle-id", "one") == 0
     assert f"kept as it is: {folder / 'router'}" in capsys.readouterr().out
     again = contents(folder)
-    assert {path for path in after if again[path] != after[path]} <= {
-        Path("edge-one/cert.pem"), Path("edge-one/key.pem"),
-    }  # fmt: skip
+    changed = {str(path) for path in after if again[path] != after[path]}
+    assert changed <= {"edge-one/cert.pem", "edge-one/key.pem"}
     assert contents(tmp_path / "old") != contents(folder / "edge-one")
     (folder / "ca/ca.key.pem").unlink()
     assert make(folder, "--vehicle-id", "new") == 2
@@ -157,7 +151,7 @@ def test_a_certificate_outside_its_time_says_so(party, made, shift_days, match):
     authority = read_authority(made / "ca")
     then = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=shift_days)
     issued = issue(authority, "edge-hunter01", "edge", [], then, days=5)
-    (party / "cert.pem").write_bytes(issued.certificate.public_bytes(Encoding.PEM))
+    (party / "cert.pem").write_bytes(issued.certificate.public_bytes(form.Encoding.PEM))
     (party / "key.pem").write_bytes(_pem(issued.key))
     with pytest.raises(UserError, match=match):
         load_tls(party)
@@ -177,7 +171,8 @@ def test_a_pair_fits_together_is_private_and_never_overwritten(tmp_path, capsys)
     assert exit_status(main, keys) == 0
     private_path, public_path = tmp_path / "keys/policy.key", tmp_path / "keys/policy.pub"
     pem = private_path.read_bytes()
-    private, public = load_pem_private_key(pem, None), load_pem_public_key(public_path.read_bytes())
+    private = form.load_pem_private_key(pem, None)
+    public = form.load_pem_public_key(public_path.read_bytes())
     public.verify(private.sign(b"policy"), b"policy")  # type: ignore[call-arg, union-attr]
     assert stat.S_IMODE(private_path.stat().st_mode) == 0o600
     (tmp_path / "file").write_text("")
@@ -194,9 +189,6 @@ def test_two_files_take_few_modules(tmp_path):
         "import sys; from deploy.__main__ import main; main(sys.argv[1:]);"
         " print(*(n for n in sys.modules if n.startswith(('deploy', 'edge_runtime', 'zenoh'))))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program, "keys", "--out", str(tmp_path / "keys")],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    ours = done.stdout.splitlines()[-1].split()
+    line = [sys.executable, "-c", program, "keys", "--out", str(tmp_path / "keys")]
+    ours = subprocess.check_output(line, text=True).splitlines()[-1].split()
     assert len(ours) <= 10, ours

@@ -1,10 +1,4 @@
-"""The installer as a process on a folder, with the real edge runtime and real Zenoh sessions.
-
-Its switch is also cut off: by something else than the service's own fault, and by SIGKILL right
-before one of its own writes, which is a moment of a power cut.
-"""
-
-from __future__ import annotations
+"""The installer as a process on a folder, with the real edge runtime and real Zenoh sessions."""
 
 import contextlib
 import fcntl
@@ -29,9 +23,7 @@ from deploy.certs import write_key_pair
 from deploy.installer import __main__ as installer
 from deploy.installer import layout as layout_module
 from deploy.installer import systemd
-from deploy.installer.__main__ import Installer
 from deploy.installer.layout import Layout, why_not_whole
-from deploy.installer.systemd import NoService, choose
 from deploy.installer.verify import UnhealthyError, UserError, read_bundle
 from deploy.tests.boards import HERE, Board, changed_wheel
 from edge_runtime.tests.harness import Simulator, make_state, wait_until
@@ -47,11 +39,7 @@ FAULTS = {
     "it answers for a while, then ends": (RUN, RUNS, WITH_VEHICLE),
     "it cannot open the vehicle": (MOCK, "self._commanded_s = -math.inf", "1 / 0"),
     "it never says that it is ready": (RUN, "ready vehicle_id", "almost vehicle_id"),
-    "it ends as soon as it is ready": (
-        RUN,
-        RUNS,
-        RUNS.replace("loop.run()", "os._exit(3)"),
-    ),
+    "it ends as soon as it is ready": (RUN, RUNS, RUNS.replace("loop.run()", "os._exit(3)")),
 }
 
 
@@ -66,13 +54,11 @@ def refused(done, *words: str) -> None:
 
 
 def test_install_upgrade_back_and_away(board: Board):
-    """A whole life on one board: each release answers the simulator with its own policy."""
     one, two = board.workshop.make(0.1), board.workshop.make(0.2)
     board.runs_a_process()
     with Simulator(board.workshop.endpoint) as simulator:
 
         def drives(episode: int) -> float:
-            """The running release's answer: states go out until one comes."""
             simulator.alive.clear()
             for step in range(200):
                 with contextlib.suppress(queue.Empty):
@@ -126,9 +112,7 @@ def heard_by(endpoint: str):
     [dict(list(FAULTS.items())[:1]), pytest.param(FAULTS, marks=pytest.mark.board)],
     ids=["one fault", "all faults"],
 )
-def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(
-    board: Board, tmp_path, faults
-):
+def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(board, tmp_path, faults):
     """Beside a good release that drives a simulator all the while; each fault in its own way."""
     shop = board.workshop
     good = shop.make(0.1)
@@ -159,9 +143,7 @@ def test_a_failing_release_goes_back_and_nobody_hears_a_command_of_it(
 
 
 @pytest.mark.board
-def test_ended_in_the_middle_of_a_switch_it_goes_back_and_a_link_that_breaks_does_not_end_it(
-    board: Board,
-):
+def test_ended_in_mid_switch_it_goes_back_and_a_link_that_breaks_does_not_end_it(board):
     old, new = board.workshop.make(0.1), board.workshop.make(0.2)
     board.runs_a_process()
     assert board.install(old.path, "process").returncode == 0
@@ -216,14 +198,12 @@ def test_a_bundle_of_another_key_is_refused_now_and_later(board: Board, workshop
     ],
 )
 def test_a_bundle_for_another_computer_is_refused(board: Board, workshop, tmp_path, changes, word):
-    refused(
-        board.install(make_bundle(workshop.inputs(), HERE._replace(**changes), tmp_path).path), word
-    )
+    made = make_bundle(workshop.inputs(), HERE._replace(**changes), tmp_path)
+    refused(board.install(made.path), word)
     assert not board.root.exists()
 
 
 def test_a_policy_that_may_not_drive_there_changes_nothing(board: Board, workshop, tmp_path):
-    """`check` of the release's own runtime says no: the release before stays."""
     good = workshop.make(0.1)
     assert board.install(good.path).returncode == 0
     wheel = changed_wheel(
@@ -251,9 +231,7 @@ def test_a_damaged_release_is_said_and_made_again(board: Board, workshop):
     assert board.status()["whole"] == "yes"
 
 
-def test_one_installer_at_a_time_to_its_end_and_uninstall_takes_only_what_is_ours(
-    board: Board, workshop
-):
+def test_one_installer_at_a_time_to_its_end_and_uninstall_takes_only_ours(board, workshop):
     made = workshop.make(0.1)
     line = board.command("install", made.path, "--trust", workshop.public_key)
     # An ssh link that broke: nobody reads what it says.
@@ -298,9 +276,7 @@ def test_all_is_on_the_disk_before_a_release_has_its_name(workshop, tmp_path, mo
 
 
 MISTAKES = {
-    **dict.fromkeys(
-        ("install", "fly", "status --service cron", "install missing.tar", "supervise"), ""
-    ),
+    **dict.fromkeys(("install", "fly", "status --service cron", "install missing.tar"), ""),
     **{
         f"rollback {option} {value}": f"argument {option}: {value!r} is not a number of seconds"
         for option in ("--health-limit", "--settle")
@@ -354,9 +330,7 @@ def test_nobody_else_can_keep_the_service_silent(tmp_path, monkeypatch):
                 raise AssertionError("it has the lock")
 
 
-def test_what_a_user_may_not_read_and_a_unit_cannot_name_is_said(
-    board: Board, workshop, monkeypatch, capsys
-):
+def test_what_may_not_be_read_or_named_in_a_unit_is_said(board, workshop, monkeypatch, capsys):
     assert board.install(workshop.make(0.1).path).returncode == 0
 
     def may_not(folder: Path) -> str:
@@ -369,13 +343,13 @@ def test_what_a_user_may_not_read_and_a_unit_cannot_name_is_said(
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     for root in ("/opt/two words", "/opt/100%"):
         with pytest.raises(UserError, match="in a unit only"):
-            choose("systemd", Path(root))
+            systemd.choose("systemd", Path(root))
 
 
 OLD, NEW = "0.1.0-old", "0.1.0-new"
 
 
-class Service(NoService):
+class Service(systemd.NoService):
     """Runs whatever `current` names; its watch of the new release ends with an error."""
 
     name = "fake"
@@ -415,7 +389,7 @@ def layout(tmp_path, monkeypatch):
         layout.release(version).mkdir(parents=True)
     layout.state.mkdir()
     layout.link("current", OLD)
-    monkeypatch.setattr(Installer, "_prove", lambda self, version: None)
+    monkeypatch.setattr(installer.Installer, "_prove", lambda self, version: None)
     return layout
 
 
@@ -439,7 +413,7 @@ def test_whatever_cuts_the_watch_off_the_old_release_runs_again(layout, monkeypa
         monkeypatch.setattr(closed, "write", broken, raising=False)
         monkeypatch.setattr(sys, "stdout", closed)
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
-        Installer(layout, service).activate(NEW, is_new=True)
+        installer.Installer(layout, service).activate(NEW, is_new=True)
     assert (layout.linked("current"), service.runs) == (OLD, OLD)
     assert layout.versions() == [OLD]
     assert service.heard == []
@@ -449,7 +423,7 @@ def test_an_interrupted_roll_back_or_stop_leaves_the_old_release_running(layout,
     layout.link("previous", NEW)
     service = Service(layout, KeyboardInterrupt())
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}"):
-        Installer(layout, service).activate(NEW, is_new=False)
+        installer.Installer(layout, service).activate(NEW, is_new=False)
     assert (layout.linked("current"), layout.linked("previous"), service.runs) == (OLD, NEW, OLD)
     stops = [KeyboardInterrupt]
 
@@ -460,7 +434,7 @@ def test_an_interrupted_roll_back_or_stop_leaves_the_old_release_running(layout,
 
     monkeypatch.setattr(service, "stop", stop)
     with pytest.raises(UnhealthyError, match=f"went back to {OLD}: interrupted"):
-        Installer(layout, service).activate(NEW, is_new=True)
+        installer.Installer(layout, service).activate(NEW, is_new=True)
     assert (layout.linked("current"), service.runs) == (OLD, OLD)
 
 
@@ -480,19 +454,14 @@ def watch(event, arguments):
 sys.addaudithook(watch)
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
-"""Kills itself, and what it has started, before the step of that number among those whose path ends
-so."""
+"""Kills itself and its children before the step of that number among those whose path ends so."""
 
 
 def killed(board: Board, bundle, where: str, number: int) -> bool:
-    """Whether it came to that step."""
-    python, _, *line = board.command(
-        "install", bundle, "--trust", board.workshop.public_key, "--service", "none"
-    )
-    done = subprocess.run(
-        [python, "-c", KILLER, where, str(number), *line], start_new_session=True,
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+    words = (bundle, "--trust", board.workshop.public_key, "--service", "none")
+    python, _, *line = board.command("install", *words)
+    line = [python, "-c", KILLER, where, str(number), *line]
+    done = subprocess.run(line, start_new_session=True, capture_output=True, text=True, timeout=60)
     assert done.returncode in (0, -signal.SIGKILL), done.stderr
     return done.returncode != 0
 

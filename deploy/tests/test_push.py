@@ -1,7 +1,5 @@
 """`deploy push` with stand-ins for ssh and scp: real processes that work on this computer."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
@@ -60,8 +58,6 @@ def far(tmp_path, monkeypatch):
 
 @pytest.fixture
 def push(far, board, workshop):
-    """Push to the board of this computer; the exit status."""
-
     def pushed(*arguments: object) -> int:
         options = ["--trust", workshop.public_key, "--root", board.root, "--no-sudo"]
         return exit_status(main, ["push", *map(str, [*arguments, *options])])
@@ -101,9 +97,7 @@ def test_a_dry_run_says_each_step_and_does_none(far, board, push, workshop, caps
     assert not board.root.exists()
 
 
-def test_an_installer_that_refuses_is_told_and_cleaned_up(
-    far, board, push, workshop, tmp_path, capfd
-):
+def test_a_refusal_there_is_told_and_cleaned_up(far, board, push, workshop, tmp_path, capfd):
     """The board trusts somebody else's key already."""
     _, other = write_key_pair(tmp_path / "other")
     made = workshop.make(0.1)

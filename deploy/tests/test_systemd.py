@@ -1,7 +1,5 @@
 """The unit files and the Dockerfile: systemd takes the units as they are, and what both promise."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -24,9 +22,8 @@ MAX_EXPOSURE = {"phil-edge.service": 20, "phil-can.service": 25}
 def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
     if shutil.which("systemd-analyze") is None:
         pytest.skip("systemd-analyze is not there (Debian's package systemd)")
-    return subprocess.run(
-        ["systemd-analyze", *arguments], capture_output=True, text=True, timeout=60, check=False
-    )
+    line = ["systemd-analyze", *arguments]
+    return subprocess.run(line, capture_output=True, text=True, timeout=60)
 
 
 @pytest.fixture
@@ -52,7 +49,6 @@ def test_systemd_takes_every_line(units):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_exposure(name):
-    """Exit status 1 above the threshold."""
     limit = f"--threshold={MAX_EXPOSURE[name]}"
     options = ("security", "--offline=true", "--no-pager")
     if "--offline" not in analyze("--help").stdout:
@@ -63,7 +59,6 @@ def test_exposure(name):
 
 
 def settings(name: str) -> dict[str, str]:
-    """The values of each key in a unit, in its order, one a line."""
     found: dict[str, str] = {}
     for line in (UNITS / name).read_text().splitlines():
         if "=" in line and not line.startswith("#"):
@@ -82,8 +77,7 @@ def test_the_runtime_has_a_watchdog_limits_no_rights_and_nothing_to_write_to():
     tries_s = float(unit["RestartSec"]) * float(unit["StartLimitBurst"])
     assert tries_s < float(unit["StartLimitIntervalSec"])  # or the limit would never be reached
     assert unit["CPUAffinity"]
-    for name in ("phil-can.service", "network-online.target"):
-        assert name in unit["After"]
+    assert {"phil-can.service", "network-online.target"} <= set(unit["After"].split())
     bus = settings("phil-can.service")  # no condition of the runtime, and at the Hunter's rate
     assert "bitrate 500000" in bus["ExecStart"]
     assert bus["CapabilityBoundingSet"] == "CAP_NET_ADMIN CAP_SYS_MODULE"
@@ -112,7 +106,6 @@ ACTIVE = "ActiveState=active\nSubState=running\nNRestarts=0\nResult=success\nSta
 
 @pytest.fixture
 def systemd(tmp_path, monkeypatch):
-    """The service as units, with a folder of our own for them."""
     programs = tmp_path / "programs"
     programs.mkdir()
     names = {"python": sys.executable, "log": str(tmp_path / "log"), "state": str(tmp_path / "s")}
@@ -121,8 +114,8 @@ def systemd(tmp_path, monkeypatch):
         (programs / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
     (tmp_path / "s").write_text(ACTIVE)
-    for folder in ("state", "etc"):
-        (tmp_path / folder).mkdir()
+    (tmp_path / "state").mkdir()
+    (tmp_path / "etc").mkdir()
     return Systemd(tmp_path, tmp_path / "etc")
 
 
@@ -185,7 +178,6 @@ def test_a_start_that_systemd_or_a_bundle_refuses_is_said(systemd, tmp_path):
 
 
 def try_release(systemd, tmp_path, said: str, state: str = ACTIVE) -> list[str]:
-    """A trial of a runtime that says so; what systemd was told."""
     (tmp_path / "log.said").write_text(said)
     (tmp_path / "s").write_text(state)
     systemd.try_release(tmp_path / "one", "abc", Limits(0.2, 0.1))
@@ -228,9 +220,8 @@ def instructions() -> list[tuple[str, str]]:
     """(INSTRUCTION, arguments), with continued lines joined and comments left out."""
     lines = [line for line in DOCKERFILE.read_text().splitlines() if not line.startswith("#")]
     joined = re.sub(r"\\\n\s*", " ", "\n".join(lines))
-    return [
-        (word, rest.strip()) for word, _, rest in (x.partition(" ") for x in joined.split("\n"))
-    ]
+    split = (line.partition(" ") for line in joined.split("\n"))
+    return [(word, rest.strip()) for word, _, rest in split]
 
 
 def only(word: str) -> str:
@@ -256,18 +247,16 @@ def test_it_runs_without_rights_and_asks_no_index():
 
 def test_no_private_key_is_left_and_its_folder_is_there_to_be_mounted(tmp_path):
     """What comes after the installer in the same layer, as its shell runs it."""
-    release = tmp_path / "releases" / "1"
-    (release / "tls").mkdir(parents=True)
-    (release / "tls" / "key.pem").write_text("private")
+    secrets = tmp_path / "releases" / "1" / "tls"
+    secrets.mkdir(parents=True)
+    (secrets / "key.pem").write_text("private")
     (tmp_path / "current").symlink_to("releases/1")
     installer, _, after = installation().partition(" && ")
     assert "install.pyz" in installer
-    done = subprocess.run(
-        ["sh", "-c", after.replace("/opt/phil", str(tmp_path))],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+    shell = ["sh", "-c", after.replace("/opt/phil", str(tmp_path))]
+    done = subprocess.run(shell, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
-    assert list((release / "tls").iterdir()) == []
+    assert list(secrets.iterdir()) == []
 
 
 def test_the_runtime_is_the_first_process_as_a_unit_starts_it():

@@ -3,22 +3,17 @@ and the same loop in virtual time."""
 
 import json
 from itertools import chain, repeat
+from unittest import mock
 
 import pytest
 
 from edge_runtime.cli import run_cli
 from edge_runtime.util import UserError
+from hil_tests import report as reports
 from hil_tests import sweep
 from hil_tests.__main__ import main
 from hil_tests.mock_hunter.hunter import make_parameters
 from hil_tests.processes import POLICY
-from hil_tests.report import (
-    check_report,
-    lag_sentence,
-    render_comparison,
-    render_sweep,
-    write_report,
-)
 from hil_tests.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
 
@@ -54,9 +49,7 @@ def rows_of(axis, *success):
     ],
 )  # fmt: skip
 def test_the_budget_is_the_largest_value_up_to_which_all_hold(success, limits, sentence):
-    rows = {
-        spec: row for axis, some in success.items() for spec, row in rows_of(axis, *some).items()
-    }
+    rows = {one: row for axis, some in success.items() for one, row in rows_of(axis, *some).items()}
     found = sweep.budget(list(success), rows, 0.98, "a policy")
     assert found["sentence"] == sentence
     assert tuple(found["limits"].values()) == limits
@@ -90,8 +83,8 @@ def report_of(seed, outcomes, times_s=None, vehicle=None, p99=4.0):
     }  # fmt: skip
 
 
-def row_of(*reports):
-    return sweep.make_row("s", [sweep.worth_keeping(report) for report in reports])
+def row_of(*parts):
+    return sweep.make_row("s", [sweep.worth_keeping(part) for part in parts])
 
 
 def vehicle_of(samples, rmse, lag_ms):
@@ -139,7 +132,7 @@ def test_the_cost_counts_seeds_that_both_loops_bring_to_the_goal():
         "scenario": "left_turn", "rows": {"policy": policy, "vehicle": vehicle}, "cost": found,
         "target_success": 0.95, "holds": False,
     }  # fmt: skip
-    text = render_comparison(comparison)
+    text = reports.render_comparison(comparison)
     assert "in 67% (21% to 94%) of 3 episodes: the bar of 95% is NOT met." in text
     assert "| actuator lag, ms | - | speed 100, pedal - |" in text
 
@@ -165,11 +158,11 @@ def test_the_lag_budget_is_the_sum_up_to_which_every_point_holds():
         (sweep.lag_budget(rows[:3], 0.95), "every lag that was tested"),
         (none, "below 95% success at the least lag"),
     ):
-        assert words in lag_sentence({"lag_budget": budgeted})
+        assert words in reports.lag_sentence({"lag_budget": budgeted})
     # The table shows lags that were not told as such.
     two = [row_at(0, 100, 20, 90), row_at(50, 200, 10, None, 1)]
     shown = {"rows": {row["spec"]: row for row in two}, "lag_budget": sweep.lag_budget(two, 0.95)}
-    text = render_sweep({**shown, "runs": 20})
+    text = reports.render_sweep({**shown, "runs": 20})
     assert "| 100 | 100% (90) | - |" in text
     assert "| 200 | - | 50%* (-) |" in text
 
@@ -187,18 +180,14 @@ def test_a_campaign_through_real_processes_resumes_where_it_was(tmp_path, monkey
     assert first["budget"]["sentence"] in capsys.readouterr().out
     assert first["budget"]["sentence"] in out.with_suffix(".md").read_text()
 
-    driven: list[sweep.Part] = []
-
-    def drive_network(task, part):
-        driven.append(part)
-        raise UserError("drives nothing")
-
+    no_drive = UserError("drives nothing")
+    drive_network = mock.Mock(side_effect=no_drive, __name__="drive_network")  # rows are kept by it
     monkeypatch.setattr(sweep, "drive_network", drive_network)
     assert run_cli(main, arguments) == 0
     assert json.loads(out.read_text())["latency"]["rows"] == first["rows"]
     next((tmp_path / "r_rows").iterdir()).unlink()
     assert run_cli(main, arguments) == 2
-    assert len(driven) == 1
+    assert drive_network.call_count == 1
 
 
 def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeypatch):
@@ -220,16 +209,16 @@ def test_a_drive_without_end_is_driven_again_beside_a_fresh_edge_runtime(monkeyp
 
 def test_the_markdown_stands_beside_the_json_or_that_is_said_before_the_work(tmp_path):
     out, markdown = tmp_path / "r.json", tmp_path / "r.md"
-    check_report(out)
-    write_report(out, {"passed": True}, ["# Campaign", "", "all", ""])
+    reports.check_report(out)
+    reports.write_report(out, {"passed": True}, ["# Campaign", "", "all", ""])
     assert json.loads(out.read_text()) == {"passed": True}
     assert markdown.read_text() == "# Campaign\n\nall\n"
     with pytest.raises(UserError, match=r"r\.md is for the JSON"):
-        check_report(markdown)
+        reports.check_report(markdown)
     markdown.unlink()
     markdown.mkdir()
     with pytest.raises(UserError, match="is a directory"):
-        check_report(out)
+        reports.check_report(out)
 
 
 def test_a_rig_drives_a_hunter_over_can_and_the_simulator_follows_it():

@@ -21,14 +21,10 @@ SMALL = (
 
 
 @pytest.mark.timeout(400)
-def test_the_demo_makes_everything_it_promises_and_then_uses_what_is_kept(
-    tmp_path, monkeypatch, capsys
-):
+def test_the_demo_makes_all_it_promises_and_then_uses_what_is_kept(tmp_path, monkeypatch, capsys):
     words = ["demo", "--out", str(tmp_path / "demo"), *SMALL]
-    first = subprocess.run(  # as a person would, without a terminal
-        [sys.executable, "-m", "hil_tests", *words],
-        capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False,
-    )  # fmt: skip
+    line = [sys.executable, "-m", "hil_tests", *words]  # as a person would, without a terminal
+    first = subprocess.run(line, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     # A policy of a hundred steps may well drive badly (status 1); anything else is a fault.
     assert first.returncode in (0, 1), first.stderr
     made = {path.name for path in (tmp_path / "demo").iterdir()}
@@ -82,10 +78,8 @@ def test_what_an_interrupted_command_keeps_is_waited_for(tmp_path):
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
         "from hil_tests.processes import run_command; run_command('child')"
     )
-    parent = subprocess.Popen(
-        [sys.executable, "-c", code], cwd=tmp_path, stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )  # fmt: skip
+    line = [sys.executable, "-c", code]
+    parent = subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True)
     wait_until((tmp_path / "ready").exists, "the child")
     os.killpg(parent.pid, signal.SIGINT)  # as a terminal does
     assert parent.wait(30) != 0

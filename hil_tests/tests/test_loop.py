@@ -1,89 +1,50 @@
-"""Both scenarios through a separate edge runtime against the same drive in process, also behind a
-bad network; and the recorded drive of the last release.
-"""
-
-from __future__ import annotations
+"""Both scenarios through an edge runtime and in process; the recorded drive of the last release."""
 
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
 from bridge.__main__ import main as bridge
 from bridge.network import parse_spec
-from bridge.tests.harness import simulate_undisturbed
+from bridge.tests.harness import simulate_undisturbed, start_edge
 from edge_runtime.cli import run_cli
-from edge_runtime.tests.harness import EdgeProcess
 from edge_runtime.transport import free_endpoint
 from hil_tests.pictures import LEFT_TURN
 from hil_tests.processes import POLICY, PUBLIC_KEY
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.evaluate import drive_episodes
-from trainer.export import export_policy, write_policy
-from trainer.learner.networks import Actor
 
-ROOT = Path(__file__).parents[2]
-LATE = "100ms"
+NONE, LATE = "none", "100ms"
 BAD = "60ms+-40ms,loss=10%,burst=3,duplicate=5%,reorder=5%,outage=0.6s/2s,rate=1Mbit/s"
 
 
 @pytest.fixture(autouse=True)
 def _in_the_root(monkeypatch):
-    monkeypatch.chdir(ROOT)
-
-
-def untrained(folder: Path, scenario: str) -> Path:
-    """An untrained actor, exported for real: it creeps forward, or hardly steers."""
-    with torch.random.fork_rng():
-        torch.manual_seed(1)
-        actor = Actor()
-    if scenario == "left_turn":
-        with torch.no_grad():
-            actor.head.output.weight.mul_(10)
-            actor.head.output.bias.add_(0.2)
-    label = {"scenario": scenario, "algorithm": "phil_td3", "seed": 0, "episode": 0}
-    path = folder / f"{scenario}.onnx"
-    write_policy(export_policy(actor, label, {}), path, None)
-    return path
-
-
-def drive(policy, folder, scenario, *options):
-    endpoint = free_endpoint()
-    with EdgeProcess("--policy", str(policy), "--connect", endpoint, "--allow-unsigned"):
-        return simulate_undisturbed(folder, endpoint, scenario, options)
+    monkeypatch.chdir(Path(__file__).parents[2])
 
 
 @pytest.mark.parametrize(
-    ("scenario", "condition", "episodes"),
-    [("left_turn", "nominal", 4), ("congestion", "nominal", 2), ("congestion", "variant", 2)],
+    ("scenario", "condition", "spec", "runs"),
+    [
+        *(("left_turn", "nominal", spec, 3) for spec in (NONE, LATE, BAD)),
+        *(("congestion", condition, NONE, 2) for condition in ("nominal", "variant")),
+    ],
 )
-def test_lock_step_over_the_wire_is_the_drive_in_process(tmp_path, scenario, condition, episodes):
-    policy = untrained(tmp_path, scenario)
-    env = make_environment(scenario, condition)
-    wanted = drive_episodes(env, OnnxDriver(policy), range(episodes), condition)
-    options = ("--episodes", str(episodes), "--condition", condition)
-    report = drive(policy, tmp_path, scenario, *options)
-    assert (report["scenario"], report["condition"]) == (scenario, condition)
-    assert report["safe_stops"] == 0
-    for ours, theirs in zip(report["per_episode"], wanted, strict=True):
-        assert (ours["seed"], ours["outcome"]) == (theirs.seed, theirs.outcome)
-        np.testing.assert_allclose(ours["actions"], theirs.actions, atol=1e-5)
-        assert ours["distance_m"] == pytest.approx(theirs.distance_m, abs=1e-4)
-
-
-@pytest.mark.parametrize("spec", [LATE, BAD])
-def test_training_and_lock_step_over_zenoh_are_the_same_drive_to_the_bit(spec, tmp_path):
+def test_lock_step_is_the_drive_in_process_to_the_bit(tmp_path, scenario, condition, spec, runs):
     """What is trained behind a network is what drives behind it."""
-    env = make_environment("left_turn")
-    trained = drive_episodes(env, OnnxDriver(POLICY), range(3), latency=parse_spec(spec))
-    report = drive(POLICY, tmp_path, "left_turn", "--episodes", "3", "--latency", spec)
-    assert report["deadline_misses"] > 0
-    assert bool(report["safe_stops"]) == (spec == BAD)
-    for ours, theirs in zip(report["per_episode"], trained, strict=True):
-        assert ours["actions"] == theirs.actions
-        assert (ours["outcome"], ours["distance_m"]) == (theirs.outcome, theirs.distance_m)
+    policy, endpoint = POLICY.with_name(f"{scenario}.onnx"), free_endpoint()
+    env, driver = make_environment(scenario, condition), OnnxDriver(policy)
+    wanted = drive_episodes(env, driver, range(runs), condition, latency=parse_spec(spec))
+    options = ("--episodes", str(runs), "--condition", condition, "--latency", spec)
+    with start_edge(endpoint, policy):
+        report = simulate_undisturbed(tmp_path, endpoint, scenario, options)
+    assert (report["scenario"], report["condition"]) == (scenario, condition)
+    assert (report["deadline_misses"] > 0) == (spec != NONE)
+    assert (report["safe_stops"] > 0) == (spec == BAD)
+    for ours, theirs in zip(report["per_episode"], wanted, strict=True):
+        names = ("seed", "outcome", "distance_m", "actions")
+        assert [ours[name] for name in names] == [getattr(theirs, name) for name in names]
 
 
 def test_every_recorded_command_is_still_the_same(tmp_path):

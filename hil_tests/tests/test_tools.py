@@ -1,9 +1,4 @@
-"""Boards that are not there (marker ``board``), the doctor, the bench's table, the mutants' judge.
-
-And the mistakes of every command of hil_tests.
-"""
-
-from __future__ import annotations
+"""The doctor, boards that are not there, the bench's table, the mutants' judge, and mistakes."""
 
 import importlib
 import os
@@ -24,24 +19,15 @@ from hil_tests import doctor
 from hil_tests.__main__ import main
 from hil_tests.bench_loop import compare, rows
 from hil_tests.board import BOARDS, FAULTS, prove, why_not
-from hil_tests.doctor import (
-    CHECKS,
-    Check,
-    examine,
-    lines,
-    program_says,
-    python_says,
-    summary,
-)
 from hil_tests.mutation.mutants import ACCEPTED, Mutant, judge, read_accepted
 from trainer.util import find_chromium
 
 ROOT = Path(__file__).parents[2]
-BY_NAME = {check.name: check for check in CHECKS}
+BY_NAME = {check.name: check for check in doctor.CHECKS}
 
 
 def found(probe, group="group"):
-    return examine(Check(group, "thing", probe, "no driving", "buy one"))
+    return doctor.examine(doctor.Check(group, "thing", probe, "no driving", "buy one"))
 
 
 def test_the_basics_work_where_the_tests_run_and_every_check_has_a_remedy(capsys):
@@ -49,8 +35,8 @@ def test_the_basics_work_where_the_tests_run_and_every_check_has_a_remedy(capsys
     said = capsys.readouterr().out
     assert "  missing  " not in said
     assert said.endswith("The basics work. Nothing is missing.\n")
-    assert all(check.without and check.remedy for check in CHECKS)
-    assert len(BY_NAME) == len(CHECKS)
+    assert all(check.without and check.remedy for check in doctor.CHECKS)
+    assert len(BY_NAME) == len(doctor.CHECKS)
 
 
 def test_without_packages_it_still_runs_and_says_what_is_missing():
@@ -70,13 +56,13 @@ def test_without_packages_it_still_runs_and_says_what_is_missing():
 def test_programs_and_modules_are_tried(monkeypatch, tmp_path):
     for probe in (
         partial(importlib.import_module, "no_such_package"),
-        partial(python_says, "import no_such_package.part"),
+        partial(doctor.python_says, "import no_such_package.part"),
     ):
         finding = found(probe)
         assert finding.detail == "Python finds no module no_such_package"
         assert finding.remedy == "make install"
     with pytest.raises(UserError, match="ZeroDivisionError"):
-        python_says("1 / 0")
+        doctor.python_says("1 / 0")
     tool = tmp_path / "tool"
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     for script, says in (
@@ -85,29 +71,29 @@ def test_programs_and_modules_are_tried(monkeypatch, tmp_path):
     ):
         tool.write_text(f"#!/bin/sh\n{script}\n")
         tool.chmod(0o755)
-        assert found(partial(program_says, "tool")).detail == says
-    assert found(partial(program_says, "toool")).detail == "toool is not installed"
+        assert found(partial(doctor.program_says, "tool")).detail == says
+    assert found(partial(doctor.program_says, "toool")).detail == "toool is not installed"
 
 
 def test_the_browser_that_is_found_is_the_one_that_the_tests_use(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert not examine(BY_NAME["Chromium"]).ok
+    assert not doctor.examine(BY_NAME["Chromium"]).ok
     assert find_chromium() is None
     browser = tmp_path / "google-chrome-stable"
     browser.write_text("#!/bin/sh\necho Chrome 1\n")
     browser.chmod(0o755)
-    assert examine(BY_NAME["Chromium"]).detail == "Chrome 1"
+    assert doctor.examine(BY_NAME["Chromium"]).detail == "Chrome 1"
     assert find_chromium() == str(browser)
 
 
 def test_a_directory_that_takes_no_file_and_a_full_disk(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert examine(BY_NAME["disk"]).ok
+    assert doctor.examine(BY_NAME["disk"]).ok
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr(doctor, "DISK_GB", 10**9)
-    assert "are wanted" in examine(BY_NAME["disk"]).detail
+    assert "are wanted" in doctor.examine(BY_NAME["disk"]).detail
     monkeypatch.chdir("/proc")
-    assert not examine(BY_NAME["disk"]).ok
+    assert not doctor.examine(BY_NAME["disk"]).ok
 
 
 def test_python_ports_buses_and_the_display_are_tried(monkeypatch):
@@ -119,28 +105,27 @@ def test_python_ports_buses_and_the_display_are_tried(monkeypatch):
         assert not taken.ok
         assert "Address already in use" in taken.detail
     assert found(probe).ok
-    said = examine(BY_NAME["CAN over UDP"]).detail
+    said = doctor.examine(BY_NAME["CAN over UDP"]).detail
     assert said == "a frame went through UDP multicast on loopback"
     monkeypatch.setattr(doctor, "OLDEST", (99, 0))
-    assert not examine(BY_NAME["Python"]).ok
+    assert not doctor.examine(BY_NAME["Python"]).ok
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
-    assert "neither DISPLAY" in examine(BY_NAME["window"]).detail
+    assert "neither DISPLAY" in doctor.examine(BY_NAME["window"]).detail
     monkeypatch.setenv("DISPLAY", ":4711")
-    assert ":4711" in examine(BY_NAME["window"]).detail
-    assert not examine(BY_NAME["window"]).ok
+    assert ":4711" in doctor.examine(BY_NAME["window"]).detail
+    assert not doctor.examine(BY_NAME["window"]).ok
 
 
 def test_packages_are_asked_for(monkeypatch, tmp_path):
-    (tmp_path / "pyproject.toml").write_text(
-        '[project]\ndependencies = ["numpy>=1", "no-such-thing!=1.2"]\n'
-    )
+    project = '[project]\ndependencies = ["numpy>=1", "no-such-thing!=1.2"]\n'
+    (tmp_path / "pyproject.toml").write_text(project)
     lock = tmp_path / "lock.txt"
     lock.write_text("numpy==0.0.1\nno-such-thing==1.0\n")
     monkeypatch.setattr(doctor, "ROOT", tmp_path)
     monkeypatch.setattr(doctor, "LOCK", lock)
-    assert examine(BY_NAME["packages"]).detail == "not installed: no-such-thing"
-    assert "(locked: 0.0.1)" in examine(BY_NAME["locked versions"]).detail
+    assert doctor.examine(BY_NAME["packages"]).detail == "not installed: no-such-thing"
+    assert "(locked: 0.0.1)" in doctor.examine(BY_NAME["locked versions"]).detail
 
 
 def test_what_goes_wrong_in_a_check_is_its_finding():
@@ -148,24 +133,24 @@ def test_what_goes_wrong_in_a_check_is_its_finding():
         raise ImportError("libsomething.so:\n no such file")
 
     broken = found(probe, "basics")
-    assert lines(broken).splitlines() == [
+    assert doctor.lines(broken).splitlines() == [
         "  missing  thing: ImportError: libsomething.so: no such file",
         "           without it: no driving",
         "           get it: buy one",
     ]
-    assert summary([broken]) == "The basics do not work here: thing."
+    assert doctor.summary([broken]) == "The basics do not work here: thing."
     extra, basic = found(probe), found(lambda: "there", "basics")
-    assert summary([extra, basic]) == "The basics work. Missing besides: thing."
-    assert summary([extra]) == "Missing: thing."
-    assert summary([basic]) == "The basics work. Nothing is missing."
+    assert doctor.summary([extra, basic]) == "The basics work. Missing besides: thing."
+    assert doctor.summary([extra]) == "Missing: thing."
+    assert doctor.summary([basic]) == "The basics work. Nothing is missing."
 
 
 CUTS = 2  # The kept report (results/deploy/aarch64.json) has more.
 
 
 def test_what_is_missing_is_said(monkeypatch, tmp_path):
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
     for board in BOARDS:
-        monkeypatch.setattr(os, "geteuid", lambda: 1000)
         with pytest.raises(UserError, match=f"no {board} here: it needs root"):
             main(["board", "--boards", board, "--out", str(tmp_path / "r.json")])
     monkeypatch.setattr(os, "geteuid", lambda: 0)
