@@ -144,7 +144,7 @@ FACTS = {
     "lane": "the human drives: no stopping in the lane",
     "stuck": "the human drives: the way is clear",
     "heading": "the human drives: it turned aside",
-    "offset": "the human drives: it drifted aside",
+    "offset": "the human drives: too far aside",
     "person": "the human drives",
     None: "the policy drives",
 }

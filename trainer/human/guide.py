@@ -9,8 +9,7 @@ from trainer.scenarios.environment import Action, Observation
 
 Reason = Literal["collision", "lane", "stuck", "heading", "offset", "person"]
 """Why the human takes over: hardly a way out of a crash, a car that stops in the traffic's lane,
-one that waits for nothing, one that turns aside, one that is or drifts aside; a person has reasons
-of their own."""
+one that waits for nothing, one that turns aside or is aside; a person has reasons of their own."""
 
 
 class Driver(Protocol):
