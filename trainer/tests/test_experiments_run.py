@@ -59,8 +59,8 @@ def test_a_killed_command_goes_on_to_the_same_record(store, straight, tmp_path):
     """The whole command, killed at a checkpoint as a power cut would."""
     code = (
         "from pathlib import Path; from trainer.tests.experiments import *; "
-        "from trainer.experiments.run import *; "
-        f"run_units([running.Task(UNIT, store_in(Path({str(tmp_path)!r})))], 1)"
+        "from trainer.experiments import run as running; "
+        f"running.run_units([running.Task(UNIT, store_in(Path({str(tmp_path)!r})))], 1)"
     )
     command = [sys.executable, "-c", code]
     process = subprocess.Popen(command, cwd=ROOT, start_new_session=True)
