@@ -320,7 +320,6 @@ def without_chunk(number: int) -> list[tuple[str, int, bytes]]:
 
 @pytest.fixture
 def repair(capsys):
-
     def repaired(*arguments):
         capsys.readouterr()
         assert bridge_status(["repair", *map(str, arguments)]) == 0

@@ -187,10 +187,11 @@ def running():
     with contextlib.ExitStack() as ends:
 
         def start(notifier: Any, vehicle: Any = None) -> Any:
-            policy, link = FakePolicy(), FakeLink()
+            policy: Any = FakePolicy()
+            link: Any = FakeLink()
             controller = Controller(shared_limits([PEDAL], {}), needs_rearm=False)
             runner = vehicle and VehicleRunner(vehicle, ["pedal"], lambda feedback: None)
-            control = ControlLoop(policy, controller, link, runner, notifier)  # type: ignore[arg-type]
+            control = ControlLoop(policy, controller, link, runner, notifier)
             control.start()
             main = threading.Thread(target=control.run)
             main.start()

@@ -182,7 +182,6 @@ def test_a_plan_may_end_in_a_stop():
 
 
 def guided(guide: HumanGuide, action: np.ndarray):
-
     def act(observation):
         intervention = guide.watch(observation, action)
         return action if intervention is None else intervention.action
