@@ -218,6 +218,8 @@ LEAVES = ("../x.py", "/x.py", "a/../../x.py", "a\\..\\x.py", "a-1.data/purelib/.
         *((wheel(name), "outside") for name in LEAVES),
         *((data, "is not a wheel") for data in (b"", b"no zip", wheel("a.py")[:-30])),
     ],
+    # A wheel holds the time at which it is made, and every worker must collect the same names.
+    ids=[*LEAVES, "empty", "no zip", "cut short"],
 )
 def test_what_is_no_wheel_or_leaves_the_folder_is_refused(tmp_path, data, match):
     with pytest.raises(verify.UserError, match=match):
