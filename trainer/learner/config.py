@@ -63,12 +63,13 @@ class LearnerConfig:
     """Newest frames that actor and critics see: eq. 28's two, or the tough setting's one."""
     batch_size: int = 128
     """Transitions in a minibatch (table A5: N)."""
-    actor_learning_rate: float = 5e-4
-    """Of the actor's optimiser, and ..."""
+    actor_learning_rate: float = 1e-4
+    """Of the actor's optimiser (table A5: 5e-4). Adam's steps are as long for a small gradient as
+    for a large one, and where the actor has little left to learn, its gradient is the critics'
+    error. Five times as fast, it followed that error away from what it had learned."""
     critic_learning_rate: float = 1e-3
-    """... of the critics'. Twice the rates of table A5 and more, since normalised critics learn
-    slower; the other way round, as in the authors' code: an actor should follow a critic that is
-    ahead of it."""
+    """Of the critics' (table A5: 2e-4). Normalised critics learn slower, and an actor should follow
+    critics that are ahead of it."""
     learning_rate_decay: float = 1.0
     """Factor on both learning rates, once an episode (table A5: 0.996). By steps is
     fairer: a policy that fails early has many short episodes."""
@@ -125,7 +126,7 @@ class LearnerConfig:
     """Exact eq. 22 and 23: separate means over policy and human samples. Off: one mean over the
     batch, as in the authors' code, since the exact form gives a handful of demonstrations half of
     the critic's loss."""
-    cloning_weight: float = 20.0
+    cloning_weight: float = 40.0
     """Weight of the behaviour cloning term (omega of eq. 23; no value in the paper). Chosen
     on single runs, in which a small weight let the policy forget the human before the critic knew
     better."""
