@@ -230,6 +230,18 @@ class Result:
         steps, values = self.points(kind, metric)
         return float(values[steps > steps[-1] - END_STEPS].mean())
 
+    @property
+    def unlearned(self) -> float:
+        """Share of validation drives by which the end lies below the best validation."""
+        return float(max(self.record["validation"]["success"])) - self.end(ALONE, SUCCESS)
+
+    @property
+    def costs(self) -> tuple[int, int, int]:
+        """Human steps, take-overs, and training episodes that missed the goal."""
+        columns = self.record["training"]
+        failures = sum(outcome != GOAL for outcome in columns["outcome"])
+        return sum(columns["human_steps"]), sum(columns["takeovers"]), failures
+
     def reached(self, condition: str) -> NDArray[np.bool_]:
         """Which test drives reached the goal, by seed."""
         return np.array([outcome == GOAL for outcome in self.record["tests"][condition]["outcome"]])

@@ -19,11 +19,12 @@ from matplotlib.patches import Patch
 from bridge.report import markdown_table
 from edge_runtime.files import write_atomic
 from edge_runtime.util import UserError
-from trainer.experiments.claims import CLAIMS, Claim, Finding, judge_both
+from trainer.experiments.claims import CLAIMS, Claim, Finding, first_reached, judge_both
 from trainer.experiments.data import (
     ALONE,
     ARRIVED_ONLY,
     DISTANCE,
+    END_STEPS,
     LATERAL,
     LONGITUDINAL,
     PAPER_SCENES,
@@ -226,7 +227,40 @@ def _floor(results: Results) -> Iterator[str]:
             yield ""
 
 
-MORE = {"fig9": _tests, "time": _times, "floor": _floor}
+def _cost(results: Results) -> Iterator[str]:
+    """Steps and human effort of every line, and how much of the best policy is left at the end."""
+    yield (
+        f"Means of the seeds. Steps until the policy alone reaches {LEARNED:.0%} of its validation "
+        f"drives, of those seeds that do; late: the validations of the last {END_STEPS:,} steps."
+    )
+    yield ""
+    rows = []
+    for line, scenario in product(EVERY_LINE, SCENARIOS):
+        found = [result for result in results.of(scenario, line) if result.unit.trained]
+        if not found:
+            continue
+        steps = [first_reached(r.grid, r.curve(ALONE, SUCCESS), LEARNED) for r in found]
+        there = [step for step in steps if np.isfinite(step)]
+        rows.append(
+            (
+                line.name,
+                words(scenario),
+                f"{np.mean(there):,.0f}" if there else "–",
+                f"{len(there)} of {len(found)}",
+                f"{100 * np.mean([r.unlearned for r in found]):.1f}",
+                f"{100 * max(r.unlearned for r in found):.1f}",
+                *(f"{cost:,.0f}" for cost in np.mean([r.costs for r in found], axis=0)),
+            )
+        )
+    learned = f"steps to {LEARNED:.0%}"
+    late = ("late below best, points", "at most")
+    head = ("", "scenario", learned, "seeds", *late, "human steps", "take-overs", "failures")
+    yield from markdown_table(head, rows)
+
+
+LEARNED = 0.9
+"""Success of the policy alone at which it counts as learned."""
+MORE = {"fig9": _tests, "time": _times, "floor": _floor, "cost": _cost}
 """Experiment -> its tables beside its claims."""
 
 

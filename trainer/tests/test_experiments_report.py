@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from edge_runtime.util import UserError
 from trainer.experiments import claims, data
 from trainer.experiments.plan import EXPERIMENTS, NORMAL, PAPER_TESTS, Unit, units_of
-from trainer.experiments.report import write_report
+from trainer.experiments.report import _cost, write_report
 from trainer.tests.experiments import UNIT, results_of, store_in, synthetic, write_human
 from trainer.tests.test_commands import call
 
@@ -161,6 +161,19 @@ def store(tmp_path):
     for unit in units_of(["fig9", "fig7"], 2, "left_turn"):
         store.put(unit, {**synthetic(unit), "id": store.id(unit)})
     return store
+
+
+def test_the_page_says_when_a_policy_was_learned_and_how_much_it_lost_again():
+    unit = Unit("left_turn", "phil_td3", NORMAL, 1)
+    results = results_of([unit], 1)
+    record = results.found[unit].record
+    record["validation"] |= {"at_step": list(range(500, 6_001, 500))}
+    record["validation"] |= {"success": [0.4, 0.8, 1.0, *[1.0] * 6, 1.0, 0.9, 0.8]}
+    outcomes = ["collision"] * 7 + ["goal"] * 3
+    record["training"] |= {"human_steps": [1200, 34], "takeovers": [50, 6], "outcome": outcomes}
+    (row,) = [line for line in _cost(results) if line.startswith("| PHIL-TD3 |")]
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells[1:] == ["left turn", "1,250", "1 of 1", "10.0", "10.0", "1,234", "56", "7"]
 
 
 def test_the_report_is_made_of_the_records_alone(store):
