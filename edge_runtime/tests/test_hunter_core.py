@@ -2,11 +2,11 @@
 
 import pytest
 
-from edge_runtime.tests.rigs import OK, PEDAL, HunterRig
+from edge_runtime.tests.rigs import OK, PEDAL, SPEC, HunterRig
 from edge_runtime.vehicles import core as rules
 from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S
+from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports
 
 TAKE, RELEASE, STAND = (0x421, b"\x01"), (0x131, b"\x00"), (0x111, bytes(8))
 CLEAR, LOCK, GIVE_BACK = (0x441, b"\x00"), (0x131, b"\x01"), (0x421, b"\x00")
@@ -189,6 +189,33 @@ def test_what_stops_it_before_the_next_tick(driving, frame, message, cause, word
     assert words in driving.words[0]
     driving.core.enable(driving.now_s)
     assert (driving.core.cause, driving.core.words) == (None, "")
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("field", protocol.MotionStatus._fields)
+def test_no_more_than_the_model_can_do_with_three_tenths_is_believed(rig, field, sign):
+    most = {"speed_mps": SPEC.max_speed_mps, "inner_steering_rad": SPEC.max_inner_steering_rad}
+    for excess, lies in ((-0.001, False), (0.001, True)):
+        message = protocol.MotionStatus(0.0, 0.0)
+        message = message._replace(**{field: sign * (1.3 * most[field] + excess)})
+        rig.tell(protocol.MOTION_STATUS, message)
+        assert (rig.core.reports.lie() is not None) is lies
+
+
+@pytest.mark.parametrize("beyond_s", [0.0, 1e-9])
+def test_a_counter_begins_anew_only_after_a_silence(beyond_s):
+    reports, again_s = Reports(SPEC, "v2"), STATUS_SILENCE_S + beyond_s
+    for now_s in (0.0, again_s):
+        reports.hear(0x211, protocol.encode(protocol.SYSTEM_STATUS, OK), now_s)
+    assert (reports.status_s == again_s) is (beyond_s > 0)
+
+
+def test_the_brake_is_locked_though_the_fault_goes_on(driving):
+    driving.status, driving.obeys = OK._replace(faults=0x1000), False
+    driving.step(50, PEDAL)
+    assert LOCK not in driving.frames()
+    driving.step(6, PEDAL)
+    assert LOCK in driving.frames()
 
 
 @pytest.mark.parametrize(("missing", "after_ticks"), [("0x221", 12), ("0x211", 20)])
