@@ -85,11 +85,17 @@ def test_a_speed_is_stuck_outside_of_all_that_was_lately_asked_and_only_after_a_
     watch = SpeedWatch(10.0)  # 1 m/s to each side
     for now_s, asked_mps, measured_mps, stuck in [
         (-3.0, 9.0, 0.0, False),  # it has had no time to follow
-        (-2.5, 2.0, 0.0, False),
-        (-1.75, 2.0, 10.0, False),  # as was asked for before
-        (-1.25, 2.0, 3.0, False),  # no more, but the highest that counts as 2 m/s
-        (-1.0, 2.0, 9.0, False),
-        (-0.5, 2.0, 1.0, False),  # the lowest
+        (-2.0625, 9.0, 0.0, False),
+        (-2.0, 9.0, 0.0, False),
+        (-1.9375, 9.0, 0.0, False),
+        (-1.875, 9.0, 0.0, True),
+        (-1.5, 2.0, 9.0, False),
+        (-0.5, 2.0, 10.0, False),  # as was asked for a second ago
+        (-0.375, 2.0, 9.0, False),  # no more
+        (-0.25, 2.0, 9.0, True),
+        (-0.125, 2.0, 3.0, False),  # the highest that counts as 2 m/s
+        (-0.0625, 2.0, 9.0, False),
+        (-0.03125, 2.0, 1.0, False),  # the lowest
         (0.0, 2.0, 0.5, False),
         (DEVIATES_S, 2.0, 9.0, False),
         (DEVIATES_S + 0.001, 2.0, 0.5, True),
@@ -338,5 +344,6 @@ def test_what_is_older_than_a_control_period_counts_no_more(earlier, period_s):
     later_s = len(earlier) * period_s + 0.2
     speeds.note(1.0, later_s)
     assert speeds.acceleration_mps2() == 0.0
+    speeds.note(5.0, later_s + 0.05)
     speeds.note(1.1, later_s + 0.1)
     assert speeds.acceleration_mps2() == pytest.approx(1.0)
