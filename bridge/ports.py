@@ -4,8 +4,8 @@ The port publishes states and hands on what comes back. A listener (viewer, reco
 every topic through a bounded queue. Zenoh's threads only put into it, so a listener that falls
 behind loses messages and never holds up the vehicle.
 
-After them stands what the commands share: their options, which say where an end is, the progress
-bar, and how they wait.
+After them stands what the commands share: their options, which say where an end is, and how they
+wait.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import queue
 import secrets
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,8 +20,6 @@ from typing import Any, NoReturn
 
 import msgspec
 import zenoh
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from bridge.environments import scene_of
 from bridge.inbound import EdgeCounts
@@ -326,15 +323,3 @@ def wait_to_be_told() -> NoReturn:
     """
     while True:
         time.sleep(RETRY_S)
-
-
-def progress_bar(unit: str) -> Progress:
-    """Make a bar on stderr that counts ``unit``; it shows nothing where stderr is no terminal."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(unit),
-        TimeElapsedColumn(),
-    )
-    return Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty())

@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from bridge.messages import DECODERS, Heard
-from bridge.ports import SimulatorPort, add_options, open_port, progress_bar
+from bridge.ports import SimulatorPort, add_options, open_port
+from bridge.progress import ProgressBar
 from bridge.recording import Recording, choose_vehicle, heard_of
 from edge_runtime.cli import ArgumentParser, add_public_key, examples, not_negative_number
 from edge_runtime.config import NONE, Config, load_config
@@ -132,9 +133,8 @@ def _answers(drive: RecordedDrive, arguments: Any) -> tuple[str, Answers]:
     wait_s, tls = arguments.wait_edge_s, tls_for(arguments.tls, endpoint)
     with open_port(arguments.listen, drive.vehicle_id, tls, arguments.connect, wait_s) as port:
         port.wait_for_edge(wait_s, endpoint)
-        with progress_bar("states") as progress:
-            states = progress.track(drive.answered(), len(drive.exchanges), description="replaying")
-            answers = _Live(port).replay(states)
+        with ProgressBar("replaying states", len(drive.exchanges)) as bar:
+            answers = _Live(port).replay(drive.answered(), bar)
         port.note_edge_counts()
         health = port.edge_counts.newest
         return health.policy_id if health else "", answers
@@ -348,7 +348,7 @@ class _Live:
         self._recorded: dict[str, str] = {}  # and back
         self._answers: Answers = {}
 
-    def replay(self, states: Iterable[tuple[State, Exchange]]) -> Answers:
+    def replay(self, states: Iterable[tuple[State, Exchange]], bar: ProgressBar) -> Answers:
         self._port.hear("command", self._inbox.put)
         zero_s, last_s = float("-inf"), 0.0
         for state, exchange in states:
@@ -362,6 +362,7 @@ class _Live:
             self._listen_until(time.monotonic() + SILENCE_S, key_of(state))
             zero_s = max(zero_s, time.monotonic() - exchange.finished_s)
             last_s = exchange.last_s
+            bar.advance({})
         self._listen_until(zero_s + last_s)
         return self._answers
 

@@ -9,7 +9,6 @@ from collections import Counter
 from typing import Any
 
 import gymnasium
-from rich.progress import Progress
 
 from bridge.clocks import CLOCKS, LOCKSTEP, REALTIME, Clock, VehicleClock
 from bridge.environments import (
@@ -24,7 +23,8 @@ from bridge.environments import (
     vehicle_action,
 )
 from bridge.inbound import CommandCheck, FeedbackCheck
-from bridge.ports import SimulatorPort, add_options, open_port, progress_bar
+from bridge.ports import SimulatorPort, add_options, open_port
+from bridge.progress import ProgressBar
 from bridge.report import episode_line, make_report, rejections, summary_line
 from bridge.virtual_link import Decision
 from edge_runtime.cli import ArgumentParser, examples, positive, sigterm_as_interrupt
@@ -98,8 +98,8 @@ def _serve(asked: Namespace, environment: gymnasium.Env[Any, Any]) -> dict[str, 
             clock = VehicleClock(port.publish_state, check, asked.latency, feedback)
         else:
             clock = CLOCKS[asked.clock](port.publish_state, check, asked.latency)
-        with contextlib.closing(clock), progress_bar("episodes") as progress:
-            bar = EpisodeBar(progress, asked.episodes)
+        with contextlib.closing(clock), EpisodeBar("episodes", asked.episodes) as bar:
+            bar.show("waiting for an edge runtime")
             port.hear("command", clock.receive)
             port.wait_for_edge(wait_s, endpoint)
             manifest = port.edge_manifest()
@@ -125,7 +125,7 @@ def _drive(
 
     def on_tick(episode: int, step: int, decision: Decision) -> None:
         waits = edge.newest is not None and edge.newest.needs_rearm
-        bar.tick(episode, step, decision, rearm if waits else "")
+        bar.tick(step, decision, rearm if waits else "")
 
     runner = EpisodeRunner(
         environment,
@@ -150,7 +150,8 @@ def _drive(
             vehicle.wait_for_standstill()
         results.append(runner.run(episode, asked.seed + episode))
         stops = [event for event in runner.safe_stops.events if event.episode == episode]
-        bar.done(episode + 1, episode_line(episode + 1, asked.episodes, results[-1], stops))
+        told = episode_line(episode + 1, asked.episodes, results[-1], stops)
+        bar.advance({}, told=told)
     wall_s = time.monotonic() - started_s
     port.note_edge_counts()
     by_simulator = check.rejected + Counter(edge.unreadable)
@@ -190,31 +191,16 @@ def _refuse_another_task(asked: Namespace, runner: EpisodeRunner, theirs: str, o
         )
 
 
-class EpisodeBar:
-    """Shows the episodes done and what the vehicle does; without a terminal, a line an episode."""
+class EpisodeBar(ProgressBar):
+    """Shows the episodes done and what the vehicle does."""
 
-    def __init__(self, progress: Progress, episodes: int) -> None:
-        self._progress = progress
-        self._task = progress.add_task("waiting for an edge runtime", total=episodes)
-        self._waits_for = ""
+    _waits_for = ""
 
-    def tick(self, episode: int, step: int, decision: Decision, waits_for: str = "") -> None:
+    def tick(self, step: int, decision: Decision, waits_for: str = "") -> None:
         """Show one tick; ``waits_for`` is the command that the vehicle needs to drive again."""
         reason = printable(decision.brake_reason)
         doing = f"braking: {reason}" if reason else "driving"
-        self._progress.update(
-            self._task, completed=episode, description=f"step {step:3d}  {doing[:40]}"
-        )
+        self.show(f"step {step:3d}  {doing[:40]}")
         if waits_for and not self._waits_for:
-            self._say(f"the vehicle stands until it is re-armed: {waits_for}")
+            self.say(f"the vehicle stands until it is re-armed: {waits_for}")
         self._waits_for = waits_for
-
-    def done(self, episodes: int, told: str) -> None:
-        """Show how many episodes are done, and without a bar what became of the last one."""
-        self._progress.update(self._task, completed=episodes)
-        if self._progress.disable:
-            self._say(told)
-
-    def _say(self, line: str) -> None:
-        """Print a line above the bar, as it is."""
-        self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -20,6 +20,7 @@ from typing import Any, Self
 import numpy as np
 import zenoh
 
+from bridge.progress import ProgressBar
 from bridge.report import markdown_table
 from edge_runtime import wire
 from edge_runtime.cli import ArgumentParser, examples, positive
@@ -29,7 +30,7 @@ from edge_runtime.transport import free_endpoint, open_session
 from hil_tests.faults.rig import make_state
 from hil_tests.processes import POLICY, PUBLIC_KEY, Process, wait_until
 from hil_tests.sweep import simulate
-from trainer.util import ProgressBar, processor_model, source_revision
+from trainer.util import processor_model, source_revision
 
 OURS, FLOOR = "bench-ours", "bench-floor"
 SCENARIO = "left_turn"

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.environments import CONDITIONS, NOMINAL
+from bridge.progress import ProgressBar
 from edge_runtime.cli import Command, add_public_key, examples, not_negative, positive, share
 from edge_runtime.policy import load_policy
 from edge_runtime.util import UserError
@@ -23,7 +24,7 @@ from hil_tests import report, sweep
 from hil_tests.faults.run import choose_rows, run_faults
 from hil_tests.mock_hunter.hunter import make_parameters, read_changes
 from trainer.options import add_scenario
-from trainer.util import ProgressBar, cores
+from trainer.util import cores
 
 PART_EPISODES, LOOP_EPISODES = 50, 5
 """Of a network, in virtual time; of a loop, in real time: short, so that all rigs end at about the

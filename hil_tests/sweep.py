@@ -18,6 +18,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bridge.progress import ProgressBar
 from bridge.report import COLLISION, GOAL
 from edge_runtime.cli import sigterm_as_interrupt
 from edge_runtime.files import make_directory, write_json
@@ -30,7 +31,6 @@ from hil_tests.virtual_drive import Driven, VirtualDrive
 from trainer.drivers import OnnxDriver, make_environment
 from trainer.experiments.data import Estimate, mean_estimate, success_estimate
 from trainer.experiments.plan import digest
-from trainer.util import ProgressBar
 
 LOOPS = POLICY, VEHICLE = ("policy", "vehicle")  # What may be in the loop
 VEHICLE_ID = "campaign01"

@@ -30,6 +30,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
+from bridge.progress import ProgressBar
 from edge_runtime.cli import examples
 from edge_runtime.files import check_writable, write_json_out
 from trainer.drivers import make_environment
@@ -44,7 +45,7 @@ from trainer.scenarios.picture import COLUMNS, ROWS
 from trainer.training.config import RunConfig
 from trainer.training.metrics import EpisodeMetrics
 from trainer.training.run import TrainingRun
-from trainer.util import ProgressBar, processor_model, source_revision
+from trainer.util import processor_model, source_revision
 
 EXAMPLE = examples(
     "python -m trainer bench --quick --threads 1",

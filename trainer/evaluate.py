@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bridge.network import LatencySpec, parse_spec
+from bridge.progress import ProgressBar
 from bridge.report import GOAL, EpisodeResult, summarise
 from edge_runtime.cli import add_public_key, examples, positive
 from edge_runtime.files import check_writable, write_json_out
@@ -20,7 +21,6 @@ from trainer.drivers import CONDITIONS, ActTogether, load_driver, make_environme
 from trainer.human.guide import Action, Driver
 from trainer.options import add_latency, add_scenario, add_seed, set_threads
 from trainer.training.delayed import VehicleEnd
-from trainer.util import ProgressBar
 
 EXAMPLE = examples(
     "python -m trainer evaluate expert --runs 20",

@@ -1,8 +1,8 @@
 """Small things that several parts of the trainer need.
 
 In this order: seeds, ranges of settings, torch files, one process in a directory, processes and
-their end, progress, and what made a result. torch takes two seconds to load, so it is imported only
-where a function needs it: ``--help`` and the configs need none of it.
+their end, and what made a result. torch takes two seconds to load, so it is imported only where a
+function needs it: ``--help`` and the configs need none of it.
 """
 
 from __future__ import annotations
@@ -27,8 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from edge_runtime.files import make_directory, try_to_lock_file, write_atomic
 from edge_runtime.util import UserError, open_regular
@@ -36,8 +34,6 @@ from edge_runtime.util import UserError, open_regular
 LOCK_FILE = ".lock"
 """In a directory that is claimed, for as long as it is."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-LINE_INTERVAL_S = 15.0
-"""Between two lines of progress where stderr is no terminal."""
 WRITTEN = ("results/paper",)
 """What the experiments write themselves. Human models, which decide trainings, count as source."""
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -251,47 +247,6 @@ def die_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-class ProgressBar:
-    """Counts to ``total`` and shows a few live figures on stderr: a bar, or now and then a line.
-
-    Use as a context manager and call ``advance`` with the figures, e.g. ``{"success": "0.85"}``.
-    """
-
-    def __init__(self, what: str, total: int, done: int = 0) -> None:
-        self.what, self.total, self.done = what, total, done
-        self._began_s = self._line_s = time.monotonic()
-        self._began_at = done
-        self._bar = Progress(
-            *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
-            *(TextColumn("{task.fields[figures]}"), TextColumn("ETA"), TimeRemainingColumn()),
-            console=Console(stderr=True),
-            disable=not sys.stderr.isatty(),
-        )
-        self._task = self._bar.add_task(what, total=total, completed=done, figures="")
-
-    def __enter__(self) -> ProgressBar:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def advance(self, figures: dict[str, str], count: int = 1) -> None:
-        """``count`` more are done; ``figures`` are shown as name and value."""
-        self.done += count
-        text = "  ".join(f"{name} {value}" for name, value in figures.items())
-        self._bar.update(self._task, completed=self.done, figures=text)
-        now_s = time.monotonic()
-        if self._bar.disable and (
-            now_s - self._line_s > LINE_INTERVAL_S or self.done == self.total
-        ):
-            self._line_s = now_s
-            each_s = (now_s - self._began_s) / max(self.done - self._began_at, 1)
-            left = f"ETA {each_s * (self.total - self.done):.0f} s"
-            line = f"{self.what}: {self.done}/{self.total}  {text}  {left}"
-            print(line, file=sys.stderr, flush=True)
 
 
 @cache

@@ -1,16 +1,19 @@
 """The Hunter's driver in made-up time: how it is enabled, what stops it, and how it ends."""
 
+import math
+
 import pytest
 
-from edge_runtime.tests.rigs import OK, PEDAL, HunterRig
+from edge_runtime.tests.rigs import OK, PEDAL, SPEC, HunterRig
 from edge_runtime.vehicles import core as rules
 from edge_runtime.vehicles.core import Event, State
 from edge_runtime.vehicles.hunter import protocol
-from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S
+from edge_runtime.vehicles.hunter.core import BUS_PATIENCE_S, STATUS_SILENCE_S, Reports
 
 TAKE, RELEASE, STAND = (0x421, b"\x01"), (0x131, b"\x00"), (0x111, bytes(8))
 CLEAR, LOCK, GIVE_BACK = (0x441, b"\x00"), (0x131, b"\x01"), (0x421, b"\x00")
 REMOTE = OK._replace(mode=protocol.REMOTE_CONTROL)
+SILENT_S = STATUS_SILENCE_S + 1e-9
 
 
 @pytest.fixture
@@ -189,6 +192,58 @@ def test_what_stops_it_before_the_next_tick(driving, frame, message, cause, word
     assert words in driving.words[0]
     driving.core.enable(driving.now_s)
     assert (driving.core.cause, driving.core.words) == (None, "")
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("field", protocol.MotionStatus._fields)
+def test_no_more_than_the_model_can_do_with_three_tenths_is_believed(rig, field, sign):
+    most = {"speed_mps": SPEC.max_speed_mps, "inner_steering_rad": SPEC.max_inner_steering_rad}
+    for excess, lies in ((-0.001, False), (0.001, True)):
+        message = protocol.MotionStatus(0.0, 0.0)
+        message = message._replace(**{field: sign * (1.3 * most[field] + excess)})
+        rig.tell(protocol.MOTION_STATUS, message)
+        assert (rig.core.reports.lie() is not None) is lies
+
+
+@pytest.mark.parametrize(
+    ("counters", "alive"),
+    [
+        ([(0.0, 200)], 0.0),  # the first one
+        ([(0.0, 200), (0.1, 200 + 127 - 256)], 0.1),  # ahead by less than half of the circle
+        ([(0.0, 200), (0.1, 200 + 128 - 256)], 0.0),
+        ([(0.0, 200), (STATUS_SILENCE_S, 200)], 0.0),  # begun anew, but not after a silence
+        ([(0.0, 200), (SILENT_S, 200)], SILENT_S),
+    ],
+)
+def test_which_counter_is_a_sign_of_life(counters, alive):
+    reports = Reports(SPEC, "v2")
+    for now_s, counter in counters:
+        status = protocol.encode(protocol.SYSTEM_STATUS, OK._replace(counter=counter))
+        reports.hear(0x211, status, now_s)
+    assert reports.status_s == alive
+
+
+def test_how_long_feedback_may_be_silent():
+    reports = Reports(SPEC, "v2")
+    for now_s, words in ((0.2, "None"), (0.2 + 1e-9, "sends no 0x221")):
+        assert words in str(reports.silence(0.0, now_s))
+    for status_s in (-0.1, 0.0):  # the same counter twice
+        reports.hear(0x211, protocol.encode(protocol.SYSTEM_STATUS, OK), status_s)
+    for now_s, words in (
+        (0.0, "None"),
+        (STATUS_SILENCE_S, "stands still"),
+        (SILENT_S, "sends no 0x211"),
+    ):
+        reports.motion_s = now_s
+        assert words in str(reports.silence(-math.inf, now_s))
+
+
+def test_the_brake_is_locked_though_the_fault_goes_on(driving):
+    driving.status, driving.obeys = OK._replace(faults=0x1000), False
+    driving.step(50, PEDAL)
+    assert LOCK not in driving.frames()
+    driving.step(6, PEDAL)
+    assert LOCK in driving.frames()
 
 
 @pytest.mark.parametrize(("missing", "after_ticks"), [("0x221", 12), ("0x211", 20)])

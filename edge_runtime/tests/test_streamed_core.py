@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 import edge_runtime
 from edge_runtime.tests.harness import render_table
 from edge_runtime.tests.rigs import PEDAL, SPEC, STREAM_S, HunterRig, Ros2Rig
-from edge_runtime.vehicles.core import LEADS_TO, Event, Finding, Speeds, State
+from edge_runtime.vehicles.core import (
+    DEVIATES_S,
+    LEADS_TO,
+    STANDS_MPS,
+    Event,
+    Finding,
+    Speeds,
+    SpeedWatch,
+    State,
+)
 from edge_runtime.vehicles.mapping import wish_of
 from edge_runtime.vehicles.ros2 import ROS2_LEADS_TO
 
@@ -50,6 +59,8 @@ def test_a_vehicle_that_stands_has_its_brake_on_unless_it_is_asked_to_go(rig):
 
 def test_to_enable_it_again_makes_it_stand_and_gives_it_the_whole_time_again(rig):
     count = len(rig.driving().asked)
+    rig.core.enable(rig.now_s)
+    assert rig.report.commanded_speed_mps == 0.0
     rig.enabled()
     assert set(rig.speeds(count)) == {0.0}  # until the next command
     rig.talks = False
@@ -68,6 +79,28 @@ def test_a_vehicle_that_was_stuck_has_a_new_chance_to_follow(rig):
     assert rig.core.state is State.ENABLED
     rig.step(30, {"pedal": -1.0})
     assert rig.core.cause is Event.STUCK
+
+
+def test_a_speed_is_stuck_outside_of_all_that_was_lately_asked_and_only_after_a_while():
+    watch = SpeedWatch(10.0)  # 1 m/s to each side
+    for now_s, asked_mps, measured_mps, stuck in [
+        (-3.0, 9.0, 0.0, False),  # it has had no time to follow
+        (-2.0625, 9.0, 0.0, False),
+        (-2.0, 9.0, 0.0, False),
+        (-1.9375, 9.0, 0.0, False),
+        (-1.875, 9.0, 0.0, True),
+        (-1.5, 2.0, 9.0, False),
+        (-0.5, 2.0, 10.0, False),  # as was asked for a second ago
+        (-0.375, 2.0, 9.0, False),  # no more
+        (-0.25, 2.0, 9.0, True),
+        (-0.125, 2.0, 3.0, False),  # the highest that counts as 2 m/s
+        (-0.0625, 2.0, 9.0, False),
+        (-0.03125, 2.0, 1.0, False),  # the lowest
+        (0.0, 2.0, 0.5, False),
+        (DEVIATES_S, 2.0, 9.0, False),
+        (DEVIATES_S + 0.001, 2.0, 0.5, True),
+    ]:
+        assert watch.is_stuck(asked_mps, measured_mps, now_s) is stuck, now_s
 
 
 def test_a_drive_with_a_lag_is_not_stuck(rig):
@@ -286,7 +319,7 @@ def test_it_only_moves_enabled_on_a_fresh_command_and_within_its_limits(make_rig
 def test_before_the_first_it_stands_and_two_in_one_moment_are_no_acceleration():
     speeds = Speeds()
     assert (speeds.speed_mps, speeds.stands, speeds.acceleration_mps2()) == (0.0, True, 0.0)
-    for speed_mps in (3.0, 4.0):
+    for speed_mps in (3.0, STANDS_MPS, -STANDS_MPS):
         speeds.note(speed_mps, 0.0)
         assert (speeds.stands, speeds.acceleration_mps2()) == (False, 0.0)
 
@@ -311,5 +344,6 @@ def test_what_is_older_than_a_control_period_counts_no_more(earlier, period_s):
     later_s = len(earlier) * period_s + 0.2
     speeds.note(1.0, later_s)
     assert speeds.acceleration_mps2() == 0.0
+    speeds.note(5.0, later_s + 0.05)
     speeds.note(1.1, later_s + 0.1)
     assert speeds.acceleration_mps2() == pytest.approx(1.0)

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from edge_runtime.files import make_directory, write_atomic
 from edge_runtime.util import UserError, read_bytes
@@ -60,7 +61,6 @@ from trainer.learner.networks import multiplies_bfloat16
 from trainer.training.metrics import METRICS_FILE, EpisodeMetrics, read_metrics, totals
 from trainer.training.run import TrainingRun
 from trainer.util import (
-    ProgressBar,
     Purpose,
     die_with_parent,
     episode_seed,

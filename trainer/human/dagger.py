@@ -13,6 +13,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bridge.progress import ProgressBar
 from edge_runtime.cli import examples
 from edge_runtime.files import write_json
 from edge_runtime.util import UserError
@@ -21,7 +22,7 @@ from trainer.drivers import EXPERTS, TRIGGERS, make_environment
 from trainer.human.guide import HumanGuide
 from trainer.human.model import MODEL_FILE, REFINING_PARTS, HumanModel, HumanModelConfig
 from trainer.person.recording import demonstrate, find_recordings
-from trainer.util import ProgressBar, Purpose, claimed, episode_seed
+from trainer.util import Purpose, claimed, episode_seed
 
 EXAMPLE = examples(
     "python -m trainer human --scenario left_turn --out runs/human",

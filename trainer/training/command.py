@@ -20,6 +20,7 @@ from typing import Any
 import torch
 
 from bridge.network import parse_spec
+from bridge.progress import ProgressBar
 from bridge.report import GOAL
 from edge_runtime.cli import INTERRUPTED, examples
 from edge_runtime.util import UserError, counted
@@ -31,7 +32,7 @@ from trainer.pictures import write_learning_curve
 from trainer.training.config import PRESETS, RunConfig
 from trainer.training.metrics import EpisodeMetrics, read_metrics, totals
 from trainer.training.run import CONFIG_FILE, TrainingRun
-from trainer.util import ProgressBar, claimed, quit_on_signals
+from trainer.util import claimed, quit_on_signals
 
 EXAMPLE = examples(
     "python -m trainer train --scenario left_turn --steps 4000 --out runs/phil_1",

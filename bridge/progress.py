@@ -1,0 +1,65 @@
+"""How far a command is: a bar on stderr, or a line now and then where stderr is no terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+LINE_INTERVAL_S = 15.0
+"""Between two lines of progress where stderr is no terminal."""
+
+
+class ProgressBar:
+    """Counts to ``total`` and shows a few live figures on stderr: a bar, or now and then a line.
+
+    Use as a context manager and call ``advance`` with the figures, e.g. ``{"success": "0.85"}``.
+    """
+
+    def __init__(self, what: str, total: int, done: int = 0) -> None:
+        self.what, self.total, self.done = what, total, done
+        self._began_s = self._line_s = time.monotonic()
+        self._began_at = done
+        self._bar = Progress(
+            *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
+            TextColumn("{task.fields[figures]}", markup=False),
+            *(TextColumn("ETA"), TimeRemainingColumn()),
+            console=Console(stderr=True),
+            disable=not sys.stderr.isatty(),
+        )
+        self._task = self._bar.add_task(what, total=total, completed=done, figures="")
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, text: str) -> None:
+        """Show beside the bar what happens now; nothing without a bar."""
+        self._bar.update(self._task, figures=text)
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar, as it is."""
+        self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def advance(self, figures: dict[str, str], count: int = 1, told: str = "") -> None:
+        """``count`` more are done; shown are the figures, or where no bar is, ``told`` instead."""
+        self.done += count
+        text = "  ".join(f"{name} {value}" for name, value in figures.items())
+        self._bar.update(self._task, completed=self.done, figures=text)
+        if not self._bar.disable:
+            return
+        now_s = time.monotonic()
+        if told:
+            self.say(told)
+        elif now_s - self._line_s > LINE_INTERVAL_S or self.done == self.total:
+            self._line_s = now_s
+            each_s = (now_s - self._began_s) / max(self.done - self._began_at, 1)
+            left = f"ETA {each_s * (self.total - self.done):.0f} s"
+            line = f"{self.what}: {self.done}/{self.total}  {text}  {left}"
+            print(line, file=sys.stderr, flush=True)
