@@ -167,10 +167,10 @@ def test_the_page_says_when_a_policy_was_learned_and_how_much_it_lost_again():
     unit = Unit("left_turn", "phil_td3", NORMAL, 1)
     results = results_of([unit], 1)
     record = results.found[unit].record
-    record["validation"] |= {"at_step": list(range(500, 6_001, 500))}
-    record["validation"] |= {"success": [0.4, 0.8, 1.0, *[1.0] * 6, 1.0, 0.9, 0.8]}
+    success = [0.4, 0.8, 1.0, *[1.0] * 6, 1.0, 0.9, 0.8]
+    record["validation"].update(at_step=list(range(500, 6_001, 500)), success=success)
     outcomes = ["collision"] * 7 + ["goal"] * 3
-    record["training"] |= {"human_steps": [1200, 34], "takeovers": [50, 6], "outcome": outcomes}
+    record["training"].update(human_steps=[1200, 34], takeovers=[50, 6], outcome=outcomes)
     (row,) = [line for line in _cost(results) if line.startswith("| PHIL-TD3 |")]
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells[1:] == ["left turn", "1,250", "1 of 1", "10.0", "10.0", "1,234", "56", "7"]
