@@ -141,6 +141,8 @@ class Demo:
             "--seed", seed, "--steps", str(arguments.steps),
             "--max-minutes", f"{arguments.minutes:g}", "--set", "batch_size=64",
             "--set", "evaluate_every_steps=500", "--set", "evaluation_runs=30", *resume,
+            # Within so few steps a fast actor learns more than it unlearns.
+            "--set", "actor_learning_rate=5e-4", "--set", "cloning_weight=20",
         )  # fmt: skip
         shutil.copy(self.run_dir / "learning_curve.png", self.directory / "learning_curve.png")
         heading("3  The actor becomes a signed policy file")
